@@ -1,0 +1,67 @@
+# Needs Python 3.11 or later, pip and make; every target sets up what it needs, once.
+PYTHON ?= $(firstword $(foreach p,python3 python3.11 python3.12 python3.13 python3.14,\
+  $(shell $(p) -c 'import sys; sys.version_info >= (3, 11) and print("$(p)")' 2>/dev/null)))
+BIN := .venv/bin
+STAMP := .venv/.installed
+
+# pytest runs in parallel; more threads in each process only slow it down
+export OMP_NUM_THREADS ?= 1
+
+.PHONY: help setup demo test check format slow bench lock clean
+
+help:
+	@echo "make demo    the whole story on a simulated cell with a hidden effect"
+	@echo "make test    the tests"
+	@echo "make check   ruff, mypy, import-linter"
+	@echo "make slow    the tests that take minutes"
+	@echo "make bench   the benchmarks"
+	@echo "make format  ruff format and safe fixes"
+	@echo "make lock    renew requirements.lock from pyproject.toml (needs the network)"
+	@echo "make clean   remove the environment and all caches"
+
+setup: $(STAMP)
+
+$(STAMP): requirements.lock pyproject.toml setup.py
+	@test -n "$(PYTHON)" || { echo "make: no Python 3.11 or later found; set PYTHON=..." >&2; exit 1; }
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary :all: \
+	  --require-hashes --requirement requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check \
+	  --no-build-isolation --no-deps --editable .
+	@touch $@
+
+demo: $(STAMP)
+	$(BIN)/hilcal demo
+
+test: $(STAMP)
+	$(BIN)/python -m pytest -q -n 2
+
+check: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: $(STAMP)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+slow: $(STAMP)
+	$(BIN)/python -m pytest -q -n 2 -m slow
+
+bench: $(STAMP)
+	$(BIN)/python -m pytest -q -m "slow or not slow" --benchmark-enable --benchmark-only
+
+lock:
+	$(PYTHON) -m venv .lock
+	.lock/bin/python -m pip install --quiet --disable-pip-version-check pip-tools
+	.lock/bin/pip-compile --quiet --upgrade --generate-hashes --allow-unsafe --strip-extras \
+	  --no-config --no-header --no-annotate --no-emit-index-url --no-emit-trusted-host \
+	  --no-emit-find-links --no-emit-options --pip-args "--only-binary :all:" \
+	  --extra dev --output-file requirements.lock pyproject.toml
+	rm -rf .lock
+
+clean:
+	rm -rf .venv .lock build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache \
+	  .hypothesis .benchmarks .import_linter_cache
+	find hilcal drivers tests -name __pycache__ -type d -prune -exec rm -rf {} +

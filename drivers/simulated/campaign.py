@@ -1,0 +1,237 @@
+"""A rehearsal: random well-spread poses, loads that hang on them, and the readings."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from drivers.simulated.elastic_tree import build
+from drivers.simulated.mechanics import elasticity, equilibrium
+from drivers.simulated.world import World
+from hilcal.cell import Cell
+from hilcal.data.readings import Readings, States
+from hilcal.errors import InputError
+from hilcal.types import Bools, Floats, Ints
+
+UNLOADED = "none"
+_READING = 20.0  # s from one reading to the next
+_LOADING = 30.0  # s that it takes to change the load
+_MOVING = 15.0  # s that the arm takes to the next pose
+_SETTLING = (8.0, 16.0)  # s that the load has hung when the reading is taken
+_MARGIN = 0.9  # share of the joint range and of the torque limits that is used
+_CANDIDATES = 12  # poses drawn per pose that is kept
+_ROUNDS = 60
+
+
+def rehearsal_states(
+    cell: Cell,
+    n_poses: int,
+    wrenches: Sequence[tuple[str, Floats]],
+    rng: np.random.Generator,
+    *,
+    approach: bool = True,
+    cycles: int = 1,
+) -> tuple[States, Ints, Ints, Ints]:
+    """Plan a campaign without any device: each pose unloaded, then under each load.
+
+    Poses are feasible (joint and torque limits with a margin, the target and every joint
+    above the floor, away from the base's column, not stretched out) and spread over the
+    joint space. A joint's approach side is the direction of its last motion: that of the
+    move to the pose and, after a change of the load, for about half of the joints that of
+    the change of torque, in which the joint gives way.
+
+    Args:
+        cell: the cell.
+        n_poses: number of poses.
+        wrenches: (name, wrench (6,)) of each load at the load point, base axes, N and N·m.
+        rng: generator.
+        approach: whether the states tell the approach sides.
+        cycles: how often the whole campaign is measured.
+
+    Returns:
+        The N = cycles * n_poses * (1 + loads) states with time, load time and approach, and
+        the (N,) indices of pose, load (0 is unloaded) and cycle.
+
+    Raises:
+        InputError: a wrong number or wrench, or no feasible poses.
+    """
+    pulls = _pulls(wrenches)
+    if n_poses < 1 or cycles < 1:
+        raise InputError(f"{n_poses} poses in {cycles} cycles; valid: at least one of each")
+    poses = spread_poses(cell, n_poses, pulls, rng)
+    loads = len(pulls)
+    pose = np.tile(np.repeat(np.arange(n_poses), loads), cycles)
+    load = np.tile(np.arange(loads), n_poses * cycles)
+    cycle = np.repeat(np.arange(cycles), n_poses * loads)
+    changes = np.diff(load, prepend=0) != 0
+    moves = load == 0
+    time = np.cumsum(_READING + _LOADING * changes + _MOVING * moves)
+    torque = np.stack([_rigid(cell, poses, pull)[1] for pull in pulls], axis=1)
+    sides = _sides(poses[pose], torque[pose, load], moves, rng)
+    states = States(
+        q=poses[pose],
+        wrench=pulls[load],
+        time=time,
+        load_time=rng.uniform(*_SETTLING, len(pose)),
+        approach=sides if approach else None,
+    )
+    return states, pose, load, cycle
+
+
+def simulate(
+    world: World,
+    states: States,
+    pose: Ints,
+    load: Ints,
+    cycle: Ints,
+    load_names: Sequence[str],
+    rng: np.random.Generator,
+    m: int = 3,
+) -> Readings:
+    """Return what the tracker reads of the states, with the covariance of every reading.
+
+    Args:
+        world: the simulated cell.
+        states: N states.
+        pose: (N,) index of the pose.
+        load: (N,) index into `load_names`.
+        cycle: (N,) index of the cycle.
+        load_names: names of the loads, "none" for unloaded.
+        rng: generator of the noise.
+        m: 3 for positions, 6 for poses.
+
+    Raises:
+        InputError: another m.
+    """
+    if m not in (3, 6):
+        raise InputError(f"a reading has {m} elements; valid: 3 (position) or 6 (pose)")
+    return Readings(
+        states=states,
+        pose=np.asarray(pose, dtype=np.int64),
+        load=np.asarray(load, dtype=np.int64),
+        cycle=np.asarray(cycle, dtype=np.int64),
+        value=world.observe(states, rng, m),
+        covariance=world.covariance(world.sight(states), m),
+        load_names=tuple(load_names),
+        pose_names=tuple(f"p{i + 1}" for i in range(int(np.max(pose)) + 1)),
+    )
+
+
+def dead_weights(masses: Sequence[float], gravity: Floats) -> list[tuple[str, Floats]]:
+    """Return the wrenches of masses that hang at the load point, kg and m/s², by name."""
+    return [
+        (f"{mass:g}kg", np.concatenate([mass * np.asarray(gravity), np.zeros(3)]))
+        for mass in masses
+    ]
+
+
+def spread_poses(cell: Cell, count: int, pulls: Floats, rng: np.random.Generator) -> Floats:
+    """Return (count, n) feasible joint angles, each far from the others, rad.
+
+    Args:
+        cell: the cell.
+        count: number of poses.
+        pulls: (L, 6) wrenches that every pose has to bear.
+        rng: generator.
+
+    Raises:
+        InputError: when the limits leave no room.
+    """
+    low = _MARGIN * np.maximum(cell.arm.q_min, -np.pi)
+    high = _MARGIN * np.minimum(cell.arm.q_max, np.pi)
+    found = np.empty((0, cell.arm.n))
+    for _ in range(_ROUNDS):
+        if len(found) >= _CANDIDATES * count:
+            break
+        drawn = rng.uniform(low, high, (max(4 * count, 60), cell.arm.n))
+        found = np.vstack([found, drawn[_feasible(cell, drawn, pulls)]])
+    if len(found) < count:
+        raise InputError(
+            f"poses: only {len(found)} of {count} feasible poses in the joint limits under "
+            "these loads; valid: fewer poses, lighter loads or wider limits"
+        )
+    # farthest point first: every next pose is the candidate farthest from those kept
+    points = np.hstack([np.cos(found), np.sin(found)])
+    kept = [0]
+    distance = np.linalg.norm(points - points[0], axis=1)
+    while len(kept) < count:
+        kept.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, np.linalg.norm(points - points[kept[-1]], axis=1))
+    return np.asarray(found[kept])
+
+
+def _feasible(cell: Cell, q: Floats, pulls: Floats) -> Bools:
+    """Return (N,) which joint angles an arm on a table could take."""
+    arm = cell.arm
+    place = np.broadcast_to(np.eye(4), (len(q), 4, 4))
+    origins = []
+    for k in range(arm.n + 1):
+        place = place @ arm.links[k]
+        origins.append(place[:, :3, 3])
+        if k < arm.n:
+            place = place @ _about_z(q[:, k])
+    target = (place @ cell.target)[:, :3, 3]
+    load = (place[:, :3, :3] @ cell.load_point) + place[:, :3, 3]
+    outer = [*origins[arm.n // 2 :], target, load]
+    reach = arm.reach
+    good = (target[:, 2] > 0.1) & (load[:, 2] > 0.1)
+    for point in outer:
+        column = np.hypot(point[:, 0], point[:, 1])
+        good &= (point[:, 2] > 0.05 * reach) & (column > 0.12 * reach)
+    good &= np.linalg.norm(target - origins[0], axis=1) > 0.25 * reach
+    shoulder = origins[min(1, arm.n)]
+    good &= np.linalg.norm(origins[arm.n] - shoulder, axis=1) < 0.85 * reach
+    limit = np.asarray(arm.torque_max, dtype=float)
+    for pull in pulls:
+        rows = np.flatnonzero(good)
+        good[rows] &= np.all(np.abs(_rigid(cell, q[rows], pull)[1]) <= _MARGIN * limit, axis=1)
+    return good
+
+
+def _rigid(cell: Cell, q: Floats, pull: Floats) -> tuple[Floats, Floats]:
+    """Return flange poses (N, 4, 4) and drive torques (N, n) of the rigid arm, N·m."""
+    arm = cell.arm
+    tree = build(arm, arm.links, cell.tool_mass, cell.tool_com, cell.gravity)
+    none = np.zeros(arm.n)
+    law = elasticity(tree, none, none, none, np.zeros(3), np.zeros((0, 2)))
+    wrench = np.broadcast_to(pull, (len(q), 6))
+    rest = equilibrium(tree, law, q, wrench, cell.load_point)
+    return rest.flange, rest.torque[:, tree.drive]
+
+
+def _sides(q: Floats, torque: Floats, moves: Bools, rng: np.random.Generator) -> Floats:
+    """Return the (N, n) approach sides, -1 or +1, of a sequence of readings."""
+    out = np.empty_like(q)
+    last_q = np.zeros(q.shape[1])
+    side = rng.choice([-1.0, 1.0], q.shape[1])
+    slips = rng.random(q.shape) < 0.5
+    for i in range(len(q)):
+        if moves[i]:
+            moved = q[i] - last_q
+            side = np.where(moved != 0.0, np.sign(moved), side)
+        else:
+            change = torque[i] - torque[i - 1]
+            side = np.where(slips[i] & (np.abs(change) > 1e-6), np.sign(change), side)
+        out[i], last_q = side, q[i]
+    return out
+
+
+def _pulls(wrenches: Sequence[tuple[str, Floats]]) -> Floats:
+    """Return the (1 + L, 6) wrenches, the unloaded one first."""
+    rows = [np.zeros(6)]
+    for name, wrench in wrenches:
+        value = np.asarray(wrench, dtype=float)
+        if value.shape != (6,) or not np.all(np.isfinite(value)):
+            raise InputError(f"load {name!r}: wrench {value.tolist()}; valid: six finite numbers")
+        if name == UNLOADED:
+            raise InputError(f"load {name!r} is the unloaded state; valid: another name")
+        rows.append(value)
+    return np.array(rows)
+
+
+def _about_z(angle: Floats) -> Floats:
+    """Return (N, 4, 4) rotations about z."""
+    out = np.zeros((len(angle), 4, 4))
+    cos, sin = np.cos(angle), np.sin(angle)
+    out[:, 0, 0], out[:, 0, 1], out[:, 1, 0], out[:, 1, 1] = cos, -sin, sin, cos
+    out[:, 2, 2] = out[:, 3, 3] = 1.0
+    return out

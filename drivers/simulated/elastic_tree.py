@@ -1,0 +1,133 @@
+"""The elastic arm as a Pinocchio tree: every way in which it gives is a joint of its own."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from hilcal.robot.arm import Arm
+from hilcal.types import Floats, Ints
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ElasticTree:
+    """Pinocchio model of the elastic arm and where its degrees of freedom sit.
+
+    The tree from base to flange is
+
+        RX RY RZ (base origin), then for each joint j: RX RY (bearing) RZ (drive),
+        and behind the drive of a long link: PY PZ RX RY RZ (its tip, x along the beam).
+
+    Attributes:
+        model: the Pinocchio model, v degrees of freedom.
+        base: (3,) indices of the base's tilts about x, y, z.
+        tilt: (n, 2) indices of the bearings' tilts about the axes across each joint.
+        drive: (n,) indices of the joints themselves: command, errors and elasticity add.
+        beam: (b, 5) indices of the tips: two displacements, twist, two rotations.
+        beam_length: (b,) lengths, m.
+        beam_link: (b,) number k of each long link, the constant transform L_k.
+        last: number of the last Pinocchio joint, which carries the flange.
+        flange: (4, 4) flange in the last joint's frame.
+    """
+
+    model: pin.Model
+    base: Ints
+    tilt: Ints
+    drive: Ints
+    beam: Ints
+    beam_length: Floats
+    beam_link: Ints
+    last: int
+    flange: Floats
+
+
+def long_links(arm: Arm) -> Ints:
+    """Return the numbers k of the (at most two) links that are longer than a third of the longest.
+
+    Only links between two joints count: upper arm and forearm of a usual arm.
+    """
+    lengths = np.linalg.norm(arm.links[1:-1, :3, 3], axis=1)
+    longest = np.argsort(-lengths, kind="stable")[:2]
+    return np.sort(longest[lengths[longest] > lengths.max() / 3.0]) + 1
+
+
+def build(
+    arm: Arm,
+    links: Floats,
+    tool_mass: float,
+    tool_com: Floats,
+    gravity: Floats,
+    *,
+    beams: bool = False,
+) -> ElasticTree:
+    """Build the tree from the true links (n + 1, 4, 4); lengths in m, masses in kg.
+
+    Args:
+        arm: the arm; its own links are not used, `links` are.
+        links: (n + 1, 4, 4) the constant transforms as they truly are.
+        tool_mass: what the flange carries permanently, kg.
+        tool_com: (3,) its centre of mass, flange axes, m.
+        gravity: (3,) base axes, m/s².
+        beams: whether long links get elastic tips.
+    """
+    model = pin.Model()
+    model.gravity.linear = np.asarray(gravity, dtype=float)
+    here = pin.SE3.Identity()
+    last = 0
+
+    def add(kind: object, name: str) -> int:
+        nonlocal here, last
+        last = model.addJoint(last, kind, here, name)
+        here = pin.SE3.Identity()
+        return int(model.idx_qs[last])
+
+    base = [
+        add(pin.JointModelRX(), "base_x"),
+        add(pin.JointModelRY(), "base_y"),
+        add(pin.JointModelRZ(), "base_z"),
+    ]
+    here = pin.SE3(links[0])
+    tilt, drive, beam = [], [], []
+    bent = long_links(arm) if beams else np.zeros(0, dtype=np.int64)
+    for j in range(arm.n):
+        tilt.append(
+            [add(pin.JointModelRX(), f"tilt_x{j + 1}"), add(pin.JointModelRY(), f"tilt_y{j + 1}")]
+        )
+        drive.append(add(pin.JointModelRZ(), f"drive{j + 1}"))
+        body = pin.Inertia(float(arm.masses[j]), arm.coms[j], np.zeros((3, 3)))
+        model.appendBodyToJoint(last, body, pin.SE3.Identity())
+        here = pin.SE3(links[j + 1])
+        if j + 1 in bent:
+            tip = pin.SE3(_beam_axes(links[j + 1][:3, 3]), links[j + 1][:3, 3])
+            here = tip
+            kinds = (
+                pin.JointModelPY(),
+                pin.JointModelPZ(),
+                pin.JointModelRX(),
+                pin.JointModelRY(),
+                pin.JointModelRZ(),
+            )
+            beam.append([add(kind, f"beam{j + 1}_{i}") for i, kind in enumerate(kinds)])
+            here = tip.inverse() * pin.SE3(links[j + 1])
+    tool = pin.Inertia(float(tool_mass), np.asarray(tool_com, dtype=float), np.zeros((3, 3)))
+    model.appendBodyToJoint(last, tool, here)
+    return ElasticTree(
+        model=model,
+        base=np.array(base),
+        tilt=np.array(tilt),
+        drive=np.array(drive),
+        beam=np.array(beam, dtype=np.int64).reshape(-1, 5),
+        beam_length=np.linalg.norm(links[bent, :3, 3], axis=1),
+        beam_link=bent,
+        last=last,
+        flange=np.asarray(here.homogeneous),
+    )
+
+
+def _beam_axes(along: Floats) -> Floats:
+    """Return a (3, 3) rotation whose x runs along the given vector."""
+    x = along / np.linalg.norm(along)
+    other = np.eye(3)[int(np.argmin(np.abs(x)))]
+    y = np.cross(other, x)
+    y /= np.linalg.norm(y)
+    return np.column_stack([x, y, np.cross(x, y)])

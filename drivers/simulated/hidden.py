@@ -1,0 +1,235 @@
+"""Hide an effect in the simulated world at a chosen strength."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from drivers.simulated.draw import Draw, joint_compliance, typical_torque
+from drivers.simulated.rigid import rotation_vector
+from drivers.simulated.tracker import TrackerNoise
+from drivers.simulated.truth import Truth
+from drivers.simulated.world import Sight, World, stand
+from hilcal.cell import Cell
+from hilcal.data.readings import States
+from hilcal.errors import InputError
+from hilcal.types import Floats, Ints
+
+DEFLECTION_EFFECTS = (
+    "joint_compliance",
+    "joint_tilt_compliance",
+    "base_compliance",
+    "link_compliance",
+    "joint_stiffening",
+    "hysteresis",
+    "load_point",
+    "tracker_drift",
+)
+"""Effects that a deflection shows; the others cancel in it to first order."""
+
+EFFECTS = (
+    *DEFLECTION_EFFECTS,
+    "encoder_offset",
+    "transmission_error",
+    "link_geometry",
+    "target_offset",
+    "base_frame",
+)
+"""Every effect that can be hidden."""
+
+READINGS_MODES = ("absolute", "deflection")
+_TOLERANCE = 1e-4
+_TRIALS = 25
+_SOFTER = 1.5  # a gear that stiffens starts softer (catalogues: K1 is about half of K3)
+_TARGET_SCATTER = 2e-3  # m, how far an unknown target sits from its configured place
+
+
+def nothing_hidden(
+    cell: Cell,
+    rng: np.random.Generator,
+    *,
+    noise: TrackerNoise | None = None,
+    joint_std: float | Floats = 2e-5,
+) -> World:
+    """Return a world whose arm has joint compliance and nothing else that is wrong.
+
+    Where the cell does not know its registration or its target, the world draws its own.
+
+    Args:
+        cell: the cell as configured.
+        rng: generator.
+        noise: the tracker's noise; the usual class of laser trackers when None.
+        joint_std: the arm's repeatability at each joint, rad; 2e-5 is 0.02 mm to 0.03 mm at
+            the flange of an arm of 1.3 m.
+    """
+    registration, station = stand(cell, rng)
+    truth = Truth.rigid(cell.arm)
+    truth = truth.with_effect("joint_compliance", joint_compliance(cell.arm, rng))
+    if not cell.target_known:
+        truth = truth.with_effect("target_offset", _TARGET_SCATTER * rng.standard_normal(3))
+    return World(
+        cell=cell,
+        physics=truth,
+        registration=registration,
+        station=station,
+        noise=noise or TrackerNoise(),
+        joint_std=np.broadcast_to(np.asarray(joint_std, dtype=float), (cell.arm.n,)).copy(),
+    )
+
+
+def hide(
+    effect: str,
+    cell: Cell,
+    states: States,
+    strength_sigma: float,
+    readings_mode: str,
+    rng: np.random.Generator,
+    *,
+    world: World | None = None,
+    m: int = 3,
+    pose: Ints | None = None,
+    cycle: Ints | None = None,
+    harmonics: int = 6,
+) -> World:
+    """Return a world in which one effect is hidden at the given strength.
+
+        sqrt(mean |W (r - r_0)|²) = strength_sigma
+
+    r are the noise-free readings with the effect, r_0 without, W whitens by the covariance
+    of a reading; in deflection mode r is the loaded minus the unloaded reading of one pose
+    and W belongs to that difference. The direction is drawn; the length is found by secants.
+
+    Args:
+        effect: one of `EFFECTS`, or "none".
+        cell: the cell as configured.
+        states: N states at which the strength holds.
+        strength_sigma: RMS over all whitened elements, >= 0.
+        readings_mode: "absolute" or "deflection".
+        rng: generator.
+        world: the world that the effect is added to; a fresh one when None (with drives half
+            as soft again where they stiffen, as real ones are at small torque).
+        m: elements per reading, 3 or 6.
+        pose: (N,) index of the pose, for deflections; equal joints are one pose when None.
+        cycle: (N,) index of the cycle, for deflections; one cycle when None.
+        harmonics: number of harmonics of a hidden transmission error.
+
+    Raises:
+        InputError: an unknown effect or mode, an effect that deflections do not show, a
+            deflection without an unloaded reading, or a strength that cannot be reached.
+    """
+    _check(effect, strength_sigma, readings_mode, m)
+    if world is None:
+        world = nothing_hidden(cell, rng)
+        if effect == "joint_stiffening":
+            softer = _SOFTER * world.physics.joint_compliance
+            world = replace(world, physics=world.physics.with_effect("joint_compliance", softer))
+    if effect == "none" or strength_sigma == 0.0:
+        return world
+    torque = np.maximum(
+        np.abs(world.drive_torque(states)).max(axis=0), 0.1 * typical_torque(cell.arm)
+    )
+    draw = Draw(cell.arm, world.physics.joint_compliance, torque, harmonics)
+    direction = draw.effect(effect, rng)
+    start = getattr(world.physics, effect)
+    if effect == "transmission_error":
+        order = max(start.shape[1], direction.shape[1])
+        start, direction = _padded(start, order), _padded(direction, order)
+    if effect == "joint_compliance":  # always there; hiding it sets its size
+        start = np.zeros_like(start)
+    clean = world.physics.with_effect(effect, start)
+    reference = replace(world, physics=clean)
+    before = reference.sight(states)
+    pairs = None if readings_mode == "absolute" else _pairs(states, pose, cycle)
+    whiten = _whitening(reference.covariance(before, m), pairs)
+
+    def hidden(factor: float) -> World:
+        return replace(world, physics=clean.with_effect(effect, start + factor * direction))
+
+    def strength(factor: float) -> float:
+        change = _change(hidden(factor).sight(states), before, m)
+        if pairs is not None:
+            change = change[pairs[0]] - change[pairs[1]]
+        return float(np.sqrt(np.mean((whiten @ change[:, :, None]) ** 2)))
+
+    return hidden(_scaled(strength, strength_sigma, effect, readings_mode))
+
+
+def _check(effect: str, strength: float, mode: str, m: int) -> None:
+    """Refuse what cannot be hidden, by name."""
+    if mode not in READINGS_MODES:
+        raise InputError(f"readings {mode!r} is unknown; valid: {', '.join(READINGS_MODES)}")
+    if m not in (3, 6):
+        raise InputError(f"a reading has {m} elements; valid: 3 (position) or 6 (pose)")
+    if not (np.isfinite(strength) and strength >= 0.0):
+        raise InputError(f"strength {strength} sigma cannot be; valid: a number >= 0")
+    if effect not in (*EFFECTS, "none"):
+        raise InputError(f"effect {effect!r} is unknown; valid: {', '.join((*EFFECTS, 'none'))}")
+    if mode == "deflection" and effect not in (*DEFLECTION_EFFECTS, "none"):
+        raise InputError(
+            f'effect {effect!r} cancels in deflections; valid with readings "deflection": '
+            f"{', '.join((*DEFLECTION_EFFECTS, 'none'))}"
+        )
+
+
+def _pairs(states: States, pose: Ints | None, cycle: Ints | None) -> tuple[Ints, Ints]:
+    """Return the rows of the loaded readings and of the unloaded ones that they belong to."""
+    if pose is None:
+        pose = np.unique(states.q, axis=0, return_inverse=True)[1].reshape(-1)
+    if cycle is None:
+        cycle = np.zeros(len(states), dtype=np.int64)
+    loaded = np.any(states.wrench != 0.0, axis=1)
+    first: dict[tuple[int, int], int] = {}
+    for row in np.flatnonzero(~loaded):
+        first.setdefault((int(pose[row]), int(cycle[row])), int(row))
+    rows = np.flatnonzero(loaded)
+    if not len(rows):
+        raise InputError("states: no loaded reading; valid: one with a wrench that is not zero")
+    keys = [(int(pose[row]), int(cycle[row])) for row in rows]
+    for row, key in zip(rows, keys, strict=True):
+        if key not in first:
+            raise InputError(
+                f"state {row}: pose {key[0]} has no unloaded reading in cycle {key[1]}; "
+                "valid: one state with a zero wrench per pose and cycle"
+            )
+    return rows, np.array([first[key] for key in keys])
+
+
+def _whitening(covariance: Floats, pairs: tuple[Ints, Ints] | None) -> Floats:
+    """Return (N, m, m) inverse Cholesky factors of a reading's or a difference's covariance."""
+    if pairs is not None:
+        covariance = covariance[pairs[0]] + covariance[pairs[1]]
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
+
+
+def _change(after: Sight, before: Sight, m: int) -> Floats:
+    """Return by how much the readings changed, (N, m); rotations as a small rotation."""
+    shift = after.position - before.position
+    if m == 3:
+        return shift
+    turn = rotation_vector(after.rotation @ np.swapaxes(before.rotation, 1, 2))
+    return np.hstack([shift, turn])
+
+
+def _padded(value: Floats, order: int) -> Floats:
+    """Return (n, order, 2) harmonics, with zeros for those that are not there."""
+    return np.pad(value, ((0, 0), (0, order - value.shape[1]), (0, 0)))
+
+
+def _scaled(strength: Callable[[float], float], wanted: float, effect: str, mode: str) -> float:
+    """Return the factor at which `strength` is `wanted`, to 1e-4 of it, by secants."""
+    old, new = 0.0, 1e-2
+    why = "valid: a smaller strength, or states that the effect acts on"
+    below, above = -wanted, strength(new) - wanted
+    try:
+        for _ in range(_TRIALS):
+            if abs(above) <= _TOLERANCE * wanted:
+                return new
+            if above == below:
+                break
+            old, new = new, new - above * (new - old) / (above - below)
+            below, above = above, strength(new) - wanted
+    except InputError as error:
+        why = f"{error}; heavier loads or steadier readings reach further"
+    raise InputError(
+        f"effect {effect!r} cannot reach {wanted:g} sigma in these states ({mode} readings): {why}"
+    )

@@ -1,0 +1,42 @@
+"""Rigid displacements for the simulated world; its own code, apart from hilcal's."""
+
+import numpy as np
+import pinocchio as pin
+from scipy.spatial.transform import Rotation
+
+from hilcal.types import Floats
+
+
+def displacement(twist: Floats) -> Floats:
+    """Return the (4, 4) rigid displacement exp([twist]) of a (6,) twist (v, omega), m and rad."""
+    return np.asarray(pin.exp6(pin.Motion(twist[:3], twist[3:])).homogeneous)
+
+
+def turned(rotation: Floats) -> Floats:
+    """Return (N, 3, 3) rotation matrices of (N, 3) rotation vectors, rad."""
+    return np.asarray(Rotation.from_rotvec(rotation).as_matrix())
+
+
+def rotation_vector(matrix: Floats) -> Floats:
+    """Return (N, 3) rotation vectors of (N, 3, 3) rotation matrices, rad, length at most pi."""
+    return np.asarray(Rotation.from_matrix(matrix).as_rotvec())
+
+
+def inverse(transform: Floats) -> Floats:
+    """Return the inverse of rigid transforms (..., 4, 4)."""
+    out = np.zeros_like(transform)
+    turn = np.swapaxes(transform[..., :3, :3], -1, -2)
+    out[..., :3, :3] = turn
+    out[..., :3, 3] = -(turn @ transform[..., :3, 3:])[..., 0]
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def moved_by(jacobian: Floats, arm: Floats) -> Floats:
+    """Return Jacobians (N, 6, k) taken at a point that lies `arm` (N, 3) further, same axes.
+
+    v' = v + omega × arm; rows are (v, omega), m and rad.
+    """
+    out = jacobian.copy()
+    out[:, :3] += np.cross(jacobian[:, 3:], arm[:, :, None], axis=1)
+    return out

@@ -1,0 +1,216 @@
+"""The physical world: where the arm truly comes to rest, and what the tracker reads."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from drivers.simulated.elastic_tree import ElasticTree, build
+from drivers.simulated.mechanics import Equilibrium, elasticity, equilibrium
+from drivers.simulated.rigid import displacement, inverse, moved_by, rotation_vector, turned
+from drivers.simulated.tracker import TrackerNoise
+from drivers.simulated.truth import Truth
+from hilcal.cell import Cell
+from hilcal.data.readings import States
+from hilcal.errors import InputError
+from hilcal.types import Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sight:
+    """What the tracker would read of N states without any noise.
+
+    Attributes:
+        position: (N, 3) of the target, sensor axes, m.
+        rotation: (N, 3, 3) of the target, sensor axes.
+        jacobian: (N, 6, n) twist of the target per commanded joint angle, sensor axes.
+    """
+
+    position: Floats
+    rotation: Floats
+    jacobian: Floats
+
+    def value(self, m: int) -> Floats:
+        """Return (N, m): the position and, for m = 6, the rotation vector."""
+        if m == 3:
+            return self.position
+        return np.hstack([self.position, rotation_vector(self.rotation)])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class World:
+    """One simulated cell with everything about it that the program is not told.
+
+    Attributes:
+        cell: the cell as configured: what the program believes.
+        physics: the hidden parameters.
+        registration: (4, 4) the true T_sensor_base, before `physics.base_frame`.
+        station: (4, 4) T_station_sensor: where the instrument stands.
+        noise: the tracker's noise.
+        joint_std: (n,) the arm's repeatability at each joint, rad.
+    """
+
+    cell: Cell
+    physics: Truth
+    registration: Floats
+    station: Floats
+    noise: TrackerNoise
+    joint_std: Floats
+    _tree: ElasticTree = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        """Build the elastic arm once."""
+        links = np.array(
+            [
+                link @ displacement(twist)
+                for link, twist in zip(self.cell.arm.links, self.physics.link_geometry, strict=True)
+            ]
+        )
+        tree = build(
+            self.cell.arm,
+            links,
+            self.cell.tool_mass,
+            self.cell.tool_com,
+            self.cell.gravity,
+            beams=bool(np.any(self.physics.link_compliance)),
+        )
+        object.__setattr__(self, "_tree", tree)
+
+    @property
+    def truth(self) -> dict[str, float]:
+        """The hidden parameters that are not zero, as "effect.part": value in SI."""
+        return self.physics.named(self.cell.arm)
+
+    def joint_errors(self, states: States) -> Floats:
+        """Return the joint displacements (N, n) that do not depend on the load, rad.
+
+        dq_j = o_j + h_j s_j + sum_k a_jk cos k q_j + b_jk sin k q_j
+
+        Raises:
+            InputError: hysteresis without approach sides.
+        """
+        hidden = self.physics
+        error = np.broadcast_to(hidden.encoder_offset, states.q.shape).copy()
+        if np.any(hidden.hysteresis):
+            if states.approach is None:
+                raise InputError(
+                    "approach: hysteresis is hidden but the states name no side from which "
+                    "the joints arrived; valid: -1 or +1 per state and joint"
+                )
+            error += hidden.hysteresis * states.approach
+        order = np.arange(1, hidden.transmission_error.shape[1] + 1)
+        phase = states.q[:, :, None] * order
+        error += (np.cos(phase) * hidden.transmission_error[:, :, 0]).sum(axis=2)
+        error += (np.sin(phase) * hidden.transmission_error[:, :, 1]).sum(axis=2)
+        return error
+
+    def rest(self, states: States, slip: Floats | None = None) -> Equilibrium:
+        """Return the static equilibrium of N states.
+
+        Args:
+            states: what the arm was told and what pulls at it.
+            slip: (N, n) how far each joint missed its command, rad (repeatability).
+        """
+        hidden, tree = self.physics, self._tree
+        beam = hidden.link_compliance[: len(tree.beam)]
+        law = elasticity(
+            tree,
+            hidden.joint_compliance,
+            hidden.joint_stiffening,
+            hidden.joint_tilt_compliance,
+            hidden.base_compliance,
+            beam,
+        )
+        q = states.q + self.joint_errors(states)
+        return equilibrium(
+            tree,
+            law,
+            q if slip is None else q + slip,
+            states.wrench,
+            self.cell.load_point + hidden.load_point,
+        )
+
+    def drive_torque(self, states: States) -> Floats:
+        """Return the (N, n) torque that weight and load exert at each drive, N·m."""
+        return self.rest(states).torque[:, self._tree.drive]
+
+    def sight(self, states: States, slip: Floats | None = None) -> Sight:
+        """Return what the tracker would read of N states without noise of its own.
+
+        T_sensor_target = exp(t [drift]) T_sensor_base exp([base_frame]) T_base_flange
+        T_flange_target, the target shifted by its offset.
+
+        Raises:
+            InputError: a drifting tracker without time stamps.
+        """
+        hidden, rest = self.physics, self.rest(states, slip)
+        target = self.cell.target.copy()
+        target[:3, 3] += hidden.target_offset
+        frame = self.registration @ displacement(hidden.base_frame)
+        view = frame[:3, :3]
+        pose = frame @ rest.flange @ target
+        position, rotation = pose[:, :3, 3], pose[:, :3, :3]
+        jac = moved_by(rest.jacobian, rest.flange[:, :3, :3] @ target[:3, 3])
+        jac = np.concatenate([view @ jac[:, :3], view @ jac[:, 3:]], axis=1)
+        if np.any(hidden.tracker_drift):
+            if states.time is None:
+                raise InputError(
+                    "time: tracker_drift is hidden but the states carry no time stamps; "
+                    "valid: seconds since the campaign's start"
+                )
+            moved = np.array([displacement(hidden.tracker_drift * t) for t in states.time])
+            position = (moved[:, :3, :3] @ position[:, :, None])[:, :, 0] + moved[:, :3, 3]
+            rotation = moved[:, :3, :3] @ rotation
+        return Sight(position, rotation, jac)
+
+    def covariance(self, sight: Sight, m: int = 3) -> Floats:
+        """Return the (N, m, m) covariance of readings: tracker + J Sigma_q Jᵀ, sensor axes."""
+        turn = self.station[:3, :3].T
+        cov = self.noise.covariance(self._from_station(sight.position), m)
+        cov[:, :3, :3] = turn @ cov[:, :3, :3] @ turn.T
+        jac = sight.jacobian[:, :m] * self.joint_std
+        return np.asarray(cov + jac @ np.swapaxes(jac, 1, 2))
+
+    def observe(self, states: States, rng: np.random.Generator, m: int = 3) -> Floats:
+        """Return the (N, m) readings of N states, with all noise.
+
+        The arm's repeatability is drawn in joint space and goes through the equilibrium, so
+        that it is correlated over all elements; then the tracker adds its own.
+        """
+        slip = self.joint_std * rng.standard_normal(states.q.shape)
+        sight = self.sight(states, slip)
+        seen = self.noise.observe(self._from_station(sight.position), rng)
+        back = inverse(self.station)
+        position = seen @ back[:3, :3].T + back[:3, 3]
+        if m == 3:
+            return position
+        turn = turned(self.noise.observe_turn(len(states), rng))
+        return np.hstack([position, rotation_vector(turn @ sight.rotation)])
+
+    def _from_station(self, position: Floats) -> Floats:
+        """Return sensor coordinates (N, 3) as the instrument sees them."""
+        return np.asarray(position @ self.station[:3, :3].T + self.station[:3, 3])
+
+
+def stand(cell: Cell, rng: np.random.Generator, distance: float = 3.0) -> tuple[Floats, Floats]:
+    """Place the tracker: return the true T_sensor_base and T_station_sensor, (4, 4) each.
+
+    An unknown registration is drawn: the station `distance` away from the base at a height
+    near the arm's, turned about the vertical at random. A known one is the truth; where its
+    origin lies within the arm's reach (readings in base axes) the instrument itself stands
+    `distance` away from it.
+
+    Args:
+        cell: the configured cell.
+        rng: generator.
+        distance: from the base to the station, m.
+    """
+    side, turn = rng.uniform(0.0, 2.0 * np.pi, 2)
+    drawn = np.eye(4)
+    cos, sin = np.cos(turn), np.sin(turn)
+    drawn[:2, :2] = [[cos, -sin], [sin, cos]]
+    drawn[:3, 3] = distance * np.cos(side), distance * np.sin(side), rng.uniform(-0.8, 0.2)
+    if not cell.registration_known:
+        return drawn, np.eye(4)
+    if np.linalg.norm(cell.registration[:3, 3]) > cell.arm.reach:
+        return cell.registration, np.eye(4)
+    return cell.registration, drawn

@@ -1,0 +1,3 @@
+"""hilcal: hardware-in-the-loop calibration of the elastic and geometric errors of a robot arm."""
+
+__version__ = "0.1.0"

@@ -1,0 +1,5 @@
+"""`python -m hilcal`: the command line."""
+
+from hilcal.cli import main
+
+main()

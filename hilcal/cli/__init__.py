@@ -1,0 +1,132 @@
+"""The command line: one file per group of commands."""
+
+import os
+import sys
+import traceback
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Annotated
+
+import typer
+
+from hilcal import __version__
+from hilcal.cli.catalogue import effects, scaling
+from hilcal.cli.demo import demo
+from hilcal.cli.fitting import compare, identify, validate
+from hilcal.cli.refining import add, diagnose, refine, view
+from hilcal.cli.tables import export, import_
+from hilcal.errors import HilcalError
+
+DEBUG = "HILCAL_DEBUG"
+_BROKEN_PIPE = 141
+_INTERRUPTED = 130
+_USAGE = 2
+
+
+def _application() -> typer.Typer:
+    def make(help_text: str) -> typer.Typer:
+        return typer.Typer(
+            add_completion=False,
+            pretty_exceptions_enable=False,
+            no_args_is_help=True,
+            rich_markup_mode=None,
+            help=help_text,
+        )
+
+    app = make(
+        "Calibrate a robot arm: fit, see where the model fails, name and add what is missing."
+    )
+    commands: dict[str, Callable[..., None]] = {
+        "demo": demo,
+        "import": import_,
+        "identify": identify,
+        "compare": compare,
+        "diagnose": diagnose,
+        "add": add,
+        "refine": refine,
+        "validate": validate,
+        "view": view,
+        "export": export,
+        "effects": effects,
+    }
+    for name, command in commands.items():
+        app.command(name)(command)
+    study = make("Studies of the program's own mathematics.")
+    study.command("scaling")(scaling)
+    study.callback()(_group)
+    app.add_typer(study, name="study")
+    app.callback()(_top)
+    return app
+
+
+def _group() -> None:
+    """Studies of the program's own mathematics."""
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        print(f"hilcal {__version__}")
+        raise typer.Exit
+
+
+def _top(
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_version, is_eager=True, help="Print the version."),
+    ] = False,
+) -> None:
+    """Calibrate a robot arm: fit, see where the model fails, name and add what is missing."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run a command and exit: 0 done, 2 wrong input, 3 a device failed, 4 cannot be answered.
+
+    Wrong input and failures are one line on stderr; HILCAL_DEBUG=1 shows where they came from.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="replace")
+    debug = os.environ.get(DEBUG, "") not in ("", "0")
+    with warnings.catch_warnings():
+        if not debug:
+            warnings.simplefilter("ignore")
+        sys.exit(_run(sys.argv[1:] if arguments is None else list(arguments), debug))
+
+
+def _run(arguments: list[str], debug: bool) -> int:
+    try:
+        result = _application()(arguments, prog_name="hilcal", standalone_mode=False)
+        sys.stdout.flush()
+    except HilcalError as error:
+        return _fail(error, str(error), error.exit_code, debug)
+    except BrokenPipeError:
+        # Nobody reads any more; what is still in the buffer must not raise again at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return _BROKEN_PIPE
+    except KeyboardInterrupt:
+        return _fail(None, "interrupted", _INTERRUPTED, debug)
+    except Exception as error:
+        # Usage errors are of the command-line library, which one depends on its version.
+        if type(error).__name__ == "NoArgsIsHelpError":
+            print(error, file=sys.stderr)
+            return _USAGE
+        told = getattr(error, "format_message", None)
+        if told is not None:
+            return _fail(error, f"{told()}".replace("\n", " "), _USAGE, debug)
+        if type(error).__name__ == "Abort":
+            return _fail(error, "interrupted", _INTERRUPTED, debug)
+        words = " ".join(str(error).split())
+        report = (
+            f"unexpected {type(error).__name__}: {words}; please report it ({DEBUG}=1 shows more)"
+        )
+        return _fail(error, report, 1, debug)
+    if result == _INTERRUPTED:
+        print("error: interrupted", file=sys.stderr)
+    return result if isinstance(result, int) else 0
+
+
+def _fail(error: BaseException | None, message: str, code: int, debug: bool) -> int:
+    if debug and error is not None:
+        traceback.print_exception(error)
+    print(f"error: {' '.join(message.split())}", file=sys.stderr)
+    return code

@@ -1,0 +1,150 @@
+"""`demo`: the whole story on a simulated cell with a hidden effect."""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from drivers.simulated.rehearsal import NOTHING, RANDOM, Rehearsal, rehearse
+from hilcal.cli.files import check_record, record_story
+from hilcal.cli.refining import Row, revisions_json
+from hilcal.cli.terminal import Json, Record, Terminal, terminal
+from hilcal.config import load_config
+from hilcal.data.campaign import Campaign
+from hilcal.diagnose.document import to_json
+from hilcal.errors import InputError
+from hilcal.identify.baseline import baseline
+from hilcal.refine import Refinement
+from hilcal.refine import refine as refine_model
+from hilcal.report import numbers, text, text_demo, text_refine
+from hilcal.report.build_story import Chapter
+from hilcal.report.progress import counting, working
+from hilcal.revisions import to_record
+from hilcal.robot.catalogue import configs_dir
+
+CELL = "demo_ur10e.toml"
+
+
+def demo(
+    hide: Annotated[
+        str | None, typer.Option("--hide", metavar="EFFECT", help="An effect, random or nothing.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option("--seed", help="Of everything random.")] = None,
+    output: Annotated[
+        Path,
+        typer.Option("-o", "--output", metavar="RUN.hilcal", help="The campaign file to make."),
+    ] = Path("demo.hilcal"),
+    record: Record = None,
+    as_json: Json = False,
+) -> None:
+    """Rehearse the whole story on a simulated cell."""
+    t = terminal(as_json)
+    check_record(record)
+    path = configs_dir() / "cells" / CELL
+    config = load_config(path)
+    choice = hide or config.simulation.hide or RANDOM
+    number = config.simulation.seed if seed is None else seed
+    if number < 0:
+        raise InputError(f"--seed {number}; valid: a whole number, 0 or more")
+    r = rehearse(config, choice, number)
+    hashed = _measure(t, r, output, path.parent)
+    _introduce(t, r, choice, number)
+    with working(t.progress) as say:
+        model = baseline(r.cell, r.readings, r.mode)
+        found = refine_model(model, r.readings, r.mode, say)
+    with Campaign.open(output) as campaign:
+        numbered = [
+            campaign.append_revision(to_record(s.fit, s.diagnosis, s.added, hashed))
+            for s in found.steps
+        ]
+    rows: list[Row] = [
+        (k, s.added, s.fit, s.diagnosis.verdict) for k, s in zip(numbered, found.steps, strict=True)
+    ]
+    for k, s in zip(numbered, found.steps, strict=True):
+        t.show(text_demo.step_report(k, s.added, s.diagnosis))
+    rows[-1] = (*rows[-1][:3], found.verdict)
+    t.show(text.heading("The error, revision by revision"))
+    t.show([text_refine.revisions_table(rows), text_refine.key()])
+    truth = text_demo.compared(found.steps[-1].fit, r.world.truth)
+    if truth:
+        t.show([text.heading("What was found against what is true"), *text_demo.truth_table(truth)])
+    ok, words = _judge(r, found)
+    t.show([text_refine.verdict_line(found.verdict, found.message), "", text.heading(words)])
+    chapters = [
+        Chapter(k, s.added, s.fit, s.diagnosis) for k, s in zip(numbered, found.steps, strict=True)
+    ]
+    record_story(t, chapters, record)
+    t.show(f"\nThe campaign is in {output}. Go on with: hilcal view {output}")
+    t.document(
+        {
+            "campaign": str(output),
+            "hidden": r.hidden,
+            "strength_sigma": r.strength_sigma,
+            "seed": number,
+            "readings": r.mode,
+            "found": ok,
+            "verdict": found.verdict,
+            "message": found.message,
+            "rejected": list(found.rejected),
+            "revisions": revisions_json(rows),
+            "parameters": [asdict(p) for p in truth],
+            "truth": r.world.truth,
+            "diagnoses": [to_json(s.diagnosis) for s in found.steps],
+        }
+    )
+
+
+def _introduce(t: Terminal, r: Rehearsal, choice: str, seed: int) -> None:
+    loads = [name for name in r.readings.load_names if name != "none"]
+    poses = len(np.unique(r.readings.pose))
+    what = {
+        NOTHING: "Nothing is hidden in it; the program does not know that.",
+        RANDOM: "An effect, drawn at random, is hidden in it.",
+    }.get(choice, f"The effect {r.hidden} is hidden in it; the program is not told.")
+    t.show(text.heading(f"A simulated {r.cell.arm.name} and a laser tracker, seed {seed}"))
+    t.show(
+        f"{poses} poses, each unloaded and under {len(loads)} loads ({', '.join(loads)}): "
+        f"{len(r.readings)} readings.\n{what}"
+    )
+    kind = "deflections: loaded minus unloaded" if r.mode == "deflection" else "absolute positions"
+    t.show(f"The model is fitted to {kind}.\n")
+
+
+def _measure(t: Terminal, r: Rehearsal, output: Path, base_dir: Path) -> str:
+    """Write the campaign, pose by pose, as a real one would grow; returns the data's hash."""
+    there = output.exists()
+    source = "rehearsal in a simulated cell"
+    poses = list(dict.fromkeys(r.readings.pose.tolist()))
+    with (
+        Campaign.create(
+            output, r.config.to_json(), str(base_dir), source, overwrite=True
+        ) as campaign,
+        counting(t.progress, "measuring poses", len(poses)) as advance,
+    ):
+        if there:
+            t.notice(f"{output} existed and is replaced")
+        for pose in poses:
+            campaign.append_readings(r.readings[r.readings.pose == pose])
+            advance(1)
+        return campaign.data_hash()
+
+
+def _judge(r: Rehearsal, found: Refinement) -> tuple[bool, str]:
+    """Whether the hidden effect was found, and that in words."""
+    added = [s.added for s in found.steps if s.added]
+    if r.hidden == NOTHING:
+        if not added and found.verdict == "adequate":
+            return True, "Nothing was hidden, and nothing was found."
+        return False, f"Nothing was hidden, but the verdict is {found.verdict.replace('_', ' ')}."
+    hidden = f"Hidden was {r.hidden}, at {r.strength_sigma:g} times the noise"
+    suspects = found.steps[0].diagnosis.suspects
+    same = suspects[0].same_as if suspects else ()
+    if r.hidden in added:
+        others = [a for a in added if a != r.hidden]
+        more = f" Added as well: {numbers.names(others)}." if others else ""
+        return True, f"{hidden}. It was found and added.{more}"
+    if added and r.hidden in same:
+        return True, f"{hidden}. It was named among those that these readings do not separate."
+    return False, f"{hidden}. It was not found."

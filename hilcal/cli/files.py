@@ -1,0 +1,173 @@
+"""Campaign files as the commands see them: open, fit, and keep what was fitted."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from hilcal.cell import Cell, cell_from_config
+from hilcal.cli.terminal import Terminal
+from hilcal.config import CellConfig
+from hilcal.data.campaign import Campaign
+from hilcal.data.readings import Readings
+from hilcal.data.revision import RevisionRecord
+from hilcal.data.whitening import MODES, SCALINGS, Mode, Scaling
+from hilcal.diagnose.verdict import Diagnosis, diagnose
+from hilcal.effects.catalogue import effect_class
+from hilcal.errors import InputError
+from hilcal.identify.baseline import baseline
+from hilcal.identify.fit import Fit, fit
+from hilcal.report.build_story import Chapter, build_story
+from hilcal.report.progress import Say, working
+from hilcal.revisions import chain, mode_of, restore, to_record, usual_mode
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Opened:
+    """An open campaign.
+
+    Attributes:
+        path: the file.
+        campaign: open for appending.
+        config: the cell's configuration.
+        cell: the cell.
+        readings: all readings.
+    """
+
+    path: Path
+    campaign: Campaign
+    config: CellConfig
+    cell: Cell
+    readings: Readings
+
+    def latest(self) -> RevisionRecord | None:
+        """Return the latest revision, if there is any."""
+        records = self.campaign.revisions()
+        return records[-1] if records else None
+
+    def mode(self, asked: str | None) -> Mode:
+        """Kind of readings: as asked, else as in the latest revision, else what they allow.
+
+        Raises:
+            InputError: an unknown kind.
+        """
+        if asked is not None:
+            return choice(asked, MODES, "--readings")
+        record = self.latest()
+        return usual_mode(self.readings) if record is None else mode_of(record)
+
+    def store(self, found: Fit, diagnosis: Diagnosis | None, added: str | None) -> int:
+        """Append a fit; returns its revision number."""
+        record = to_record(found, diagnosis, added, self.campaign.data_hash())
+        return self.campaign.append_revision(record)
+
+    def latest_fit(self, t: Terminal, say: Say) -> tuple[int, Fit]:
+        """Return the latest revision as a fit; without any, make and store the baseline."""
+        record = self.latest()
+        if record is not None:
+            say(f"restoring revision {record.number}")
+            return record.number, restore(record, self.cell, self.readings)
+        mode = self.mode(None)
+        model = baseline(self.cell, self.readings, mode)
+        say(f"fitting {' + '.join(model.names) or 'the nominal arm'}")
+        found = fit(model, self.readings, mode)
+        number = self.store(found, None, None)
+        t.notice(
+            f"no revision yet: made the baseline, revision {number} "
+            f"({' + '.join(model.names) or 'the nominal arm'}, {mode} readings)"
+        )
+        return number, found
+
+    def chapters(self, t: Terminal, say: Say) -> list[Chapter]:
+        """Return the latest revision and those that it was made from, diagnosed."""
+        if self.latest() is None:
+            self.latest_fit(t, say)
+        out = []
+        for record in chain(self.campaign.revisions()):
+            say(f"restoring revision {record.number}")
+            found = restore(record, self.cell, self.readings)
+            judged = None
+            if found.scaling == "gc":
+                say(f"diagnosing revision {record.number}")
+                judged = diagnose(found)
+            out.append(Chapter(record.number, record.added, found, judged))
+        return out
+
+
+@contextmanager
+def open_run(path: Path) -> Iterator[Opened]:
+    """Open a campaign file.
+
+    Raises:
+        InputError: not a sound campaign, or without readings.
+    """
+    with Campaign.open(path) as campaign:
+        config = CellConfig.from_json(campaign.config_json)
+        cell = cell_from_config(config, Path(campaign.base_dir))
+        yield Opened(path, campaign, config, cell, campaign.readings())
+
+
+def choice(name: str, valid: tuple[Mode, ...], option: str) -> Mode:
+    """Check a kind of readings.
+
+    Raises:
+        InputError: lists the valid ones.
+    """
+    for known in valid:
+        if name == known:
+            return known
+    raise InputError(f"{option} {name!r} is unknown; valid: {', '.join(valid)}")
+
+
+def scalings(name: str) -> tuple[Scaling, ...]:
+    """Return the scalings that `--scaling` asks for; the one that is kept comes last.
+
+    Raises:
+        InputError: lists the valid ones.
+    """
+    if name == "all":
+        return SCALINGS
+    found = tuple(s for s in SCALINGS if s == name)
+    if not found:
+        raise InputError(f"--scaling {name!r} is unknown; valid: {', '.join(SCALINGS)}, all")
+    return found
+
+
+def effect_names(text: str | None) -> tuple[str, ...] | None:
+    """Split and check `--effects a,b`.
+
+    Raises:
+        InputError: an unknown name (lists the valid ones), or one that is there twice.
+    """
+    if text is None:
+        return None
+    names = tuple(part.strip() for part in text.split(",") if part.strip())
+    if not names:
+        raise InputError("--effects is empty; give one name or several, separated by commas")
+    for name in names:
+        effect_class(name)
+        if names.count(name) > 1:
+            raise InputError(f"--effects: {name} is there twice")
+    return names
+
+
+def check_record(path: Path | None) -> None:
+    """Refuse a recording that cannot be written before any work is done.
+
+    Raises:
+        InputError: no such folder.
+    """
+    if path is not None and not path.absolute().parent.is_dir():
+        raise InputError(f"--record {path}: no folder {path.absolute().parent}; make it first")
+
+
+def record_story(t: Terminal, chapters: list[Chapter], path: Path | None) -> None:
+    """Write a recording, where it is asked for."""
+    if path is None:
+        return
+    from hilcal.report.viewer import save  # loads the viewer's library, which takes a while
+
+    with working(t.progress) as say:
+        say(f"writing {path}")
+        save(build_story(chapters), path)
+    t.notice(f"recorded {path}; open it with: rerun {path}")

@@ -1,0 +1,164 @@
+"""`identify`, `compare` and `validate`: fits, and how far they are from what was measured."""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hilcal.cli.files import effect_names, open_run, scalings
+from hilcal.cli.terminal import Json, Run, terminal
+from hilcal.data.whitening import Scaling
+from hilcal.diagnose.projection import projection
+from hilcal.diagnose.where import where
+from hilcal.errors import InputError
+from hilcal.identify.baseline import baseline, with_effects
+from hilcal.identify.document import to_json
+from hilcal.identify.everything import everything
+from hilcal.identify.fit import Fit, fit
+from hilcal.identify.validation import validate as predict_other
+from hilcal.report import numbers, text
+from hilcal.report.progress import working
+from hilcal.report.text_scalings import scalings_table
+from hilcal.revisions import mode_of, restore_model
+
+Readings = Annotated[
+    str | None,
+    typer.Option("--readings", metavar="KIND", help="deflection or absolute."),
+]
+
+
+def identify(
+    run: Run,
+    effects: Annotated[
+        str | None,
+        typer.Option("--effects", metavar="A,B", help="Effects to fit, besides unknown frames."),
+    ] = None,
+    scaling: Annotated[
+        str, typer.Option("--scaling", metavar="S", help="none, gu, gc or all, side by side.")
+    ] = "gc",
+    readings: Readings = None,
+    as_json: Json = False,
+) -> None:
+    """Fit a model to the readings, and keep it as a revision."""
+    t = terminal(as_json)
+    wanted, names = scalings(scaling), effect_names(effects)
+    with open_run(run) as o:
+        mode = o.mode(readings)
+        fits: dict[Scaling, Fit] = {}
+        with working(t.progress) as say:
+            say("registering")
+            if names is None:
+                model = baseline(o.cell, o.readings, mode)
+            else:
+                model = with_effects(o.cell, o.readings, mode, names)
+            for s in wanted:
+                say(f"fitting {text.model_name(model.names)}, scaling {s}")
+                fits[s] = fit(model, o.readings, mode, s)
+        kept = fits[wanted[-1]]
+        number = o.store(kept, None, None)
+    t.show(text.fit_report(kept))
+    document = {"revision": number, **to_json(kept)}
+    if len(fits) > 1:
+        t.show(["", *scalings_table(fits)])
+        document["scalings"] = {s: to_json(found) for s, found in fits.items()}
+    t.show(f"\nStored as revision {number} of {run}.")
+    t.document(document)
+
+
+def compare(run: Run, as_json: Json = False) -> None:
+    """Show where the latest model fails."""
+    t = terminal(as_json)
+    with open_run(run) as o, working(t.progress) as say:
+        number, found = o.latest_fit(t, say)
+        if found.scaling != "gc":
+            raise InputError(
+                f"revision {number} has scaling {found.scaling}; comparing needs gc: run hilcal "
+                "identify again"
+            )
+        say("looking where it fails")
+        places = where(projection(found))
+    e = everything(found)
+    worst = text.worst_poses(e)
+    t.show(text.heading(f"Revision {number}: {text.model_name(found.model.names)}"))
+    t.show([text.misses(found), text.follows(places), "", text.errors(found), ""])
+    t.show([text.where_table(places), ""])
+    t.show(text.worst_table(worst))
+    t.document(
+        {
+            "revision": number,
+            "model": list(found.model.names),
+            "readings": found.mode,
+            "error": {"fit": found.error.to_json(), "holdout": found.holdout.to_json()},
+            "variance_factor": found.variance_factor,
+            "variance_factor_interval": list(found.variance_factor_interval),
+            "noise_floor_m": e.noise_floor,
+            "where": [
+                {"variable": p.variable, "share": p.share, "p_value": p.p_value} for p in places
+            ],
+            "worst": [asdict(w) for w in worst],
+        }
+    )
+
+
+def validate(
+    run: Run,
+    other: Annotated[
+        Path, typer.Argument(metavar="OTHER.hilcal", help="A campaign that was never fitted.")
+    ],
+    register: Annotated[
+        bool, typer.Option("--register", help="The tracker was set up anew: fit its place first.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Predict readings of another campaign with the latest model."""
+    t = terminal(as_json)
+    with open_run(run) as o, open_run(other) as unseen, working(t.progress) as say:
+        if o.cell.arm.name != unseen.cell.arm.name:
+            raise InputError(
+                f"{other}: robot {unseen.cell.arm.name}; the model of {run} is of {o.cell.arm.name}"
+            )
+        record = o.latest()
+        if record is None:
+            o.latest_fit(t, say)
+            record = o.campaign.revision(1)
+        model, theta = restore_model(record, o.cell, o.readings)
+        say(f"predicting {len(unseen.readings)} readings")
+        found = predict_other(
+            model, theta, o.readings, unseen.readings, mode_of(record), registered=register
+        )
+    t.show(text.heading(f"Revision {record.number}: {text.model_name(model.names)}"))
+    what = "deflections" if mode_of(record) == "deflection" else "positions"
+    out = text.table("3-D position error", "rms", "mean", "largest", "rms in σ")
+    e = found.error
+    out.add_row(
+        "never fitted",
+        numbers.length(e.rms_m),
+        numbers.length(e.mean_m),
+        numbers.length(e.max_m),
+        f"{e.rms_sigma:.2f}",
+    )
+    out.add_row("noise alone", numbers.length(found.noise_floor), "", "", "1.00")
+    t.show(
+        f"{len(found.raw)} {what} that were never fitted are predicted to "
+        f"{numbers.length(e.rms_m)} rms; noise alone would leave "
+        f"{numbers.length(found.noise_floor)}.\n"
+    )
+    t.show([out, ""])
+    if e.rms_sigma > 5 and not register:
+        t.show(
+            "Was the tracker set up anew for these readings? Then --register fits its place first."
+        )
+    t.document(
+        {
+            "revision": record.number,
+            "model": list(model.names),
+            "readings": mode_of(record),
+            "registered": register,
+            "n_readings": len(found.readings),
+            "n_measurements": len(found.raw),
+            "error": e.to_json(),
+            "variance_factor": found.variance_factor,
+            "noise_floor_m": found.noise_floor,
+        }
+    )

@@ -1,0 +1,148 @@
+"""`import` and `export`: tables in, tables out."""
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.padding import Padding
+
+from hilcal.cell import cell_from_config
+from hilcal.cli.files import open_run
+from hilcal.cli.terminal import Json, Run, terminal
+from hilcal.config import CellConfig, load_config
+from hilcal.data.campaign import Campaign
+from hilcal.data.ipa_ur10 import read_ipa_ur10
+from hilcal.data.noise import TrackerNoise
+from hilcal.data.readings import Readings
+from hilcal.data.table import read_table, write_table
+from hilcal.errors import InputError
+from hilcal.report import text
+from hilcal.report.progress import working
+from hilcal.robot.arm import Arm
+
+FORMATS = ("table", "ipa-ur10")
+
+
+def import_(
+    table: Annotated[Path, typer.Argument(metavar="TABLE.csv", help="What was measured.")],
+    config: Annotated[
+        Path, typer.Option("--config", metavar="CELL.toml", help="The cell it was measured in.")
+    ],
+    output: Annotated[
+        Path,
+        typer.Option("-o", "--output", metavar="RUN.hilcal", help="The campaign file to make."),
+    ],
+    kind: Annotated[
+        str, typer.Option("--format", metavar="FORMAT", help="table or ipa-ur10.")
+    ] = "table",
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing campaign.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Make a campaign file from a table of readings."""
+    t = terminal(as_json)
+    if kind not in FORMATS:
+        raise InputError(f"--format {kind!r} is unknown; valid: {', '.join(FORMATS)}")
+    settings = load_config(config)
+    base_dir = config.absolute().parent
+    cell = cell_from_config(settings, base_dir)
+    with working(t.progress) as say:
+        say(f"reading {table}")
+        readings, notes = _read(table, kind, settings, cell.arm)
+        say(f"writing {output}")
+        source = f"{table.name} ({kind})"
+        with Campaign.create(
+            output, settings.to_json(), str(base_dir), source, overwrite=force
+        ) as campaign:
+            campaign.append_readings(readings)
+    loads = [readings.load_names[k] for k in np.unique(readings.load)]
+    poses = len(np.unique(readings.pose))
+    t.show(text.heading(f"{output}: {len(readings)} readings of {poses} poses"))
+    t.show(
+        f"  robot {settings.robot.model}; each reading is a "
+        f"{'position' if readings.m == 3 else 'position and an orientation'}\n"
+        f"  loads: {', '.join(loads)}"
+    )
+    t.show(Padding(note, (0, 0, 0, 2)) for note in notes)
+    t.document(
+        {
+            "campaign": str(output),
+            "robot": settings.robot.model,
+            "n_readings": len(readings),
+            "n_poses": poses,
+            "elements": readings.m,
+            "loads": loads,
+            "notes": list(notes),
+        }
+    )
+
+
+def _read(
+    table: Path, kind: str, settings: CellConfig, arm: Arm
+) -> tuple[Readings, tuple[str, ...]]:
+    if kind == "ipa-ur10":
+        found = read_ipa_ur10(table, arm)
+        return found.readings, found.notes
+    s = settings.tracker
+    noise = TrackerNoise(
+        s.range_std_m,
+        s.range_std_per_m,
+        s.transverse_std_m,
+        s.transverse_std_per_m,
+        s.orientation_std_rad,
+    )
+    readings = read_table(table, arm, noise, s.station_m)
+    with table.open(encoding="utf-8-sig", errors="replace") as stream:
+        stated = "cov_x_x" in stream.readline()
+    if stated:
+        return readings, ("covariance: from the table",)
+    where = "" if s.frame == "tracker" or s.station_m else ", as if it stood at the arm's base"
+    return readings, (f"covariance: from the tracker's noise in [tracker]{where}",)
+
+
+def export(
+    run: Run,
+    table: Annotated[
+        Path | None, typer.Option("--table", metavar="F.csv", help="The readings, SI units.")
+    ] = None,
+    parameters: Annotated[
+        Path | None,
+        typer.Option("--parameters", metavar="F.csv", help="Parameters of the latest revision."),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Write readings and parameters as CSV."""
+    t = terminal(as_json)
+    wanted = [path for path in (table, parameters) if path is not None]
+    if not wanted:
+        raise InputError("nothing to export; give --table F.csv, --parameters F.csv or both")
+    for path in wanted:
+        if path.exists() and not force:
+            raise InputError(f"{path}: the file exists; choose another name or give --force")
+    with open_run(run) as opened_run:
+        record = opened_run.latest()
+        if parameters is not None and record is None:
+            raise InputError(f"{run}: no revision yet, so no parameters; run hilcal identify first")
+        if table is not None:
+            write_table(opened_run.readings, table)
+            t.show(f"{table}: {len(opened_run.readings)} readings")
+        if parameters is not None and record is not None:
+            rows = record.result_json["identify"]["parameters"]
+            _write_parameters(parameters, rows)
+            t.show(f"{parameters}: {len(rows)} parameters of revision {record.number}")
+    t.document({"written": [str(path) for path in wanted]})
+
+
+def _write_parameters(path: Path, rows: Sequence[dict[str, object]]) -> None:
+    names = ("name", "value", "std", "unit", "identifiable")
+    try:
+        with path.open("w", encoding="utf-8", newline="") as stream:
+            out = csv.writer(stream, lineterminator="\n")
+            out.writerow(names)
+            for row in rows:
+                out.writerow("" if row[k] is None else row[k] for k in names)
+    except OSError as e:
+        raise InputError(f"{path}: cannot be written ({e.strerror})") from e

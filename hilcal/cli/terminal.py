@@ -1,0 +1,67 @@
+"""Where output goes: tables or one JSON document on stdout, everything else on stderr."""
+
+import json
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console, RenderableType
+
+from hilcal.identify.document import plain
+
+WIDTH = 100
+
+Json = Annotated[
+    bool, typer.Option("--json", help="One JSON document on stdout; words and progress on stderr.")
+]
+Run = Annotated[Path, typer.Argument(metavar="RUN.hilcal", help="The campaign file.")]
+Record = Annotated[
+    Path | None, typer.Option("--record", metavar="F.rrd", help="Write a recording for rerun.")
+]
+
+
+@dataclass(frozen=True, slots=True)
+class Terminal:
+    """The two streams.
+
+    Attributes:
+        json: whether stdout is for one JSON document.
+        people: where tables and words for people go.
+        progress: where progress and notices go.
+    """
+
+    json: bool
+    people: Console
+    progress: Console
+
+    def show(self, parts: Iterable[RenderableType] | RenderableType) -> None:
+        """Print for people."""
+        if isinstance(parts, str) or not isinstance(parts, Iterable):
+            parts = (parts,)
+        for part in parts:
+            self.people.print(part, markup=False, highlight=False)
+
+    def notice(self, words: str) -> None:
+        """Say what people should know but did not ask for."""
+        self.progress.print(words, markup=False, highlight=False, soft_wrap=True)
+
+    def document(self, content: object) -> None:
+        """Print the JSON document, where it is asked for."""
+        if self.json:
+            print(json.dumps(plain(content), allow_nan=False, indent=2))
+
+
+def terminal(as_json: bool) -> Terminal:
+    """Return the streams of a command."""
+    progress = console(stderr=True)
+    return Terminal(as_json, progress if as_json else console(stderr=False), progress)
+
+
+def console(*, stderr: bool) -> Console:
+    """Return a console; 100 columns where the stream is not a terminal."""
+    stream = sys.stderr if stderr else sys.stdout
+    width = None if stream.isatty() else WIDTH
+    return Console(file=stream, width=width)

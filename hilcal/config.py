@@ -1,0 +1,253 @@
+"""The cell's configuration: one frozen section per table of CELL.toml."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, Strict, model_validator
+
+from hilcal.errors import InputError
+from hilcal.toml import (
+    NonNegative,
+    Positive,
+    Section,
+    Vector3,
+    check_json,
+    load_section,
+)
+from hilcal.types import Floats
+
+STANDARD_GRAVITY_M_S2 = 9.80665
+
+_VECTOR_M = "three finite numbers in m, e.g. [0.0, 0.0, 0.1]"
+_ROTVEC = "a rotation vector: three finite numbers in rad, e.g. [0.0, 0.0, 1.57]"
+
+
+def _std(what: str) -> str:
+    return f"the standard deviation {what}"
+
+
+class Robot(Section):
+    """[robot]: which arm, and how it stands in gravity."""
+
+    model: str = Field(
+        min_length=1, description='a catalogue name, e.g. "ur10e", or the path of a .urdf file'
+    )
+    gravity_m_s2: Vector3 = Field(
+        (0.0, 0.0, -STANDARD_GRAVITY_M_S2),
+        description="gravity in base axes: three finite numbers in m/s², e.g. [0.0, 0.0, -9.80665]",
+    )
+    base_link: str | None = Field(None, description="the name of a link of the URDF")
+    tip_link: str | None = Field(None, description="the name of a link of the URDF")
+
+    @model_validator(mode="after")
+    def _plausible_gravity(self) -> "Robot":
+        size = float(np.linalg.norm(self.gravity_m_s2))
+        if size > 30.0:
+            raise ValueError(
+                f"gravity_m_s2 has the length {size:.4g} m/s²; on Earth it is 9.76 to 9.84"
+            )
+        return self
+
+
+class Tool(Section):
+    """[tool]: what the flange carries, where the target sits and the load acts (flange axes)."""
+
+    target_m: Vector3 | None = Field(
+        None, description=_VECTOR_M + "; leave it out to have it estimated"
+    )
+    target_rotvec_rad: Vector3 | None = Field(None, description=_ROTVEC)
+    load_point_m: Vector3 = Field((0.0, 0.0, 0.0), description=_VECTOR_M)
+    mass_kg: NonNegative = Field(0.0, description="a mass in kg, 0 or more")
+    com_m: Vector3 = Field((0.0, 0.0, 0.0), description=_VECTOR_M)
+
+    @model_validator(mode="after")
+    def _metres(self) -> "Tool":
+        for key in ("target_m", "load_point_m", "com_m"):
+            value = getattr(self, key)
+            if value is not None and max(map(abs, value)) > 5.0:
+                raise ValueError(f"{key} = {list(value)} lies over 5 m off the flange; is it in m?")
+        if self.target_rotvec_rad is not None and self.target_m is None:
+            raise ValueError("target_rotvec_rad without target_m; give both or neither")
+        return self
+
+
+class Tracker(Section):
+    """[tracker]: the frame of the readings, its registration, and the tracker's noise.
+
+    The noise of a point at the distance d is sqrt(range² + transverse²) with standard
+    deviations `std + std_per_m * d` along and across the beam. Defaults: half of the maximum
+    permissible errors of a Leica AT500 (range 10 µm + 0.3 µm/m, transverse 15 µm + 6 µm/m),
+    and half of 0.01° for orientations.
+    """
+
+    frame: Literal["tracker", "base"] = Field(
+        "tracker", description='"tracker" or "base": the axes in which positions are given'
+    )
+    base_xyz_m: Vector3 | None = Field(
+        None, description=_VECTOR_M + ": the arm's base in the tracker frame"
+    )
+    base_rotvec_rad: Vector3 | None = Field(None, description=_ROTVEC)
+    station_m: Vector3 | None = Field(
+        None, description=_VECTOR_M + ": the tracker's position in base axes"
+    )
+    range_std_m: Positive = Field(
+        5e-6, description=_std("along the beam in m, more than 0, e.g. 5e-6")
+    )
+    range_std_per_m: NonNegative = Field(
+        0.15e-6, description=_std("along the beam per metre of distance, 0 or more, e.g. 0.15e-6")
+    )
+    transverse_std_m: Positive = Field(
+        7.5e-6, description=_std("across the beam in m, more than 0, e.g. 7.5e-6")
+    )
+    transverse_std_per_m: NonNegative = Field(
+        3e-6, description=_std("across the beam per metre of distance, 0 or more, e.g. 3e-6")
+    )
+    orientation_std_rad: Positive = Field(
+        8.7e-5, description=_std("of a target's orientation in rad, more than 0, e.g. 8.7e-5")
+    )
+
+    @model_validator(mode="after")
+    def _registration(self) -> "Tracker":
+        given = [k for k in ("base_xyz_m", "base_rotvec_rad") if getattr(self, k) is not None]
+        if self.frame == "base" and given:
+            raise ValueError(
+                f'{given[0]} together with frame = "base"; a registration is given only with '
+                'frame = "tracker"'
+            )
+        if len(given) == 1:
+            raise ValueError(
+                f"{given[0]} alone; a known registration needs base_xyz_m and base_rotvec_rad "
+                "(leave both out to have it estimated)"
+            )
+        if self.frame == "tracker" and self.station_m is not None:
+            raise ValueError(
+                'station_m together with frame = "tracker"; there the tracker is the origin, '
+                'and station_m is given only with frame = "base"'
+            )
+        for key in ("range_std_m", "transverse_std_m"):
+            if getattr(self, key) > 0.1:
+                raise ValueError(f"{key} = {getattr(self, key)} is over 0.1 m; is it in m?")
+        return self
+
+
+class Repeatability(Section):
+    """[repeatability]: scatter of the joints from one arrival to the next."""
+
+    joint_std_rad: NonNegative | Annotated[tuple[NonNegative, ...], Field(min_length=1)] = Field(
+        0.0, description="one standard deviation in rad, 0 or more, or one per joint"
+    )
+
+    def per_joint(self, n: int) -> Floats:
+        """Return (n,) standard deviations, rad.
+
+        Raises:
+            InputError: the number of values is not the arm's number of joints.
+        """
+        values = np.asarray(self.joint_std_rad, dtype=np.float64)
+        if values.ndim == 1 and len(values) != n:
+            raise InputError(
+                f"[repeatability] joint_std_rad has {len(values)} values; "
+                f"it must be one number or {n}, one per joint"
+            )
+        return np.broadcast_to(values, n).copy()
+
+
+class Load(Section):
+    """[[loads]]: a load at hand: a dead weight, a pull in base axes, or both."""
+
+    name: str = Field(min_length=1, description='a name other than "none"')
+    mass_kg: NonNegative = Field(0.0, description="a mass in kg, 0 or more")
+    force_N: Vector3 = Field(
+        (0.0, 0.0, 0.0), description="three finite numbers in N, base axes, e.g. [50.0, 0.0, 0.0]"
+    )
+    moment_Nm: Vector3 = Field(
+        (0.0, 0.0, 0.0), description="three finite numbers in N·m, base axes"
+    )
+
+    @model_validator(mode="after")
+    def _some_load(self) -> "Load":
+        if self.name == "none":
+            raise ValueError('the name "none" is kept for the unloaded state; choose another')
+        if self.mass_kg == 0.0 and not any((*self.force_N, *self.moment_Nm)):
+            raise ValueError(
+                f'load "{self.name}" is zero; give mass_kg, force_N or moment_Nm '
+                "(the unloaded state is always there)"
+            )
+        return self
+
+    def wrench(self, gravity: Floats) -> Floats:
+        """Return (6,) force and moment at the load point, base axes, N and N·m.
+
+        force = mass * gravity + force_N; a dead weight hangs from the load point.
+        """
+        force = self.mass_kg * gravity + np.asarray(self.force_N)
+        return np.concatenate([force, np.asarray(self.moment_Nm)])
+
+
+class Limits(Section):
+    """[limits]: what a plan keeps clear of."""
+
+    joint_margin_rad: NonNegative = Field(
+        0.05, description="the distance kept from every joint limit in rad, 0 or more"
+    )
+    torque_share: Annotated[float, Strict(), Field(gt=0, le=1)] = Field(
+        0.9, description="the usable share of the joint torques, more than 0, at most 1"
+    )
+
+
+class Simulation(Section):
+    """[simulation]: what a simulated cell hides."""
+
+    seed: Annotated[int, Strict(), Field(ge=0)] = Field(
+        0, description="the seed of the random numbers, a whole number, 0 or more"
+    )
+    hide: str | None = Field(None, description='the name of an effect to hide, or "random"')
+    strength_sigma: Positive = Field(
+        3.0, description="the RMS strength of the hidden effect in sigmas of a reading, more than 0"
+    )
+
+
+class CellConfig(Section):
+    """The whole of CELL.toml."""
+
+    robot: Robot = Field(description='a section [robot] with model = "ur10e" or the like')
+    tool: Tool = Field(default_factory=Tool, description="a section [tool]")
+    tracker: Tracker = Field(default_factory=Tracker, description="a section [tracker]")
+    repeatability: Repeatability = Field(
+        default_factory=Repeatability, description="a section [repeatability]"
+    )
+    loads: tuple[Load, ...] = Field((), description="sections [[loads]], one per load")
+    limits: Limits = Field(default_factory=Limits, description="a section [limits]")
+    simulation: Simulation = Field(default_factory=Simulation, description="a section [simulation]")
+
+    @model_validator(mode="after")
+    def _distinct_loads(self) -> "CellConfig":
+        names = [load.name for load in self.loads]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f'two [[loads]] have the name "{name}"; names must differ')
+        return self
+
+    def to_json(self) -> str:
+        """Return the configuration as JSON, defaults included; `from_json` reads it back."""
+        return self.model_dump_json()
+
+    @classmethod
+    def from_json(cls, text: str) -> "CellConfig":
+        """Read what `to_json` wrote.
+
+        Raises:
+            InputError: not JSON, unknown key, missing key or bad value.
+        """
+        return check_json(text, cls, "stored cell configuration")
+
+
+def load_config(path: Path) -> CellConfig:
+    """Read CELL.toml; paths in it are relative to its directory.
+
+    Raises:
+        InputError: unreadable file, syntax error (names the line), unknown key (lists the
+            valid ones of its section), missing key or bad value.
+    """
+    return load_section(path, CellConfig)

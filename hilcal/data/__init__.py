@@ -1,0 +1,1 @@
+"""States and readings, covariances, the exchange table and the campaign file."""

@@ -1,0 +1,275 @@
+"""RUN.hilcal: one SQLite file with immutable readings and appended model revisions."""
+
+import json
+import os
+import sqlite3
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from hilcal import __version__
+from hilcal.data import rows, schema
+from hilcal.data.readings import Readings
+from hilcal.data.records import Layout, content_hash, layout_of
+from hilcal.data.revision import RevisionRecord, from_text, to_text, utc_now
+from hilcal.errors import InputError
+
+_META = ("config", "base_dir", "source", "created", "program_version")
+
+
+class Campaign:
+    """An open campaign file; use it in a `with` statement.
+
+    What `append_readings` and `append_revision` have returned from survives a kill of the
+    process and a loss of power. Readings and revisions cannot be changed or deleted.
+    """
+
+    def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
+        """Take over an open connection; use `create` or `open`."""
+        self.path = path
+        self._connection = connection
+        self._meta = self._read_meta()
+
+    @classmethod
+    def create(
+        cls,
+        path: str | Path,
+        config_json: str,
+        base_dir: str,
+        source: str,
+        *,
+        overwrite: bool = False,
+    ) -> Self:
+        """Make an empty campaign; the file appears only when it is complete.
+
+        Args:
+            path: the file to make.
+            config_json: the cell's configuration.
+            base_dir: the directory to which its relative paths refer.
+            source: where the readings come from, in words.
+            overwrite: replace an existing campaign (never a file of another kind).
+
+        Raises:
+            InputError: the file exists, or cannot be written.
+        """
+        path = Path(path)
+        new = path.with_name(f".{path.name}.new")
+        meta = dict(
+            zip(_META, (config_json, base_dir, source, utc_now(), __version__), strict=True)
+        )
+        try:
+            _may_write(path, overwrite)
+            for leftover in (new, *_sidecars(new)):
+                leftover.unlink(missing_ok=True)
+            new.touch()
+            _fill(new, meta)
+            for leftover in _sidecars(path):  # a journal of another file would be rolled back in
+                leftover.unlink(missing_ok=True)
+            os.replace(new, path)
+        except OSError as e:
+            raise InputError(f"{path}: cannot be written ({e.strerror})") from e
+        return cls.open(path)
+
+    @classmethod
+    def open(cls, path: str | Path) -> Self:
+        """Open a campaign and check that it is whole.
+
+        Raises:
+            InputError: no such file, another format, a newer version, damaged or truncated.
+        """
+        path = Path(path)
+        try:
+            with path.open("rb") as stream:
+                head = stream.read(len(schema.HEADER))
+        except FileNotFoundError as e:
+            raise InputError(f"{path}: no such campaign file") from e
+        except OSError as e:
+            raise InputError(f"{path}: cannot be read ({e.strerror})") from e
+        if head != schema.HEADER:
+            what = "is empty" if not head else "is not a hilcal campaign (not an SQLite file)"
+            raise InputError(f"{path}: the file {what}")
+        with schema.sqlite_errors(path):
+            connection = schema.connect(path)
+            try:
+                schema.check_file(connection, path)
+                return cls(path, connection)
+            except BaseException:
+                connection.close()
+                raise
+
+    def close(self) -> None:
+        """Close the file."""
+        self._connection.close()
+
+    def __enter__(self) -> Self:
+        """Return the campaign."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close the file."""
+        self.close()
+
+    @property
+    def n_readings(self) -> int:
+        """Number of readings."""
+        with schema.sqlite_errors(self.path):
+            (count,) = self._connection.execute("SELECT count(*) FROM readings").fetchone()
+        return int(count)
+
+    @property
+    def config_json(self) -> str:
+        """The cell's configuration."""
+        return self._meta["config"]
+
+    @property
+    def base_dir(self) -> str:
+        """The directory to which the configuration's relative paths refer."""
+        return self._meta["base_dir"]
+
+    @property
+    def source(self) -> str:
+        """Where the readings come from."""
+        return self._meta["source"]
+
+    @property
+    def created(self) -> str:
+        """When the campaign was made, ISO 8601, UTC."""
+        return self._meta["created"]
+
+    def append_readings(self, readings: Readings) -> int:
+        """Append readings in one transaction; names already known keep their numbers.
+
+        Returns:
+            The number of readings in the campaign.
+
+        Raises:
+            InputError: other quantities, joints or elements than the readings before; a known
+                pose with other commanded joints; not finite; the file cannot be written.
+        """
+        with schema.sqlite_errors(self.path), schema.transaction(self._connection):
+            if len(readings):
+                self._claim_layout(layout_of(readings))
+            rows.check_poses(self._connection, self.path, readings)
+            return rows.insert_readings(self._connection, readings)
+
+    def readings(self) -> Readings:
+        """All readings in the order in which they were appended.
+
+        Raises:
+            InputError: there are none yet, or they are damaged.
+        """
+        layout = self._layout()
+        if layout is None:
+            raise InputError(f"{self.path}: the campaign holds no readings yet")
+        with schema.sqlite_errors(self.path):
+            return rows.fetch_readings(self._connection, self.path, layout)
+
+    def data_hash(self) -> str:
+        """SHA-256 of the readings; see `content_hash`."""
+        return content_hash(self.readings())
+
+    def append_revision(self, record: RevisionRecord) -> int:
+        """Append a model revision.
+
+        Returns:
+            Its number, 1, 2, ...; `record.number` is not looked at.
+
+        Raises:
+            InputError: the file cannot be written.
+            ValueError: a number in it is not finite.
+        """
+        text = to_text(record)
+        with schema.sqlite_errors(self.path), schema.transaction(self._connection):
+            (last,) = self._connection.execute(
+                "SELECT ifnull(max(id), 0) FROM revisions"
+            ).fetchone()
+            number = int(last) + 1
+            row = (number, text, rows.text_crc(str(number), text))
+            self._connection.execute("INSERT INTO revisions VALUES (?, ?, ?)", row)
+        return number
+
+    def revisions(self) -> tuple[RevisionRecord, ...]:
+        """All revisions, oldest first.
+
+        Raises:
+            InputError: they are damaged.
+        """
+        with schema.sqlite_errors(self.path):
+            stored = self._connection.execute("SELECT id, content, crc FROM revisions ORDER BY id")
+            records = []
+            for expected, (number, text, crc) in enumerate(stored.fetchall(), start=1):
+                try:
+                    if number != expected or rows.text_crc(str(number), text) != crc:
+                        raise ValueError
+                    records.append(from_text(text, number))
+                except ValueError as e:
+                    where = f"damaged at revision {expected}"
+                    raise InputError(f"{self.path}: the campaign is {where}") from e
+        return tuple(records)
+
+    def revision(self, number: int) -> RevisionRecord:
+        """One revision.
+
+        Raises:
+            InputError: there is none of this number; names the valid ones.
+        """
+        records = self.revisions()
+        if not 1 <= number <= len(records):
+            valid = f"there are 1 to {len(records)}" if records else "there are none yet"
+            raise InputError(f"{self.path}: no revision {number}; {valid}")
+        return records[number - 1]
+
+    def _read_meta(self) -> dict[str, str]:
+        meta = rows.fetch_meta(self._connection, self.path)
+        if missing := sorted(set(_META) - set(meta)):
+            raise InputError(f"{self.path}: the campaign file is damaged (no {missing[0]})")
+        return meta
+
+    def _layout(self) -> Layout | None:
+        with schema.sqlite_errors(self.path):
+            text = self._read_meta().get("layout")
+        return None if text is None else tuple((str(n), int(w)) for n, w in json.loads(text))
+
+    def _claim_layout(self, layout: Layout) -> None:
+        """Fix the quantities of a reading with the first ones; refuse others later."""
+        known = self._layout()
+        if known is None:
+            rows.insert_meta(self._connection, "layout", json.dumps(layout))
+        elif known != layout:
+            differ = sorted({name for name, _ in set(known) ^ set(layout)})
+            raise InputError(
+                f"{self.path}: the readings differ from those before in {', '.join(differ)}; "
+                f"a campaign holds one kind of reading, start another for these"
+            )
+
+
+def _sidecars(path: Path) -> tuple[Path, ...]:
+    return tuple(path.with_name(path.name + end) for end in ("-journal", "-wal", "-shm"))
+
+
+def _may_write(path: Path, overwrite: bool) -> None:
+    if not path.exists():
+        return
+    if not overwrite:
+        raise InputError(f"{path}: the file exists; choose another name or ask to overwrite it")
+    if not path.is_file() or (path.stat().st_size > 0 and not schema.is_campaign(path)):
+        raise InputError(f"{path}: exists and is not a campaign; it is not overwritten")
+
+
+def _fill(path: Path, meta: dict[str, str]) -> None:
+    with schema.sqlite_errors(path):
+        connection = schema.connect(path)
+        try:
+            connection.execute("PRAGMA journal_mode = DELETE")
+            with schema.transaction(connection):
+                for statement in schema.statements():
+                    connection.execute(statement)
+                for key, value in meta.items():
+                    rows.insert_meta(connection, key, value)
+        finally:
+            connection.close()

@@ -1,0 +1,146 @@
+"""Names of the exchange table's columns, and what to say about a wrong header."""
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from difflib import get_close_matches
+
+from hilcal.errors import InputError
+
+POSITION = ("x_m", "y_m", "z_m")
+ROTATION = ("rx_rad", "ry_rad", "rz_rad")
+WRENCH = ("fx_N", "fy_N", "fz_N", "mx_Nm", "my_Nm", "mz_Nm")
+TEXT = ("pose", "load")
+OWN_PREFIX = "x_"
+_AXES = ("x", "y", "z", "rx", "ry", "rz")
+
+
+def joint_columns(n: int) -> tuple[str, ...]:
+    """Columns of the commanded joints, rad."""
+    return tuple(f"q{i}_rad" for i in range(1, n + 1))
+
+
+def actual_columns(n: int) -> tuple[str, ...]:
+    """Columns of the joints that the encoders reported, rad."""
+    return tuple(f"qa{i}_rad" for i in range(1, n + 1))
+
+
+def temperature_columns(n: int) -> tuple[str, ...]:
+    """Columns of the joints' temperatures, °C."""
+    return tuple(f"joint{i}_degC" for i in range(1, n + 1))
+
+
+def approach_columns(n: int) -> tuple[str, ...]:
+    """Columns of the side from which each joint arrived, -1 or +1."""
+    return tuple(f"approach{i}" for i in range(1, n + 1))
+
+
+def covariance_columns(m: int) -> tuple[str, ...]:
+    """Columns of the upper triangle of an (m, m) covariance, row by row."""
+    return tuple(f"cov_{_AXES[i]}_{_AXES[j]}" for i in range(m) for j in range(i, m))
+
+
+def required_columns(n: int) -> tuple[str, ...]:
+    """Columns that every table of an arm of n joints has."""
+    return (*TEXT, *joint_columns(n), *POSITION)
+
+
+def groups(n: int) -> tuple[tuple[str, ...], ...]:
+    """Optional columns of which a table has all or none."""
+    return ROTATION, temperature_columns(n), approach_columns(n), actual_columns(n)
+
+
+def known_columns(n: int) -> tuple[str, ...]:
+    """All columns that have a meaning for an arm of n joints."""
+    return (
+        *required_columns(n),
+        *covariance_columns(6),
+        *WRENCH,
+        *("cycle", "time_s", "load_time_s", "air_degC"),
+        *(name for group in groups(n) for name in group),
+    )
+
+
+def _closest(name: str, valid: Iterable[str]) -> str | None:
+    by_lower = {v.lower(): v for v in valid}
+    if name.lower() in by_lower:
+        return by_lower[name.lower()]
+    found = get_close_matches(name.lower(), list(by_lower), n=1, cutoff=0.5)
+    return by_lower[found[0]] if found else None
+
+
+def check_header(path: str, header: Sequence[str], n: int, arm: str) -> None:
+    """Refuse a header that does not fit an arm of n joints.
+
+    Raises:
+        InputError: a column is unnamed, duplicated, unknown or missing, or a group of columns
+            is incomplete; names the column and the closest valid name.
+    """
+    if "" in header:
+        raise InputError(f"{path}: column {header.index('') + 1} has no name in row 1")
+    for k, name in enumerate(header, start=1):
+        if not name.isprintable() or len(name) > 80:
+            raise InputError(f"{path}: column {k} has no proper name in row 1: {name[:40]!r}")
+    for name, count in Counter(header).items():
+        if count > 1:
+            raise InputError(f"{path}: column '{name}' appears {count} times; keep one")
+    known = known_columns(n)
+    missing = [c for c in required_columns(n) if c not in header]
+    for name in header:
+        if name not in known and not name.startswith(OWN_PREFIX):
+            raise InputError(f"{path}: unknown column '{name}'{_advice(name, known, header, n)}")
+    if missing:
+        raise InputError(
+            f"{path}: column '{missing[0]}' is missing{_hint(missing, header, n, arm)}"
+        )
+    for group in groups(n):
+        lacking = [c for c in group if c not in header]
+        if 0 < len(lacking) < len(group):
+            raise InputError(
+                f"{path}: column '{lacking[0]}' is missing; give all of "
+                f"{', '.join(group)} or none of them"
+            )
+
+
+def _advice(name: str, known: Sequence[str], header: Sequence[str], n: int) -> str:
+    """Return what to do about an unknown column."""
+    parts = name.split("_")
+    if len(parts) == 3 and parts[0] == "cov" and f"cov_{parts[2]}_{parts[1]}" in known:
+        return f"; give the upper triangle only: 'cov_{parts[2]}_{parts[1]}'"
+    close = _closest(name, (c for c in known if c not in header)) or _closest(name, known)
+    meant = f"; did you mean '{close}'?" if close else ""
+    joints = f" (the arm has {n} joints)" if close and any(ch.isdigit() for ch in close) else ""
+    return f"{meant}{joints} Columns of your own must start with '{OWN_PREFIX}'"
+
+
+def _hint(missing: Sequence[str], header: Sequence[str], n: int, arm: str) -> str:
+    """Return what may stand in place of a missing column."""
+    own = [c for c in header if c.startswith(OWN_PREFIX)]
+    close = _closest(missing[0], own) if missing[0] not in TEXT else None
+    if close:
+        return f"; '{close}' is taken as a column of your own: positions must be '{missing[0]}'"
+    others = f", and so are {len(missing) - 1} more" if len(missing) > 1 else ""
+    return f"{others}; a table for {arm} needs {', '.join(required_columns(n))}"
+
+
+def covariance_size(path: str, header: Sequence[str]) -> int | None:
+    """Size m of the covariance that the table gives, None where it gives none.
+
+    Raises:
+        InputError: the triangle is incomplete, or larger or smaller than the reading.
+    """
+    given = [c for c in header if c in covariance_columns(6)]
+    if not given:
+        return None
+    m = 6 if ROTATION[0] in header else 3
+    wanted = covariance_columns(m)
+    for name in wanted:
+        if name not in given:
+            raise InputError(
+                f"{path}: column '{name}' is missing; a covariance of {m} elements needs its "
+                f"whole upper triangle: {wanted[0]} ... {wanted[-1]} ({len(wanted)} columns)"
+            )
+    if extra := [c for c in given if c not in wanted]:
+        raise InputError(
+            f"{path}: column '{extra[0]}' needs the rotation vector {', '.join(ROTATION)}"
+        )
+    return m

@@ -1,0 +1,95 @@
+"""States and readings: what the arm was told, and what the tracker saw."""
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from hilcal.types import Bools, Floats, Ints
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class States:
+    """N states of the arm: everything that a prediction may depend on.
+
+    Attributes:
+        q: (N, n) commanded joint angles, rad.
+        wrench: (N, 6) force and moment that the load exerts on the tool at the load point,
+            base axes, N and N·m; zero where unloaded.
+        time: (N,) time since the campaign's start, s; None when unknown.
+        load_time: (N,) time under the present load, s.
+        air_temperature: (N,) °C.
+        joint_temperature: (N, n) °C.
+        approach: (N, n) side from which each joint arrived, -1 or +1.
+        q_actual: (N, n) joint angles that the encoders reported, rad.
+    """
+
+    q: Floats
+    wrench: Floats
+    time: Floats | None = None
+    load_time: Floats | None = None
+    air_temperature: Floats | None = None
+    joint_temperature: Floats | None = None
+    approach: Floats | None = None
+    q_actual: Floats | None = None
+
+    def __len__(self) -> int:
+        """Return the number of states N."""
+        return len(self.q)
+
+    def __getitem__(self, rows: Ints | Bools | slice) -> "States":
+        """Return the chosen states."""
+        given = {f.name: a for f in fields(self) if (a := getattr(self, f.name)) is not None}
+        return replace(self, **{name: a[rows] for name, a in given.items()})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Readings:
+    """N readings of the target's position (m = 3) or pose (m = 6), one per state.
+
+    Attributes:
+        states: the N states.
+        pose: (N,) index of the commanded pose; equal numbers mean the same pose.
+        load: (N,) index into `load_names`; the unloaded state has the name "none".
+        cycle: (N,) readings of one pose and one cycle share their unloaded reading.
+        value: (N, m) position in m and, for m = 6, rotation vector in rad, sensor axes.
+        covariance: (N, m, m) covariance of `value`, m², m·rad, rad²; for the rotations it is
+            the covariance of a small rotation about the sensor's axes.
+        load_names: names of the loads.
+        pose_names: names of the poses, as in the table.
+    """
+
+    states: States
+    pose: Ints
+    load: Ints
+    cycle: Ints
+    value: Floats
+    covariance: Floats
+    load_names: tuple[str, ...]
+    pose_names: tuple[str, ...]
+
+    def __len__(self) -> int:
+        """Return the number of readings N."""
+        return len(self.pose)
+
+    def __getitem__(self, rows: Ints | Bools | slice) -> "Readings":
+        """Return the chosen readings; names are kept."""
+        return replace(
+            self,
+            states=self.states[rows],
+            pose=self.pose[rows],
+            load=self.load[rows],
+            cycle=self.cycle[rows],
+            value=self.value[rows],
+            covariance=self.covariance[rows],
+        )
+
+    @property
+    def m(self) -> int:
+        """Elements per reading: 3 or 6."""
+        return int(self.value.shape[1])
+
+    @property
+    def unloaded(self) -> Bools:
+        """(N,) which readings were taken without a load."""
+        none = [i for i, name in enumerate(self.load_names) if name == "none"]
+        return np.isin(self.load, none)

@@ -1,0 +1,64 @@
+"""A model revision: what was fitted, to which data, by which program, with what result."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from datetime import UTC, datetime
+from typing import Any
+
+
+def utc_now() -> str:
+    """Present time, ISO 8601, UTC, to the second."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+@dataclass(frozen=True, slots=True)
+class RevisionRecord:
+    """One fit, as a campaign file keeps it; all mappings are JSON.
+
+    Attributes:
+        effects: canonical names of the model's effects, in order.
+        added: the effect that this revision added to the one before; None for a first model.
+        options: what was chosen: scaling, kind of readings, options of the effects.
+        data_hash: `content_hash` of the readings that were fitted.
+        program_version: version of the program that fitted.
+        parameters_json: the parameters, enough to predict with the model again.
+        result_json: what `identify --json` or `diagnose --json` reported.
+        created: ISO 8601, UTC.
+        number: 1, 2, ... in one campaign; the campaign gives it.
+    """
+
+    effects: tuple[str, ...]
+    added: str | None
+    options: Mapping[str, Any]
+    data_hash: str
+    program_version: str
+    parameters_json: Mapping[str, Any]
+    result_json: Mapping[str, Any]
+    created: str = field(default_factory=utc_now)
+    number: int = 0
+
+
+def to_text(record: RevisionRecord) -> str:
+    """JSON text of a record without its number; floats keep their exact value.
+
+    Raises:
+        ValueError: a number is NaN or infinite, which JSON cannot hold (use null).
+        TypeError: a value is not of JSON.
+    """
+    content = {f.name: getattr(record, f.name) for f in fields(record) if f.name != "number"}
+    return json.dumps(content, allow_nan=False, sort_keys=True, ensure_ascii=False)
+
+
+def from_text(text: str, number: int) -> RevisionRecord:
+    """Record from its JSON text.
+
+    Raises:
+        ValueError: not such a text.
+    """
+    try:
+        content = json.loads(text)
+        content["effects"] = tuple(content["effects"])
+        return RevisionRecord(**content, number=number)
+    except (KeyError, TypeError) as e:
+        raise ValueError(str(e)) from e

@@ -1,0 +1,141 @@
+"""Rows of a campaign file: readings and texts in and out, each under a checksum."""
+
+import sqlite3
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from hilcal.data.checks import SAME_POSE
+from hilcal.data.readings import Readings
+from hilcal.data.records import Layout, pack, unpack
+from hilcal.errors import InputError
+from hilcal.types import Ints
+
+_NAMES = {
+    "poses": "SELECT name FROM poses ORDER BY id",
+    "loads": "SELECT name FROM loads ORDER BY id",
+}
+_NEW_NAME = {"poses": "INSERT INTO poses VALUES (?, ?)", "loads": "INSERT INTO loads VALUES (?, ?)"}
+
+
+def text_crc(key: str, text: str) -> int:
+    """Checksum of a text under a key."""
+    return zlib.crc32(text.encode(), zlib.crc32(key.encode()))
+
+
+def _reading_crc(number: int, where: Sequence[int], record: bytes) -> int:
+    return zlib.crc32(record, zlib.crc32(np.array([number, *where], dtype="<i8").tobytes()))
+
+
+def insert_meta(connection: sqlite3.Connection, key: str, value: str) -> None:
+    """Store a text about the campaign; it cannot be changed later."""
+    connection.execute("INSERT INTO meta VALUES (?, ?, ?)", (key, value, text_crc(key, value)))
+
+
+def fetch_meta(connection: sqlite3.Connection, path: Path) -> dict[str, str]:
+    """All texts about the campaign.
+
+    Raises:
+        InputError: one is damaged.
+    """
+    rows = connection.execute("SELECT key, value, crc FROM meta").fetchall()
+    meta = {str(key): str(value) for key, value, _ in rows}
+    if any(text_crc(str(key), str(value)) != crc for key, value, crc in rows):
+        raise InputError(f"{path}: the campaign file is damaged (its description)")
+    return meta
+
+
+def fetch_names(connection: sqlite3.Connection, table: str) -> tuple[str, ...]:
+    """Names of the poses or loads by number."""
+    return tuple(str(name) for (name,) in connection.execute(_NAMES[table]))
+
+
+def insert_names(connection: sqlite3.Connection, table: str, names: Sequence[str]) -> Ints:
+    """Numbers of names; new ones are appended in order.
+
+    Raises:
+        InputError: a name stands for two of them.
+    """
+    if len(set(names)) != len(names):
+        raise InputError(f"readings: two {table} have the same name")
+    known = {name: k for k, name in enumerate(fetch_names(connection, table))}
+    for name in names:
+        if name not in known:
+            connection.execute(_NEW_NAME[table], (len(known), name))
+            known[name] = len(known)
+    return np.array([known[name] for name in names], dtype=np.int64)
+
+
+def insert_readings(connection: sqlite3.Connection, readings: Readings) -> int:
+    """Append readings after those that are there; returns how many there are then."""
+    records = pack(readings)
+    pose = insert_names(connection, "poses", readings.pose_names)[readings.pose]
+    load = insert_names(connection, "loads", readings.load_names)[readings.load]
+    (last,) = connection.execute("SELECT ifnull(max(id), 0) FROM readings").fetchone()
+    index = np.stack([pose, load, readings.cycle], axis=1).tolist()
+    connection.executemany(
+        "INSERT INTO readings VALUES (?, ?, ?, ?, ?, ?)",
+        (
+            (number, *where, record, _reading_crc(number, where, record))
+            for number, (where, record) in enumerate(
+                zip(index, map(bytes, records), strict=True), start=int(last) + 1
+            )
+        ),
+    )
+    return int(last) + len(readings)
+
+
+def fetch_readings(connection: sqlite3.Connection, path: Path, layout: Layout) -> Readings:
+    """All readings, in order.
+
+    Raises:
+        InputError: one is missing or damaged.
+    """
+    rows = connection.execute(
+        "SELECT id, pose, load, cycle, record, crc FROM readings ORDER BY id"
+    ).fetchall()
+    names = [fetch_names(connection, table) for table in ("poses", "loads")]
+    size = 8 * sum(width for _, width in layout)
+    for number, (key, *where, record, crc) in enumerate(rows, start=1):
+        try:
+            whole = key == number and len(record) == size
+            whole = whole and _reading_crc(key, where, record) == crc
+        except (TypeError, ValueError, OverflowError):
+            whole = False
+        if not whole:
+            raise InputError(f"{path}: the campaign file is damaged at reading {number}")
+    records = np.frombuffer(b"".join(row[4] for row in rows), dtype="<f8").reshape(len(rows), -1)
+    index = np.array([row[1:4] for row in rows], dtype=np.int64)
+    if np.any(index[:, :2].max(axis=0) >= [len(n) for n in names]):
+        raise InputError(f"{path}: the campaign file is damaged (names are missing)")
+    return unpack(records, layout, index, *names)
+
+
+def check_poses(connection: sqlite3.Connection, path: Path, readings: Readings) -> None:
+    """Refuse a pose that is commanded to other joints than in earlier readings.
+
+    Raises:
+        InputError: names the pose.
+    """
+    if len(readings) == 0:
+        return
+    q = readings.states.q
+    pose, first, group = np.unique(readings.pose, return_index=True, return_inverse=True)
+    reference = q[first]
+    for k, number in enumerate(pose.tolist()):
+        stored = connection.execute(
+            "SELECT record FROM readings "
+            "WHERE pose = (SELECT id FROM poses WHERE name = ?) LIMIT 1",
+            (readings.pose_names[number],),
+        ).fetchone()
+        if stored is not None:  # q comes first in a record
+            reference[k] = np.frombuffer(stored[0], "<f8", q.shape[1])
+    bad = np.abs(q - reference[group]).max(axis=1) > SAME_POSE
+    if bad.any():
+        name = readings.pose_names[readings.pose[np.argmax(bad)]]
+        raise InputError(
+            f"{path}: pose '{name}' is commanded to other joints than before; "
+            f"give another pose another name"
+        )

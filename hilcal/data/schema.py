@@ -1,0 +1,131 @@
+"""Schema of a campaign file: tables that only grow.
+
+The journal is SQLite's rollback journal, not a write-ahead log: what is committed is in the
+one file and nowhere else, whatever kills the process; a `-journal` beside it holds only the
+undoing of an unfinished transaction and is gone after the next opening. Source: SQLite
+documentation, "Atomic Commit In SQLite" and "PRAGMA synchronous".
+"""
+
+import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from hilcal.errors import InputError
+
+APPLICATION_ID = 0x68696C63  # "hilc"
+VERSION = 1
+HEADER = b"SQLite format 3\x00"
+
+_TABLES = """
+CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL, crc INTEGER NOT NULL) WITHOUT ROWID;
+CREATE TABLE poses (id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE);
+CREATE TABLE loads (id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE);
+CREATE TABLE readings (
+    id INTEGER PRIMARY KEY,
+    pose INTEGER NOT NULL REFERENCES poses (id),
+    load INTEGER NOT NULL REFERENCES loads (id),
+    cycle INTEGER NOT NULL,
+    record BLOB NOT NULL,
+    crc INTEGER NOT NULL
+);
+CREATE INDEX readings_pose ON readings (pose);
+CREATE TABLE revisions (id INTEGER PRIMARY KEY, content TEXT NOT NULL, crc INTEGER NOT NULL);
+"""
+_KEYS = {"meta": "key", "poses": "id", "loads": "id", "readings": "id", "revisions": "id"}
+
+
+def statements() -> list[str]:
+    """All statements that make an empty campaign, triggers against change included."""
+    made = [s for s in _TABLES.split(";") if s.strip()]
+    for table, key in _KEYS.items():
+        refuse = f"SELECT RAISE(ABORT, '{table} are immutable: append only')"
+        for event in ("UPDATE", "DELETE"):
+            made.append(
+                f"CREATE TRIGGER {table}_no_{event.lower()} BEFORE {event} ON {table} "
+                f"BEGIN {refuse}; END"
+            )
+        made.append(
+            f"CREATE TRIGGER {table}_no_replace BEFORE INSERT ON {table} "  # noqa: S608
+            f"WHEN EXISTS (SELECT 1 FROM {table} WHERE {key} = NEW.{key}) BEGIN {refuse}; END"
+        )
+    made.append(f"PRAGMA application_id = {APPLICATION_ID}")
+    made.append(f"PRAGMA user_version = {VERSION}")
+    return made
+
+
+def is_campaign(path: Path) -> bool:
+    """Whether a file's header is that of a campaign (whatever the state of the rest)."""
+    with path.open("rb") as stream:
+        head = stream.read(72)
+    return head.startswith(HEADER) and head[68:72] == APPLICATION_ID.to_bytes(4, "big")
+
+
+@contextmanager
+def sqlite_errors(path: Path) -> Iterator[None]:
+    """Turn SQLite's errors into one line.
+
+    Raises:
+        InputError: says what is wrong with the file.
+    """
+    try:
+        yield
+    except UnicodeEncodeError as e:
+        raise InputError(f"{path}: a text is not valid Unicode ({e.object!r})") from e
+    except sqlite3.DatabaseError as e:
+        text = str(e)
+        if "malformed" in text or "not a database" in text:
+            raise InputError(f"{path}: the campaign file is damaged or truncated ({text})") from e
+        if "locked" in text or "busy" in text:
+            raise InputError(f"{path}: another program is writing to the campaign") from e
+        raise InputError(f"{path}: the campaign file cannot be used ({text})") from e
+
+
+def connect(path: Path) -> sqlite3.Connection:
+    """Open an existing file, every commit durable before it returns."""
+    connection = sqlite3.connect(
+        f"{path.absolute().as_uri()}?mode=rw", uri=True, isolation_level=None, timeout=10.0
+    )
+    for pragma in ("synchronous = EXTRA", "foreign_keys = ON", "trusted_schema = OFF"):
+        connection.execute(f"PRAGMA {pragma}")
+    connection.execute("PRAGMA cell_size_check = ON")
+    return connection
+
+
+@contextmanager
+def transaction(connection: sqlite3.Connection) -> Iterator[None]:
+    """Commit everything or nothing."""
+    connection.execute("BEGIN IMMEDIATE")
+    try:
+        yield
+        connection.execute("COMMIT")
+    except BaseException:
+        if connection.in_transaction:
+            connection.execute("ROLLBACK")
+        raise
+
+
+def check_file(connection: sqlite3.Connection, path: Path) -> None:
+    """Refuse what is not a sound campaign of a known version.
+
+    Raises:
+        InputError: says which.
+    """
+    (application,) = connection.execute("PRAGMA application_id").fetchone()
+    if application != APPLICATION_ID:
+        raise InputError(f"{path}: an SQLite file, but not a hilcal campaign")
+    (version,) = connection.execute("PRAGMA user_version").fetchone()
+    if version > VERSION:
+        raise InputError(
+            f"{path}: made by a newer hilcal (schema {version}, this one reads up to {VERSION})"
+        )
+    (pages,) = connection.execute("PRAGMA page_count").fetchone()
+    (page_size,) = connection.execute("PRAGMA page_size").fetchone()
+    if path.stat().st_size < pages * page_size:  # SQLite fills a cut page with zeros
+        raise InputError(f"{path}: the campaign file is truncated")
+    (sound,) = connection.execute("PRAGMA quick_check(1)").fetchone()
+    if sound != "ok":
+        raise InputError(f"{path}: the campaign file is damaged ({' '.join(sound.split())})")
+    rows = connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
+    if missing := sorted(set(_KEYS) - {name for (name,) in rows}):
+        raise InputError(f"{path}: the campaign file is damaged (no table '{missing[0]}')")

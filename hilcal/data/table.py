@@ -1,0 +1,237 @@
+"""The exchange table: readings as CSV, one row per reading."""
+
+import csv
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from hilcal.data import checks, columns
+from hilcal.data.csvfile import Columns, read_columns
+from hilcal.data.noise import TrackerNoise, tracker_covariance, tracker_pose_covariance
+from hilcal.data.readings import Readings, States
+from hilcal.errors import InputError
+from hilcal.robot.arm import Arm
+from hilcal.types import Floats, Ints
+
+
+def read_table(
+    path: str | Path,
+    arm: Arm,
+    noise: TrackerNoise | None,
+    station: Floats | Sequence[float] | None = None,
+) -> Readings:
+    """Read an exchange table; every unit is SI, every complaint names row and column.
+
+    Args:
+        path: a CSV file with the columns of `columns.known_columns`.
+        arm: tells the number of joints, their limits and the reach.
+        noise: gives the covariances where the table has none.
+        station: (3,) where the tracker's beam starts, m; the origin where None.
+
+    Returns:
+        The readings in the table's order; poses and loads are numbered as they appear.
+
+    Raises:
+        InputError: anything that cannot be right.
+    """
+    table = read_columns(path, lambda header: _choose(str(path), header, arm))
+    checks.check_names(table)
+    pose, pose_names = _index(table.text["pose"])
+    load, load_names = _index(table.text["load"])
+    states = _states(table, arm)
+    checks.check_same_pose(table, pose, pose_names, states.q)
+    checks.check_wrenches(table, states.wrench, load, load_names, arm)
+    value = table.matrix(columns.POSITION)
+    checks.check_positions(table, value, states.q, arm)
+    if columns.ROTATION[0] in table.number:
+        rotation = table.matrix(columns.ROTATION)
+        checks.check_rotations(table, rotation)
+        value = np.hstack([value, rotation])
+    return Readings(
+        states=states,
+        pose=pose,
+        load=load,
+        cycle=_cycles(table),
+        value=value,
+        covariance=_covariances(table, value, noise, station),
+        load_names=tuple(load_names),
+        pose_names=tuple(pose_names),
+    )
+
+
+def _choose(path: str, header: list[str], arm: Arm) -> tuple[Sequence[str], Sequence[str]]:
+    """Check the header; text and number columns to read."""
+    if header and header[0].startswith("Timestamp;"):
+        raise InputError(f"{path}: not an exchange table; looks like --format ipa-ur10")
+    if len(header) == 1 and (";" in header[0] or "\t" in header[0]):
+        raise InputError(f"{path}: columns must be separated by ',' with '.' as decimal mark")
+    known = columns.known_columns(arm.n)
+    if not any(name in known for name in header):
+        raise InputError(
+            f"{path}: not an exchange table: row 1 has none of its columns; "
+            f"expected {', '.join(columns.required_columns(arm.n))}"
+        )
+    columns.check_header(path, header, arm.n, arm.name)
+    columns.covariance_size(path, header)
+    return columns.TEXT, [name for name in header if name in known and name not in columns.TEXT]
+
+
+def _index(names: list[str]) -> tuple[Ints, list[str]]:
+    """Numbers of names in order of first appearance, and those names."""
+    order = {name: k for k, name in enumerate(dict.fromkeys(names))}
+    return np.fromiter((order[n] for n in names), dtype=np.int64, count=len(names)), list(order)
+
+
+def _states(table: Columns, arm: Arm) -> States:
+    number, n = table.number, arm.n
+    q = table.matrix(columns.joint_columns(n))
+    checks.check_joints(table, columns.joint_columns(n), q, arm)
+    zero = np.zeros(len(q))
+    wrench = np.stack([number.get(name, zero) for name in columns.WRENCH], axis=1)
+    temperature = _group(table, columns.temperature_columns(n))
+    approach = _group(table, columns.approach_columns(n))
+    actual = _group(table, columns.actual_columns(n))
+    if approach is not None:
+        names = columns.approach_columns(n)
+        table.refuse(np.abs(approach) != 1, names, lambda v: f"{v:g} must be -1 or +1")
+    if actual is not None:
+        checks.check_actual_joints(table, columns.actual_columns(n), actual, q)
+    if temperature is not None:
+        _in_range(table, columns.temperature_columns(n), -50, 150, "°C")
+    if "air_degC" in number:
+        _in_range(table, ("air_degC",), -50, 80, "°C")
+    if "load_time_s" in number:
+        _in_range(table, ("load_time_s",), 0, np.inf, "s")
+    return States(
+        q=q,
+        wrench=wrench,
+        time=number.get("time_s"),
+        load_time=number.get("load_time_s"),
+        air_temperature=number.get("air_degC"),
+        joint_temperature=temperature,
+        approach=approach,
+        q_actual=actual,
+    )
+
+
+def _group(table: Columns, names: Sequence[str]) -> Floats | None:
+    return table.matrix(names) if names[0] in table.number else None
+
+
+def _in_range(table: Columns, names: Sequence[str], low: float, high: float, unit: str) -> None:
+    value = table.matrix(names)
+    table.refuse(
+        (value < low) | (value > high),
+        names,
+        lambda v: f"{v:g} {unit} cannot be right; expected {low:g} to {high:g} {unit}",
+    )
+
+
+def _cycles(table: Columns) -> Ints:
+    if "cycle" not in table.number:
+        return np.zeros(len(table.rows), dtype=np.int64)
+    cycle = table.matrix(("cycle",))
+    wrong = (cycle != np.rint(cycle)) | (np.abs(cycle) > 2**53)
+    table.refuse(wrong, ("cycle",), lambda v: f"{v:g} must be a whole number")
+    return cycle[:, 0].astype(np.int64)
+
+
+def _covariances(
+    table: Columns,
+    value: Floats,
+    noise: TrackerNoise | None,
+    station: Floats | Sequence[float] | None,
+) -> Floats:
+    m = value.shape[1]
+    names = columns.covariance_columns(m)
+    if names[0] in table.number:
+        i, j = np.triu_indices(m)
+        cov = np.zeros((len(value), m, m))
+        cov[:, i, j] = cov[:, j, i] = table.matrix(names)
+        checks.check_covariances(table, cov)
+        return cov
+    if noise is None:
+        raise InputError(
+            f"{table.path}: no covariance columns ({names[0]} ... {names[-1]}) and no noise in "
+            f"the section [tracker] of the configuration; give one of them"
+        )
+    origin = np.zeros(3) if station is None else np.asarray(station, dtype=float)
+    for k in np.flatnonzero(np.linalg.norm(value[:, :3] - origin, axis=1) < 1e-3)[:1]:
+        raise InputError(
+            f"{table.at(int(k))}: position lies at the tracker's station; set station_m in the "
+            f"section [tracker] of the configuration"
+        )
+    law = tracker_covariance if m == 3 else tracker_pose_covariance
+    return law(value[:, :3], noise, origin)
+
+
+def write_table(readings: Readings, path: str | Path) -> None:
+    """Write an exchange table that `read_table` reads back exactly (shortest exact decimals).
+
+    Raises:
+        InputError: a name that a table cannot hold, or the file cannot be written.
+    """
+    text = [_names(readings.pose_names, readings.pose, "pose")]
+    text.append(_names(readings.load_names, readings.load, "load"))
+    header, numbers = _number_columns(readings)
+    cells = [list(map(repr, column.tolist())) for column in numbers]
+    _write(
+        Path(path),
+        lambda out: (
+            out.writerow((*columns.TEXT, *header)),
+            out.writerows(zip(*text, *cells, strict=True)),
+        ),
+    )
+
+
+def _names(names: Sequence[str], index: Ints, what: str) -> list[str]:
+    used = [names[k] for k in dict.fromkeys(index.tolist())]
+    for name in used:
+        if not name or name != name.strip() or not name.isprintable():
+            raise InputError(f"{what} {name!r}: a name must be printable, not empty, not padded")
+        if what == "load" and name != "none" and name.lower() == "none":
+            raise InputError(f"load '{name}' must be spelled 'none'")
+    if len(set(used)) < len(used):
+        name = next(name for name in used if used.count(name) > 1)
+        raise InputError(f"{what} '{name}': two of the readings' {what}s have this name")
+    return [names[k] for k in index.tolist()]
+
+
+def _number_columns(readings: Readings) -> tuple[list[str], list[Floats | Ints]]:
+    """Names and (N,) arrays of the number columns that the readings have."""
+    s, m, n = readings.states, readings.m, readings.states.q.shape[1]
+    i, j = np.triu_indices(m)
+    blocks: list[tuple[Sequence[str], Floats | Ints | None]] = [
+        (("cycle",), readings.cycle),
+        (columns.joint_columns(n), s.q),
+        ((columns.POSITION + columns.ROTATION)[:m], readings.value),
+        (columns.covariance_columns(m), readings.covariance[:, i, j]),
+        (columns.WRENCH, s.wrench if np.any(s.wrench) else None),
+        (("time_s",), s.time),
+        (("load_time_s",), s.load_time),
+        (("air_degC",), s.air_temperature),
+        (columns.temperature_columns(n), s.joint_temperature),
+        (columns.approach_columns(n), s.approach),
+        (columns.actual_columns(n), s.q_actual),
+    ]
+    header: list[str] = []
+    numbers: list[Floats | Ints] = []
+    for names, block in blocks:
+        if block is not None:
+            header += names
+            numbers += list(block.reshape(len(readings), len(names)).T)
+    return header, numbers
+
+
+def _write(path: Path, rows: Callable[..., object]) -> None:
+    """Write a CSV file; a file of that name is replaced when the new one is complete."""
+    new = path.with_name(f".{path.name}.new")
+    try:
+        with new.open("w", encoding="utf-8", newline="") as stream:
+            rows(csv.writer(stream, lineterminator="\n"))
+        os.replace(new, path)
+    except (OSError, UnicodeEncodeError) as e:
+        new.unlink(missing_ok=True)
+        raise InputError(f"{path}: cannot be written ({e})") from e

@@ -1,0 +1,163 @@
+"""Where the model fails: which variables the misfit follows.
+
+For a variable x, a generic family asks whether *any* joint's angle, or the target's position,
+errs as a smooth function of x: columns φ_k(x) times the motion of each joint and times each
+base axis. The family is scored like a suspect, so its p-value is exact; its share says how much
+of the misfit it predicts on poses left out. It names no cause.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+from scipy.stats import f as f_distribution
+
+from hilcal.diagnose.projection import Projection
+from hilcal.observe import motion
+from hilcal.types import Floats
+
+POLYNOMIAL = 3
+MANY = 4000
+"""Degrees of freedom from which the families of joint angles are finer."""
+
+
+@dataclass(frozen=True, slots=True)
+class Where:
+    """How far the misfit follows one variable.
+
+    Attributes:
+        variable: e.g. "joint 2 angle", "joint 2 torque", "load", "time".
+        share: share of the misfit that it predicts on poses left out.
+        p_value: of the joint test.
+    """
+
+    variable: str
+    share: float
+    p_value: float
+
+
+def where(p: Projection) -> tuple[Where, ...]:
+    """Score all variables that vary in these readings; largest share first."""
+    fit, w = p.fit, p.fit.whitening
+    prediction, model = fit.solution.prediction, fit.model
+    moves = motion(
+        model.cell,
+        prediction.observation,
+        prediction.situation.chain,
+        prediction.deviation,
+        w.m,
+    )
+    count = len(prediction.situation.angle)
+    axes = np.zeros((count, w.m, 3))
+    axes[:, :3] = prediction.observation.axes
+    # Motions of ordinary size: 1 mrad of a joint, 1 mm of the target.
+    generic = 1e-3 * np.concatenate([moves.dq, axes], axis=2)
+    at_measurement = generic[w.reading]
+    out = []
+    for name, basis, follows_load in _variables(p):
+        if follows_load:
+            raw = w.raw(_times(generic, basis))
+        else:
+            raw = _times(at_measurement, basis[w.reading])
+        x = w.whiten(raw).reshape(-1, raw.shape[2])
+        result = p.score(x)
+        share = max(p.held_out_share(x, result), 0.0)
+        out.append(Where(name, share, result.p_value))
+    out += [*_poses(p, axes[w.reading]), *_axes(p)]
+    return tuple(sorted(out, key=lambda v: (-v.share, v.p_value)))
+
+
+def _times(motions: Floats, basis: Floats) -> Floats:
+    """All products (D, m, K·F) of motions (D, m, K) and functions (D, F)."""
+    product = motions[:, :, :, None] * basis[:, None, None, :]
+    return product.reshape(*motions.shape[:2], -1)
+
+
+def _variables(p: Projection) -> list[tuple[str, Floats, bool]]:
+    """Name, functions (N, F), and whether a deflection takes their difference."""
+    fit = p.fit
+    readings = fit.readings[~fit.outlier]
+    s, situation = readings.states, fit.solution.prediction.situation
+    absolute = fit.mode == "absolute"
+    harmonics = np.arange(1, 3 if fit.dof < MANY else 7)
+    out: list[tuple[str, Floats, bool]] = []
+    for j in range(situation.angle.shape[1]):
+        phase = situation.angle[:, j, None] * harmonics
+        functions = np.concatenate([np.cos(phase), np.sin(phase)], axis=1)
+        out.append((f"joint {j + 1} angle", functions, False))
+        torque = situation.torque[:, j]
+        if np.ptp(torque) > 1e-6:
+            out.append((f"joint {j + 1} torque", _powers(torque, 0.0), True))
+        if s.approach is not None and np.ptp(s.approach[:, j]) > 0:
+            out.append((f"joint {j + 1} approach", s.approach[:, [j]], True))
+        if s.joint_temperature is not None and np.ptp(s.joint_temperature[:, j]) > 0:
+            out.append((f"joint {j + 1} temperature", _powers(s.joint_temperature[:, j]), True))
+    for name, values in (
+        ("time", s.time),
+        ("time under load", s.load_time),
+        ("air temperature", s.air_temperature),
+    ):
+        if values is not None and np.ptp(values) > 0:
+            out.append((name, _powers(values), True))
+    loads = np.unique(readings.load)
+    if len(loads) > 1:
+        member = (readings.load[:, None] == loads).astype(float)
+        out.append(("load", member[:, member.any(axis=0)], absolute))
+    return out
+
+
+def _powers(x: Floats, centre: float | None = None) -> Floats:
+    """(N, 3) powers of x about a centre (its median unless given), scaled to at most 1."""
+    away = x - (np.median(x) if centre is None else centre)
+    scaled = away / max(float(np.abs(away).max()), 1e-300)
+    return np.asarray(scaled[:, None] ** np.arange(1, POLYNOMIAL + 1))
+
+
+def _poses(p: Projection, axes: Floats) -> list[Where]:
+    """How far the misfit is common to all readings of a pose, where poses have several.
+
+    A pose that is left out cannot be predicted from itself, so the share is in-sample, less
+    what as many columns explain by chance.
+    """
+    fit, w = p.fit, p.fit.whitening
+    poses = int(fit.pose.max()) + 1
+    if poses * 3 > fit.dof / 2 or len(fit.pose) < 2 * poses:
+        return []
+    member = (fit.pose[:, None] == np.arange(poses)).astype(float)
+    raw = 1e-3 * _times(axes, member)
+    free = p.free(w.whiten(raw).reshape(-1, raw.shape[2]))
+    u, s, _ = np.linalg.svd(free, full_matrices=False)
+    u = u[:, s > 1e-6 * s.max(initial=0.0)]
+    rank = u.shape[1]
+    gain = float(np.sum((u.T @ fit.white) ** 2))
+    within = (p.yy - gain) / (fit.dof - rank)
+    p_value = float(f_distribution.sf(gain / rank / within, rank, fit.dof - rank))
+    return [Where("pose", p.share(gain - rank * within), p_value)]
+
+
+def _axes(p: Projection) -> list[Where]:
+    """Directions: towards the base axis, around it, and up."""
+    fit, w = p.fit, p.fit.whitening
+    o = fit.solution.prediction.observation
+    x = o.base_position[w.reading]
+    across = np.hypot(x[:, 0], x[:, 1])
+    up = np.tile([0.0, 0.0, 1.0], (len(x), 1))
+    radial = np.stack([x[:, 0] / across, x[:, 1] / across, 0 * across], axis=1)
+    around = np.cross(up, radial)
+    excess = {}
+    scale = len(fit.raw) * w.m / max(fit.dof, 1.0)
+    for name, direction in (("radial", radial), ("tangential", around), ("vertical", up)):
+        e = np.einsum("dij,dj->di", o.axes[w.reading], direction)
+        r = np.sum(e * fit.raw[:, :3], axis=1)
+        v = np.einsum("di,dij,dj->d", e, w.covariance[:, :3, :3], e)
+        excess[name] = float(np.sum(r**2 / v)) * scale
+    count = len(fit.raw)
+    total = sum(max(value - count, 0.0) for value in excess.values())
+    return [
+        Where(
+            f"direction {name}",
+            0.0 if total == 0 else max(value - count, 0.0) / max(total, 3 * np.sqrt(6 * count)),
+            float(chi2.sf(value, count)),
+        )
+        for name, value in excess.items()
+    ]

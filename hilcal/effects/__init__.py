@@ -1,0 +1,1 @@
+"""Physical effects: one file each, the protocol, and the catalogue."""

@@ -1,0 +1,35 @@
+"""`base_frame`: the registration of the tracker to the base is off."""
+
+import numpy as np
+
+from hilcal.effects.options import prior_of_lengths_and_turns
+from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
+from hilcal.types import Floats
+
+
+class BaseFrame(Effect):
+    """Twist of the base relative to its registration, base axes [m, rad].
+
+    Options:
+        prior_m, prior_rad: standard deviations of what is known of it already.
+    """
+
+    name = "base_frame"
+    summary = "registration of the tracker to the arm's base is off"
+    option_names = ("prior_m", "prior_rad")
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Displacement along and rotation about the base axes."""
+        return tuple(Parameter(a, "m", 1e-3, f"base shift along {a}") for a in "xyz") + tuple(
+            Parameter(f"r{a}", "rad", 1e-3, f"base turn about {a}") for a in "xyz"
+        )
+
+    def columns(self, s: Situation) -> tuple[Columns, ...]:
+        """Unit twists of the base."""
+        index = np.arange(6)
+        return (Columns("base", index, 0 * index, np.eye(6)[None]),)
+
+    def prior_std(self) -> Floats | None:
+        """Prior of displacement and rotation, where given."""
+        return prior_of_lengths_and_turns(self.name, self.options, 6)

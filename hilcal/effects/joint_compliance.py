@@ -1,0 +1,31 @@
+"""`joint_compliance`: the drive train twists under torque."""
+
+import numpy as np
+
+from hilcal.effects.protocol import Columns, Effect, Parameter, Response, Situation
+from hilcal.types import Floats
+
+
+class JointCompliance(Effect):
+    """dq_j = c_j τ_j, one compliance per joint [rad/(N·m)]."""
+
+    name = "joint_compliance"
+    summary = "dq_j = c_j τ_j: each joint gives way in proportion to its torque"
+    elastic = True
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """One compliance per joint."""
+        return tuple(
+            Parameter(f"j{j + 1}", "rad/(N·m)", 2e-5, f"compliance of joint {j + 1}")
+            for j in range(self.cell.arm.n)
+        )
+
+    def columns(self, s: Situation) -> tuple[Columns, ...]:
+        """Torques: ∂dq_j/∂c_j = τ_j."""
+        joints = np.arange(self.cell.arm.n)
+        return (Columns("dq", joints, joints, s.torque),)
+
+    def response(self, theta: Floats, s: Situation, change: Floats) -> Response:
+        """Return dq_j = c_j dτ_j."""
+        return Response(dq=change[:, :, :-1, 5] * theta)

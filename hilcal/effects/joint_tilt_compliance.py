@@ -1,0 +1,34 @@
+"""`joint_tilt_compliance`: the joints' bearings tilt across their axes."""
+
+import numpy as np
+
+from hilcal.effects.protocol import Columns, Effect, Parameter, Response, Situation
+from hilcal.types import Floats
+
+ACROSS = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 0.0])
+
+
+class JointTiltCompliance(Effect):
+    """Rotation at p_j of k_j (t_j − z_j z_jᵀ t_j), one compliance per joint [rad/(N·m)]."""
+
+    name = "joint_tilt_compliance"
+    summary = "rotation k_j t_j⊥ at joint j: its bearing tilts under the moment across its axis"
+    elastic = True
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """One tilt compliance per joint."""
+        return tuple(
+            Parameter(f"j{j + 1}", "rad/(N·m)", 3e-6, f"tilt compliance of joint {j + 1}")
+            for j in range(self.cell.arm.n)
+        )
+
+    def columns(self, s: Situation) -> tuple[Columns, ...]:
+        """Twist of slot j by the moment across the axis; slot axes have z along it."""
+        joints = np.arange(self.cell.arm.n)
+        return (Columns("twist", joints, joints, s.wrench[:, :-1] * ACROSS),)
+
+    def response(self, theta: Floats, s: Situation, change: Floats) -> Response:
+        """Rotation k_j dt_j⊥."""
+        k = np.append(theta, 0.0)
+        return Response(twist=change * (k[:, None] * ACROSS))

@@ -1,0 +1,37 @@
+"""`load_point`: the load acts elsewhere than configured."""
+
+import numpy as np
+
+from hilcal.effects.protocol import Columns, Effect, LoadChange, Parameter, Situation
+from hilcal.robot.statics import slot_wrench_change
+from hilcal.types import Floats
+
+
+class LoadPoint(Effect):
+    """Shift of the point where the wrench acts, flange axes [m].
+
+    It acts through the elastic effects only: a shift δ changes the moment at the flange
+    by (R δ) × f.
+    """
+
+    name = "load_point"
+    summary = "the load acts elsewhere than configured (flange axes)"
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Shift along x, y and z of the flange."""
+        return tuple(Parameter(a, "m", 1e-2, f"shift along flange {a}") for a in "xyz")
+
+    def columns(self, s: Situation) -> tuple[Columns, ...]:
+        """No deviation of its own."""
+        return ()
+
+    def load_change(self, theta: Floats) -> LoadChange:
+        """Shift of the load point."""
+        return LoadChange(point=theta)
+
+    def wrench_columns(self, s: Situation) -> Floats:
+        """Moment (R e) × f at the flange for a unit shift along each flange axis e."""
+        axes = np.swapaxes(s.chain.rotation[-1], 1, 2)
+        moment = np.cross(axes, s.states.wrench[:, None, :3])
+        return slot_wrench_change(s.chain, np.zeros_like(moment), moment)

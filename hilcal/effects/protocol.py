@@ -1,0 +1,205 @@
+"""What an effect is: parameters, a deviation linear in them, and the derivative of it.
+
+An effect says *where it acts* (a `Deviation`), not what the tool does; the chain does the
+rest. A new effect is one small class in one file: `parameters`, `columns`, and where it is
+elastic `response`, or where it changes the load `load_change`.
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar, Literal, Self
+
+import numpy as np
+
+from hilcal.cell import Cell
+from hilcal.data.readings import States
+from hilcal.effects.options import Options
+from hilcal.errors import InputError
+from hilcal.robot.chain import Chain
+from hilcal.robot.deviation import Deviation
+from hilcal.types import Floats, Ints
+
+Field = Literal["dq", "twist", "base", "station", "target", "scale"]
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One parameter of an effect.
+
+    Attributes:
+        name: within the effect, e.g. "j2" or "j3.cos4".
+        unit: physical unit, SI.
+        scale: a magnitude that would be ordinary in practice; it defines when a direction
+            counts as identifiable and how parameters of one effect compare.
+        meaning: one phrase for people.
+    """
+
+    name: str
+    unit: str
+    scale: float
+    meaning: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Situation:
+    """N states at their deflected configuration: all that a law may depend on.
+
+    Attributes:
+        cell: arm, tool and target.
+        states: the N states.
+        angle: (N, n) joint angles that the laws see, rad.
+        chain: the deviated chain, or None before it is known.
+        wrench: (N, n + 1, 6) wrench transmitted through each slot, slot axes; element
+            (j, 5) is the torque τ of joint j + 1.
+    """
+
+    cell: Cell
+    states: States
+    angle: Floats
+    chain: Chain
+    wrench: Floats
+
+    @property
+    def torque(self) -> Floats:
+        """(N, n) static torques about the joint axes, N·m."""
+        return self.wrench[:, :-1, 5]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Columns:
+    """Derivative of one field of the deviation by P of an effect's parameters.
+
+    Attributes:
+        field: the field of `Deviation` that moves.
+        parameter: (P,) indices of the parameters within the effect.
+        element: (P,) joint (for dq) or slot (for twist) that moves; ignored otherwise.
+        values: (N, P) for dq and scale, (N, P, 6) for the others; N may be 1 (constant).
+    """
+
+    field: Field
+    parameter: Ints
+    element: Ints
+    values: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Response:
+    """Change of an elastic deviation by P changes of the slot wrenches.
+
+    Attributes:
+        dq: (N, P, n) or None.
+        twist: (N, P, n + 1, 6) or None.
+    """
+
+    dq: Floats | None = None
+    twist: Floats | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoadChange:
+    """Change of the load: shift of the load point in flange axes, (3,) m."""
+
+    point: Floats
+
+
+class Effect(ABC):
+    """A physical cause of deviations, linear in its parameters.
+
+    Class attributes:
+        name: canonical name.
+        summary: the law in one line.
+        elastic: the deviation depends on the transmitted wrenches.
+        needs: columns of `States` without which the effect cannot be computed.
+    """
+
+    name: ClassVar[str]
+    summary: ClassVar[str]
+    elastic: ClassVar[bool] = False
+    needs: ClassVar[tuple[str, ...]] = ()
+    option_names: ClassVar[tuple[str, ...]] = ()
+
+    def __init__(self, cell: Cell, states: States, options: Options | None = None) -> None:
+        """Build the effect for a cell and the states at hand.
+
+        Raises:
+            InputError: on an unknown option, or where `states` lacks a needed column.
+        """
+        self.cell = cell
+        self.options: dict[str, object] = dict(options or {})
+        for key in self.options:
+            if key not in self.option_names:
+                valid = ", ".join(self.option_names) or "none"
+                raise InputError(f"effect {self.name}: unknown option {key!r}; valid: {valid}")
+        missing = [need for need in self.needs if getattr(states, need) is None]
+        if missing:
+            raise InputError(
+                f"effect {self.name} needs {', '.join(missing)}, which the readings do not have"
+            )
+        self.setup(states)
+
+    def setup(self, states: States) -> None:  # noqa: B027 - optional
+        """Prepare what depends on the states as a whole, e.g. a reference time."""
+
+    @property
+    @abstractmethod
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The parameters, in order."""
+
+    @abstractmethod
+    def columns(self, s: Situation) -> tuple[Columns, ...]:
+        """Derivative of the deviation by the parameters, at fixed wrenches."""
+
+    def response(self, theta: Floats, s: Situation, change: Floats) -> Response:
+        """Change of the deviation by changes (N, P, n + 1, 6) of the slot wrenches."""
+        return Response()
+
+    def load_change(self, theta: Floats) -> LoadChange | None:
+        """Return the change of the load, for effects that act through it."""
+        return None
+
+    def wrench_columns(self, s: Situation) -> Floats | None:
+        """Derivative (N, P, n + 1, 6) of the slot wrenches, for effects that change the load."""
+        return None
+
+    def groups(self) -> Ints | None:
+        """(P,) shrinkage group of each parameter, or None for parameters without a prior.
+
+        The parameters of one group share a zero-mean normal prior whose variance is
+        chosen from the data by the evidence.
+        """
+        return None
+
+    def prior_std(self) -> Floats | None:
+        """(P,) standard deviations of a fixed zero-mean prior, or None for a flat one."""
+        return None
+
+    @classmethod
+    def computable(cls, states: States) -> bool:
+        """Whether `states` has all the columns that the effect needs."""
+        return all(getattr(states, need) is not None for need in cls.needs)
+
+    def for_scoring(self, states: States) -> "Effect":
+        """Return a version that is cheap to score as a suspect; the same unless overridden."""
+        return self
+
+    def with_options(self, states: States, **options: object) -> Self:
+        """Return the same effect with some options changed."""
+        return type(self)(self.cell, states, {**self.options, **options})
+
+    def deviation(self, theta: Floats, s: Situation) -> Deviation:
+        """Deviation of N states at parameters theta (P,)."""
+        count, n = s.angle.shape
+        fields: dict[str, Floats] = {}
+        for c in self.columns(s):
+            t = theta[c.parameter]
+            if c.field in ("dq", "twist"):
+                width = (n,) if c.field == "dq" else (n + 1, 6)
+                out = fields.setdefault(c.field, np.zeros((count, *width)))
+                for e in np.unique(c.element):
+                    mine = c.element == e
+                    out[:, e] += np.einsum("np...,p->n...", c.values[:, mine], t[mine])
+            else:
+                value = np.einsum("np...,p->n...", c.values, t)
+                shape = (count, *value.shape[1:])
+                fields[c.field] = fields.get(c.field, 0.0) + np.broadcast_to(value, shape)
+        return Deviation(**fields)

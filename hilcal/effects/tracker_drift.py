@@ -1,0 +1,47 @@
+"""`tracker_drift`: the tracker's station moves while the campaign runs."""
+
+import numpy as np
+
+from hilcal.data.readings import States
+from hilcal.effects.options import number
+from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
+from hilcal.errors import InputError
+from hilcal.types import Floats
+
+
+class TrackerDrift(Effect):
+    """Station twist that grows linearly with time, sensor axes [m/s, rad/s].
+
+    Options:
+        reference_s: the time at which the station stands as registered; unless given, the
+            time of the first reading.
+    """
+
+    name = "tracker_drift"
+    summary = "the tracker's station moves linearly in time"
+    needs = ("time",)
+    option_names = ("reference_s", "span_s")
+
+    def setup(self, states: States) -> None:
+        """Take the time of the first reading as the reference unless told otherwise."""
+        assert states.time is not None  # noqa: S101 - checked at construction
+        self.options.setdefault("reference_s", float(states.time.min()))
+        self.options.setdefault("span_s", max(float(np.ptp(states.time)), 1.0))
+        self.reference = number(self.name, self.options, "reference_s")
+        self.span = number(self.name, self.options, "span_s")
+        if self.span <= 0:
+            raise InputError(f"effect {self.name}: span_s = {self.span:g}; valid: more than 0")
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Rates of displacement and rotation; 50 µm and 50 µrad over the campaign."""
+        return tuple(Parameter(a, "m/s", 5e-5 / self.span) for a in "xyz") + tuple(
+            Parameter(f"r{a}", "rad/s", 5e-5 / self.span) for a in "xyz"
+        )
+
+    def columns(self, s: Situation) -> tuple[Columns, ...]:
+        """Unit twists times the time since the reference."""
+        assert s.states.time is not None  # noqa: S101 - checked at construction
+        elapsed: Floats = s.states.time - self.reference
+        index = np.arange(6)
+        return (Columns("station", index, 0 * index, elapsed[:, None, None] * np.eye(6)),)

@@ -1,0 +1,64 @@
+"""`transmission_error`: gears and encoders err periodically with the joint angle."""
+
+import numpy as np
+
+from hilcal.data.readings import States
+from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
+from hilcal.errors import InputError
+from hilcal.types import Ints
+
+MOST_HARMONICS = 120
+FEWEST_HARMONICS = 4
+POSES_PER_HARMONIC = 5
+SCORED_HARMONICS = 40
+
+
+class TransmissionError(Effect):
+    """dq_j = Σ_k a_jk cos k q_j + b_jk sin k q_j, k = 1..K [rad].
+
+    The evidence decides how strong each harmonic of each joint is, and drops the needless
+    ones; K only bounds the search.
+
+    Options:
+        harmonics: K, the harmonics tried per joint; unless given, one for every five distinct
+            poses, at least 4 and at most 120.
+    """
+
+    name = "transmission_error"
+    summary = "dq_j = Σ a_jk cos k q_j + b_jk sin k q_j: gear and encoder error"
+    option_names = ("harmonics",)
+
+    def setup(self, states: States) -> None:
+        """Read or choose the number of harmonics."""
+        poses = len(np.unique(np.round(states.q, 3), axis=0))
+        chosen = int(np.clip(poses // POSES_PER_HARMONIC, FEWEST_HARMONICS, MOST_HARMONICS))
+        count = self.options.setdefault("harmonics", chosen)
+        if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= 1000:
+            raise InputError(f"effect {self.name}: harmonics = {count!r}; valid: 1 to 1000")
+        self.harmonics = np.arange(1, count + 1)
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Cosine and sine amplitude of each harmonic of each joint."""
+        return tuple(
+            Parameter(f"j{j + 1}.{wave}{k}", "rad", 5e-5)
+            for j in range(self.cell.arm.n)
+            for k in self.harmonics
+            for wave in ("cos", "sin")
+        )
+
+    def columns(self, s: Situation) -> tuple[Columns, ...]:
+        """Waves: ∂dq_j/∂a_jk = cos k q_j, ∂dq_j/∂b_jk = sin k q_j."""
+        phase = s.angle[:, :, None] * self.harmonics
+        values = np.stack([np.cos(phase), np.sin(phase)], axis=-1).reshape(len(phase), -1)
+        per_joint = 2 * len(self.harmonics)
+        joints = np.repeat(np.arange(self.cell.arm.n), per_joint)
+        return (Columns("dq", np.arange(len(joints)), joints, values),)
+
+    def groups(self) -> Ints:
+        """One variance per joint and harmonic."""
+        return np.repeat(np.arange(self.cell.arm.n * len(self.harmonics)), 2)
+
+    def for_scoring(self, states: States) -> Effect:
+        """As a suspect, fewer harmonics are scored than a fit tries."""
+        return self.with_options(states, harmonics=min(len(self.harmonics), SCORED_HARMONICS))

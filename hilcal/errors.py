@@ -1,0 +1,25 @@
+"""Errors that a user can act on; each carries the exit code of the command line."""
+
+
+class HilcalError(Exception):
+    """Base of all errors that are reported in one line, without a traceback."""
+
+    exit_code = 1
+
+
+class InputError(HilcalError):
+    """Wrong input: says what is wrong, where, and what would be valid."""
+
+    exit_code = 2
+
+
+class DeviceError(HilcalError):
+    """A device failed or did not answer."""
+
+    exit_code = 3
+
+
+class CannotAnswerError(HilcalError):
+    """The data cannot answer the question; says what to measure."""
+
+    exit_code = 4

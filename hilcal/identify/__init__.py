@@ -1,0 +1,1 @@
+"""Whitened Gauss-Newton, scaling, identifiability, uncertainty, fit."""

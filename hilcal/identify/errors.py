@@ -1,0 +1,39 @@
+"""Error blocks: how far the model is from the measurements."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilcal.types import Floats
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorBlock:
+    """Position error per measurement, and the whitened residual.
+
+    Attributes:
+        rms_m: root mean square of the 3-D position error, m.
+        mean_m: its mean, m.
+        max_m: its maximum, m.
+        rms_sigma: root mean square of the whitened elements, pure number.
+    """
+
+    rms_m: float
+    mean_m: float
+    max_m: float
+    rms_sigma: float
+
+    def to_json(self) -> dict[str, float]:
+        """Keys and values of the contract."""
+        return {k: getattr(self, k) for k in ("rms_m", "mean_m", "max_m", "rms_sigma")}
+
+
+def error_block(raw: Floats, whitened: Floats, rank: int) -> ErrorBlock:
+    """Summarise raw residuals (D, m) and their whitened rows (R,) of given rank."""
+    distance = np.linalg.norm(raw[:, :3], axis=1)
+    return ErrorBlock(
+        rms_m=float(np.sqrt(np.mean(distance**2))),
+        mean_m=float(distance.mean()),
+        max_m=float(distance.max()),
+        rms_sigma=float(np.sqrt(whitened @ whitened / max(rank, 1))),
+    )

@@ -1,0 +1,58 @@
+"""All measurements of a fit: those that were set aside as gross errors included."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilcal.data.readings import Readings
+from hilcal.data.whitening import Whitening, whitening
+from hilcal.identify.fit import Fit, mahalanobis2
+from hilcal.identify.residual import residual
+from hilcal.model import Prediction
+from hilcal.types import Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Everything:
+    """D measurements, whatever became of them in the fit; equal for all fits of equal readings.
+
+    Attributes:
+        readings: all readings.
+        whitening: their gc-scaling; `whitening.reading` (D,) are rows of `readings`.
+        prediction: of all readings.
+        raw: (D, m) residual, sensor axes.
+    """
+
+    readings: Readings
+    whitening: Whitening
+    prediction: Prediction
+    raw: Floats
+
+    @property
+    def mahalanobis2(self) -> Floats:
+        """(D,) squared Mahalanobis distance of each measurement by itself."""
+        return mahalanobis2(self.raw, self.whitening.covariance)
+
+    @property
+    def noise_floor(self) -> float:
+        """Root mean square of the 3-D position error that the stated noise alone leaves, m."""
+        trace = np.trace(self.whitening.covariance[:, :3, :3], axis1=1, axis2=2)
+        return float(np.sqrt(np.mean(trace)))
+
+    def name(self, measurement: int) -> tuple[str, str]:
+        """Pose and load of a measurement."""
+        return names(self.readings, int(self.whitening.reading[measurement]))
+
+
+def names(readings: Readings, row: int) -> tuple[str, str]:
+    """Pose and load of a reading."""
+    return readings.pose_names[readings.pose[row]], readings.load_names[readings.load[row]]
+
+
+def everything(fit: Fit) -> Everything:
+    """Predict all readings of a fit."""
+    if not fit.outlier.any():
+        return Everything(fit.readings, fit.whitening, fit.solution.prediction, fit.raw)
+    w = whitening(fit.readings, fit.mode, "gc")
+    prediction = fit.model.predict(fit.readings.states, fit.theta)
+    return Everything(fit.readings, w, prediction, residual(fit.readings, prediction, w))

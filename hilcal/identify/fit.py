@@ -1,0 +1,210 @@
+"""A fit: parameters, what can be said of them, and how far the model is from the data."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from hilcal.data.readings import Readings
+from hilcal.data.whitening import Mode, Scaling, Whitening, inverse_root, whitening
+from hilcal.errors import CannotAnswerError
+from hilcal.identify.errors import ErrorBlock, error_block
+from hilcal.identify.gauss_newton import Solution, solve
+from hilcal.identify.holdout import leave_out
+from hilcal.identify.outliers import find_outliers
+from hilcal.identify.poses import distinct_poses, random_folds
+from hilcal.identify.residual import residual
+from hilcal.identify.uncertainty import Uncertainty, uncertainty
+from hilcal.model import Model
+from hilcal.types import Bools, Floats, Ints
+
+CONFIDENCE = 0.95
+OUTLIER_ROUNDS = 3
+MAX_OUTLIER_SHARE = 0.05
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """A model fitted to readings; nothing in it changes any more.
+
+    D is the number of measurements (readings or deflections), m their elements, P the
+    number of parameters.
+
+    Attributes:
+        model: robot and effects.
+        readings: all readings.
+        mode: "deflection" or "absolute".
+        scaling: "none", "gu" or "gc".
+        whitening: gc-scaling of the readings that were fitted.
+        solution: where Gauss-Newton came to rest.
+        uncertainty: standard uncertainties and what is identifiable.
+        pose: (D,) distinct pose of each fitted measurement.
+        raw: (D, m) residual.
+        white: (R,) gc-whitened residual.
+        left_out: (D, m) residual of each measurement, predicted without its pose.
+        outlier: (N,) readings that were set aside as gross errors.
+        chi2: whitened sum of squares.
+        dof: degrees of freedom.
+        error: error block of the fit.
+        holdout: error block of whole poses left out.
+    """
+
+    model: Model
+    readings: Readings
+    mode: Mode
+    scaling: Scaling
+    whitening: Whitening
+    solution: Solution
+    uncertainty: Uncertainty
+    pose: Ints
+    raw: Floats
+    white: Floats
+    left_out: Floats
+    outlier: Bools
+    chi2: float
+    dof: float
+    error: ErrorBlock
+    holdout: ErrorBlock
+
+    @property
+    def theta(self) -> Floats:
+        """(P,) parameters."""
+        return self.solution.theta
+
+    @property
+    def variance_factor(self) -> float:
+        """χ²/dof of the gc-whitened residual; 1 where model and noise are right."""
+        return self.chi2 / self.dof
+
+    @property
+    def variance_factor_interval(self) -> tuple[float, float]:
+        """95 % confidence interval of the variance factor."""
+        return variance_interval(self.chi2, self.dof)
+
+    @property
+    def rank(self) -> int:
+        """Number of directions of the parameters that the data determine."""
+        return int(self.solution.equations.basis.transform.shape[1])
+
+    @property
+    def mahalanobis2(self) -> Floats:
+        """(D,) squared Mahalanobis distance of each measurement by itself."""
+        return mahalanobis2(self.raw, self.whitening.covariance)
+
+
+def mahalanobis2(raw: Floats, covariance: Floats) -> Floats:
+    """Squared Mahalanobis distances (D,) of residuals (D, m) with covariances (D, m, m)."""
+    white = np.einsum("dij,dj->di", inverse_root(covariance), raw)
+    return np.asarray(np.sum(white**2, axis=1))
+
+
+def variance_interval(total: float, dof: float) -> tuple[float, float]:
+    """95 % confidence interval of χ²/dof."""
+    tail = (1 - CONFIDENCE) / 2
+    return float(total / chi2.isf(tail, dof)), float(total / chi2.ppf(tail, dof))
+
+
+def fit(
+    model: Model,
+    readings: Readings,
+    mode: Mode,
+    scaling: Scaling = "gc",
+    start: Floats | None = None,
+    prior: Floats | None = None,
+) -> Fit:
+    """Fit a model to readings.
+
+    With `start` and `prior` of an earlier fit the same fit is found again, quickly.
+
+    Gross errors are set aside first: they keep their place in the file and are listed, but
+    take no part. At most 5 % of the readings can be; more is not an outlier but a misfit.
+
+    Raises:
+        CannotAnswerError: fewer measured elements than identifiable parameters.
+        InputError: from `whitening`, where a deflection lacks its unloaded reading.
+    """
+    used = np.ones(len(readings), dtype=bool)
+    solution, w = _solve(model, readings, mode, scaling, start, prior)
+    for _ in range(OUTLIER_ROUNDS):
+        distance2 = mahalanobis2(solution.raw, w.covariance)
+        rows = np.flatnonzero(used)[w.reading[find_outliers(distance2, w.m)]]
+        if not len(rows) or len(rows) + np.sum(~used) > MAX_OUTLIER_SHARE * len(readings):
+            break
+        used[rows] = False
+        solution, w = _solve(model, readings[used], mode, scaling, solution.theta, prior)
+    return _assemble(model, readings, ~used, mode, scaling, w, solution)
+
+
+def _solve(
+    model: Model,
+    readings: Readings,
+    mode: Mode,
+    scaling: Scaling,
+    start: Floats | None,
+    prior: Floats | None,
+) -> tuple[Solution, Whitening]:
+    w = whitening(readings, mode, scaling)
+    solution = solve(model, readings, w, start, prior)
+    free = solution.equations.basis.structural
+    if w.rank <= free:
+        raise CannotAnswerError(
+            f"{w.rank} measured elements for {free} parameters: nothing is left to judge the model "
+            f"by; measure at least {free // w.m + 2} {_what(mode)}, better {3 * free // w.m + 1}"
+        )
+    return solution, w
+
+
+def _what(mode: Mode) -> str:
+    return "loaded readings with their unloaded ones" if mode == "deflection" else "readings"
+
+
+def _assemble(
+    model: Model,
+    readings: Readings,
+    outlier: Bools,
+    mode: Mode,
+    scaling: Scaling,
+    fitted: Whitening,
+    solution: Solution,
+) -> Fit:
+    kept, raw = readings[~outlier], solution.raw
+    w = fitted if scaling == "gc" else whitening(kept, mode, "gc")
+    white = w.whiten(raw).reshape(-1)
+    pose = distinct_poses(kept)[w.reading]
+    folds = leave_out(solution, random_folds(pose), fitted)
+    total = float(white @ white)
+    dof = max(w.rank - solution.effective, 1.0)
+    # Readings that were set aside count in the errors: they are data, predicted unseen.
+    everything, all_raw, all_left_out = w, raw, folds.raw
+    if outlier.any():
+        everything = whitening(readings, mode, "gc")
+        prediction = model.predict(readings.states, solution.theta)
+        all_raw = residual(readings, prediction, everything)
+        all_left_out = all_raw.copy()
+        place = {int(r): i for i, r in enumerate(np.flatnonzero(~outlier)[w.reading])}
+        for i, r in enumerate(everything.reading):
+            if int(r) in place:
+                all_left_out[i] = folds.raw[place[int(r)]]
+    return Fit(
+        model=model,
+        readings=readings,
+        mode=mode,
+        scaling=scaling,
+        whitening=w,
+        # The folds are done; the largest array of the fit is not needed any more.
+        solution=replace(solution, jacobian=np.empty((0, w.m, 0))),
+        uncertainty=uncertainty(model, kept, fitted, solution, pose, total, dof),
+        pose=pose,
+        raw=raw,
+        white=white,
+        left_out=folds.raw,
+        outlier=outlier,
+        chi2=total,
+        dof=dof,
+        error=_block(all_raw, everything),
+        holdout=_block(all_left_out, everything),
+    )
+
+
+def _block(raw: Floats, w: Whitening) -> ErrorBlock:
+    return error_block(raw, w.whiten(raw).reshape(-1), w.rank)

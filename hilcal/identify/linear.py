@@ -1,0 +1,148 @@
+"""The whitened linear problem: rank analysis, parameter scaling, priors, solution.
+
+    minimise ‖r − A δ‖² + β ‖(θ + δ − 0)/σ‖²  over δ
+
+A (R, P) whitened Jacobian, r (R,) whitened residual, σ (P,) prior standard deviations
+(infinite for flat), β the noise variance factor that the prior is weighed against.
+
+Parameter scaling: columns are multiplied by an ordinary magnitude of their parameter, so
+that singular values are pure numbers: s = by how many σ all data together move when the
+parameters move along a direction by an ordinary amount. Directions with s below
+`INFORMATION` (or below rounding) cannot be seen and are held at zero; the remaining flat
+directions are rotated and scaled to be orthonormal before the normal equations are formed,
+so that forming them costs no accuracy.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg as sl
+
+from hilcal.types import Bools, Floats, Ints
+
+INFORMATION = 0.05
+"""In units of the residual's spread: a direction is estimated where 20 times the ordinary
+magnitude along it would move all data together by one σ."""
+ROUNDING = 1e-10
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Basis:
+    """Coordinates z of the identifiable subspace: θ = T z.
+
+    Attributes:
+        transform: (P, K) columns of θ per z; prior columns are scaled units.
+        prior_precision: (K,) 1/σ² in z coordinates (zero for flat ones).
+        null: (P, U) unit directions, in units of the ordinary magnitudes, that the data
+            cannot see.
+        flat: (P,) parameters without a prior.
+        held: indices of the parameters with a prior, in the order of their z.
+        singular: (K_flat,) singular values that were kept.
+        structural: number of directions of the flat parameters that the columns span, up to
+            rounding, whether the noise lets them be seen or not.
+        condition_unscaled: condition number of A in physical units, identifiable part.
+        condition_scaled: the same after parameter scaling.
+    """
+
+    transform: Floats
+    prior_precision: Floats
+    null: Floats
+    flat: Bools
+    held: Ints
+    singular: Floats
+    structural: int
+    condition_unscaled: float
+    condition_scaled: float
+
+
+def find_basis(a: Floats, scale: Floats, prior: Floats, spread: float | None = 1.0) -> Basis:
+    """Rank analysis of A (R, P): what the data can see of the flat parameters.
+
+    Args:
+        a: (R, P) whitened Jacobian.
+        scale: (P,) ordinary magnitudes.
+        prior: (P,) prior standard deviations, infinite for flat parameters, zero for
+            parameters held at zero.
+        spread: standard deviation of the whitened residual, at least 1; None where rows are
+            not in units of noise, so that only rounding decides the rank.
+    """
+    flat = np.isinf(prior)
+    held = np.flatnonzero(~flat & (prior > 0))
+    columns = np.flatnonzero(flat)
+    p = a.shape[1]
+    scaled = a[:, columns] * scale[columns]
+    r = np.asarray(sl.qr(scaled, mode="r", check_finite=False)[0], dtype=float)[: len(columns)]
+    _, s, vt = np.linalg.svd(r, full_matrices=True)
+    s = np.concatenate([s, np.zeros(len(columns) - len(s))])
+    floor = ROUNDING * s.max(initial=0.0)
+    keep = s > (floor if spread is None else max(INFORMATION * max(spread, 1.0), floor))
+    transform = np.zeros((p, int(keep.sum()) + len(held)))
+    kept = int(keep.sum())
+    transform[columns, :kept] = scale[columns, None] * vt[keep].T / s[keep]
+    transform[held, kept + np.arange(len(held))] = prior[held]
+    null = np.zeros((p, len(columns) - kept))
+    null[columns] = vt[~keep].T
+    precision = np.concatenate([np.zeros(kept), np.ones(len(held))])
+    conditions = _conditions(r, scale[columns], kept)
+    structural = int(np.count_nonzero(s > floor))
+    return Basis(transform, precision, null, flat, held, s[keep], structural, *conditions)
+
+
+def _conditions(r: Floats, scale: Floats, rank: int) -> tuple[float, float]:
+    """Condition numbers of the identifiable part, in physical units and scaled."""
+    if rank == 0:
+        return 1.0, 1.0
+    physical = np.linalg.svd(r / scale, compute_uv=False)
+    norms = np.linalg.norm(r, axis=0)
+    scaled = np.linalg.svd(r / np.where(norms > 0, norms, 1.0), compute_uv=False)
+    return float(physical[0] / physical[rank - 1]), float(scaled[0] / scaled[rank - 1])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NormalEquations:
+    """H z = b in the coordinates of a basis, H = gram + β·diag(prior precision).
+
+    Attributes:
+        basis: the coordinates.
+        gram: (K, K) Tᵀ AᵀA T.
+        rhs: (K,) Tᵀ Aᵀ (r + A θ_0), the data's part for z itself (not its step).
+    """
+
+    basis: Basis
+    gram: Floats
+    rhs: Floats
+
+    def factor(self, beta: float) -> tuple[Floats, bool]:
+        """Cholesky factor of H, as SciPy's `cho_solve` takes it."""
+        h = self.gram + np.diag(beta * self.basis.prior_precision)
+        c, low = sl.cho_factor(h, check_finite=False)
+        return c, bool(low)
+
+    def solve(self, beta: float = 1.0) -> Floats:
+        """Solution z (K,)."""
+        return np.asarray(sl.cho_solve(self.factor(beta), self.rhs, check_finite=False))
+
+    def inverse(self, beta: float = 1.0) -> Floats:
+        """H⁻¹ (K, K): covariance of z for unit noise variance."""
+        eye = np.eye(len(self.rhs))
+        return np.asarray(sl.cho_solve(self.factor(beta), eye, check_finite=False))
+
+
+def normal_equations(a: Floats, target: Floats, basis: Basis, gram: Floats) -> NormalEquations:
+    """Form the normal equations of A (R, P) in the coordinates of a basis.
+
+    The flat directions are formed from their rows, which are orthonormal, so that squaring
+    costs no accuracy; columns with a prior are taken from the gram AᵀA (P, P), for speed.
+    """
+    flat = len(basis.singular)
+    rows = a @ basis.transform[:, :flat]
+    held = basis.held
+    sigma = basis.transform[held, flat + np.arange(len(held))]
+    size = basis.transform.shape[1]
+    full = np.empty((size, size))
+    full[:flat, :flat] = rows.T @ rows
+    full[:flat, flat:] = (rows.T @ a)[:, held] * sigma
+    full[flat:, :flat] = full[:flat, flat:].T
+    full[flat:, flat:] = sigma[:, None] * gram[np.ix_(held, held)] * sigma
+    rhs = np.concatenate([rows.T @ target, sigma * (a.T @ target)[held]])
+    return NormalEquations(basis, full, rhs)

@@ -1,0 +1,73 @@
+"""Which readings belong to one pose, for leaving out.
+
+Two commanded poses that agree in every joint within `SAME_POSE` are one pose here, whatever
+their names: a repeated pose that is left out must not be predicted from its repetition.
+"""
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from hilcal.data.readings import Readings
+from hilcal.data.whitening import Whitening
+from hilcal.types import Floats, Ints
+
+SAME_POSE = 2e-3
+FOLDS = 10
+
+
+def distinct_poses(readings: Readings) -> Ints:
+    """(N,) number of the distinct pose of each reading, in order of first appearance."""
+    first, row, name = np.unique(readings.pose, return_index=True, return_inverse=True)
+    pairs = cKDTree(readings.states.q[row]).query_pairs(SAME_POSE, p=np.inf, output_type="ndarray")
+    links = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(first),) * 2)
+    label = connected_components(links, directed=False)[1][name.reshape(-1)]
+    _, index, inverse = np.unique(label, return_index=True, return_inverse=True)
+    return np.asarray(np.argsort(np.argsort(index))[inverse.reshape(-1)])
+
+
+def random_folds(pose: Ints, count: int = FOLDS) -> Ints:
+    """Fold of each measurement from its distinct pose: dealt at random, always the same."""
+    total = int(pose.max()) + 1
+    deal = np.random.default_rng(20240607).permutation(total) % min(count, total)
+    return np.asarray(deal[pose])
+
+
+def block_folds(pose: Ints, count: int = FOLDS) -> Ints:
+    """Fold of each measurement: poses that were measured one after the other stay together."""
+    total = int(pose.max()) + 1
+    return np.asarray(np.arange(total) * min(count, total) // total)[pose]
+
+
+def region_folds(angle: Floats, pose: Ints, count: int = FOLDS) -> Ints:
+    """Fold of each measurement: poses close to each other in joint space stay together.
+
+    The poses are cut into halves, over and over, across the direction in which their joint
+    angles spread most.
+
+    Args:
+        angle: (D, n) joint angles.
+        pose: (D,) distinct pose of each measurement.
+        count: number of regions aimed at.
+    """
+    total = int(pose.max()) + 1
+    q = np.zeros((total, angle.shape[1]))
+    q[pose] = angle
+    regions = [np.arange(total)]
+    while len(regions) < min(count, total):
+        regions.sort(key=len)
+        rows = regions.pop()
+        spread = q[rows] - q[rows].mean(axis=0)
+        along = spread @ np.linalg.svd(spread, full_matrices=False)[2][0]
+        order = rows[np.argsort(along, kind="stable")]
+        regions += [order[: len(order) // 2], order[len(order) // 2 :]]
+    fold = np.empty(total, dtype=np.int64)
+    for number, rows in enumerate(regions):
+        fold[rows] = number
+    return fold[pose]
+
+
+def of_measurements(per_reading: Ints, w: Whitening) -> Ints:
+    """(D,) value of the reading behind each measurement."""
+    return per_reading[w.reading]

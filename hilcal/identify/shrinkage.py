@@ -1,0 +1,123 @@
+"""How strong a family of parameters is, chosen from the data by the evidence.
+
+Parameters of one group share a prior N(0, σ_g²). The σ_g maximise the marginal likelihood
+(evidence) of the linear problem; MacKay's fixed point for the linear-Gaussian model:
+
+    γ_g = Σ_{p in g} (1 − Σ_pp/σ_g²),   σ_g² ← Σ θ_p²/γ_g,   β ← ‖r − A θ‖²/(R − Σ γ)
+
+with Σ the posterior covariance and β the noise variance factor (at least 1: the stated
+noise is believed to be there). Groups that the data do not ask for are dropped: those that
+shrink to nothing, and those whose evidence is largest at σ_g = 0, where Σ q_p²/s_p over the
+group is less than its size (q, s: quality and sparsity of a column).
+
+Sources: MacKay, *Bayesian interpolation*, Neural Computation 4 (1992) 415-447; Tipping and
+Faul, *Fast marginal likelihood maximisation for sparse Bayesian models*, AISTATS 2003.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg as sl
+
+from hilcal.types import Floats, Ints
+
+ITERATIONS = 25
+NEGLIGIBLE = 1e-3
+TOLERANCE = 0.2
+PATIENCE = 3
+"""Iterations before groups are judged by quality and sparsity."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shrinkage:
+    """Result of the evidence maximisation.
+
+    Attributes:
+        std: (P,) prior standard deviations, zero where a group was dropped.
+        beta: noise variance factor.
+        effective: effective number of parameters in the shrunk families.
+    """
+
+    std: Floats
+    beta: float
+    effective: float
+
+
+def shrink(
+    gram: Floats,
+    rhs: Floats,
+    target_norm2: float,
+    rows: int,
+    flat: int,
+    groups: Ints,
+    start: Floats,
+    beta: float = 1.0,
+) -> Shrinkage:
+    """Maximise the evidence over the group variances.
+
+    Args:
+        gram: (F + P, F + P) gram of [flat columns, family columns], family columns unscaled.
+        rhs: (F + P,) right-hand side.
+        target_norm2: ‖target‖².
+        rows: number of whitened rows R that carry information.
+        flat: number F of flat columns, which come first.
+        groups: (P,) group of each family column.
+        start: (P,) starting standard deviations.
+        beta: starting noise variance factor.
+    """
+    # Eliminate the flat columns exactly once.
+    if flat:
+        c = sl.cho_factor(gram[:flat, :flat], check_finite=False)
+        cross = gram[:flat, flat:]
+        solved = sl.cho_solve(c, np.column_stack([cross, rhs[:flat]]), check_finite=False)
+        g = gram[flat:, flat:] - cross.T @ solved[:, :-1]
+        b = rhs[flat:] - cross.T @ solved[:, -1]
+        yy = target_norm2 - float(rhs[:flat] @ solved[:, -1])
+    else:
+        g, b, yy = gram, rhs, target_norm2
+    count = int(groups.max()) + 1 if len(groups) else 0
+    members = np.maximum(np.bincount(groups, minlength=count), 1)
+    # Group variances; a group's strength is judged by what it does to the data.
+    variance = np.bincount(groups, weights=start**2, minlength=count) / members
+    reach = np.bincount(groups, weights=np.diag(g), minlength=count)
+    active = (variance > 0) & (reach > 0)
+    effective = 0.0
+    keep = np.flatnonzero(active[groups])
+    g, b = g[np.ix_(keep, keep)], b[keep]
+    for iteration in range(ITERATIONS):
+        if not len(keep):
+            effective = 0.0
+            beta = max(1.0, yy / max(rows - flat, 1))
+            break
+        group = groups[keep]
+        std = np.sqrt(variance[group])
+        h = std[:, None] * g * (std / beta)
+        h[np.diag_indices_from(h)] += 1.0
+        low = sl.cholesky(h, lower=True, check_finite=False, overwrite_a=True)
+        inverse = sl.lapack.dtrtri(low, lower=1)[0]
+        posterior = np.einsum("ij,ij->j", inverse, inverse)
+        z = inverse.T @ (inverse @ (std * b / beta))
+        gamma = np.bincount(group, weights=1 - posterior, minlength=count)
+        theta = std * z
+        norm2 = np.bincount(group, weights=theta**2, minlength=count)
+        effective = float(gamma.sum())
+        rss = yy - 2 * float(theta @ b) + float(theta @ (g @ theta))
+        beta = max(1.0, rss / max(rows - flat - effective, 1.0))
+        updated = np.where(active, norm2 / np.maximum(gamma, 1e-12), 0.0)
+        # Dropped: what is left of the group moves the data by far less than the noise ...
+        gone = active & (updated * reach < NEGLIGIBLE * beta * members)
+        if iteration >= PATIENCE:
+            # ... or the evidence falls with its variance all the way down to zero.
+            apart = np.maximum(1 / posterior - 1, 1e-12)
+            quality = np.bincount(group, weights=(z / posterior) ** 2 / apart, minlength=count)
+            gone |= active & (quality < members)
+        change = np.abs(np.log(np.maximum(updated, 1e-300) / np.maximum(variance, 1e-300)))
+        weighty = active & ~gone & (gamma > 0.05 * members)
+        variance, active = updated, active & ~gone
+        left = active[group]
+        if not left.all():
+            keep, g, b = keep[left], g[np.ix_(left, left)], b[left]
+        if not weighty.any() or change[weighty].max() < TOLERANCE:
+            break
+    std_all = np.sqrt(np.where(active, variance, 0.0))[groups]
+    return Shrinkage(std_all, float(beta), effective)

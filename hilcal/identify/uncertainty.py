@@ -1,0 +1,132 @@
+"""Standard uncertainties that are true, and which parameters deserve a number.
+
+While the residual is what the noise explains, Cov(θ) = T H⁻¹ Tᵀ. Where it is not, errors of
+neighbouring readings have causes in common and that formula is far too optimistic. Then the
+larger of three is stated: the formal one times the variance factor, and two delete-a-group
+jackknives, with groups of readings taken one after the other and with groups close in joint
+space:
+
+    Var(θ_p) = (G − 1)/G Σ_g (θ_p without g − mean)²
+
+Source: Efron and Tibshirani, *An Introduction to the Bootstrap*, chapter 11.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from hilcal.data.readings import Readings
+from hilcal.data.whitening import Whitening
+from hilcal.identify.gauss_newton import Solution, scales_of
+from hilcal.identify.holdout import leave_out
+from hilcal.identify.poses import block_folds, region_folds
+from hilcal.model import Model
+from hilcal.types import Bools, Floats, Ints
+
+NULL_SHARE = 0.1
+"""A direction that the data cannot see may move an identifiable parameter by this share of
+its standard uncertainty when it is off by an ordinary magnitude."""
+LEARNT = 0.7
+"""A parameter with a prior is identified where the data shrink its spread below this share."""
+MEANINGLESS = 10.0
+"""A parameter whose standard uncertainty is this many ordinary magnitudes tells nothing."""
+MISFIT_CHANCE = 0.01
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Uncertainty:
+    """What can be said of the parameters.
+
+    Attributes:
+        std: (P,) standard uncertainties; infinite where not identifiable.
+        formal: (P,) what independent noise of the stated size alone would give.
+        identifiable: (P,) which parameters the data determine.
+        inflated: whether the residual is larger than noise, so that `std` comes from
+            leaving out groups of poses.
+        null: names of the directions that the data cannot see.
+    """
+
+    std: Floats
+    formal: Floats
+    identifiable: Bools
+    inflated: bool
+    null: tuple[str, ...]
+
+
+def uncertainty(
+    model: Model,
+    readings: Readings,
+    w: Whitening,
+    solution: Solution,
+    pose: Ints,
+    total: float,
+    dof: float,
+) -> Uncertainty:
+    """Uncertainties of a solution in the scaling `w`, with gc-whitened χ² `total` on `dof`."""
+    basis = solution.equations.basis
+    scale = scales_of(model)
+    spread = solution.equations.inverse(solution.beta)
+    variance = np.einsum("pk,kl,pl->p", basis.transform, spread, basis.transform)
+    noise = solution.beta if w.scaling == "none" else 1.0
+    formal = np.sqrt(np.maximum(variance, 0.0) * noise)
+    misfit = w.scaling != "none" and bool(chi2.sf(total, dof) < MISFIT_CHANCE)
+    std = formal
+    if misfit:
+        std = formal * np.sqrt(total / dof)
+        angle = readings.states.q[w.reading]
+        for fold in (block_folds(pose), region_folds(angle, pose)):
+            folds = leave_out(solution, fold, w)
+            count = len(folds.change)
+            away = folds.change - folds.change.mean(axis=0)
+            jackknife = np.sqrt((count - 1) / count * np.sum(away**2, axis=0))
+            std = np.maximum(std, jackknife)
+    identifiable = _identifiable(solution, scale, std)
+    return Uncertainty(
+        np.where(identifiable, std, np.inf),
+        formal,
+        identifiable,
+        misfit,
+        name_directions(model, basis.null),
+    )
+
+
+def _identifiable(solution: Solution, scale: Floats, std: Floats) -> Bools:
+    """A parameter is identifiable where what cannot be seen hardly moves it."""
+    basis = solution.equations.basis
+    unseen = scale * np.linalg.norm(basis.null, axis=1)
+    flat = (unseen <= NULL_SHARE * std) & (std < MEANINGLESS * scale)
+    learnt = std < LEARNT * np.where(np.isinf(solution.prior), np.inf, solution.prior)
+    return np.where(basis.flat, flat, learnt & (solution.prior > 0))
+
+
+def name_directions(model: Model, null: Floats, most: int = 3) -> tuple[str, ...]:
+    """Name unidentifiable directions by the parameters that move together in them.
+
+    The directions are brought to echelon form first, each pivoting on its largest element,
+    so that every one involves few parameters. Factors are in ordinary magnitudes.
+    """
+    names = [f"{e.name}.{p.name}" for e in model.effects for p in e.parameters]
+    rows = null.T.copy()
+    for i in range(len(rows)):
+        pivot = i + int(np.argmax(np.abs(rows[i:]).max(axis=1)))
+        rows[[i, pivot]] = rows[[pivot, i]]
+        column = int(np.argmax(np.abs(rows[i])))
+        rows[i] /= rows[i, column]
+        others = np.arange(len(rows)) != i
+        rows[others] -= np.outer(rows[others, column], rows[i])
+    out = []
+    for row in rows:
+        order = np.argsort(-np.abs(row), kind="stable")
+        strong = [k for k in order if abs(row[k]) > 0.05]
+        text = " ".join(
+            ("+ " if row[k] > 0 else "− ") + _times(abs(row[k])) + names[k] for k in strong[:most]
+        )
+        more = f" … ({len(strong) - most} more)" if len(strong) > most else ""
+        out.append(text.removeprefix("+ ") + more)
+    return tuple(out)
+
+
+def _times(factor: float) -> str:
+    text = f"{factor:.2g}"
+    return "" if text == "1" else f"{text}·"

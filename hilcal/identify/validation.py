@@ -1,0 +1,125 @@
+"""Prediction of readings that a model was never fitted to."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hilcal.data.readings import Readings
+from hilcal.data.whitening import Mode, Whitening, whitening
+from hilcal.effects.catalogue import make
+from hilcal.effects.protocol import Effect
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.identify.errors import ErrorBlock, error_block
+from hilcal.identify.registration import register
+from hilcal.identify.residual import residual
+from hilcal.model import Model
+from hilcal.types import Floats
+
+STEPS = 10
+CONVERGED = 1e-6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Validation:
+    """What a model says of readings that it never saw.
+
+    Attributes:
+        readings: the other readings.
+        whitening: their gc-scaling.
+        raw: (D, m) residual.
+        error: error block.
+        variance_factor: whitened sum of squares by its rank; nothing was fitted but, where
+            asked for, the registration.
+        registered: whether the registration was estimated anew.
+    """
+
+    readings: Readings
+    whitening: Whitening
+    raw: Floats
+    error: ErrorBlock
+    variance_factor: float
+    registered: bool
+
+    @property
+    def noise_floor(self) -> float:
+        """Root mean square of the 3-D position error that the stated noise alone leaves, m."""
+        trace = np.trace(self.whitening.covariance[:, :3, :3], axis1=1, axis2=2)
+        return float(np.sqrt(np.mean(trace)))
+
+
+def validate(
+    model: Model,
+    theta: Floats,
+    fitted: Readings,
+    other: Readings,
+    mode: Mode,
+    *,
+    registered: bool = False,
+) -> Validation:
+    """Predict other readings with a fitted model.
+
+    Args:
+        model: the model.
+        theta: (P,) its parameters.
+        fitted: the readings that it was fitted to.
+        other: readings that took no part.
+        mode: "deflection" or "absolute".
+        registered: estimate `base_frame`, and nothing else, from the other readings first:
+            the tracker was set up anew.
+
+    Raises:
+        InputError: an effect of the model needs a column that the other readings lack.
+        CannotAnswerError: the registration does not settle.
+    """
+    for effect in model.effects:
+        if not effect.computable(other.states):
+            raise InputError(
+                f"effect {effect.name} needs {', '.join(effect.needs)}, which the other readings "
+                "do not have"
+            )
+    w = whitening(other, mode, "gc")
+    if registered:
+        model, theta = _register(model, theta, fitted, other, w)
+    raw = residual(other, model.predict(other.states, theta), w)
+    white = w.whiten(raw).reshape(-1)
+    free = 6 if registered else 0
+    return Validation(
+        readings=other,
+        whitening=w,
+        raw=raw,
+        error=error_block(raw, white, w.rank),
+        variance_factor=float(white @ white) / max(w.rank - free, 1),
+        registered=registered,
+    )
+
+
+def _register(
+    model: Model, theta: Floats, fitted: Readings, other: Readings, w: Whitening
+) -> tuple[Model, Floats]:
+    """Closed-form registration to the other readings, then Gauss-Newton on `base_frame`."""
+    parts = dict(zip(model.names, (theta[s] for s in model.slices()), strict=True))
+    offset = parts.get("target_offset")
+    target = model.cell.target.copy()
+    if offset is not None:
+        target[:3, 3] += offset[:3]
+    unknown = replace(model.cell, target=target, registration_known=False, target_known=True)
+    cell = replace(model.cell, registration=register(unknown, other).registration)
+    effects: list[Effect] = [
+        make(e.name, cell, fitted.states, e.options)
+        for e in model.effects
+        if e.name != "base_frame"
+    ]
+    frame = make("base_frame", cell, fitted.states)
+    moved = Model(cell, (*effects, frame))
+    values = np.concatenate([*(parts[e.name] for e in effects), np.zeros(6)])
+    for _ in range(STEPS):
+        prediction = moved.predict(other.states, values)
+        target_row = w.whiten(residual(other, prediction, w)).reshape(-1)
+        columns = w.whiten(w.raw(moved.jacobian_of((frame,), prediction, values, w.m)))
+        step = np.linalg.lstsq(columns.reshape(-1, 6), target_row, rcond=1e-9)[0]
+        values[-6:] += step
+        if float(np.linalg.norm(columns.reshape(-1, 6) @ step)) < CONVERGED * len(target_row):
+            return moved, values
+    raise CannotAnswerError(
+        "registration: does not settle on these readings; measure poses spread in space"
+    )

@@ -1,0 +1,202 @@
+"""A model is a cell and a tuple of effects; `model + effect` is a new model."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import accumulate, pairwise
+
+import numpy as np
+
+from hilcal.cell import Cell
+from hilcal.data.readings import States
+from hilcal.effects.protocol import Effect, Situation
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.observe import Observation, motion, observe
+from hilcal.robot import chain as chains
+from hilcal.robot.batch import along_states, chunks, join, take, zeros
+from hilcal.robot.chain import Chain
+from hilcal.robot.deviation import Deviation
+from hilcal.robot.statics import Load, slot_wrenches
+from hilcal.types import Floats
+
+EQUILIBRIUM_TOLERANCE = 1e-13
+"""Motion of the flange that may be missing from the converged equilibrium, m."""
+MAX_EQUILIBRIUM_STEPS = 30
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    """What a model says of N states.
+
+    Attributes:
+        situation: the states at their deflected configuration.
+        deviation: the summed deviation.
+        observation: what the sensor would read.
+    """
+
+    situation: Situation
+    deviation: Deviation
+    observation: Observation
+
+    def __getitem__(self, rows: slice) -> "Prediction":
+        """Return the prediction of the chosen states."""
+        s = self.situation
+        chosen = replace(
+            s,
+            states=s.states[rows],
+            angle=s.angle[rows],
+            chain=take(s.chain, rows, axis=1),
+            wrench=s.wrench[rows],
+        )
+        return Prediction(chosen, take(self.deviation, rows), take(self.observation, rows))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Model:
+    """Robot and effects."""
+
+    cell: Cell
+    effects: tuple[Effect, ...]
+
+    def __post_init__(self) -> None:
+        """Refuse an effect that is there twice."""
+        names = self.names
+        for name in names:
+            if names.count(name) > 1:
+                raise InputError(f"effect {name} is in the model already: {', '.join(names)}")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the effects, in order."""
+        return tuple(e.name for e in self.effects)
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return sum(len(e.parameters) for e in self.effects)
+
+    def slices(self) -> tuple[slice, ...]:
+        """Where each effect's parameters lie in the vector of all."""
+        ends = accumulate((len(e.parameters) for e in self.effects), initial=0)
+        return tuple(slice(a, b) for a, b in pairwise(ends))
+
+    def __add__(self, effect: Effect) -> "Model":
+        """Return the model with one more effect."""
+        return replace(self, effects=(*self.effects, effect))
+
+    def predict(self, states: States, theta: Floats) -> Prediction:
+        """Equilibrium of N states: elastic deviations at the deflected configuration.
+
+        The elastic deviations depend on the wrenches, those on the configuration, and the
+        configuration on the deviations: a fixed point, which the iteration approaches by a
+        factor of about deflection/reach (1e-3) per step.
+
+        Raises:
+            CannotAnswerError: the deviations grow instead of settling.
+        """
+        parts = [self._equilibrium(states[rows], theta) for rows in chunks(len(states))]
+        return _joined(states, parts)
+
+    def _equilibrium(self, states: States, theta: Floats) -> Prediction:
+        """Return the equilibrium of a chunk of states."""
+        cell = self.cell
+        angle = states.q if states.q_actual is None else states.q_actual
+        angle = along_states(angle)
+        parts = [(e, theta[s]) for e, s in zip(self.effects, self.slices(), strict=True)]
+        chain = chains.evaluate(cell.arm, angle)
+        s = Situation(cell, states, angle, chain, zeros(len(states), cell.arm.n + 1, 6))
+        rigid = sum((e.deviation(t, s) for e, t in parts if not e.elastic), Deviation())
+        elastic = [(e, t) for e, t in parts if e.elastic]
+        load = self._load(states, theta)
+        before: float | None = None
+        for _ in range(MAX_EQUILIBRIUM_STEPS):
+            s = replace(s, chain=chain, wrench=slot_wrenches(cell.arm, chain, load))
+            deviation = sum((e.deviation(t, s) for e, t in elastic), rigid)
+            chain = chains.evaluate(cell.arm, angle, deviation)
+            moved = _flange_motion(s.chain, chain, cell.arm.reach)
+            # The steps shrink geometrically: what is missing is about the next one.
+            missing = moved if before is None else moved * (moved / before)
+            if not elastic or missing <= EQUILIBRIUM_TOLERANCE:
+                break
+            before = moved
+        else:
+            raise CannotAnswerError(
+                "no static equilibrium: with these parameters the elastic deviations of "
+                f"{', '.join(e.name for e, _ in elastic)} grow instead of settling; measure "
+                "poses and loads that determine them, or leave an effect out"
+            )
+        s = replace(s, chain=chain)
+        return Prediction(s, deviation, observe(cell, chain, deviation))
+
+    def jacobian(self, prediction: Prediction, theta: Floats, m: int) -> Floats:
+        """Derivative (N, m, P) of the readings by all parameters, sensor axes."""
+        return self.jacobian_of(self.effects, prediction, theta, m)
+
+    def jacobian_of(
+        self, effects: tuple[Effect, ...], prediction: Prediction, theta: Floats, m: int
+    ) -> Floats:
+        """Derivative (N, m, P) of the readings by the parameters of `effects`.
+
+        `effects` may or may not be in the model; one that is not is taken at zero. Analytic,
+        at the wrenches of the deflected configuration: their own change with the parameters,
+        smaller by deflection/reach, is left to the iteration.
+        """
+        count = len(prediction.situation.angle)
+        out = np.empty((count, m, sum(len(e.parameters) for e in effects)))
+        for rows in chunks(count):
+            self._fill(out[rows], effects, prediction[rows], theta)
+        return out
+
+    def _fill(
+        self, out: Floats, effects: tuple[Effect, ...], prediction: Prediction, theta: Floats
+    ) -> None:
+        """Write the derivative (N, m, P) of a chunk of states."""
+        s = prediction.situation
+        m = out.shape[1]
+        moves = motion(self.cell, prediction.observation, s.chain, prediction.deviation, m)
+        first = 0
+        for e in effects:
+            block = zeros(len(s.states), m, len(e.parameters))
+            for c in e.columns(s):
+                block[:, :, c.parameter] += moves.by_columns(c)
+            change = e.wrench_columns(s)
+            if change is not None:
+                for other, part in zip(self.effects, self.slices(), strict=True):
+                    if other.elastic:
+                        block += moves.by_response(other.response(theta[part], s, change))
+            out[:, :, first : first + block.shape[2]] = block
+            first += block.shape[2]
+
+    def _load(self, states: States, theta: Floats) -> Load:
+        cell, point = self.cell, self.cell.load_point
+        for e, s in zip(self.effects, self.slices(), strict=True):
+            change = e.load_change(theta[s])
+            if change is not None:
+                point = point + change.point
+        wrench = along_states(states.wrench)
+        return Load(wrench, point, cell.tool_mass, cell.tool_com, cell.gravity)
+
+
+def _flange_motion(a: Chain, b: Chain, reach: float) -> float:
+    """Largest displacement, or rotation times reach, of the flange from one chain to another."""
+    shift = np.abs(b.position[-1] - a.position[-1]).max(initial=0.0)
+    turn = np.abs(b.rotation[-1] - a.rotation[-1]).max(initial=0.0)
+    return float(max(shift, reach * turn))
+
+
+def _joined(states: States, parts: Sequence[Prediction]) -> Prediction:
+    """Put the predictions of successive chunks of the states together."""
+    if len(parts) == 1:
+        return parts[0]
+    situations = [part.situation for part in parts]
+    situation = replace(
+        situations[0],
+        states=states,
+        angle=np.concatenate([s.angle for s in situations]),
+        chain=join([s.chain for s in situations], axis=1),
+        wrench=np.concatenate([s.wrench for s in situations]),
+    )
+    return Prediction(
+        situation,
+        join([part.deviation for part in parts]),
+        join([part.observation for part in parts]),
+    )

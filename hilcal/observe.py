@@ -1,0 +1,173 @@
+"""The sensor's side: what the tracker reads of the target, and how it moves.
+
+T_sensor_target = exp(station) T_sensor_base exp(base) T_base_flange T_flange_target'
+position read   = (1 + scale) · position
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilcal.cell import Cell
+from hilcal.effects.protocol import Columns, Response
+from hilcal.robot import se3
+from hilcal.robot.batch import along_states, empty, zeros
+from hilcal.robot.chain import Chain, joint_jacobian, slot_jacobian, twist_jacobian
+from hilcal.robot.deviation import Deviation
+from hilcal.types import Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observation:
+    """What the sensor would read without noise.
+
+    Attributes:
+        position: (N, 3) target position, sensor axes, m.
+        rotation: (N, 3, 3) target axes in sensor axes.
+        base_position: (N, 3) target position in the base axes of the chain, m.
+        axes: (N, 3, 3) orientation of the chain's base axes in sensor axes.
+    """
+
+    position: Floats
+    rotation: Floats
+    base_position: Floats
+    axes: Floats
+
+
+def observe(cell: Cell, chain: Chain, deviation: Deviation) -> Observation:
+    """Read the target of a deviated chain."""
+    offset, turn = cell.target[:3, 3], cell.target[:3, :3]
+    axes, origin = cell.registration[:3, :3], cell.registration[:3, 3]
+    rotation = chain.rotation[-1]
+    if deviation.target is not None:
+        offset = offset + deviation.target[:, :3]
+        rotation = se3.product(rotation, se3.rotation(deviation.target[:, 3:]))
+    rotation = se3.product(rotation, turn)
+    base_position = position = chain.point(offset)
+    if deviation.base is not None:
+        base_r, base_p = se3.exp(deviation.base)
+        position = base_p + se3.apply(base_r, position)
+        rotation, axes = se3.product(base_r, rotation), se3.product(axes, base_r)
+    position = origin + se3.apply(cell.registration[:3, :3], position)
+    rotation = se3.product(cell.registration[:3, :3], rotation)
+    if deviation.station is not None:
+        station_r, station_p = se3.exp(deviation.station)
+        position = station_p + se3.apply(station_r, position)
+        rotation, axes = se3.product(station_r, rotation), se3.product(station_r, axes)
+    if deviation.scale is not None:
+        position = position * (1 + deviation.scale[:, None])
+    axes = np.broadcast_to(axes, rotation.shape)
+    return Observation(position, rotation, base_position, axes)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """Motion of the reading per change of each field of the deviation, sensor axes.
+
+    Only the first m rows (position, or position and rotation) are kept.
+    """
+
+    cell: Cell
+    observation: Observation
+    chain: Chain
+    deviation: Deviation
+    m: int
+    dq: Floats
+
+    def by_columns(self, c: Columns) -> Floats:
+        """Motion (N, m, P) by the parameters of one block of columns."""
+        if c.field == "dq":
+            return self.dq[:, :, c.element] * c.values[:, None, :]
+        if c.field == "scale":
+            out = zeros(len(self.dq), self.m, len(c.parameter))
+            out[:, :3] = self._unscaled()[:, :, None] * c.values[:, None, :]
+            return out
+        if c.field == "twist":
+            out = empty(len(self.dq), self.m, len(c.parameter))
+            for slot in np.unique(c.element):
+                mine = c.element == slot
+                out[:, :, mine] = _per_column(self.by_slot(int(slot)), c.values[:, mine])
+            return out
+        sides = {"base": self.by_base, "station": self.by_station, "target": self.by_target}
+        return _per_column(sides[c.field](), c.values)
+
+    def by_response(self, r: Response) -> Floats:
+        """Motion (N, m, P) by a response of the elastic deviations."""
+        out: Floats = np.zeros(1)
+        if r.dq is not None:
+            out = out + _per_column(self.dq, r.dq)
+        if r.twist is not None:
+            for slot in range(r.twist.shape[2]):
+                if np.any(r.twist[:, :, slot]):
+                    out = out + _per_column(self.by_slot(slot), r.twist[:, :, slot])
+        return out
+
+    def by_slot(self, slot: int) -> Floats:
+        """Motion (N, m, 6) by the twist of a slot."""
+        moved = slot_jacobian(self.chain, slot, self.observation.base_position)
+        return _to_sensor(self.observation, self.deviation, moved, self.m)
+
+    def by_base(self) -> Floats:
+        """Motion (N, m, 6) by the twist of the base."""
+        o = self.observation
+        moved = twist_jacobian(_still(o), o.base_position, self.deviation.base)
+        return _to_sensor(o, self.deviation, moved, self.m)
+
+    def by_station(self) -> Floats:
+        """Motion (N, m, 6) by the twist of the station; exp(ξ + δ) = exp(J_r(−ξ) δ) exp(ξ)."""
+        station, scale = self.deviation.station, self.deviation.scale
+        back = None if station is None else -station
+        moved = twist_jacobian(_still(self.observation), self._unscaled(), back)
+        if scale is not None:
+            moved[:, :3] *= 1 + scale[:, None, None]
+        return moved[:, : self.m]
+
+    def by_target(self) -> Floats:
+        """Motion (N, m, 6) by the displacement of the target."""
+        flange = self.chain.rotation[-1]
+        moved = empty(len(self.dq), 6, 6)
+        moved[:, :3, 3:] = moved[:, 3:, :3] = 0.0
+        moved[:, :3, :3] = moved[:, 3:, 3:] = flange
+        if self.deviation.target is not None:
+            # The turn as read is exp(ω) before the target's own axes: ∂ = J_r(−ω).
+            turn = zeros(len(self.dq), 6)
+            turn[:, 3:] = -self.deviation.target[:, 3:]
+            moved[:, 3:, 3:] = se3.product(flange, se3.right_jacobian_blocks(turn)[0])
+        return _to_sensor(self.observation, self.deviation, moved, self.m)
+
+    def _unscaled(self) -> Floats:
+        """Position (N, 3) before the scale error, sensor axes."""
+        scale = self.deviation.scale
+        position = self.observation.position
+        return position if scale is None else position / (1 + scale[:, None])
+
+
+def motion(
+    cell: Cell, observation: Observation, chain: Chain, deviation: Deviation, m: int
+) -> Motion:
+    """Prepare the motions of a reading with m elements."""
+    moved = joint_jacobian(chain, observation.base_position)
+    dq = _to_sensor(observation, deviation, moved, m)
+    return Motion(cell, observation, chain, deviation, m, dq)
+
+
+def _still(o: Observation) -> Floats:
+    """(N, 3, 3) identities."""
+    return np.broadcast_to(np.eye(3), o.axes.shape)
+
+
+def _per_column(moved: Floats, values: Floats) -> Floats:
+    """Motion (N, m, P) by P changes (N or 1, P, E), from the motion (N, m, E) per element."""
+    out = empty(*moved.shape[:2], values.shape[1])
+    return np.asarray(np.einsum("nie,npe->nip", moved, along_states(values), out=out))
+
+
+def _to_sensor(o: Observation, deviation: Deviation, moved: Floats, m: int) -> Floats:
+    """Turn motions (N, 6, P) from base axes into the first m rows in sensor axes."""
+    out = empty(len(moved), m, moved.shape[2])
+    for first in range(0, m, 3):
+        rows = slice(first, first + 3)
+        np.einsum("nij,njp->nip", o.axes, moved[:, rows], out=out[:, rows])
+    if deviation.scale is not None:
+        out[:, :3] *= 1 + deviation.scale[:, None, None]
+    return out

@@ -1,0 +1,1 @@
+"""Reports: the story as data, in rerun, as pictures."""

@@ -1,0 +1,201 @@
+"""From fits and diagnoses to the story that the viewer tells."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg as sl
+
+from hilcal.cell import Cell
+from hilcal.data.whitening import Mode
+from hilcal.diagnose.projection import projection
+from hilcal.diagnose.suspects import Suspect, candidates
+from hilcal.diagnose.verdict import Diagnosis
+from hilcal.errors import InputError
+from hilcal.identify.document import finite
+from hilcal.identify.everything import Everything, everything
+from hilcal.identify.fit import Fit, mahalanobis2
+from hilcal.model import Model
+from hilcal.report.story import (
+    Regressor,
+    Story,
+    StoryParameter,
+    StoryRevision,
+    StorySuspect,
+)
+from hilcal.types import Floats, Ints
+
+CERTAIN = 0.005
+MOST_NUMBER = 10**9
+UNDIAGNOSED = "not diagnosed"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chapter:
+    """One revision as it is told.
+
+    Attributes:
+        number: of the revision.
+        added: the effect that it added.
+        fit: the fit.
+        diagnosis: of it, or None where it was not diagnosed.
+    """
+
+    number: int
+    added: str | None
+    fit: Fit
+    diagnosis: Diagnosis | None
+
+
+def build_story(chapters: Sequence[Chapter]) -> Story:
+    """Build the story of successive revisions of one campaign, in base axes.
+
+    All readings are shown, also those that were set aside as gross errors. Sensor axes are
+    turned into base axes by the last revision's registration. An arrow starts where the rigid
+    nominal arm would hold the target.
+
+    Raises:
+        InputError: no revision, or revisions of different readings.
+    """
+    if not chapters:
+        raise InputError("no revision to show; run hilcal identify first")
+    parts = [everything(c.fit) for c in chapters]
+    last = parts[-1]
+    mode: Mode = chapters[-1].fit.mode
+    for c, part in zip(chapters, parts, strict=True):
+        if c.fit.mode != mode or not np.array_equal(part.whitening.reading, last.whitening.reading):
+            raise InputError(
+                f"revision {c.number} was fitted to other readings; nothing to compare"
+            )
+    readings, rows = last.readings, last.whitening.reading
+    axes = np.swapaxes(last.prediction.observation.axes[rows], 1, 2)
+    nominal = _nominal(chapters[-1].fit.model.cell, last)
+    if mode == "absolute":
+        measured = last.prediction.observation.base_position + _turn(axes, last.raw[:, :3])
+    else:
+        measured = _turn(axes, last.whitening.raw(readings.value[:, :3]))
+    covariance = axes @ last.whitening.covariance[:, :3, :3] @ np.swapaxes(axes, 1, 2)
+    return Story(
+        arm=chapters[-1].fit.model.cell.arm,
+        mode=mode,
+        q=readings.states.q[rows],
+        pose=pose_numbers(readings.pose_names)[readings.pose[rows]],
+        load_names=tuple(readings.load_names[k] for k in readings.load[rows]),
+        anchor=nominal[rows],
+        measured=measured,
+        covariance=0.5 * (covariance + np.swapaxes(covariance, 1, 2)),
+        noise_floor_m=last.noise_floor,
+        revisions=tuple(
+            _revision(c, part, axes, measured) for c, part in zip(chapters, parts, strict=True)
+        ),
+    )
+
+
+def pose_numbers(names: Sequence[str]) -> Ints:
+    """Number of each pose: that which its name ends in, where all have their own; else 1, 2, ..."""
+    ends = [re.search(r"[0-9]+$", name) for name in names]
+    numbers = [int(end.group()) for end in ends if end is not None]
+    if len(set(numbers)) < len(names) or max(numbers) >= MOST_NUMBER:
+        return np.arange(1, len(names) + 1)
+    return np.array(numbers, dtype=np.int64)
+
+
+def _nominal(cell: Cell, e: Everything) -> Floats:
+    """Target positions (N, 3) of the rigid nominal arm, base axes."""
+    prediction = Model(cell, ()).predict(e.readings.states, np.zeros(0))
+    return prediction.observation.base_position
+
+
+def _turn(axes: Floats, vectors: Floats) -> Floats:
+    return np.asarray(np.einsum("dij,dj->di", axes, vectors))
+
+
+def _revision(c: Chapter, e: Everything, axes: Floats, measured: Floats) -> StoryRevision:
+    residual = _turn(axes, e.raw[:, :3])
+    d = c.diagnosis
+    told = () if d is None else _told(d)
+    return StoryRevision(
+        revision=c.number,
+        added=c.added,
+        model=c.fit.model.names,
+        verdict=UNDIAGNOSED if d is None else d.verdict,
+        message="run hilcal diagnose for a verdict" if d is None else d.message,
+        residual=residual,
+        predicted=measured - residual,
+        whitened_norm2=mahalanobis2(e.raw[:, :3], e.whitening.covariance[:, :3, :3]),
+        error_fit=c.fit.error.to_json(),
+        error_holdout=c.fit.holdout.to_json(),
+        variance_factor=c.fit.variance_factor,
+        suspects=tuple(
+            StorySuspect(s.effect, s.share, s.holdout_share, s.score.p_value, s.same_as)
+            for s in told
+        ),
+        parameters=story_parameters(c.fit),
+        regressor=None if d is None or not told else regressor(c.fit, told[0]),
+    )
+
+
+def _told(d: Diagnosis) -> tuple[Suspect, ...]:
+    """Suspects worth showing: those that pass the test, best first; none where nothing is wrong."""
+    return tuple(
+        s
+        for s in d.suspects
+        if s.effect in d.significant or (d.significant and s.score.p_value < CERTAIN)
+    )
+
+
+def story_parameters(fit: Fit) -> tuple[StoryParameter, ...]:
+    """Parameters that are not held at zero."""
+    u, prior = fit.uncertainty, fit.solution.prior
+    parameters = [(e.name, p) for e in fit.model.effects for p in e.parameters]
+    return tuple(
+        StoryParameter(
+            name=f"{effect}.{p.name}",
+            value=float(fit.theta[k]) if u.identifiable[k] else None,
+            std=finite(u.std[k]) if u.identifiable[k] else None,
+            unit=p.unit,
+            identifiable=bool(u.identifiable[k]),
+        )
+        for k, (effect, p) in enumerate(parameters)
+        if prior[k] > 0
+    )
+
+
+def regressor(fit: Fit, suspect: Suspect) -> Regressor | None:
+    """Residual against what the suspect would explain, both along the suspect's own direction.
+
+    With X the suspect's columns, freed of what the fitted model can do, and s its estimated
+    parameters, c = X s is what it would explain of each measurement (3-vectors, raw). Plotted
+    are |c| and the residual along c, both with the sign of c along the direction in which
+    the c spread most. Where the suspect is right the points lie on the line of slope 1.
+    """
+    p = projection(fit)
+    effect = next((e for e in candidates(p) if e.name == suspect.effect), None)
+    if effect is None or not len(suspect.score.step):
+        return None
+    w, s = fit.whitening, fit.solution
+    scale = np.array([q.scale for q in effect.parameters])
+    jacobian = fit.model.jacobian_of((effect,), s.prediction, s.theta, w.m)
+    contribution = w.raw(jacobian @ (scale * suspect.score.step))
+    if p.rows.shape[1]:
+        z = sl.cho_solve(p.factor, p.rows.T @ w.whiten(contribution).reshape(-1))
+        adapted = fit.model.predict(
+            s.prediction.situation.states, s.theta - s.equations.basis.transform @ z
+        )
+        shift = adapted.observation.position - s.prediction.observation.position
+        contribution[:, :3] += w.raw(shift)
+    c = contribution[:, :3]
+    size = np.linalg.norm(c, axis=1)
+    seen = size > 1e-9 * max(float(size.max(initial=0.0)), 1e-15)
+    if not seen.any():
+        return None
+    main = np.linalg.svd(c, full_matrices=False)[2][0]
+    side = np.where(c @ main < 0, -1.0, 1.0)[seen]
+    along = np.sum(fit.raw[seen, :3] * c[seen], axis=1) / size[seen]
+    return Regressor(
+        x=1e6 * side * size[seen],
+        y=1e6 * side * along,
+        x_label=f"what {suspect.effect} would explain [µm]",
+        y_label="residual along it [µm]",
+    )

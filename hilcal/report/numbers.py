@@ -1,0 +1,90 @@
+"""Numbers for people: sensible digits, and units in which they are easy to read."""
+
+import math
+from collections.abc import Collection, Sequence
+
+# SI unit: units for people with their factor, small values first, and the value from which
+# the next one is better.
+_UNITS: dict[str, tuple[tuple[str, float, float], ...]] = {
+    "m": (("µm", 1e6, 1e-3), ("mm", 1e3, math.inf)),
+    "rad": (("µrad", 1e6, 1e-3), ("mrad", 1e3, math.inf)),
+    "rad/(N·m)": (("µrad/(N·m)", 1e6, math.inf),),
+    "rad/(N·m)³": (("prad/(N·m)³", 1e12, math.inf),),
+    "m/s": (("µm/h", 3.6e9, math.inf),),
+    "rad/s": (("µrad/h", 3.6e9, math.inf),),
+}
+
+
+def unit_for(unit: str, values: Sequence[float]) -> tuple[str, float]:
+    """Unit for people, and its factor, for values that stand in one column."""
+    largest = max((abs(v) for v in values), default=0.0)
+    for name, factor, limit in _UNITS.get(unit, ()):
+        if largest < limit:
+            return name, factor
+    return unit, 1.0
+
+
+def length(metres: float) -> str:
+    """Return a length: µm below 1 mm, then mm, then m; three digits."""
+    size = abs(metres)
+    if size < 1e-3:
+        return f"{digits(1e6 * metres)} µm"
+    return f"{digits(1e3 * metres)} mm" if size < 1.0 else f"{digits(metres)} m"
+
+
+def digits(value: float, count: int = 3) -> str:
+    """Write a number with so many significant digits, without an exponent where that is short."""
+    if value == 0 or not math.isfinite(value):
+        return f"{value:g}"
+    power = math.floor(math.log10(abs(value)))
+    if -4 <= power < 7:
+        return f"{value:.{max(count - 1 - power, 0)}f}"
+    return f"{value:.{count - 1}e}"
+
+
+def with_std(value: float, std: float) -> tuple[str, str]:
+    """Write a value to the last of two significant digits of its standard uncertainty."""
+    if not (math.isfinite(std) and std > 0):
+        return digits(value), ""
+    places = 1 - math.floor(math.log10(std))
+    if not -7 < places < 7:
+        return digits(value), digits(std, 2)
+    places = max(places, 0)
+    return f"{value:.{places}f}", f"{std:.{places}f}"
+
+
+def percent(share: float) -> str:
+    """Write a share in percent."""
+    return f"{share:.0%}"
+
+
+def chance(p: float) -> str:
+    """Write a p-value, so that small ones stay short."""
+    if p < 1e-16:
+        return "< 1e-16"
+    return f"{p:.0e}" if p < 1e-3 else f"{p:.2g}"
+
+
+def condition(value: float | None) -> str:
+    """Write a condition number."""
+    return "-" if value is None else digits(value, 2)
+
+
+def sentence(message: str, keep: Collection[str] = ()) -> str:
+    """Write a message as a sentence; words of `keep`, such as effects, keep their spelling."""
+    first = message.split(" ", 1)[0].rstrip(",:;")
+    head = message if first in keep else message[:1].upper() + message[1:]
+    return head if head.endswith(".") else f"{head}."
+
+
+def few(items: Sequence[str], most: int = 2) -> str:
+    """Write the first names of a list, and how many more there are."""
+    rest = len(items) - most
+    return ", ".join(items[:most]) + (f" and {rest} more" if rest > 0 else "")
+
+
+def names(items: Sequence[str], word: str = "and") -> str:
+    """Write a list in words: a, b and c."""
+    if len(items) < 2:
+        return "".join(items)
+    return f"{', '.join(items[:-1])} {word} {items[-1]}"

@@ -1,0 +1,243 @@
+"""Pictures of a recording, made without a screen by rerun's own headless viewer."""
+
+import contextlib
+import ctypes
+import ctypes.util
+import json
+import os
+import shutil
+import socket
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hilcal.errors import HilcalError, InputError
+
+if TYPE_CHECKING:
+    from rerun.experimental import ViewerClient, ViewerState
+
+_ICD_DIRS = ("/usr/share/vulkan/icd.d", "/usr/local/share/vulkan/icd.d", "/etc/vulkan/icd.d")
+_START_TIMEOUT = 60.0
+_LOAD_TIMEOUT = 120.0
+_SETTLE = 0.3
+_MISSING = (
+    "no Vulkan driver: pictures need the Vulkan loader and a driver; "
+    "on Debian install mesa-vulkan-drivers and libvulkan1"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """One picture to take: of one view, by name, or of the whole window."""
+
+    png: Path
+    timeline: str | None = None
+    at: int | None = None
+    view: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ViewReport:
+    """A view of the viewer, and every warning or error that it reported."""
+
+    name: str
+    problems: tuple[str, ...]
+
+
+def vulkan_available() -> bool:
+    """Return whether the Vulkan loader and at least one driver description are installed."""
+    named = os.environ.get("VK_DRIVER_FILES") or os.environ.get("VK_ICD_FILENAMES")
+    if named:
+        drivers = any(Path(p).is_file() for p in named.split(os.pathsep))
+    else:
+        drivers = any(any(Path(d).glob("*.json")) for d in _ICD_DIRS)
+    if not drivers:
+        return False
+    try:
+        ctypes.CDLL(ctypes.util.find_library("vulkan") or "libvulkan.so.1")
+    except OSError:
+        return False
+    return True
+
+
+def picture(
+    rrd: Path,
+    png: Path,
+    timeline: str | None = None,
+    at: int | None = None,
+    view: str | None = None,
+    size: tuple[int, int] = (1920, 1080),
+    longest: int | None = None,
+) -> tuple[ViewReport, ...]:
+    """Draw a recording into one PNG file; see `pictures`."""
+    return pictures(rrd, [Shot(png, timeline, at, view)], size, longest)
+
+
+def pictures(
+    rrd: Path,
+    shots: Sequence[Shot],
+    size: tuple[int, int] = (1920, 1080),
+    longest: int | None = None,
+) -> tuple[ViewReport, ...]:
+    """Draw a recording into PNG files, one per shot, with one start of the viewer.
+
+    Args:
+        rrd: the recording.
+        shots: what to draw.
+        size: width and height of the window, points; the picture may have twice the pixels.
+        longest: longest side of the pictures, pixels; None for all pixels.
+
+    Returns:
+        The views, with what they reported; no problems in a sound recording.
+
+    Raises:
+        InputError: no such recording, timeline or view.
+        HilcalError: no Vulkan driver, or the viewer failed.
+    """
+    if not Path(rrd).is_file():
+        raise InputError(f"recording {rrd}: no such file")
+    if not vulkan_available():
+        raise HilcalError(_MISSING)
+    problems: dict[str, set[str]] = {}
+    with _headless(size) as viewer:
+        viewer.open([str(Path(rrd).resolve())])
+        _wait_until_loaded(viewer)
+        viewer.take_screenshot(max_size=64)  # the first frame compiles shaders and loads meshes
+        for shot in shots:
+            _take(viewer, shot, longest)
+            for v in viewer.get_state().views:
+                found = problems.setdefault(v.name or v.view_id, set())
+                found.update(f"{r.severity}: {r.summary} {r.details or ''}" for r in v.reports)
+    return tuple(ViewReport(name, tuple(sorted(found))) for name, found in problems.items())
+
+
+def _take(viewer: "ViewerClient", shot: Shot, longest: int | None) -> None:
+    state = viewer.get_state()
+    if shot.timeline is not None:
+        names = [t.name for r in state.recordings for t in r.timelines]
+        if shot.timeline not in names:
+            raise InputError(
+                f"no timeline {shot.timeline!r}; the recording has {', '.join(sorted(names))}"
+            )
+        if shot.at is None:
+            viewer.set_time(shot.timeline, play_state="paused")
+        else:
+            viewer.set_time(shot.timeline, sequence=shot.at, play_state="paused")
+        time.sleep(_SETTLE)
+        state = viewer.get_state()
+    view_id = None
+    if shot.view is not None:
+        view_id = next((v.view_id for v in state.views if v.name == shot.view), None)
+        if view_id is None:
+            names = [v.name for v in state.views if v.name]
+            raise InputError(f"no view {shot.view!r}; the recording has {', '.join(names)}")
+        _bring_forward(viewer, view_id)
+    Path(shot.png).write_bytes(viewer.take_screenshot(view_id, max_size=longest))
+
+
+def _bring_forward(viewer: "ViewerClient", view_id: str) -> None:
+    """Make a view the active one of its tabs: only what is on the window is drawn."""
+    parts = viewer.get_blueprint().blueprint
+    path = f"/view/{view_id}"
+    for name, part in parts.items():
+        container = part.get("ContainerBlueprint", {})
+        if path in container.get("contents", ()) and container.get("active_tab", path) != path:
+            changed = {**part, "ContainerBlueprint": {**container, "active_tab": path}}
+            viewer.set_blueprint({**parts, name: changed}, of="recording")
+            time.sleep(_SETTLE)
+            return
+
+
+def _wait_until_loaded(viewer: "ViewerClient") -> "ViewerState":
+    end = time.monotonic() + _LOAD_TIMEOUT
+    while True:
+        state = viewer.get_state()
+        if state.views and not state.loading:
+            return state
+        if time.monotonic() > end:
+            raise HilcalError(f"the viewer did not load the recording within {_LOAD_TIMEOUT:g} s")
+        time.sleep(0.05)
+
+
+@contextlib.contextmanager
+def _headless(size: tuple[int, int]) -> Iterator["ViewerClient"]:
+    """Run a viewer of our own in a home of its own, with analytics off; end it afterwards."""
+    with tempfile.TemporaryDirectory(prefix="hilcal-picture-") as home, socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+        probe.close()
+        log = Path(home, "viewer.log")
+        command = [executable(), "--headless", "--hide-welcome-screen"]
+        command += ["--bind", "127.0.0.1", "--port", str(port)]
+        command += ["--window-size", f"{size[0]}x{size[1]}"]
+        with log.open("wb") as sink:
+            process = subprocess.Popen(  # noqa: S603 (our own arguments)
+                command, env=_environment(Path(home)), stdout=sink, stderr=subprocess.STDOUT
+            )
+        try:
+            yield _connect(process, port)
+        except (ConnectionError, RuntimeError) as error:
+            tail = log.read_text(errors="replace").strip().splitlines()[-1:] or ["no message"]
+            raise HilcalError(f"the viewer failed: {error}; it said: {tail[0]}") from error
+        finally:
+            process.terminate()
+            try:
+                process.wait(5)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+def _connect(process: subprocess.Popen[bytes], port: int) -> "ViewerClient":
+    from rerun.experimental import ViewerClient
+
+    end = time.monotonic() + _START_TIMEOUT
+    while True:
+        if process.poll() is not None:
+            raise ConnectionError(f"it exited with status {process.returncode}")
+        try:
+            with socket.create_connection(("127.0.0.1", port), 0.2):
+                pass
+            client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+            client.get_state()
+        except (OSError, RuntimeError) as error:
+            if time.monotonic() > end:
+                raise ConnectionError(f"it did not answer in {_START_TIMEOUT:g} s") from error
+            time.sleep(0.05)
+        else:
+            return client
+
+
+def executable() -> str:
+    """Return the path of the rerun viewer that was installed with its SDK."""
+    try:
+        import rerun_cli  # type: ignore[import-untyped, unused-ignore]
+    except ImportError:
+        found = shutil.which("rerun")
+        if found is None:
+            raise HilcalError("no rerun viewer: install rerun-sdk") from None
+        return found
+    return str(Path(str(rerun_cli.__file__)).parent / "rerun")
+
+
+def _environment(home: Path) -> dict[str, str]:
+    config, run = home / "config", home / "run"
+    for folder in (config / "rerun", run):
+        folder.mkdir(parents=True, mode=0o700)
+    (config / "rerun" / "analytics.json").write_text(
+        json.dumps({"analytics_enabled": False, "analytics_id": "off", "metadata": {}})
+    )
+    env = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    return env | {
+        "HOME": str(home),
+        "XDG_CONFIG_HOME": str(config),
+        "XDG_DATA_HOME": str(home / "data"),
+        "XDG_CACHE_HOME": str(home / "cache"),
+        "XDG_RUNTIME_DIR": str(run),
+        "RUST_LOG": "error",  # warnings pop up over the picture
+        "NO_COLOR": "1",
+    }

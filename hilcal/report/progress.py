@@ -1,0 +1,44 @@
+"""Progress of what takes over a second: a spinner or a bar on a terminal, plain lines elsewhere."""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+Say = Callable[[str], None]
+Advance = Callable[[int], None]
+
+
+@contextmanager
+def working(console: Console) -> Iterator[Say]:
+    """Yield a function that shows what is being done now.
+
+    On a terminal one line with a spinner and the time; otherwise one line each, with the
+    seconds since the start.
+    """
+    begun = time.monotonic()
+    if console.is_terminal:
+        with console.status("") as status:
+            yield lambda text: status.update(f"{text} ...", spinner="dots")
+        return
+
+    def say(text: str) -> None:
+        seconds = f"[{time.monotonic() - begun:5.1f} s]"
+        console.print(f"{seconds} {text}", markup=False, highlight=False, soft_wrap=True)
+
+    yield say
+
+
+@contextmanager
+def counting(console: Console, what: str, total: int) -> Iterator[Advance]:
+    """Yield a function that advances a bar; a line at the start and at the end elsewhere."""
+    if not console.is_terminal:
+        console.print(f"{what}: {total}", markup=False, highlight=False)
+        yield lambda step: None
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+    with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as bar:
+        task = bar.add_task(what, total=total)
+        yield lambda step: bar.advance(task, step)

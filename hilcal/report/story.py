@@ -1,0 +1,175 @@
+"""The story that a viewer tells: readings, and one model revision after another."""
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from hilcal.errors import InputError
+from hilcal.robot.arm import Arm
+from hilcal.types import Floats, Ints
+
+Mode = Literal["deflection", "absolute"]
+ERROR_KEYS = ("rms_m", "mean_m", "max_m", "rms_sigma")
+
+
+@dataclass(frozen=True, slots=True)
+class StoryParameter:
+    """One parameter of a fit; `value` and `std` in `unit`, None where not identifiable."""
+
+    name: str
+    value: float | None
+    std: float | None
+    unit: str
+    identifiable: bool
+
+
+@dataclass(frozen=True, slots=True)
+class StorySuspect:
+    """One missing effect that would explain part of the misfit.
+
+    Attributes:
+        effect: its name.
+        share: share of the misfit that it explains on the fitted readings, 0..1.
+        holdout_share: the same on readings left out; may be negative.
+        p_value: of the joint test on the whitened residual.
+        same_as: effects that the data cannot tell apart from it.
+    """
+
+    effect: str
+    share: float
+    holdout_share: float
+    p_value: float
+    same_as: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Regressor:
+    """A residual component against what the leading suspect says that it depends on.
+
+    Attributes:
+        x: (K,) regressor, in the units that `x_label` names.
+        y: (K,) residual, in the units that `y_label` names.
+    """
+
+    x: Floats
+    y: Floats
+    x_label: str
+    y_label: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StoryRevision:
+    """One fitted model revision.
+
+    Attributes:
+        revision: its number, growing along the story.
+        added: the effect that this revision added; None for the first.
+        model: names of all effects in it.
+        verdict: one of the verdicts of `diagnose`.
+        message: the verdict in words.
+        residual: (N, 3) measured - predicted, base axes, m.
+        predicted: (N, 3) position in absolute mode, deflection vector in deflection mode, m.
+        whitened_norm2: (N,) squared Mahalanobis distance of each reading, 3 degrees of freedom.
+        error_fit: error of the fitted readings, keys `ERROR_KEYS`.
+        error_holdout: error of whole poses left out, same keys.
+        variance_factor: whitened residual sum of squares by degrees of freedom.
+        suspects: missing effects, best first.
+        parameters: the fit's parameters.
+        regressor: what the leading suspect would bend straight; None when there is none.
+    """
+
+    revision: int
+    added: str | None
+    model: tuple[str, ...]
+    verdict: str
+    message: str
+    residual: Floats
+    predicted: Floats
+    whitened_norm2: Floats
+    error_fit: Mapping[str, float]
+    error_holdout: Mapping[str, float]
+    variance_factor: float
+    suspects: tuple[StorySuspect, ...] = ()
+    parameters: tuple[StoryParameter, ...] = ()
+    regressor: Regressor | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Story:
+    """N readings and the revisions of the model that was fitted to them; SI, base axes.
+
+    Attributes:
+        arm: the arm.
+        mode: what the readings are.
+        q: (N, n) joint angles, rad.
+        pose: (N,) index of the commanded pose.
+        load_names: (N,) name of each reading's load.
+        anchor: (N, 3) nominal position of the target, where arrows start, m.
+        measured: (N, 3) deflection vector, or position in absolute mode, m.
+        covariance: (N, 3, 3) covariance of the residual, m².
+        noise_floor_m: rms 3-D error that noise alone would leave, m.
+        revisions: the revisions, in growing order.
+    """
+
+    arm: Arm
+    mode: Mode
+    q: Floats
+    pose: Ints
+    load_names: tuple[str, ...]
+    anchor: Floats
+    measured: Floats
+    covariance: Floats
+    noise_floor_m: float
+    revisions: tuple[StoryRevision, ...]
+
+    def __len__(self) -> int:
+        """Return the number of readings N."""
+        return len(self.pose)
+
+
+def check(story: Story) -> None:
+    """Check shapes, finiteness and the order of revisions.
+
+    Raises:
+        InputError: names the first field that is wrong and the shape that it should have.
+    """
+    n = len(story)
+    if n == 0:
+        raise InputError("story.pose: no readings; at least one is needed")
+    if not story.revisions:
+        raise InputError("story.revisions: empty; at least one fitted revision is needed")
+    if len(story.load_names) != n:
+        raise InputError(f"story.load_names: {len(story.load_names)} names for {n} readings")
+    _array("story.q", story.q, (n, story.arm.n))
+    _array("story.anchor", story.anchor, (n, 3))
+    _array("story.measured", story.measured, (n, 3))
+    _array("story.covariance", story.covariance, (n, 3, 3))
+    if not (np.isfinite(story.noise_floor_m) and story.noise_floor_m >= 0):
+        raise InputError(f"story.noise_floor_m: {story.noise_floor_m}; must be finite and >= 0")
+    numbers = [r.revision for r in story.revisions]
+    if any(b <= a for a, b in itertools.pairwise(numbers)):
+        raise InputError(f"story.revisions: numbers {numbers} do not grow")
+    for r in story.revisions:
+        where = f"revision {r.revision}"
+        _array(f"{where}: residual", r.residual, (n, 3))
+        _array(f"{where}: predicted", r.predicted, (n, 3))
+        _array(f"{where}: whitened_norm2", r.whitened_norm2, (n,))
+        for name, error in (("error_fit", r.error_fit), ("error_holdout", r.error_holdout)):
+            missing = [k for k in ERROR_KEYS if k not in error]
+            if missing:
+                raise InputError(
+                    f"{where}: {name} lacks {', '.join(missing)}; needs {', '.join(ERROR_KEYS)}"
+                )
+        if r.regressor is not None and r.regressor.x.shape != r.regressor.y.shape:
+            raise InputError(f"{where}: regressor x and y differ in length")
+
+
+def _array(name: str, value: Floats, shape: tuple[int, ...]) -> None:
+    if value.shape != shape:
+        raise InputError(f"{name}: shape {value.shape}, should be {shape}")
+    if not np.isfinite(value).all():
+        row = int(np.argwhere(~np.isfinite(value))[0][0])
+        raise InputError(f"{name}: not finite in row {row}")

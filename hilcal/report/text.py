@@ -1,0 +1,269 @@
+"""A fit in words and tables, for people."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from rich import box
+from rich.console import RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from hilcal.diagnose.where import Where
+from hilcal.effects.protocol import Effect
+from hilcal.identify.document import notes, outliers, registration
+from hilcal.identify.everything import Everything, everything
+from hilcal.identify.fit import Fit
+from hilcal.report import numbers
+from hilcal.robot import se3
+from hilcal.types import Ints
+
+ALL_ROWS = 60
+STRONGEST = 5
+DIRECTIONS = 8
+POSE = "pose"
+CERTAIN = 0.005
+
+
+def heading(words: str) -> Text:
+    """Return a heading."""
+    return Text(words, style="bold")
+
+
+def table(*columns: str, left: Sequence[int] = (0,)) -> Table:
+    """Return an empty table; numbers stand to the right, the columns of `left` to the left."""
+    out = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
+    for k, name in enumerate(columns):
+        out.add_column(name, justify="left" if k in left else "right", overflow="fold")
+    return out
+
+
+def model_name(names: Sequence[str]) -> str:
+    """Write a model as the sum of its effects."""
+    return " + ".join(names) or "the rigid nominal arm"
+
+
+def kind(fit: Fit) -> str:
+    """Return what was fitted, in words."""
+    if fit.mode == "absolute":
+        return f"{len(fit.raw)} absolute readings"
+    return f"{len(fit.raw)} deflections (loaded minus unloaded) of {len(fit.readings)} readings"
+
+
+def fit_report(fit: Fit) -> Iterator[RenderableType]:
+    """Yield all that people want to know of a fit."""
+    yield heading(f"Model: {model_name(fit.model.names)}")
+    yield f"Fitted to {kind(fit)}; scaling {fit.scaling}.\n"
+    yield from parameters(fit)
+    yield errors(fit)
+    yield ""
+    yield from remarks(fit)
+
+
+def parameters(fit: Fit) -> Iterator[RenderableType]:
+    """Yield a table of parameters, and a summary of each large family."""
+    rows = table("parameter", "value", "±", "unit", "meaning", left=(0, 3, 4))
+    families, unseen = [], []
+    seen = fit.uncertainty.identifiable
+    for effect, s in zip(fit.model.effects, fit.model.slices(), strict=True):
+        index = np.arange(s.start, s.stop)
+        if effect.groups() is not None or len(index) > ALL_ROWS:
+            families.append(family(fit, effect, index))
+        else:
+            _parameter_rows(rows, fit, effect, index)
+            left = [p.name for k, p in zip(index, effect.parameters, strict=True) if not seen[k]]
+            if left:
+                unseen.append(f"{effect.name} {_which(left, len(index))}")
+    if rows.row_count:
+        yield rows
+        yield Text("±: standard uncertainty.\n", style="dim")
+    yield from families
+    if unseen:
+        yield f"Not determined by these readings: {'; '.join(unseen)}.\n"
+
+
+def _which(names: Sequence[str], count: int) -> str:
+    if len(names) == count:
+        return "(none of it)" if count > 6 else " ".join(names)
+    return " ".join(names) if len(names) <= 6 else f"({len(names)} of {count})"
+
+
+def _parameter_rows(rows: Table, fit: Fit, effect: Effect, index: Ints) -> None:
+    seen = fit.uncertainty.identifiable
+    for k, p in zip(index, effect.parameters, strict=True):
+        alike = [
+            i for i, o in zip(index, effect.parameters, strict=True) if o.unit == p.unit and seen[i]
+        ]
+        unit, factor = numbers.unit_for(p.unit, [float(fit.theta[i]) for i in alike])
+        if not seen[k]:
+            continue
+        value, std = numbers.with_std(
+            factor * float(fit.theta[k]), factor * float(fit.uncertainty.std[k])
+        )
+        rows.add_row(f"{effect.name}.{p.name}", value, std, unit, p.meaning)
+
+
+def family(fit: Fit, effect: Effect, index: Ints) -> RenderableType:
+    """Summarise a family of hundreds of parameters."""
+    theta, live = fit.theta[index], fit.solution.prior[index] > 0
+    units = {p.unit for p in effect.parameters}
+    unit, factor = numbers.unit_for(units.pop(), list(theta)) if len(units) == 1 else ("", 1.0)
+    lines = [
+        f"{effect.name}: {int(live.sum())} of {len(index)} parameters kept, the rest are zero."
+    ]
+    joints: dict[str, float] = {}
+    for value, p in zip(theta, effect.parameters, strict=True):
+        head = p.name.split(".")[0]
+        joints[head] = joints.get(head, 0.0) + float(value) ** 2 / 2
+    rms = ", ".join(f"{j} {numbers.digits(factor * v**0.5)}" for j, v in joints.items())
+    lines.append(f"  rms over a turn [{unit}]: {rms}")
+    strongest = np.argsort(-np.abs(theta), kind="stable")[:STRONGEST]
+    named = ", ".join(
+        f"{effect.parameters[k].name} {numbers.digits(factor * float(theta[k]))}" for k in strongest
+    )
+    lines.append(f"  strongest [{unit}]: {named}\n")
+    return "\n".join(lines)
+
+
+def errors(fit: Fit) -> RenderableType:
+    """Return the table of errors: fitted, left out, and what noise alone leaves."""
+    out = table("3-D position error", "rms", "mean", "largest", "rms in σ")
+    for name, e in (("poses fitted", fit.error), ("poses left out", fit.holdout)):
+        out.add_row(
+            name,
+            numbers.length(e.rms_m),
+            numbers.length(e.mean_m),
+            numbers.length(e.max_m),
+            f"{e.rms_sigma:.2f}",
+        )
+    out.add_row("noise alone", numbers.length(everything(fit).noise_floor), "", "", "1.00")
+    return out
+
+
+def remarks(fit: Fit) -> Iterator[RenderableType]:
+    """Yield a sentence for each thing that the numbers alone do not say."""
+    low, high = fit.variance_factor_interval
+    yield (
+        f"Variance factor {fit.variance_factor:.3g} (95 % interval {low:.3g} to {high:.3g}): the "
+        "squared error in units of the noise, 1 where model and noise are right."
+    )
+    yield scaling_remark(fit)
+    null = fit.uncertainty.null
+    if null:
+        what = "directions, parameters that move together," if len(null) > 1 else "direction"
+        yield f"{len(null)} {what} cannot be seen in these readings:"
+        yield from (f"  {d}" for d in null[:DIRECTIONS])
+        if len(null) > DIRECTIONS:
+            yield f"  ... and {len(null) - DIRECTIONS} more; --json lists all"
+    if "base_frame" in fit.model.names:
+        yield placed(fit)
+    for note in notes(fit):
+        yield note[0].upper() + note[1:] + "."
+    gross = outliers(fit)
+    if gross:
+        listed = ", ".join(f"{o['pose']}/{o['load']} ({o['sigma']:.0f} σ)" for o in gross[:8])
+        more = f" and {len(gross) - 8} more" if len(gross) > 8 else ""
+        yield f"{len(gross)} readings set aside as gross errors (pose/load): {listed}{more}."
+
+
+def placed(fit: Fit) -> str:
+    """Say where the base is, since `base_frame` is relative to where the fit started."""
+    t = registration(fit)
+    place = ", ".join(f"{x:.5f}" for x in t[:3, 3])
+    turn = ", ".join(f"{x:.4f}" for x in np.degrees(se3.rotation_vector(t[:3, :3])))
+    return (
+        f"As fitted, the base is at ({place}) m in the tracker frame, turned by the rotation "
+        f"vector ({turn})°; base_frame is what was added to the registration that the fit "
+        "started from."
+    )
+
+
+def scaling_remark(fit: Fit) -> str:
+    """Say whether parameter scaling was needed."""
+    basis = fit.solution.equations.basis
+    before, after = basis.condition_unscaled, basis.condition_scaled
+    if not (np.isfinite(before) and np.isfinite(after)):
+        return "Condition numbers: none, the model has no free parameter."
+    need = (
+        "parameter scaling was needed"
+        if before > 1e3 and before > 10 * after
+        else "parameter scaling made no difference that matters"
+    )
+    return (
+        f"Condition number {numbers.condition(before)} in physical units, "
+        f"{numbers.condition(after)} after parameter scaling: {need}."
+    )
+
+
+def misses(fit: Fit) -> str:
+    """Say in a sentence how far the model is from the measurements."""
+    floor = everything(fit).noise_floor
+    what = "deflections" if fit.mode == "deflection" else "positions"
+    return (
+        f"On poses left out, predicted {what} are off by {numbers.length(fit.holdout.rms_m)} rms; "
+        f"noise alone would leave {numbers.length(floor)}."
+    )
+
+
+def follows(places: Sequence[Where]) -> str:
+    """Say in a sentence what the misfit follows."""
+    found = [p for p in places if p.p_value < CERTAIN and p.share > 0.05]
+    sides = [p for p in found if p.variable.startswith("direction") and p.share > 0.5]
+    same = [p for p in found if p.variable == POSE and p.share > 0.5]
+    causes = [p for p in found if p.variable != POSE and not p.variable.startswith("direction")][:3]
+    if not causes and not sides and not same:
+        return (
+            "The misfit follows none of the variables: neither joints nor load, time or direction."
+        )
+    named = [f"{p.variable} ({numbers.percent(p.share)})" for p in causes]
+    told = (
+        f"The misfit follows {numbers.names(named)}"
+        if named
+        else "The misfit follows none of the variables"
+    )
+    if sides:
+        side = sides[0].variable.removeprefix("direction ")
+        told += f"; {numbers.percent(sides[0].share)} of it is {side}"
+    if same:
+        told += f"; {numbers.percent(same[0].share)} of it is the same under every load of a pose"
+    return f"{told}."
+
+
+def where_table(places: Sequence[Where], most: int = 12) -> RenderableType:
+    """Return the table of variables that the misfit follows."""
+    out = table("where the model fails", "share of the misfit", "p-value")
+    for p in places[:most]:
+        out.add_row(p.variable, numbers.percent(p.share), numbers.chance(p.p_value))
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class Worst:
+    """The measurement of a pose that errs most: 3-D error in m, and all of it in σ."""
+
+    pose: str
+    load: str
+    error_m: float
+    sigma: float
+
+
+def worst_poses(e: Everything, most: int = 6) -> list[Worst]:
+    """Measurements of the poses that err most in units of the noise, worst first."""
+    distance = np.sqrt(e.mahalanobis2)
+    found: dict[str, Worst] = {}
+    for k in np.argsort(-distance, kind="stable"):
+        pose, load = e.name(int(k))
+        if pose not in found:
+            error = float(np.linalg.norm(e.raw[k, :3]))
+            found[pose] = Worst(pose, load, error, float(distance[k]))
+        if len(found) == most:
+            break
+    return list(found.values())
+
+
+def worst_table(worst: Sequence[Worst]) -> RenderableType:
+    """Return the table of the worst poses."""
+    out = table("worst poses", "load", "error", "in σ", left=(0, 1))
+    for w in worst:
+        out.add_row(w.pose, w.load, numbers.length(w.error_m), f"{w.sigma:.1f}")
+    return out

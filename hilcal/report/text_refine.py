@@ -1,0 +1,119 @@
+"""Diagnoses and revisions in words and tables, for people."""
+
+from collections.abc import Iterator, Mapping, Sequence
+
+from rich.console import RenderableType
+from rich.text import Text
+
+from hilcal.diagnose.verdict import Diagnosis
+from hilcal.effects.catalogue import catalogue
+from hilcal.identify.everything import everything
+from hilcal.identify.fit import Fit
+from hilcal.report import numbers, text
+
+VERDICTS: Mapping[str, str] = {
+    "adequate": "adequate: what is left is noise",
+    "missing_effect": "an effect is missing",
+    "ambiguous": "ambiguous: these readings do not separate the suspects",
+    "unknown_effect": "unknown effect: something is missing that the catalogue does not hold",
+    "noise_misjudged": "the noise is not what was stated",
+}
+SUSPECTS = 6
+
+
+def sentence(message: str) -> str:
+    """Write a message as a sentence; effects keep their spelling."""
+    return numbers.sentence(message, catalogue())
+
+
+def verdict_line(verdict: str, message: str) -> Text:
+    """Return the verdict with its message."""
+    style = "bold green" if verdict == "adequate" else "bold yellow"
+    return Text.assemble(
+        "Verdict: ", (VERDICTS.get(verdict, verdict), style), f".\n{sentence(message)}"
+    )
+
+
+def suspects_table(d: Diagnosis, most: int = SUSPECTS) -> RenderableType:
+    """Return the ranked suspects that chance alone does not explain."""
+    shown = [s for s in d.suspects if s.effect in d.significant or s.score.p_value < text.CERTAIN]
+    out = text.table(
+        "missing effect?", "explains", "on poses left out", "p-value", "not told from", left=(0, 4)
+    )
+    for s in shown[:most]:
+        out.add_row(
+            s.effect,
+            numbers.percent(s.share),
+            numbers.percent(max(s.holdout_share, 0.0)),
+            numbers.chance(s.score.p_value),
+            numbers.few(s.same_as) if s.effect in d.significant else "",
+        )
+    return out
+
+
+def diagnosis_report(d: Diagnosis) -> Iterator[RenderableType]:
+    """Yield the verdict, where the model fails and the suspects."""
+    yield text.heading(f"Model: {text.model_name(d.fit.model.names)}")
+    yield text.misses(d.fit)
+    if d.verdict != "adequate":
+        yield text.follows(d.where)
+    yield ""
+    yield verdict_line(d.verdict, d.message)
+    yield ""
+    if d.significant:
+        yield suspects_table(d)
+        yield Text(
+            "explains: share of the misfit, the error beyond noise, that adding the effect would "
+            "remove; p-value: chance of that much if it were not there.\n",
+            style="dim",
+        )
+    if d.verdict != "adequate":
+        yield from (text.where_table(d.where), "")
+    if d.verdict in ("unknown_effect", "noise_misjudged"):
+        yield (
+            f"A generic learner that knows nothing of robots predicts "
+            f"{numbers.percent(d.predictable_share)} of the misfit."
+        )
+    if d.pure_error is not None:
+        yield (
+            f"Repeated readings scatter {d.pure_error.factor**0.5:.2f} times as much as stated "
+            f"({d.pure_error.dof:.0f} degrees of freedom)."
+        )
+
+
+def revisions_table(rows: Sequence[tuple[int, str | None, Fit, str]]) -> RenderableType:
+    """Return the table in which the error falls, from (number, added, fit, verdict)."""
+    out = text.table(
+        "rev.",
+        "model",
+        "poses\nfitted",
+        "\nσ",
+        "poses\nleft out",
+        "\nσ",
+        "variance\nfactor",
+        "verdict",
+        left=(0, 1, 7),
+    )
+    for number, added, fit, verdict in rows:
+        out.add_row(
+            str(number),
+            f"+ {added}" if added else text.model_name(fit.model.names),
+            numbers.length(fit.error.rms_m),
+            f"{fit.error.rms_sigma:.2f}",
+            numbers.length(fit.holdout.rms_m),
+            f"{fit.holdout.rms_sigma:.2f}",
+            numbers.digits(fit.variance_factor),
+            verdict.replace("_", " "),
+        )
+    floor = numbers.length(everything(rows[-1][2]).noise_floor)
+    out.add_row("", "noise alone", floor, "1.00", floor, "1.00", "1", "", style="dim")
+    return out
+
+
+def key() -> Text:
+    """Return what the columns of `revisions_table` are."""
+    return Text(
+        "Errors: rms of the 3-D position, and of all elements in σ, one standard deviation of "
+        "the noise.\n",
+        style="dim",
+    )

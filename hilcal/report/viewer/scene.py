@@ -1,0 +1,191 @@
+"""The 3-D views: arm, residual arrows in their noise balls, deflections."""
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from hilcal.report.primitive_arm import BodyMesh, arm_meshes, tool_mesh
+from hilcal.report.story import StoryRevision
+from hilcal.report.viewer import style
+from hilcal.report.viewer.digest import Digest, capped, deviation, quaternions_of
+from hilcal.types import Floats
+
+_DEFLECTION_CAP = 0.6
+_LABEL_ABOVE = np.array([0.0, 0.0, 0.3])
+
+
+def static_scene(rec: rr.RecordingStream, d: Digest) -> None:
+    """Log what never changes: the arm's shapes and the axes of the world."""
+    arm = d.story.arm
+    rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    for i, mesh in enumerate(arm_meshes(arm)):
+        rec.log(f"world/arm/body{i}", _mesh(mesh), static=True)
+    flange = tool_mesh(arm, d.target, style.MEASURED)
+    rec.log(f"world/arm/body{arm.n + 1}", _mesh(flange), static=True)
+
+
+def revision_scene(rec: rr.RecordingStream, d: Digest, r: StoryRevision) -> None:
+    """Log one revision at the recording's current time: arrows, balls, the arm at its worst."""
+    story, worst = d.story, d.worst(r)
+    _arm(rec, d, int(d.row[worst]))
+    shown = d.shown(r)
+    colors = style.LEVEL_COLORS[style.levels(r.whitened_norm2[shown])]
+    rec.log(
+        "world/residual/arrows",
+        rr.Arrows3D(
+            origins=story.anchor[shown],
+            vectors=d.arrows(r.residual[shown]),
+            colors=colors,
+            radii=np.where(style.levels(r.whitened_norm2[shown]) > 0, 0.0055, 0.0035),
+        ),
+    )
+    balls = d.balled(r)
+    rec.log(
+        "world/residual/noise",
+        rr.Ellipsoids3D(
+            centers=story.anchor[balls],
+            half_sizes=d.half_sizes[balls],
+            quaternions=d.quaternions[balls],
+            colors=[(*style.NOISE, 46)],
+            fill_mode="solid",
+        ),
+    )
+    level = int(style.levels(r.whitened_norm2[worst : worst + 1])[0])
+    color = style.LABEL_COLORS[level]
+    at = story.anchor[worst]
+    rec.log(
+        "world/residual/worst",
+        _label(
+            at + _LABEL_ABOVE,
+            f"worst: pose {story.pose[worst]}, {pose_words(d, r, worst)}",
+            color,
+        ),
+    )
+    rec.log(
+        "world/residual/leader",
+        rr.LineStrips3D([[at, at + _LABEL_ABOVE]], colors=[color], radii=rr.Radius.ui_points(1.0)),
+    )
+    _deflections(rec, d, r)
+
+
+def pose_scene(rec: rr.RecordingStream, d: Digest) -> None:
+    """Send the arm and the highlighted arrow of every pose, as columns on `pose`."""
+    story, r = d.story, d.story.revisions[-1]
+    time = rr.TimeColumn("pose", sequence=d.poses)
+    for i in range(1, d.bodies.shape[1]):
+        rec.send_columns(
+            f"world/arm/body{i}",
+            indexes=[time],
+            columns=rr.Transform3D.columns(
+                translation=d.bodies[:, i, :3, 3],
+                quaternion=quaternions_of(d.bodies[:, i, :3, :3]),
+            ),
+        )
+    worst = d.worst_of_poses(r)
+    rec.send_columns(
+        "world/residual/current",
+        indexes=[time],
+        columns=[
+            *rr.Arrows3D.columns(
+                origins=story.anchor[worst],
+                vectors=d.arrows(r.residual[worst]),
+                colors=style.LEVEL_COLORS[style.levels(r.whitened_norm2[worst])],
+                radii=np.full(len(worst), 0.012),
+            )
+        ],
+    )
+    rec.send_columns(
+        "world/residual/ball",
+        indexes=[time],
+        columns=rr.Ellipsoids3D.columns(
+            centers=story.anchor[worst],
+            half_sizes=d.half_sizes[worst],
+            quaternions=d.quaternions[worst],
+            colors=np.tile(np.array(style.PREDICTED, dtype=np.uint8), (len(worst), 1)),
+        ),
+    )
+    strips = np.stack([story.anchor[worst], story.anchor[worst] + _LABEL_ABOVE], 1)
+    rec.send_columns(
+        "world/residual/leader",
+        indexes=[time],
+        columns=rr.LineStrips3D.columns(
+            strips=strips,
+            colors=style.LABEL_COLORS[style.levels(r.whitened_norm2[worst])],
+        ),
+    )
+    rec.send_columns(
+        "world/residual/worst",
+        indexes=[time],
+        columns=rr.Points3D.columns(
+            positions=story.anchor[worst] + _LABEL_ABOVE,
+            labels=[f"pose {story.pose[i]}: {pose_words(d, r, i)}" for i in worst],
+            colors=style.LABEL_COLORS[style.levels(r.whitened_norm2[worst])],
+            radii=np.full(len(worst), 1e-4),
+            show_labels=[True] * len(worst),
+        ),
+    )
+
+
+def pose_words(d: Digest, r: StoryRevision, i: int) -> str:
+    """Return a reading's residual as words: length, and in σ."""
+    length = float(np.linalg.norm(r.residual[i]))
+    return f"{style.micrometres(length)} ({np.sqrt(r.whitened_norm2[i]):.1f} σ)"
+
+
+def center(d: Digest) -> tuple[Floats, float]:
+    """Middle of everything drawn and its half size: where the eye looks, m."""
+    points = np.vstack([d.story.anchor, np.zeros((1, 3))])
+    lo, hi = points.min(0), points.max(0)
+    return (lo + hi) / 2, max(float(np.linalg.norm(hi - lo)) / 2, 0.3 * d.story.arm.reach)
+
+
+def _arm(rec: rr.RecordingStream, d: Digest, pose: int) -> None:
+    quaternion = quaternions_of(d.bodies[pose, :, :3, :3])
+    for i in range(1, d.bodies.shape[1]):
+        rec.log(
+            f"world/arm/body{i}",
+            rr.Transform3D(
+                translation=d.bodies[pose, i, :3, 3],
+                quaternion=rr.Quaternion(xyzw=quaternion[i]),
+            ),
+        )
+
+
+def _deflections(rec: rr.RecordingStream, d: Digest, r: StoryRevision) -> None:
+    """Log one pair of arrows per pose, of its largest deflection, and what parts their tips."""
+    story, some = d.story, d.most_deflected(r)
+    at = story.anchor[some]
+    tips = []
+    for name, value, color, radius in (
+        ("measured", story.measured, style.MEASURED, 0.0055),
+        ("predicted", r.predicted, style.PREDICTED, 0.0045),
+    ):
+        moved = capped(deviation(story, value)[some] * d.deflection_scale, _DEFLECTION_CAP)
+        tips.append(at + moved)
+        rec.log(
+            f"world/deflection/{name}",
+            rr.Arrows3D(origins=at, vectors=moved, colors=[color], radii=[radius]),
+        )
+    rec.log(
+        "world/deflection/missed",
+        rr.LineStrips3D(
+            list(np.stack(tips, 1)),
+            colors=style.LEVEL_COLORS[style.levels(r.whitened_norm2[some])],
+            radii=rr.Radius.ui_points(1.6),
+        ),
+    )
+
+
+def _mesh(mesh: BodyMesh) -> rr.Mesh3D:
+    return rr.Mesh3D(
+        vertex_positions=mesh.vertices.astype(np.float32),
+        vertex_normals=mesh.normals.astype(np.float32),
+        triangle_indices=mesh.triangles.astype(np.uint32),
+        vertex_colors=mesh.colors.astype(np.uint8),
+    )
+
+
+def _label(position: Floats, text: str, color: NDArray[np.uint8]) -> rr.Points3D:
+    return rr.Points3D(
+        [position], labels=[style.safe(text)], colors=[color], radii=[1e-4], show_labels=True
+    )

@@ -1,0 +1,206 @@
+"""Recordings: to a file, and to viewers that join when they like."""
+
+import contextlib
+import hashlib
+import logging
+import os
+import socket
+import subprocess
+import uuid
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+
+from hilcal.errors import HilcalError, InputError
+from hilcal.report import picture
+from hilcal.report.story import Story, StoryRevision, check
+from hilcal.report.viewer import charts, layout, scene, style, words
+from hilcal.report.viewer.digest import Digest, Limits, digest
+
+APPLICATION = "hilcal"
+_FLUSH_TIMEOUT = 10.0
+_LOG = logging.getLogger(__name__)
+Sink = rr.FileSink | rr.GrpcServerSink
+
+
+@dataclass(frozen=True, slots=True)
+class Served:
+    """A recording that viewers can open at `url` for as long as it is served."""
+
+    url: str
+
+
+def record(story: Story, *sinks: Sink, limits: Limits | None = None) -> rr.RecordingStream:
+    """Send a story to sinks, flushed after each revision; equal stories give equal recordings.
+
+    Args:
+        story: what is told.
+        sinks: where it goes.
+        limits: how much is drawn at most.
+
+    Returns:
+        The open stream; it closes, and ends its sinks, when it is dropped.
+
+    Raises:
+        InputError: the story's arrays do not fit together.
+        HilcalError: a sink does not take the data (disk full, ...).
+    """
+    d, rec = _open(story, limits)
+    rec.set_sinks(*sinks, default_blueprint=layout.blueprint(d))
+    _tell(rec, d)
+    return rec
+
+
+def save(story: Story, path: Path, limits: Limits | None = None) -> None:
+    """Write a story as a recording file, whole or not at all; an existing file is replaced.
+
+    The recording is encoded in memory: rerun's own file sink can wait forever on a full disk.
+
+    Raises:
+        InputError: the folder is missing, or the story's arrays do not fit together.
+        HilcalError: the file cannot be written.
+    """
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise InputError(f"recording {path}: no folder {path.parent}; make it first")
+    d, rec = _open(story, limits)
+    memory = rec.memory_recording()
+    rec.send_blueprint(layout.blueprint(d), make_active=False, make_default=True)
+    _tell(rec, d)
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        part.write_bytes(memory.drain_as_bytes())
+        part.replace(path)
+    except OSError as error:
+        raise HilcalError(f"recording {path}: cannot be written: {error.strerror}") from error
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+        rec.disconnect()
+
+
+@contextlib.contextmanager
+def serve(
+    story: Story, ip: str = "127.0.0.1", port: int = 9876, limits: Limits | None = None
+) -> Iterator[Served]:
+    """Serve a story to viewers until the block ends; viewers may join late and rejoin.
+
+    The operator opens `rerun <url>`. The viewer's analytics are switched off for this user.
+
+    Raises:
+        InputError: the story's arrays do not fit together, or the port is taken.
+        HilcalError: the port cannot be served.
+    """
+    disable_analytics()
+    try:
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind((ip, port))  # the server itself would only log that the port is taken
+    except (OSError, OverflowError) as error:
+        raise InputError(
+            f"viewer server {ip}:{port}: {error}; choose a free port of this machine"
+        ) from error
+    try:
+        rec = record(story, rr.GrpcServerSink(bind_ip=ip, port=port), limits=limits)
+    except (OSError, RuntimeError) as error:
+        raise HilcalError(f"viewer server {ip}:{port}: {error}") from error
+    try:
+        yield Served(f"rerun+http://{ip}:{port}/proxy")
+    finally:
+        rec.disconnect()
+
+
+def recording_id(story: Story) -> str:
+    """Return an identifier that depends on what the story tells, and on nothing else."""
+    sha = hashlib.sha256(f"{story.arm.name} {story.mode} {story.load_names}".encode())
+    for array in (story.q, story.pose, story.anchor, story.measured, story.covariance):
+        sha.update(np.ascontiguousarray(array).tobytes())
+    for r in story.revisions:
+        sha.update(f"{r.revision} {r.added} {r.model} {r.suspects} {r.parameters}".encode())
+        sha.update(np.ascontiguousarray(r.residual).tobytes())
+    return str(uuid.UUID(bytes=sha.digest()[:16]))
+
+
+def flush(rec: rr.RecordingStream) -> None:
+    """Hand everything logged so far to the sinks; a slow viewer only costs the time-out.
+
+    Raises:
+        HilcalError: a sink has failed: a full disk shows only here.
+    """
+    try:
+        rec.flush(timeout_sec=_FLUSH_TIMEOUT)
+    except (ValueError, RuntimeError, OSError) as error:
+        if "timeout" in str(error).lower() or "timed out" in str(error).lower():
+            _LOG.warning("recording: a viewer is slow: %s", error)
+            return
+        raise HilcalError(f"the recording's sink failed: {error}") from error
+
+
+def disable_analytics() -> None:
+    """Switch the viewer's usage statistics off for this user; they are on by default."""
+    with contextlib.suppress(OSError, subprocess.SubprocessError, HilcalError):
+        subprocess.run(  # noqa: S603 (our own arguments)
+            [picture.executable(), "analytics", "disable"],
+            check=False,
+            capture_output=True,
+            timeout=10,
+        )
+
+
+def _open(story: Story, limits: Limits | None) -> tuple[Digest, rr.RecordingStream]:
+    check(story)
+    rec = rr.RecordingStream(APPLICATION, recording_id=recording_id(story), send_properties=False)
+    rec.set_log_time_enabled(False)
+    rec.set_log_tick_enabled(False)
+    return digest(story, limits or Limits()), rec
+
+
+def _tell(rec: rr.RecordingStream, d: Digest) -> None:
+    """Log the whole story, flushed after each revision."""
+    rec.send_recording_name(f"hilcal: {style.safe(d.story.arm.name)}, {len(d.story)} readings")
+    scene.static_scene(rec, d)
+    charts.static_charts(rec)
+    rec.log("words/guide", _markdown(words.GUIDE), static=True)
+    for r in d.story.revisions:
+        rec.set_time("revision", sequence=r.revision)
+        _revision(rec, d, r, on_revisions=True)
+        flush(rec)
+    rec.reset_time()
+    _poses(rec, d)
+    flush(rec)
+
+
+def _revision(rec: rr.RecordingStream, d: Digest, r: StoryRevision, on_revisions: bool) -> None:
+    scene.revision_scene(rec, d, r)
+    if on_revisions:
+        charts.error_series(rec, d, r)
+    charts.revision_charts(rec, d, r)
+    rec.log("words/verdict", _markdown(words.verdict(d, r)))
+    rec.log("words/parameters", _markdown(words.parameters(r, d.limits.parameters)))
+    rec.log("words/revisions", _markdown(words.revisions(d, r.revision)))
+    level = "INFO" if r.verdict == "adequate" else "WARN"
+    rec.log("log", rr.TextLog(words.log_line(d, r), level=level))
+
+
+def _poses(rec: rr.RecordingStream, d: Digest) -> None:
+    """Tell the last revision on the timeline `pose`, and move the arm along it."""
+    last = d.story.revisions[-1]
+    rec.set_time("pose", sequence=int(d.poses[0]))
+    _revision(rec, d, last, on_revisions=False)
+    rec.reset_time()
+    scene.pose_scene(rec, d)
+    time = [rr.TimeColumn("pose", sequence=d.poses)]
+    cards = [words.pose_card(d, k) for k in range(len(d.poses))]
+    rec.send_columns(
+        "words/verdict",
+        indexes=time,
+        columns=rr.TextDocument.columns(text=cards, media_type=["text/markdown"] * len(cards)),
+    )
+    charts.pose_charts(rec, d)
+
+
+def _markdown(text: str) -> rr.TextDocument:
+    return rr.TextDocument(text, media_type="text/markdown")

@@ -1,0 +1,1 @@
+"""The arm as mathematics: model, batched chain, Jacobians, static wrenches."""

@@ -1,0 +1,55 @@
+"""The arm: constant link transforms, joint axes along z, masses and limits."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilcal.types import Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Arm:
+    """A serial arm of n revolute joints.
+
+    The chain from base to flange is
+
+        T_base_flange(q) = L_0 Rz(q_1) L_1 Rz(q_2) ... Rz(q_n) L_n
+
+    with constant rigid transforms L_k. *Slot* k (k = 0..n) is the frame right after L_k:
+    for k < n its origin is a point of the axis of joint k + 1 and its z is that axis;
+    slot n is the flange. Body i (i = 1..n) is what joint i moves; its frame is slot i - 1
+    turned by joint i.
+
+    Attributes:
+        name: catalogue name or file stem.
+        links: (n + 1, 4, 4) transforms L_k, lengths in m.
+        masses: (n,) masses of the bodies, kg.
+        coms: (n, 3) centres of mass in the body frames (after the joint's rotation), m.
+        q_min: (n,) lower joint limits, rad.
+        q_max: (n,) upper joint limits, rad.
+        torque_max: (n,) joint torque limits, N·m.
+        payload: rated payload, kg.
+        joint_names: (n,) names.
+        source: where the figures come from.
+    """
+
+    name: str
+    links: Floats
+    masses: Floats
+    coms: Floats
+    q_min: Floats
+    q_max: Floats
+    torque_max: Floats
+    payload: float
+    joint_names: tuple[str, ...]
+    source: str
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return len(self.masses)
+
+    @property
+    def reach(self) -> float:
+        """Sum of the lengths of all link transforms, m."""
+        return float(np.linalg.norm(self.links[:, :3, 3], axis=1).sum())

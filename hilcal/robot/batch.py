@@ -1,0 +1,68 @@
+"""Batches of N states: their layout in memory, and the chunks they are worked off in.
+
+Arrays (N, ...) are kept in Fortran order: shapes name the states first, and memory runs along
+them. Every elementwise operation and every `einsum` then works on long contiguous vectors,
+however small the matrices are that a formula is written in; numpy hands the order on by
+itself, only new arrays have to be made with it. Chunks keep temporaries in the processor's
+cache.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import Field, fields, replace
+from typing import Any, ClassVar, Protocol, TypeVar
+
+import numpy as np
+
+from hilcal.types import Floats
+
+CHUNK = 8192
+
+
+class Record(Protocol):
+    """A dataclass whose fields are arrays over the states, or None."""
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+
+R = TypeVar("R", bound=Record)
+
+
+def empty(*shape: int) -> Floats:
+    """Return a new array (N, ...) whose memory runs along the states."""
+    return np.empty(shape, order="F")
+
+
+def zeros(*shape: int) -> Floats:
+    """Return a new array (N, ...) of zeros whose memory runs along the states."""
+    return np.zeros(shape, order="F")
+
+
+def along_states(x: Floats) -> Floats:
+    """Return x (N, ...) with memory along the states: itself, or a copy."""
+    return np.asfortranarray(x)
+
+
+def chunks(count: int) -> Iterator[slice]:
+    """Yield slices that cover `count` states; one empty slice where there is none."""
+    for start in range(0, max(count, 1), CHUNK):
+        yield slice(start, min(start + CHUNK, count))
+
+
+def take(record: R, rows: slice, axis: int = 0) -> R:
+    """Return the chosen states of a record whose arrays have the states on `axis`."""
+    index = (*(slice(None),) * axis, rows)
+    return by_field([record], lambda given: given[0][index])
+
+
+def join(records: Sequence[R], axis: int = 0) -> R:
+    """Put the records of successive chunks of states together."""
+    return by_field(records, lambda given: np.concatenate(given, axis=axis))
+
+
+def by_field(records: Sequence[R], combine: Callable[[Sequence[Floats]], Floats]) -> R:
+    """Combine records field by field, leaving out what is None."""
+    combined = {}
+    for f in fields(records[0]):
+        given = [a for record in records if (a := getattr(record, f.name)) is not None]
+        combined[f.name] = combine(given) if given else None
+    return replace(records[0], **combined)

@@ -1,0 +1,63 @@
+"""The arms that come with the program, and the way to load any other."""
+
+from pathlib import Path
+
+from hilcal.errors import InputError
+from hilcal.robot.arm import Arm
+from hilcal.robot.dh import arm_from_dh
+from hilcal.robot.urdf import arm_from_urdf
+from hilcal.toml import suggest
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+
+def configs_dir() -> Path:
+    """Return the directory of the configurations that come with the program.
+
+    It is `hilcal/configs` in an installed wheel, and `configs` beside the package in a
+    checkout or an editable installation.
+    """
+    inside = _PACKAGE / "configs"
+    return inside if inside.is_dir() else _PACKAGE.parent / "configs"
+
+
+def robot_names() -> tuple[str, ...]:
+    """Names of the arms in the catalogue."""
+    return tuple(sorted(path.stem for path in (configs_dir() / "robots").glob("*.toml")))
+
+
+def load_arm(
+    model: str,
+    base_dir: Path | None = None,
+    *,
+    base_link: str | None = None,
+    tip_link: str | None = None,
+) -> Arm:
+    """Load an arm by catalogue name, or from a file: `.urdf`, or `.toml` with a DH table.
+
+    Args:
+        model: catalogue name, or a path relative to `base_dir`.
+        base_dir: directory of the cell configuration; the working directory if None.
+        base_link: first link of a URDF's chain.
+        tip_link: last link of a URDF's chain.
+
+    Raises:
+        InputError: unknown name (lists the valid ones), or a file that does not describe a
+            serial arm of revolute joints.
+    """
+    path = (base_dir or Path()) / model
+    suffix = path.suffix.lower()
+    if suffix == ".urdf":
+        return arm_from_urdf(path, base_link, tip_link)
+    for key, value in (("base_link", base_link), ("tip_link", tip_link)):
+        if value is not None:
+            raise InputError(f'{key} = "{value}" is only for a URDF; the robot is "{model}"')
+    if suffix == ".toml":
+        return arm_from_dh(path)
+    names = robot_names()
+    if model not in names:
+        raise InputError(
+            f'unknown robot "{model}"{suggest(model, names)}; '
+            f"valid: {', '.join(names)}, or the path of a .urdf file"
+        )
+    return arm_from_dh(configs_dir() / "robots" / f"{model}.toml")

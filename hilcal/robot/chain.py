@@ -1,0 +1,110 @@
+"""The deviated chain, batched over N states, and what moves its target.
+
+    T_base_flange = L_0 exp(ξ_0) Rz(q_1 + dq_1) L_1 exp(ξ_1) ... Rz(q_n + dq_n) L_n exp(ξ_n)
+
+evaluated exactly; there is no loop over states, only over the n joints.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilcal.robot import se3
+from hilcal.robot.arm import Arm
+from hilcal.robot.batch import along_states, empty
+from hilcal.robot.deviation import Deviation
+from hilcal.types import Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chain:
+    """Frames of the deviated chain in base axes.
+
+    Attributes:
+        rotation: (n + 1, N, 3, 3) orientation of slot k, after its twist.
+        position: (n + 1, N, 3) origin of slot k, after its twist, m.
+        com: (n, N, 3) centre of mass of body i + 1, m.
+        twist: (n + 1, N, 6) the twists that were applied, or None.
+    """
+
+    rotation: Floats
+    position: Floats
+    com: Floats
+    twist: Floats | None
+
+    def point(self, offset: Floats) -> Floats:
+        """Position of a point fixed in flange axes, offset (3,) or (N, 3) -> (N, 3)."""
+        return np.asarray(self.position[-1] + se3.apply(self.rotation[-1], offset))
+
+
+def evaluate(arm: Arm, q: Floats, deviation: Deviation | None = None) -> Chain:
+    """Evaluate the deviated chain at q (N, n); exact, batched."""
+    deviation = deviation or Deviation()
+    angle = along_states(q if deviation.dq is None else q + deviation.dq)
+    twist = deviation.twist
+    if twist is not None:
+        twist = np.swapaxes(along_states(twist), 0, 1)
+    count, n = angle.shape
+    cos, sin = np.cos(angle)[..., None], np.sin(angle)[..., None]
+    rotation = np.moveaxis(empty(count, 3, 3, n + 1), -1, 0)
+    position = np.moveaxis(empty(count, 3, n + 1), -1, 0)
+    com = np.moveaxis(empty(count, 3, n), -1, 0)
+    body, p = empty(count, 3, 3), np.zeros(3)  # the frame that link k starts from
+    body[...] = np.eye(3)
+    for k, link in enumerate(arm.links):
+        r = rotation[k]
+        position[k] = p + se3.apply(body, link[:3, 3])
+        np.einsum("nij,jk->nik", body, link[:3, :3], out=r)
+        if twist is not None and np.any(twist[k]):
+            step_r, step_p = se3.exp(twist[k])
+            position[k] += se3.apply(r, step_p)
+            r[...] = se3.product(r, step_r)
+        p = position[k]
+        if k < n:
+            c, s = cos[:, k], sin[:, k]
+            body[..., 0] = r[..., 0] * c + r[..., 1] * s
+            body[..., 1] = r[..., 1] * c - r[..., 0] * s
+            body[..., 2] = r[..., 2]
+            com[k] = p + se3.apply(body, arm.coms[k])
+    return Chain(rotation, position, com, twist)
+
+
+def joint_jacobian(chain: Chain, x: Floats) -> Floats:
+    """Geometric Jacobian (N, 6, n) of a flange-fixed point now at x (N, 3), base axes.
+
+    Column j is (z_j × (x − p_j), z_j); rows are m/rad and rad/rad.
+    """
+    n = len(chain.com)
+    z = np.swapaxes(chain.rotation[:n, :, :, 2], 0, 1)
+    lever = x[:, None] - np.swapaxes(chain.position[:n], 0, 1)
+    out = empty(len(x), 6, n)
+    out[:, :3] = np.swapaxes(se3.cross(z, lever), 1, 2)
+    out[:, 3:] = np.swapaxes(z, 1, 2)
+    return out
+
+
+def slot_jacobian(chain: Chain, slot: int, x: Floats) -> Floats:
+    """Motion (N, 6, 6) of a flange-fixed point at x (N, 3) per change of the twist of a slot."""
+    twist = None if chain.twist is None else chain.twist[slot]
+    return twist_jacobian(chain.rotation[slot], x - chain.position[slot], twist)
+
+
+def twist_jacobian(r: Floats, lever: Floats, twist: Floats | None) -> Floats:
+    """Motion (N, 6, 6) of a point carried by a frame, per change of the frame's twist.
+
+        (v, ω) = [R, −[l]× R; 0, R] [J(ξ), Q(ξ); 0, J(ξ)] dξ
+
+    with R (N, 3, 3) the frame's orientation after its twist ξ (N, 6), l (N, 3) the lever from
+    its origin to the point, and the blocks J, Q of the right Jacobian (`se3`). v, ω and l are
+    in the axes that R leads to.
+    """
+    out = empty(len(lever), 6, 6)
+    shift: Floats | float = 0.0
+    if twist is not None and np.any(twist):
+        j, q = se3.right_jacobian_blocks(twist)
+        r, shift = se3.product(r, j), se3.product(r, q)
+    out[:, :3, :3] = out[:, 3:, 3:] = r
+    out[:, 3:, :3] = 0.0
+    columns = np.swapaxes(r, 1, 2)
+    out[:, :3, 3:] = np.swapaxes(se3.cross(columns, lever[:, None]), 1, 2) + shift
+    return out

@@ -1,0 +1,102 @@
+"""Arms from classic Denavit-Hartenberg tables."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from hilcal.robot.arm import Arm
+from hilcal.toml import NonNegative, Number, Positive, Section, Vector3, load_section
+from hilcal.types import Floats
+
+_LENGTH = "a finite number in m"
+_ANGLE = "a finite number in degrees"
+
+
+class JointRow(Section):
+    """One joint of a DH table: row i, and the body that joint i moves."""
+
+    name: str = Field(min_length=1, description="a name")
+    a_m: Number = Field(description=_LENGTH)
+    d_m: Number = Field(description=_LENGTH)
+    alpha_deg: Number = Field(description=_ANGLE)
+    offset_deg: Number = Field(0.0, description=_ANGLE)
+    mass_kg: NonNegative = Field(description="a mass in kg, 0 or more")
+    com_m: Vector3 = Field(description="three finite numbers in m, in DH frame i (after row i)")
+    q_min_deg: Number = Field(description=_ANGLE)
+    q_max_deg: Number = Field(description=_ANGLE)
+    torque_max_Nm: Positive = Field(description="a torque in N·m, more than 0")
+
+    @model_validator(mode="after")
+    def _range(self) -> "JointRow":
+        if self.q_min_deg >= self.q_max_deg:
+            raise ValueError(
+                f"q_min_deg = {self.q_min_deg} must be less than q_max_deg = {self.q_max_deg}"
+            )
+        return self
+
+
+class DhTable(Section):
+    """A file of `configs/robots`."""
+
+    title: str = Field(min_length=1, description="the arm's full name")
+    payload_kg: Positive = Field(description="the rated payload in kg, more than 0")
+    weight_kg: Positive | None = Field(
+        None, description="the weight of the whole arm in kg (not used in predictions)"
+    )
+    source: str = Field(min_length=1, description="where the figures come from")
+    joints: tuple[JointRow, ...] = Field(min_length=1, description="sections [[joints]], in order")
+
+
+def arm_from_dh(path: Path) -> Arm:
+    """Read an arm from a DH table in TOML.
+
+    T_base_flange = Π_i Rz(q_i + offset_i) Tz(d_i) Tx(a_i) Rx(alpha_i), hence the constant
+    transforms L_0 = Rz(offset_1), L_i = Tz(d_i) Tx(a_i) Rx(alpha_i) Rz(offset_{i+1}).
+    Centres of mass come in DH frame i; in the body frame they are Tz(d) Tx(a) Rx(alpha) com.
+
+    Raises:
+        InputError: unreadable file, unknown or missing key, bad value.
+    """
+    table = load_section(path, DhTable)
+    rows = table.joints
+    fixed = [_fixed_part(row) for row in rows]
+    offsets = [math.radians(row.offset_deg) for row in rows]
+    coms = [f[:3, :3] @ row.com_m + f[:3, 3] for f, row in zip(fixed, rows, strict=True)]
+    return Arm(
+        name=path.stem,
+        links=_links(fixed, offsets),
+        masses=np.array([row.mass_kg for row in rows]),
+        coms=np.array(coms),
+        q_min=np.radians([row.q_min_deg for row in rows]),
+        q_max=np.radians([row.q_max_deg for row in rows]),
+        torque_max=np.array([row.torque_max_Nm for row in rows]),
+        payload=table.payload_kg,
+        joint_names=tuple(row.name for row in rows),
+        source=table.source,
+    )
+
+
+def _links(fixed: Sequence[Floats], offsets: Sequence[float]) -> Floats:
+    """(n + 1, 4, 4) transforms L_k from the fixed parts of the rows and the joint offsets."""
+    turns = [_rotation_z(offset) for offset in offsets] + [np.eye(4)]
+    return np.array([turns[0], *(part @ turn for part, turn in zip(fixed, turns[1:], strict=True))])
+
+
+def _rotation_z(angle: float) -> Floats:
+    c, s = math.cos(angle), math.sin(angle)
+    turn = np.eye(4)
+    turn[:2, :2] = [[c, -s], [s, c]]
+    return turn
+
+
+def _fixed_part(row: JointRow) -> Floats:
+    """(4, 4) Tz(d) Tx(a) Rx(alpha)."""
+    alpha = math.radians(row.alpha_deg)
+    c, s = math.cos(alpha), math.sin(alpha)
+    part = np.eye(4)
+    part[1:3, 1:3] = [[c, -s], [s, c]]
+    part[:3, 3] = [row.a_m, 0.0, row.d_m]
+    return part

@@ -1,0 +1,197 @@
+"""Rigid displacements, batched: exponential, logarithm, adjoint, right Jacobian.
+
+Twists are (v, ω): translation first. All functions take arrays with any leading shape; the
+memory of new arrays runs along the first axis (see `batch`). With θ = |ω| everything
+follows from b = (1 − cos θ)/θ² and c = (θ − sin θ)/θ³, two functions of θ² without a
+singularity:
+
+    sin θ/θ = 1 − c θ²        cos θ = 1 − b θ²
+
+Source of the closed forms: Lynch and Park, *Modern Robotics*, chapter 3; Barfoot,
+*State Estimation for Robotics*, section 7.1.
+"""
+
+from math import factorial
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hilcal.robot.batch import empty, zeros
+from hilcal.types import Floats
+
+_NEAR = 0.25
+"""θ² below which b and c are summed as series: the closed forms cancel near zero."""
+_TERMS = 8
+_B = np.array([(-1) ** k / factorial(2 * k + 2) for k in range(_TERMS)])
+_C = np.array([(-1) ** k / factorial(2 * k + 3) for k in range(_TERMS)])
+_B_SLOPE, _C_SLOPE = np.polynomial.polynomial.polyder(_B), np.polynomial.polynomial.polyder(_C)
+
+
+def cross(a: Floats, b: Floats) -> Floats:
+    """Cross product a × b over the last axis; (..., 3), broadcast."""
+    a1, a2, a3 = a[..., 0], a[..., 1], a[..., 2]
+    b1, b2, b3 = b[..., 0], b[..., 1], b[..., 2]
+    out = empty(*np.broadcast_shapes(a.shape, b.shape))
+    out[..., 0] = a2 * b3 - a3 * b2
+    out[..., 1] = a3 * b1 - a1 * b3
+    out[..., 2] = a1 * b2 - a2 * b1
+    return out
+
+
+def apply(r: Floats, v: Floats) -> Floats:
+    """Matrices times vectors; (..., 3, 3), (..., 3) -> (..., 3), broadcast."""
+    out = empty(*np.broadcast_shapes(r.shape[:-1], v.shape))
+    return np.asarray(np.einsum("...ij,...j->...i", r, v, out=out))
+
+
+def product(a: Floats, b: Floats) -> Floats:
+    """Matrices times matrices; (..., i, j), (..., j, k) -> (..., i, k), broadcast."""
+    lead = np.broadcast_shapes(a.shape[:-2], b.shape[:-2])
+    out = empty(*lead, a.shape[-2], b.shape[-1])
+    return np.asarray(np.einsum("...ij,...jk->...ik", a, b, out=out))
+
+
+def skew(a: Floats) -> Floats:
+    """Return [a]× with [a]× b = a × b; (..., 3) -> (..., 3, 3)."""
+    s = zeros(*a.shape, 3)
+    s[..., 0, 1], s[..., 0, 2] = -a[..., 2], a[..., 1]
+    s[..., 1, 0], s[..., 1, 2] = a[..., 2], -a[..., 0]
+    s[..., 2, 0], s[..., 2, 1] = -a[..., 1], a[..., 0]
+    return s
+
+
+def rotation(w: Floats) -> Floats:
+    """Rotation matrix exp([ω]×) = cos θ I + sin θ/θ [ω]× + b ω ωᵀ; (..., 3) -> (..., 3, 3)."""
+    t2 = _square(w)
+    b, c = _coefficients(t2)
+    return _combine(1 - b * t2, 1 - c * t2, b, w)
+
+
+def rotation_vector(r: Floats) -> Floats:
+    """Rotation vector of a rotation matrix, angle in [0, π]; (..., 3, 3) -> (..., 3)."""
+    flat = Rotation.from_matrix(r.reshape(-1, 3, 3)).as_rotvec()
+    return np.asarray(flat, dtype=float).reshape(r.shape[:-1])
+
+
+def exp(twist: Floats) -> tuple[Floats, Floats]:
+    """Rotation (..., 3, 3) and translation (..., 3) of exp of a twist (..., 6).
+
+    R = exp([ω]×),  p = v + b ω × v + c ω × (ω × v); pure rotations cost less.
+    """
+    v, w = twist[..., :3], twist[..., 3:]
+    t2 = _square(w)
+    b, c = _coefficients(t2)
+    r = _combine(1 - b * t2, 1 - c * t2, b, w)
+    if not v.any():
+        return r, zeros(*v.shape)
+    turned = cross(w, v)
+    return r, v + b[..., None] * turned + c[..., None] * cross(w, turned)
+
+
+def matrix(r: Floats, p: Floats) -> Floats:
+    """Homogeneous (..., 4, 4) from rotation and translation."""
+    t = np.zeros((*p.shape[:-1], 4, 4))
+    t[..., :3, :3], t[..., :3, 3], t[..., 3, 3] = r, p, 1.0
+    return t
+
+
+def inverse(t: Floats) -> Floats:
+    """Inverse of a homogeneous rigid transform (..., 4, 4)."""
+    r = np.swapaxes(t[..., :3, :3], -1, -2)
+    return matrix(r, -(r @ t[..., :3, 3, None])[..., 0])
+
+
+def adjoint(r: Floats, p: Floats) -> Floats:
+    """Ad with Ad ξ the twist in the outer frame of ξ in the inner one; (..., 6, 6)."""
+    ad = np.zeros((*p.shape[:-1], 6, 6))
+    ad[..., :3, :3] = r
+    ad[..., 3:, 3:] = r
+    ad[..., :3, 3:] = skew(p) @ r
+    return ad
+
+
+def right_jacobian(twist: Floats) -> Floats:
+    """J_r with exp(ξ + δ) = exp(ξ) exp(J_r(ξ) δ) to first order; (..., 6) -> (..., 6, 6).
+
+    J_r = [J, Q; 0, J] with the blocks of `right_jacobian_blocks`.
+    """
+    j, q = right_jacobian_blocks(twist)
+    out = np.zeros((*twist.shape[:-1], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = j
+    out[..., :3, 3:] = q
+    return out
+
+
+def right_jacobian_blocks(twist: Floats) -> tuple[Floats, Floats]:
+    """Blocks J(ω) and Q(v, ω) of the right Jacobian, both (..., 3, 3).
+
+        J = (1 − c θ²) I − b [ω]× + c ω ωᵀ
+        Q = dJ(ω + ε v)/dε = −b [v]× + c (v ωᵀ + ω vᵀ) − 2 c d I
+                             + 2 d (−b' [ω]× + c' (ω ωᵀ − θ² I)),   d = ω · v
+
+    with b', c' the slopes of b and c over θ². Q is the slope of J along v because a twist is
+    the dual number ω + ε v and J an analytic function of it.
+    """
+    v, w = twist[..., :3], twist[..., 3:]
+    t2 = _square(w)
+    b, c = _coefficients(t2)
+    j = _combine(1 - c * t2, -b, c, w)
+    if not v.any():
+        return j, zeros(*j.shape)
+    b_slope, c_slope = _slopes(t2, b, c)
+    twice = 2 * np.sum(v * w, axis=-1)
+    q = _combine(-twice * (c + c_slope * t2), -twice * b_slope, twice * c_slope, w)
+    q -= b[..., None, None] * skew(v)
+    cv = c[..., None] * v
+    q += cv[..., :, None] * w[..., None, :]
+    q += w[..., :, None] * cv[..., None, :]
+    return j, q
+
+
+def _square(w: Floats) -> Floats:
+    """Squared length over the last axis."""
+    return np.asarray(np.sum(w * w, axis=-1))
+
+
+def _combine(i: Floats, k: Floats, s: Floats, w: Floats) -> Floats:
+    """Return i I + k [ω]× + s ω ωᵀ; coefficients (...), ω (..., 3) -> (..., 3, 3)."""
+    out = empty(*w.shape, 3)
+    sw, kw = s[..., None] * w, k[..., None] * w
+    for row in range(3):
+        right, left = (row + 1) % 3, (row + 2) % 3
+        out[..., row, row] = i + sw[..., row] * w[..., row]
+        out[..., row, right] = sw[..., row] * w[..., right] - kw[..., left]
+        out[..., row, left] = sw[..., row] * w[..., left] + kw[..., right]
+    return out
+
+
+def _coefficients(t2: Floats) -> tuple[Floats, Floats]:
+    """Return b and c as functions of θ²."""
+    near = t2 < _NEAR
+    if near.all():
+        return _series(_B, t2), _series(_C, t2)
+    far = np.where(near, 1.0, t2)
+    t = np.sqrt(far)
+    b, c = (1 - np.cos(t)) / far, (t - np.sin(t)) / (far * t)
+    t2 = np.where(near, t2, 0.0)
+    return np.where(near, _series(_B, t2), b), np.where(near, _series(_C, t2), c)
+
+
+def _slopes(t2: Floats, b: Floats, c: Floats) -> tuple[Floats, Floats]:
+    """Return db/dθ² and dc/dθ²."""
+    near = t2 < _NEAR
+    far = np.where(near, 1.0, 2 * t2)
+    b_slope, c_slope = (1 - c * t2 - 2 * b) / far, (b - 3 * c) / far
+    t2 = np.where(near, t2, 0.0)
+    return (
+        np.where(near, _series(_B_SLOPE, t2), b_slope),
+        np.where(near, _series(_C_SLOPE, t2), c_slope),
+    )
+
+
+def _series(coefficients: Floats, t2: Floats) -> Floats:
+    """Power series in θ², as far as its terms show in double precision."""
+    largest = t2.max(initial=0.0)
+    terms = np.abs(coefficients) * largest ** np.arange(len(coefficients))
+    kept = max(int(np.count_nonzero(terms > 1e-18)), 1)
+    return np.asarray(np.polynomial.polynomial.polyval(t2, coefficients[:kept], tensor=False))

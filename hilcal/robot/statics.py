@@ -1,0 +1,75 @@
+"""Static wrenches that load and weight transmit through each slot of the deviated arm."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilcal.robot import se3
+from hilcal.robot.arm import Arm
+from hilcal.robot.batch import empty
+from hilcal.robot.chain import Chain
+from hilcal.types import Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Load:
+    """What pulls at the arm beside its own weight.
+
+    Attributes:
+        wrench: (N, 6) force and moment on the tool at the load point, base axes, N, N·m.
+        point: (3,) or (N, 3) load point, flange axes, m.
+        tool_mass: mass carried permanently, kg.
+        tool_com: (3,) its centre of mass, flange axes, m.
+        gravity: (3,) acceleration, base axes, m/s².
+    """
+
+    wrench: Floats
+    point: Floats
+    tool_mass: float
+    tool_com: Floats
+    gravity: Floats
+
+
+def slot_wrenches(arm: Arm, chain: Chain, load: Load) -> Floats:
+    """Wrench (N, n + 1, 6) of everything beyond slot k, at its origin, in its axes.
+
+        f_k = f_{k+1} + m_{k+1} g
+        t_k = t_{k+1} + (p_{k+1} − p_k) × f_{k+1} + (c_{k+1} − p_k) × m_{k+1} g
+
+    at the configuration of `chain`. Element (k, 5) for k < n is the static torque τ_{k+1}
+    that load and weight exert about the axis of joint k + 1.
+    """
+    n, count = arm.n, len(load.wrench)
+    flange = chain.position[n]
+    force, weight = load.wrench[:, :3], load.tool_mass * load.gravity
+    f = force + weight
+    t = load.wrench[:, 3:] + se3.cross(chain.point(load.point) - flange, force)
+    t = t + se3.cross(chain.point(load.tool_com) - flange, weight)
+    out = empty(count, n + 1, 6)
+    for k in range(n, -1, -1):
+        if k < n:
+            weight = arm.masses[k] * load.gravity
+            t += se3.cross(chain.position[k + 1] - chain.position[k], f)
+            t += se3.cross(chain.com[k] - chain.position[k], weight)
+            f += weight
+        np.einsum("nji,nj->ni", chain.rotation[k], f, out=out[:, k, :3])
+        np.einsum("nji,nj->ni", chain.rotation[k], t, out=out[:, k, 3:])
+    return out
+
+
+def slot_wrench_change(chain: Chain, force: Floats, moment: Floats) -> Floats:
+    """Change (N, P, n + 1, 6) of the slot wrenches by changes of the wrench at the flange.
+
+    Args:
+        chain: the deviated chain.
+        force: (N, P, 3) change of the force, base axes, N.
+        moment: (N, P, 3) change of the moment about the flange's origin, base axes, N·m.
+    """
+    slots, count = chain.position.shape[:2]
+    out = empty(count, force.shape[1], slots, 6)
+    for k in range(slots):
+        lever = (chain.position[-1] - chain.position[k])[:, None, :]
+        t = moment + se3.cross(lever, force)
+        np.einsum("nji,npj->npi", chain.rotation[k], force, out=out[:, :, k, :3])
+        np.einsum("nji,npj->npi", chain.rotation[k], t, out=out[:, :, k, 3:])
+    return out

@@ -1,0 +1,181 @@
+"""Arms from URDF files: any serial chain of revolute joints about arbitrary axes."""
+
+import math
+import os
+import re
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO
+from xml.parsers import expat
+
+import numpy as np
+import pinocchio as pin
+
+from hilcal.errors import InputError
+from hilcal.robot.arm import Arm
+from hilcal.toml import suggest
+from hilcal.types import Floats
+
+_WHOLE_TURN = 2.0 * math.pi
+
+
+def arm_from_urdf(path: Path, base_link: str | None = None, tip_link: str | None = None) -> Arm:
+    """Read the arm between two links of a URDF.
+
+    With M_k the placement of joint k in its predecessor and R_k a rotation that takes z to
+    the joint's axis, the constant transforms are L_0 = T_base_root M_1 R_1,
+    L_k = R_kᵀ M_{k+1} R_{k+1} and L_n = R_nᵀ M_tip. Masses rigidly attached to a moving link
+    are merged into it; joints outside the chain (fingers of a gripper) are held at zero.
+    A continuous joint gets the range ±2π; an effort of 0 means unknown (infinite); a URDF
+    names no payload (infinite).
+
+    Args:
+        path: the file.
+        base_link: link whose frame is the base; the root link if None.
+        tip_link: link whose frame is the flange; the only leaf link if None.
+
+    Raises:
+        InputError: no file, not a URDF, unknown link, a branching chain without `tip_link`
+            (lists the leaf links), or a joint that is not revolute.
+    """
+    model = _read(path)
+    names = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
+    base, tip = base_link or names[0], tip_link or _only_leaf(model, path)
+    for key, name in (("base_link", base), ("tip_link", tip)):
+        if name not in names:
+            raise InputError(
+                f'{path.name}: {key} = "{name}" is no link{suggest(name, names)}; '
+                f"valid: {', '.join(names)}"
+            )
+    chain = _chain(model, base, tip, path)
+    others = [joint for joint in range(1, model.njoints) if joint not in chain]
+    reduced = pin.buildReducedModel(model, others, pin.neutral(model))
+    return _arm(reduced, _link(reduced, base).placement, _link(reduced, tip).placement, path)
+
+
+def _arm(model: pin.Model, base: pin.SE3, tip: pin.SE3, path: Path) -> Arm:
+    """Turn the frames of a model whose joints are just the chain so that z is the axis."""
+    joints = range(1, model.njoints)
+    turns = [_z_to(_axis(model, joint)[3:]) for joint in joints]
+    coms = [
+        turn[:3, :3].T @ model.inertias[joint].lever
+        for turn, joint in zip(turns, joints, strict=True)
+    ]
+    before = [base.inverse().homogeneous, *(turn.T for turn in turns)]
+    placements = [*(model.jointPlacements[joint].homogeneous for joint in joints), tip.homogeneous]
+    after = [*turns, np.eye(4)]
+    lower, upper, effort = zip(*(_limits(model, joint) for joint in joints), strict=True)
+    return Arm(
+        name=path.stem,
+        links=np.array([b @ m @ a for b, m, a in zip(before, placements, after, strict=True)]),
+        masses=np.array([model.inertias[joint].mass for joint in joints]),
+        coms=np.array(coms),
+        q_min=np.array(lower),
+        q_max=np.array(upper),
+        torque_max=np.array(effort),
+        payload=math.inf,
+        joint_names=tuple(model.names[joint] for joint in joints),
+        source=f"URDF {path.name}",
+    )
+
+
+def _limits(model: pin.Model, joint: int) -> tuple[float, float, float]:
+    """Lower and upper limit in rad, and effort in N·m."""
+    kind = model.joints[joint]
+    effort = float(model.upperEffortLimit[kind.idx_v]) or math.inf
+    if kind.nq != 1:  # continuous: Pinocchio keeps cosine and sine
+        return -_WHOLE_TURN, _WHOLE_TURN, effort
+    lower, upper = model.lowerPositionLimit[kind.idx_q], model.upperPositionLimit[kind.idx_q]
+    return float(lower), float(upper), effort
+
+
+def _axis(model: pin.Model, joint: int) -> Floats:
+    """(6,) unit twist of a joint of one degree of freedom, in its own frame."""
+    data = model.createData()
+    pin.computeJointJacobians(model, data, pin.neutral(model))
+    jacobian = pin.getJointJacobian(model, data, joint, pin.ReferenceFrame.LOCAL)
+    return np.asarray(jacobian[:, model.joints[joint].idx_v], dtype=np.float64)
+
+
+def _z_to(axis: Floats) -> Floats:
+    """(4, 4) the smallest rotation that takes z to a unit axis."""
+    turn = np.eye(4)
+    turn[:3, :3] = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), axis).matrix()
+    return turn
+
+
+def _chain(model: pin.Model, base: str, tip: str, path: Path) -> list[int]:
+    """Joints between two links, all of them revolute."""
+    start, joint = _link(model, base).parentJoint, _link(model, tip).parentJoint
+    chain: list[int] = []
+    while joint not in (start, 0):
+        chain.insert(0, joint)
+        joint = model.parents[joint]
+    if joint != start or not chain:
+        raise InputError(
+            f'{path.name}: no moving joint leads from link "{base}" to link "{tip}"; '
+            "set base_link and tip_link to the two ends of the arm"
+        )
+    for joint in chain:
+        if model.joints[joint].nv != 1 or np.any(_axis(model, joint)[:3]):
+            raise InputError(
+                f'{path.name}: joint "{model.names[joint]}" is not revolute; '
+                "every moving joint of the arm must be revolute or continuous"
+            )
+    return chain
+
+
+def _link(model: pin.Model, name: str) -> pin.Frame:
+    return model.frames[model.getFrameId(name, pin.FrameType.BODY)]
+
+
+def _only_leaf(model: pin.Model, path: Path) -> str:
+    """Name of the only moving link that nothing is attached to."""
+    parents = {frame.parentFrame for frame in model.frames}
+    leaves = [
+        str(frame.name)
+        for i, frame in enumerate(model.frames)
+        if i not in parents and frame.parentJoint != 0
+    ]
+    if not leaves:
+        raise InputError(f"{path.name}: no moving joint; expected an arm of revolute joints")
+    if len(leaves) > 1:
+        raise InputError(
+            f"{path.name}: the chain branches; set tip_link to one of its leaf links "
+            f"({', '.join(leaves)}) or to a link before them"
+        )
+    return leaves[0]
+
+
+def _read(path: Path) -> pin.Model:
+    try:
+        expat.ParserCreate().Parse(path.read_bytes(), True)
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}; expected a URDF file") from None
+    except expat.ExpatError as error:
+        raise InputError(f"{path.name}: not XML: {error}; expected a URDF file") from None
+    with _captured_stderr() as log:
+        try:
+            return pin.buildModelFromUrdf(str(path))
+        except (ValueError, RuntimeError, IndexError) as error:
+            log.seek(0)
+            reasons = re.findall(r"Error:\s*(.+)", log.read())
+            reason = reasons[0].strip() if reasons else " ".join(str(error).split())
+    raise InputError(f"{path.name}: not a valid URDF: {reason}")
+
+
+@contextmanager
+def _captured_stderr() -> Iterator[IO[str]]:
+    """Keep what the C++ parser writes to file descriptor 2, to put it into one message."""
+    sys.stderr.flush()
+    saved = os.dup(2)
+    with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as log:
+        os.dup2(log.fileno(), 2)
+        try:
+            yield log
+        finally:
+            os.dup2(saved, 2)
+            os.close(saved)

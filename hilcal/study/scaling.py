@@ -1,0 +1,246 @@
+"""What `none`, `gu` and `gc` do to the same data, by Monte-Carlo.
+
+The whitening of `hilcal.data.whitening` is applied to simulated readings of an arm under known
+loads. The noise is drawn per reading; deflections are formed as in a campaign, loaded minus
+unloaded; errors of the estimates are set against the Cramér–Rao bound, and the stated 95 %
+intervals are counted.
+"""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from scipy import stats
+from scipy.linalg import solve_triangular
+
+from hilcal.data.whitening import SCALINGS, Scaling, Whitening, whitening
+from hilcal.errors import InputError
+from hilcal.robot.arm import Arm
+from hilcal.robot.catalogue import load_arm
+from hilcal.study.scaling_design import Design, bound, make_design, make_readings
+from hilcal.types import Floats
+
+LEVEL = 0.95
+CORRELATIONS = (0.0, 0.3, 0.6, 0.9, 0.99)
+# Name, and what a length in m and an angle in rad are multiplied by.
+UNITS: tuple[tuple[str, float, float], ...] = (
+    ("m, rad", 1.0, 1.0),
+    ("mm, rad", 1e3, 1.0),
+    ("m, mrad", 1.0, 1e3),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class StudyCell:
+    """One scaling of one experiment; `_mc` are standard uncertainties of the Monte-Carlo.
+
+    Attributes:
+        scaling: "none", "gu" or "gc".
+        correlation: share ρ of each element's variance that is common to the elements.
+        unit: units that the deflections were written in.
+        shared_unloaded: whether the loads of a pose share one unloaded reading.
+        error_over_bound: root mean square over runs and parameters of the error of a parameter
+            in units of its bound, sqrt(F⁻¹_jj); 1 where the bound is attained.
+        error_over_bound_mc: of it.
+        coverage: share of the stated 95 % intervals that hold the true parameter.
+        coverage_mc: of it.
+        variance_factor: mean χ²/dof of the whitened residual; None for `none`, where it has
+            no meaning.
+        parameter_error_over_bound: (n,) the same per parameter.
+        parameter_coverage: (n,) the same per parameter.
+        unit_shift: largest change of any estimate in any run against the first unit, in
+            units of the bound.
+    """
+
+    scaling: Scaling
+    correlation: float
+    unit: str
+    shared_unloaded: bool
+    error_over_bound: float
+    error_over_bound_mc: float
+    coverage: float
+    coverage_mc: float
+    variance_factor: float | None
+    parameter_error_over_bound: tuple[float, ...]
+    parameter_coverage: tuple[float, ...]
+    unit_shift: float
+
+
+@dataclass(frozen=True, slots=True)
+class ScalingStudy:
+    """The study's cells and what they were made of.
+
+    Attributes:
+        arm: name of the arm.
+        runs: Monte-Carlo runs per cell.
+        poses: number of poses.
+        loads: wrenches per pose.
+        typical_correlation: the ρ whose mean square correlation is that of the arm and the
+            tracker as specified.
+        cells: every scaling, correlation, unit and way of sharing the unloaded reading.
+    """
+
+    arm: str
+    runs: int
+    poses: int
+    loads: int
+    typical_correlation: float
+    cells: tuple[StudyCell, ...]
+
+    def of(self, scaling: Scaling, unit: str, shared_unloaded: bool) -> tuple[StudyCell, ...]:
+        """Cells of one curve, by growing correlation."""
+        key = (scaling, unit, shared_unloaded)
+        found = [c for c in self.cells if (c.scaling, c.unit, c.shared_unloaded) == key]
+        return tuple(sorted(found, key=lambda c: c.correlation))
+
+    def to_json(self) -> dict[str, object]:
+        """Return the study as plain values, with a summary per scaling."""
+        summary = {}
+        for scaling in SCALINGS:
+            mine = [c for c in self.cells if c.scaling == scaling]
+            summary[scaling] = {
+                "error_over_bound_min": min(c.error_over_bound for c in mine),
+                "error_over_bound_max": max(c.error_over_bound for c in mine),
+                "coverage_min": min(c.coverage for c in mine),
+                "coverage_max": max(c.coverage for c in mine),
+                "unit_shift_max": max(c.unit_shift for c in mine),
+            }
+        return asdict(self) | {"level": LEVEL, "summary": summary}
+
+
+def scaling_study(
+    rng: np.random.Generator,
+    runs: int = 2000,
+    correlations: Sequence[float] = CORRELATIONS,
+    *,
+    arm: Arm | None = None,
+    poses: int = 30,
+) -> ScalingStudy:
+    """Simulate the identification of joint compliances with every scaling.
+
+    Args:
+        rng: source of poses and noise.
+        runs: Monte-Carlo runs; all scalings and units see the same noise.
+        correlations: shares ρ of variance that the six elements have in common, each in [0, 1).
+        arm: the arm; None for the UR10e.
+        poses: number of random feasible poses.
+
+    Raises:
+        InputError: fewer than 2 runs or poses, no correlation, or one outside [0, 1).
+        CannotAnswerError: the arm cannot hold the wrenches in so many poses.
+    """
+    if runs < 2:
+        raise InputError(f"runs = {runs}: a Monte-Carlo study needs 2 or more")
+    if poses < 2:
+        raise InputError(f"poses = {poses}: the regression needs 2 or more")
+    if not len(correlations):
+        raise InputError("correlations: none given; give one or more in [0, 1)")
+    for rho in correlations:
+        if not 0 <= rho < 1:
+            raise InputError(f"correlation {rho:g}: must be in [0, 1)")
+    design = make_design(rng, arm or load_arm("ur10e"), poses)
+    cells = [
+        cell
+        for shared in (False, True)
+        for rho in correlations
+        for cell in _experiment(rng, design, float(rho), shared, runs)
+    ]
+    return ScalingStudy(
+        arm=design.arm.name,
+        runs=runs,
+        poses=poses,
+        loads=len(design.wrenches),
+        typical_correlation=_off_diagonal(design.specified) / _off_diagonal(design.common),
+        cells=tuple(cells),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fit:
+    """Errors of all runs (n, R), half widths of their intervals, mean χ²/dof."""
+
+    error: Floats
+    half_width: Floats
+    variance_factor: float | None
+
+
+def _experiment(
+    rng: np.random.Generator, design: Design, rho: float, shared: bool, runs: int
+) -> list[StudyCell]:
+    """All scalings and units on the same noise."""
+    covariance = design.covariance(rho)
+    limit = np.sqrt(np.diagonal(bound(design, covariance, shared)))[:, None]
+    readings = make_readings(design, covariance, shared)
+    noise = np.linalg.cholesky(covariance)[readings.pose] @ rng.standard_normal(
+        (len(readings), 6, runs)
+    )
+    cells = []
+    for scaling in SCALINGS:
+        first: Floats | None = None
+        for unit, length, angle in UNITS:
+            u = np.array([length] * 3 + [angle] * 3)
+            scaled = make_readings(design, u[:, None] * covariance * u, shared)
+            w = whitening(scaled, "deflection", scaling)
+            # Row 0 of the loads is "none", so measurement d belongs to wrench load - 1.
+            blocks = design.observation[scaled.pose[w.reading], scaled.load[w.reading] - 1]
+            fit = _fit(w, u[:, None] * blocks, w.raw(u[:, None] * noise))
+            first = fit.error if first is None else first
+            shift = float(np.abs((fit.error - first) / limit).max())
+            cells.append(_cell(fit, limit, scaling, rho, unit, shared, shift))
+    return cells
+
+
+def _fit(w: Whitening, blocks: Floats, noise: Floats) -> _Fit:
+    """Least squares of the scaled regression for all runs at once.
+
+    Args:
+        w: the scaling, D measurements of 6 elements.
+        blocks: (D, 6, n) observation matrix.
+        noise: (D, 6, R) errors of the deflections.
+    """
+    a = w.whiten(blocks).reshape(-1, blocks.shape[-1])
+    e = w.whiten(noise).reshape(-1, noise.shape[-1])
+    q, r = np.linalg.qr(a)
+    projected = q.T @ e
+    error = solve_triangular(r, projected)
+    spread = np.linalg.norm(solve_triangular(r, np.eye(len(r))), axis=1)[:, None]
+    dof = w.rank - len(r)
+    factor = (np.sum(e * e, axis=0) - np.sum(projected * projected, axis=0)) / dof
+    if w.scaling == "none":  # no noise is stated: the residual's own variance
+        half = stats.t.ppf((1 + LEVEL) / 2, dof) * spread * np.sqrt(factor)
+        return _Fit(error, half, None)
+    half = np.broadcast_to(stats.norm.ppf((1 + LEVEL) / 2) * spread, error.shape)
+    return _Fit(error, half, float(factor.mean()))
+
+
+def _cell(
+    fit: _Fit, limit: Floats, scaling: Scaling, rho: float, unit: str, shared: bool, shift: float
+) -> StudyCell:
+    """Figures of one cell, with the Monte-Carlo's own uncertainty from the runs' spread."""
+    square = (fit.error / limit) ** 2
+    per_run = square.mean(axis=0)
+    rms = float(np.sqrt(per_run.mean()))
+    inside = np.abs(fit.error) <= fit.half_width
+    inside_run = inside.mean(axis=0)
+    root = np.sqrt(len(per_run))
+    return StudyCell(
+        scaling=scaling,
+        correlation=rho,
+        unit=unit,
+        shared_unloaded=shared,
+        error_over_bound=rms,
+        error_over_bound_mc=float(per_run.std(ddof=1) / root / (2 * rms)),
+        coverage=float(inside_run.mean()),
+        coverage_mc=float(inside_run.std(ddof=1) / root),
+        variance_factor=fit.variance_factor,
+        parameter_error_over_bound=tuple(np.sqrt(square.mean(axis=1)).tolist()),
+        parameter_coverage=tuple(inside.mean(axis=1).tolist()),
+        unit_shift=shift,
+    )
+
+
+def _off_diagonal(correlation: Floats) -> float:
+    """Root mean square of the correlations between different elements."""
+    k = correlation.shape[-1]
+    off = correlation[..., ~np.eye(k, dtype=bool)]
+    return float(np.sqrt(np.mean(off**2)))

@@ -1,0 +1,163 @@
+"""Reading TOML into checked sections, with one clear line for whatever is wrong."""
+
+import difflib
+import json
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError
+from pydantic.fields import FieldInfo
+
+from hilcal.errors import InputError
+
+Number = Annotated[float, Strict()]
+NonNegative = Annotated[float, Strict(), Field(ge=0)]
+Positive = Annotated[float, Strict(), Field(gt=0)]
+Vector3 = tuple[Number, Number, Number]
+
+
+class Section(BaseModel):
+    """One section of a file: immutable, finite numbers only, unknown keys refused.
+
+    The description of a field says what is valid; it completes "it must be ...".
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+S = TypeVar("S", bound=Section)
+
+
+def load_section(path: Path, section: type[S]) -> S:
+    """Read a TOML file as `section`.
+
+    Raises:
+        InputError: unreadable file, syntax error (names the line), unknown key, bad value.
+    """
+    return check_section(read_toml(path), section, path.name)
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Read a TOML file as a dictionary.
+
+    Raises:
+        InputError: unreadable file, not UTF-8, or a syntax error (names the line).
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; expected a TOML file") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not UTF-8 text (byte {error.start}); expected TOML") from None
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        where = f"(at line {max(1, len(text.splitlines()))}, end of document)"
+        message = str(error).replace("(at end of document)", where)
+        raise InputError(f"{path.name}: TOML syntax error: {message}") from None
+
+
+def check_section(data: object, section: type[S], where: str) -> S:
+    """Check a dictionary against `section`; `where` names its origin in messages.
+
+    Raises:
+        InputError: unknown key (lists the valid ones), missing key or bad value.
+    """
+    try:
+        return section.model_validate(data)
+    except ValidationError as error:
+        raise InputError(f"{where}: {_message(error, section)}") from None
+
+
+def check_json(text: str, section: type[S], where: str) -> S:
+    """Check a JSON document against `section`.
+
+    Raises:
+        InputError: not JSON, unknown key, missing key or bad value.
+    """
+    try:
+        data = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise InputError(f"{where}: not JSON: {error.msg} (line {error.lineno})") from None
+    return check_section(data, section, where)
+
+
+def suggest(name: str, valid: Sequence[str]) -> str:
+    """Return ' (did you mean "x"?)' for a name close to a valid one, else nothing."""
+    close = difflib.get_close_matches(name, valid, n=1)
+    return f' (did you mean "{close[0]}"?)' if close else ""
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """Where an error is: `[tool]` or nothing, its class, the field and the vector's element."""
+
+    words: str
+    section: type[Section]
+    key: str = ""
+    field: FieldInfo | None = None
+    element: int | None = None
+
+
+def _message(error: ValidationError, root: type[Section]) -> str:
+    """One line for the gravest error: unknown keys first, since they explain missing ones."""
+    first = min(error.errors(include_url=False), key=lambda e: e["type"] != "extra_forbidden")
+    kind = first["type"]
+    place = _locate(root, first["loc"], inside=kind in ("value_error", "extra_forbidden"))
+    if kind == "extra_forbidden":
+        unknown, valid = str(first["loc"][-1]), list(place.section.model_fields)
+        thing = "key" if place.words else "section or key"
+        return (
+            f'{place.words or "the file"} has no {thing} "{unknown}"{suggest(unknown, valid)}; '
+            f"valid here: {', '.join(valid)}"
+        )
+    must = place.field.description if place.field is not None else None
+    must = f"it must be {must}" if must else first["msg"]
+    if kind == "value_error":
+        return f"{place.words} {first['ctx']['error']}".strip()
+    if kind == "missing" and place.element is None:
+        return f'{place.words or "the file"} lacks "{place.key}": {must}'
+    whole = place.element is None or kind == "missing"
+    element = "" if whole else f", element {place.element}"
+    value = _show(first["input"])
+    return f"{place.words} {place.key}{element} = {value} is not valid: {must}".strip()
+
+
+def _locate(root: type[Section], loc: tuple[int | str, ...], *, inside: bool) -> _Place:
+    """Follow an error's location through the sections to the key."""
+    place = _Place("", root)
+    for i, part in enumerate(loc):
+        if isinstance(part, int):  # of an array of sections
+            place = replace(place, words=f"[{place.words}] number {part + 1}")
+            continue
+        field = place.section.model_fields.get(part)
+        inner = _section_of(field)
+        if inner is None:
+            numbers = [p + 1 for p in loc[i + 1 :] if isinstance(p, int)]
+            return replace(place, key=part, field=field, element=next(iter(numbers), None))
+        if i == len(loc) - 1 and not inside:  # the section itself is missing or not a section
+            return replace(place, key=part, field=field)
+        place = _Place(f"[{part}]", inner)
+    return place
+
+
+def _section_of(field: FieldInfo | None) -> type[Section] | None:
+    """Return the section class inside a field's annotation, if any."""
+    pending: list[Any] = [] if field is None else [field.annotation]
+    while pending:
+        kind = pending.pop()
+        if isinstance(kind, type) and issubclass(kind, Section):
+            return kind
+        pending.extend(getattr(kind, "__args__", ()))
+    return None
+
+
+def _show(value: object) -> str:
+    """Show a value shortly, on one line."""
+    text = json.dumps(value, default=str)
+    return text if len(text) <= 60 else f"{text[:57]}..."

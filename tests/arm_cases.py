@@ -1,0 +1,81 @@
+"""Arms, states and an independent arithmetic of rigid displacements for the tests of the arm."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import scipy.linalg as sl
+
+from hilcal.cell import STANDARD_GRAVITY, Cell
+from hilcal.robot.arm import Arm
+from hilcal.robot.catalogue import load_arm, robot_names
+from hilcal.types import Floats
+
+ODD = "odd"
+ARMS = (*robot_names(), ODD)
+
+
+def arm_of(name: str) -> Arm:
+    """An arm of the catalogue, or one of seven joints with axes in odd directions."""
+    if name != ODD:
+        return load_arm(name)
+    rng = np.random.default_rng(7)
+    n = 7
+    ends = rng.normal(size=(n + 1, 6)) * [0.3, 0.3, 0.3, 1.5, 1.5, 1.5]
+    return Arm(
+        name=ODD,
+        links=np.array([displacement(end) for end in ends]),
+        masses=rng.uniform(0.5, 8.0, n),
+        coms=rng.normal(size=(n, 3)) * 0.1,
+        q_min=np.full(n, -np.pi),
+        q_max=np.full(n, np.pi),
+        torque_max=np.full(n, 200.0),
+        payload=5.0,
+        joint_names=tuple(f"j{i + 1}" for i in range(n)),
+        source="made up",
+    )
+
+
+def cell_of(arm: Arm, gravity: Sequence[float] | Floats = STANDARD_GRAVITY) -> Cell:
+    """A cell in which nothing is at the origin or aligned."""
+    return Cell(
+        arm=arm,
+        target=displacement([0.05, 0.02, 0.11, 0.4, -0.3, 0.9]),
+        load_point=np.array([0.03, -0.02, 0.12]),
+        tool_mass=1.3,
+        tool_com=np.array([0.01, 0.03, 0.06]),
+        gravity=np.array(gravity),
+        registration=displacement([2.0, -1.0, 0.4, 0.2, -0.1, 2.1]),
+        registration_known=False,
+        target_known=False,
+    )
+
+
+def displacement(twist: Sequence[float] | Floats) -> Floats:
+    """(4, 4) exponential of a twist (v, ω), by the matrix exponential of SciPy."""
+    v, w = np.asarray(twist, dtype=float)[:3], np.asarray(twist, dtype=float)[3:]
+    hat = np.zeros((4, 4))
+    hat[:3, :3] = [[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]]
+    hat[:3, 3] = v
+    return np.asarray(sl.expm(hat))
+
+
+def twisted(arm: Arm, twist: Floats) -> Arm:
+    """The arm whose links end in the twists (n + 1, 6) of one state."""
+    ends = [pin.exp6(pin.Motion(t)).homogeneous for t in twist]
+    return replace(arm, links=arm.links @ np.array(ends))
+
+
+def slots_of(arm: Arm, q: Floats) -> Floats:
+    """(n + 1, 4, 4) slots of one state, by products of homogeneous matrices."""
+    pose, out = arm.links[0], [arm.links[0]]
+    for angle, link in zip(q, arm.links[1:], strict=True):
+        pose = pose @ displacement([0, 0, 0, 0, 0, angle]) @ link
+        out.append(pose)
+    return np.array(out)
+
+
+def slope(f: Callable[[float], Floats], h: float) -> Floats:
+    """Central difference of f at 0, of fourth order."""
+    return (8 * (f(h) - f(-h)) - (f(2 * h) - f(-2 * h))) / (12 * h)

@@ -1,0 +1,186 @@
+"""Cost of one Gauss-Newton step against LAPACK's QR of the same whitened matrix, in one run.
+
+The machine's speed and its other work cancel in the ratio: the two are timed in turn, and the
+shortest times are compared. Nothing is asserted of times; `make bench` prints the ratios and
+stores them in `extra_info`.
+"""
+
+import time
+import tracemalloc
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.linalg as sl
+from arm_cases import arm_of, cell_of
+
+from hilcal.data.readings import Readings, States
+from hilcal.data.whitening import Whitening, whitening
+from hilcal.effects.base_compliance import BaseCompliance
+from hilcal.effects.base_frame import BaseFrame
+from hilcal.effects.encoder_offset import EncoderOffset
+from hilcal.effects.joint_compliance import JointCompliance
+from hilcal.effects.joint_tilt_compliance import JointTiltCompliance
+from hilcal.effects.target_offset import TargetOffset
+from hilcal.identify.gauss_newton import prior_of, scales_of, whitened_jacobian
+from hilcal.identify.linear import find_basis, normal_equations
+from hilcal.identify.residual import residual
+from hilcal.model import Model, Prediction
+from hilcal.types import Floats
+
+pytestmark = pytest.mark.slow
+
+READINGS = 100_000
+SIZES = (25_000, 50_000, READINGS)
+ROUNDS = 5
+EFFECTS = (
+    BaseFrame,
+    TargetOffset,
+    EncoderOffset,
+    JointCompliance,
+    JointTiltCompliance,
+    BaseCompliance,
+)  # 6 + 3 + 6 + 6 + 6 + 3 = 30 parameters
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """Readings of a UR10e of which every fourth is unloaded, and a model of 30 parameters."""
+
+    model: Model
+    readings: Readings
+    theta: Floats
+
+
+def problem_of(count: int) -> Problem:
+    rng = np.random.default_rng(20)
+    cell = cell_of(arm_of("ur10e"))
+    number = np.arange(count)
+    loaded = number % 4 > 0
+    states = States(
+        q=rng.uniform(-np.pi, np.pi, (count, 6)),
+        wrench=rng.normal(size=(count, 6)) * [60, 60, 60, 5, 5, 5] * loaded[:, None],
+    )
+    root = rng.normal(size=(count, 3, 3))
+    readings = Readings(
+        states=states,
+        pose=number // 4,
+        load=loaded.astype(np.int64),
+        cycle=np.zeros(count, dtype=np.int64),
+        value=rng.normal(size=(count, 3)),
+        covariance=4e-10 * (root @ np.swapaxes(root, 1, 2) + np.eye(3)),
+        load_names=("none", "load"),
+        pose_names=tuple(str(i) for i in range(int(number[-1]) // 4 + 1)),
+    )
+    model = Model(cell, tuple(effect(cell, states) for effect in EFFECTS))
+    assert model.size == 30
+    return Problem(model, readings, scales_of(model) * np.abs(rng.normal(size=model.size)))
+
+
+def assemble(p: Problem, prediction: Prediction, w: Whitening) -> Floats:
+    """Whitened Jacobian (3 N, 30)."""
+    return whitened_jacobian(p.model, prediction, p.theta, w, np.arange(p.model.size))
+
+
+def solve(p: Problem, prediction: Prediction, w: Whitening, a: Floats) -> Floats:
+    """Rank analysis, normal equations and solution."""
+    target = w.whiten(residual(p.readings, prediction, w)).reshape(-1) + a @ p.theta
+    basis = find_basis(a, scales_of(p.model), prior_of(p.model)[0])
+    return np.asarray(basis.transform @ normal_equations(a.T @ a, a.T @ target, basis).solve())
+
+
+def step(p: Problem, prediction: Prediction) -> Floats:
+    """What is measured: whitening, assembling and solving."""
+    w = whitening(p.readings, "absolute")
+    return solve(p, prediction, w, assemble(p, prediction, w))
+
+
+def lapack_qr(a: Floats) -> Floats:
+    """LAPACK's QR alone."""
+    return np.asarray(sl.qr(a, mode="r", check_finite=False)[0])
+
+
+def shortest(works: dict[str, Callable[[], object]]) -> dict[str, float]:
+    """Shortest time of each piece of work, s; they are done in turn."""
+    times: dict[str, list[float]] = {name: [] for name in works}
+    for _ in range(ROUNDS):
+        for name, work in works.items():
+            start = time.perf_counter()
+            work()
+            times[name].append(time.perf_counter() - start)
+    return {name: min(seconds) for name, seconds in times.items()}
+
+
+def works_of(p: Problem) -> dict[str, Callable[[], object]]:
+    prediction = p.model.predict(p.readings.states, p.theta)
+    w = whitening(p.readings, "absolute")
+    a = assemble(p, prediction, w)
+    return {
+        "qr": lambda: lapack_qr(a),
+        "whitening": lambda: whitening(p.readings, "absolute"),
+        "jacobian": lambda: p.model.jacobian(prediction, p.theta, 3),
+        "assembling": lambda: assemble(p, prediction, w),
+        "solving": lambda: solve(p, prediction, w, a),
+        "step": lambda: step(p, prediction),
+        "predicting": lambda: p.model.predict(p.readings.states, p.theta),
+    }
+
+
+def test_a_step_against_qr(benchmark: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    """`ratio`: whitening, assembling and solving over LAPACK's QR."""
+    p = problem_of(READINGS)
+    prediction = p.model.predict(p.readings.states, p.theta)
+    seconds = shortest(works_of(p))
+    ratios = {name: s / seconds["qr"] for name, s in seconds.items()}
+    benchmark.extra_info["ratio"] = ratios["step"]
+    benchmark.extra_info["ratios"] = ratios
+    with capsys.disabled():
+        print(f"\n{READINGS} readings x 3 x 30 parameters, times of LAPACK's QR:")
+        print("  " + ", ".join(f"{name} {ratio:.2f}" for name, ratio in ratios.items()))
+        print(f"  ratio {ratios['step']:.2f}")
+    solution = benchmark.pedantic(step, args=(p, prediction), rounds=ROUNDS)
+    assert np.isfinite(solution).all()
+
+
+def test_time_is_linear_in_the_readings(benchmark: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    """Microseconds per reading at growing numbers of readings."""
+    per_reading: dict[str, dict[int, float]] = {"step": {}, "predicting": {}}
+    for count in SIZES:
+        works = works_of(problem_of(count))
+        found = shortest({name: works[name] for name in per_reading})
+        for name, seconds in found.items():
+            per_reading[name][count] = 1e6 * seconds / count
+    benchmark.extra_info["us_per_reading"] = per_reading
+    with capsys.disabled():
+        for name, costs in per_reading.items():
+            print(f"\n{name}, µs per reading: { ({n: round(c, 2) for n, c in costs.items()}) }")
+    p = problem_of(SIZES[0])
+    benchmark.pedantic(p.model.predict, args=(p.readings.states, p.theta), rounds=ROUNDS)
+
+
+def peak_memory(count: int) -> float:
+    """Peak memory of a prediction and a step, bytes."""
+    p = problem_of(count)
+    tracemalloc.start()
+    try:
+        step(p, p.model.predict(p.readings.states, p.theta))
+        return float(tracemalloc.get_traced_memory()[1])
+    finally:
+        tracemalloc.stop()
+
+
+def test_memory_is_linear_in_the_readings(
+    benchmark: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    small, large = SIZES[:2]
+    per_reading = {count: peak_memory(count) / count for count in (small, large)}
+    benchmark.extra_info["bytes_per_reading"] = per_reading
+    with capsys.disabled():
+        print(
+            f"\nbytes per reading at the peak: { ({n: round(b) for n, b in per_reading.items()}) }"
+        )
+    benchmark.pedantic(peak_memory, args=(small,), rounds=1)
+    # twice the readings, twice the memory: (readings)² would show as a factor of 2 here
+    assert per_reading[large] < 1.1 * per_reading[small]

@@ -1,0 +1,27 @@
+"""Fixtures that several test files share."""
+
+import os
+from pathlib import Path
+
+import hypothesis
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+# Shared machines are slow at times: no deadlines, and the same examples on every run.
+hypothesis.settings.register_profile("hilcal", deadline=None, derandomize=True, max_examples=50)
+hypothesis.settings.load_profile("hilcal")
+
+
+def data_dir() -> Path:
+    """Directory of shared data: HILCAL_DATA, or ../shared/data beside the repository."""
+    return Path(os.environ.get("HILCAL_DATA", ROOT.parent / "shared" / "data"))
+
+
+@pytest.fixture(scope="session")
+def ipa_ur10() -> Path:
+    """Directory of the IPA UR10 accuracy series (Series_B, Series_C)."""
+    path = data_dir() / "ipa_ur10"
+    if not path.is_dir():
+        pytest.skip("data set ipa_ur10 is absent: set HILCAL_DATA to the directory that holds it")
+    return path

@@ -1,0 +1,128 @@
+"""An arm and readings for the tests of what goes in and out."""
+
+import numpy as np
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from hilcal.data.readings import Readings, States
+from hilcal.robot.arm import Arm
+from hilcal.types import Floats
+
+STATE_FIELDS = (
+    "q",
+    "wrench",
+    "time",
+    "load_time",
+    "air_temperature",
+    "joint_temperature",
+    "approach",
+    "q_actual",
+)
+
+
+def make_arm(n: int = 6) -> Arm:
+    """An arm of n joints with a reach of n times 0.25 m and limits of ±2π."""
+    links = np.tile(np.eye(4), (n + 1, 1, 1))
+    links[1:, 0, 3] = 0.25
+    return Arm(
+        name="test-arm",
+        links=links,
+        masses=np.ones(n),
+        coms=np.zeros((n, 3)),
+        q_min=np.full(n, -2 * np.pi),
+        q_max=np.full(n, 2 * np.pi),
+        torque_max=np.full(n, 100.0),
+        payload=10.0,
+        joint_names=tuple(f"joint{i}" for i in range(1, n + 1)),
+        source="made up",
+    )
+
+
+def floats(shape: tuple[int, ...], size: float) -> st.SearchStrategy[Floats]:
+    """Arrays of any doubles within ±size."""
+    return arrays(np.float64, shape, elements=st.floats(-size, size, allow_nan=False))
+
+
+names = st.text(st.characters(codec="utf-8"), min_size=1, max_size=8).filter(
+    lambda s: s == s.strip() and s.isprintable() and s.lower() != "none"
+)
+
+
+@st.composite
+def readings(draw: st.DrawFn, n: int = 6) -> Readings:
+    """Readings that a table and a campaign can hold, numbered in order of first appearance."""
+    count = draw(st.integers(1, 5))
+    m = draw(st.sampled_from([3, 6]))
+    pose_names = draw(st.lists(names, min_size=count, max_size=count, unique=True))
+    load_names = ["none", draw(names)]
+    pose = first_seen(draw(st.lists(st.integers(0, count - 1), min_size=count, max_size=count)))
+    load_raw = draw(st.lists(st.integers(0, 1), min_size=count, max_size=count))
+    load = first_seen(load_raw)
+    used = [load_names[k] for k in dict.fromkeys(load_raw)]
+    loaded = np.array(load_raw, dtype=float)[:, None]
+    q = draw(floats((count, n), 6.0))[pose]
+    root = draw(floats((count, m, m), 1.0))
+    cov = 1e-8 * (root @ np.swapaxes(root, 1, 2) + np.eye(m))
+    cov = np.triu(cov) + np.swapaxes(np.triu(cov, 1), 1, 2)
+
+    def maybe(values: st.SearchStrategy[Floats]) -> Floats | None:
+        return draw(st.none() | values)
+
+    return Readings(
+        states=States(
+            q=q,
+            wrench=draw(floats((count, 6), 100.0)) * loaded,
+            time=maybe(floats((count,), 1e6)),
+            load_time=maybe(floats((count,), 1e4).map(np.abs)),
+            air_temperature=maybe(floats((count,), 40.0)),
+            joint_temperature=maybe(floats((count, n), 40.0)),
+            approach=maybe(floats((count, n), 1.0).map(lambda a: np.where(a < 0, -1.0, 1.0))),
+            q_actual=maybe(floats((count, n), 0.05).map(lambda a: q + a)),
+        ),
+        pose=pose,
+        load=load,
+        cycle=np.array(draw(st.lists(st.integers(-9, 2**53), min_size=count, max_size=count))),
+        value=draw(floats((count, m), 1.5)),
+        covariance=cov,
+        load_names=tuple(used),
+        pose_names=tuple(pose_names[: pose.max() + 1]),
+    )
+
+
+def first_seen(numbers: list[int]) -> np.ndarray:
+    """Renumber in order of first appearance."""
+    order = {k: i for i, k in enumerate(dict.fromkeys(numbers))}
+    return np.array([order[k] for k in numbers], dtype=np.int64)
+
+
+def simple(count: int, m: int = 3, seed: int = 0) -> Readings:
+    """Readings of `count` poses without a load."""
+    rng = np.random.default_rng(seed)
+    zero = np.zeros(count, dtype=np.int64)
+    return Readings(
+        states=States(
+            q=rng.uniform(-3, 3, (count, 6)),
+            wrench=np.zeros((count, 6)),
+            time=np.arange(count, dtype=float),
+        ),
+        pose=np.arange(count),
+        load=zero,
+        cycle=zero.copy(),
+        value=rng.uniform(-1, 1, (count, m)),
+        covariance=np.tile(1e-9 * np.eye(m), (count, 1, 1)),
+        load_names=("none",),
+        pose_names=tuple(f"p{k}" for k in range(count)),
+    )
+
+
+def assert_same(a: Readings, b: Readings) -> None:
+    """Every array equal to the last bit, every name equal."""
+    for name in STATE_FIELDS:
+        left, right = getattr(a.states, name), getattr(b.states, name)
+        assert (left is None) == (right is None), name
+        if left is not None:
+            np.testing.assert_array_equal(left, right, err_msg=name)
+    for name in ("pose", "load", "cycle", "value", "covariance"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+    assert a.load_names == b.load_names
+    assert a.pose_names == b.pose_names

@@ -1,0 +1,314 @@
+"""Cell files: what is read, and one clear line for everything that is wrong."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hilcal.cell import STANDARD_GRAVITY, cell_from_config
+from hilcal.config import CellConfig, load_config
+from hilcal.errors import InputError
+from hilcal.robot.catalogue import configs_dir
+
+ROBOT = '[robot]\nmodel = "ur10e"\n'
+
+
+def load(tmp_path: Path, text: str) -> CellConfig:
+    path = tmp_path / "cell.toml"
+    path.write_text(text, encoding="utf-8")
+    return load_config(path)
+
+
+def test_the_least_that_is_needed(tmp_path: Path) -> None:
+    config = load(tmp_path, ROBOT)
+    cell = cell_from_config(config, tmp_path)
+    assert cell.arm.name == "ur10e"
+    assert not cell.target_known
+    assert not cell.registration_known
+    np.testing.assert_array_equal(cell.target, np.eye(4))
+    np.testing.assert_array_equal(cell.registration, np.eye(4))
+    np.testing.assert_array_equal(cell.gravity, STANDARD_GRAVITY)
+    np.testing.assert_array_equal(cell.load_point, np.zeros(3))
+    assert cell.tool_mass == 0.0
+    assert config.loads == ()
+
+
+def test_everything_is_taken_over(tmp_path: Path) -> None:
+    config = load(
+        tmp_path,
+        """
+        [robot]
+        model = "ur5"
+        gravity_m_s2 = [0, 9.8, 0]
+        [tool]
+        target_m = [0.1, 0.2, 0.3]
+        target_rotvec_rad = [0, 0, 1.5707963267948966]
+        load_point_m = [0, 0, 1]
+        mass_kg = 2
+        com_m = [0.01, 0.02, 0.03]
+        [tracker]
+        frame = "tracker"
+        base_xyz_m = [3, 1, -0.5]
+        base_rotvec_rad = [3.141592653589793, 0, 0]
+        range_std_m = 1e-5
+        [repeatability]
+        joint_std_rad = [1e-5, 2e-5, 3e-5, 4e-5, 5e-5, 6e-5]
+        [[loads]]
+        name = "pull"
+        mass_kg = 2.0
+        force_N = [10, 0, 0]
+        moment_Nm = [0, 0, 3]
+        [limits]
+        joint_margin_rad = 0.1
+        [simulation]
+        seed = 7
+        hide = "hysteresis"
+        """,
+    )
+    cell = cell_from_config(config, tmp_path)
+    expected = [[0, -1, 0, 0.1], [1, 0, 0, 0.2], [0, 0, 1, 0.3], [0, 0, 0, 1]]
+    np.testing.assert_allclose(cell.target, expected, atol=1e-15)
+    expected = [[1, 0, 0, 3], [0, -1, 0, 1], [0, 0, -1, -0.5], [0, 0, 0, 1]]
+    np.testing.assert_allclose(cell.registration, expected, atol=1e-15)
+    assert cell.target_known
+    assert cell.registration_known
+    np.testing.assert_array_equal(cell.load_point, [0, 0, 1])
+    np.testing.assert_array_equal(cell.tool_com, [0.01, 0.02, 0.03])
+    assert cell.tool_mass == 2.0
+    # the weight hangs along gravity, whatever its direction in base axes
+    wrench = config.loads[0].wrench(cell.gravity)
+    np.testing.assert_allclose(wrench, [10, 19.6, 0, 0, 0, 3])
+    np.testing.assert_allclose(config.repeatability.per_joint(6), np.arange(1, 7) * 1e-5)
+    assert (config.tracker.range_std_m, config.limits.joint_margin_rad) == (1e-5, 0.1)
+    assert (config.simulation.seed, config.simulation.hide) == (7, "hysteresis")
+
+
+def test_readings_in_base_axes_need_no_registration(tmp_path: Path) -> None:
+    config = load(tmp_path, ROBOT + '[tracker]\nframe = "base"\nstation_m = [3, 0, 1]\n')
+    cell = cell_from_config(config, tmp_path)
+    assert cell.registration_known
+    np.testing.assert_array_equal(cell.registration, np.eye(4))
+    assert config.tracker.station_m == (3.0, 0.0, 1.0)
+
+
+def test_one_repeatability_holds_for_all_joints(tmp_path: Path) -> None:
+    config = load(tmp_path, ROBOT + "[repeatability]\njoint_std_rad = 1e-5\n")
+    np.testing.assert_array_equal(config.repeatability.per_joint(6), np.full(6, 1e-5))
+
+
+def test_a_robot_file_is_found_beside_the_cell_file(tmp_path: Path) -> None:
+    (tmp_path / "arms").mkdir()
+    text = (configs_dir() / "robots" / "ur3.toml").read_text()
+    (tmp_path / "arms" / "mine.toml").write_text(text)
+    config = load(tmp_path, '[robot]\nmodel = "arms/mine.toml"\n')
+    assert cell_from_config(config, tmp_path).arm.name == "mine"
+
+
+@pytest.mark.parametrize(
+    "path", sorted((configs_dir() / "cells").glob("*.toml")), ids=lambda p: p.stem
+)
+def test_example_cells(path: Path) -> None:
+    cell = cell_from_config(load_config(path), path.parent)
+    assert cell.arm.n == 6
+
+
+def test_the_demo_cell_stays_within_the_payload() -> None:
+    config = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
+    cell = cell_from_config(config)
+    for load in config.loads:
+        force = np.linalg.norm(load.wrench(cell.gravity)[:3])
+        assert force / 9.81 + cell.tool_mass <= cell.arm.payload
+
+
+number = st.floats(-4.0, 4.0)
+vector = st.tuples(number, number, number)
+
+
+@given(
+    target=st.none() | vector,
+    mass=st.floats(0, 20),
+    loads=st.lists(st.tuples(st.text(min_size=1), st.floats(0.1, 20), vector), max_size=4),
+    joint_std=st.floats(0, 1e-3) | st.tuples(*[st.floats(0, 1e-3)] * 6),
+    base=st.none() | st.tuples(vector, vector),
+)
+def test_json_round_trip(target, mass, loads, joint_std, base) -> None:  # type: ignore[no-untyped-def]
+    tracker = {} if base is None else {"base_xyz_m": base[0], "base_rotvec_rad": base[1]}
+    config = CellConfig.model_validate(
+        {
+            "robot": {"model": "ur10"},
+            "tool": {"target_m": target, "mass_kg": mass},
+            "tracker": tracker,
+            "loads": [
+                {"name": f"{i} {name}", "mass_kg": m, "force_N": f}
+                for i, (name, m, f) in enumerate(loads)
+            ],
+            "repeatability": {"joint_std_rad": joint_std},
+        }
+    )
+    assert CellConfig.from_json(config.to_json()) == config
+
+
+def test_a_configuration_cannot_be_changed(tmp_path: Path) -> None:
+    config = load(tmp_path, ROBOT)
+    with pytest.raises(ValueError, match="frozen"):
+        config.tool.mass_kg = 1.0
+
+
+LOAD = '[[loads]]\nname = "a"\nmass_kg = 1.0\n'
+
+WRONG = {
+    "unknown key": (
+        ROBOT + "[tool]\ntaget_m = [0, 0, 0]\n",
+        r'^cell.toml: \[tool\] has no key "taget_m" \(did you mean "target_m"\?\); valid here: '
+        r"target_m, target_rotvec_rad, load_point_m, mass_kg, com_m$",
+    ),
+    "unknown section": (
+        ROBOT + "[trackers]\nframe = 'base'\n",
+        r'has no section or key "trackers" \(did you mean "tracker"\?\); valid here: robot, tool, '
+        r"tracker, repeatability, loads, limits, simulation$",
+    ),
+    "unknown key in the second load": (
+        ROBOT + LOAD + "[[loads]]\nname = 'b'\nmass = 1\n",
+        r'\[\[loads\]\] number 2 has no key "mass" \(did you mean "mass_kg"\?\); valid here: name',
+    ),
+    "unknown key rather than the missing one": (
+        '[robot]\nmodle = "ur10"\n',
+        r'\[robot\] has no key "modle" \(did you mean "model"\?\)',
+    ),
+    "no robot": ("[tool]\n", r'the file lacks "robot": it must be a section \[robot\]'),
+    "no model": ("[robot]\n", r'\[robot\] lacks "model": it must be a catalogue name'),
+    "empty model": ('[robot]\nmodel = ""\n', r'\[robot\] model = "" is not valid'),
+    "section is a value": (
+        ROBOT.replace("[robot]", "tool = 3\n[robot]"),
+        r"^cell.toml: tool = 3 is not valid: it must be a section \[tool\]$",
+    ),
+    "loads is a table": (ROBOT + "[loads]\nname = 'a'\n", r"loads = .* not valid.*\[\[loads\]\]"),
+    "negative mass": (
+        ROBOT + "[tool]\nmass_kg = -1.0\n",
+        r"^cell.toml: \[tool\] mass_kg = -1.0 is not valid: it must be a mass in kg, 0 or more$",
+    ),
+    "negative mass of a load": (
+        ROBOT + "[[loads]]\nname = 'a'\nmass_kg = -2.5\n",
+        r"\[\[loads\]\] number 1 mass_kg = -2.5 is not valid: it must be a mass in kg, 0 or more",
+    ),
+    "text for a number": (ROBOT + '[tool]\nmass_kg = "2"\n', r'mass_kg = "2" is not valid'),
+    "truth value for a number": (ROBOT + "[tool]\nmass_kg = true\n", r"mass_kg = true is not"),
+    "two elements": (ROBOT + "[tool]\ntarget_m = [0, 0]\n", r"\[tool\] target_m.* three finite"),
+    "four elements": (
+        ROBOT + "[tool]\ncom_m = [0, 0, 0, 0]\n",
+        r"\[tool\] com_m = \[0, 0, 0, 0\] is not valid: it must be three finite numbers in m",
+    ),
+    "not a number": (
+        ROBOT + "[tool]\ntarget_m = [0, nan, 0]\n",
+        r"\[tool\] target_m, element 2 = NaN is not valid: it must be three finite numbers in m",
+    ),
+    "infinite": (ROBOT + "[tool]\nmass_kg = inf\n", r"mass_kg = Infinity is not valid"),
+    "millimetres": (
+        ROBOT + "[tool]\ntarget_m = [60, 20, 120]\n",
+        r"\[tool\] target_m = \[60.0, 20.0, 120.0\] lies over 5 m off the flange; is it in m\?",
+    ),
+    "orientation without a place": (
+        ROBOT + "[tool]\ntarget_rotvec_rad = [0, 0, 1]\n",
+        r"\[tool\] target_rotvec_rad without target_m",
+    ),
+    "gravity in mm/s²": (
+        '[robot]\nmodel = "ur10"\ngravity_m_s2 = [0, 0, -9806.65]\n',
+        r"\[robot\] gravity_m_s2 has the length 9807 m/s²",
+    ),
+    "frame": (
+        ROBOT + '[tracker]\nframe = "world"\n',
+        r'\[tracker\] frame = "world" is not valid: it must be "tracker" or "base"',
+    ),
+    "half a registration": (
+        ROBOT + "[tracker]\nbase_xyz_m = [1, 2, 3]\n",
+        r"\[tracker\] base_xyz_m alone; a known registration needs base_xyz_m and base_rotvec_rad",
+    ),
+    "registration in base axes": (
+        ROBOT + '[tracker]\nframe = "base"\nbase_rotvec_rad = [0, 0, 0]\n',
+        r'\[tracker\] base_rotvec_rad together with frame = "base"',
+    ),
+    "station in the tracker frame": (
+        ROBOT + "[tracker]\nstation_m = [1, 2, 3]\n",
+        r'\[tracker\] station_m together with frame = "tracker"',
+    ),
+    "no noise": (
+        ROBOT + "[tracker]\nrange_std_m = 0.0\n",
+        r"\[tracker\] range_std_m = 0.0 is not valid: it must be .* more than 0",
+    ),
+    "negative noise per metre": (
+        ROBOT + "[tracker]\ntransverse_std_per_m = -1e-6\n",
+        r"transverse_std_per_m = -1e-06 is not valid: it must be .* 0 or more",
+    ),
+    "noise in µm": (ROBOT + "[tracker]\nrange_std_m = 5.0\n", r"range_std_m = 5.0 is over 0.1 m"),
+    "negative repeatability": (
+        ROBOT + "[repeatability]\njoint_std_rad = [1e-5, -1e-5]\n",
+        r"\[repeatability\] joint_std_rad.* is not valid: it must be one standard deviation",
+    ),
+    "load without a load": (
+        ROBOT + '[[loads]]\nname = "a"\n',
+        r'\[\[loads\]\] number 1 load "a" is zero; give mass_kg, force_N or moment_Nm',
+    ),
+    "load named none": (
+        ROBOT + '[[loads]]\nname = "none"\nmass_kg = 1\n',
+        r'\[\[loads\]\] number 1 the name "none" is kept for the unloaded state',
+    ),
+    "two loads of one name": (ROBOT + LOAD + LOAD, r'two \[\[loads\]\] have the name "a"'),
+    "share over 1": (ROBOT + "[limits]\ntorque_share = 1.5\n", "torque_share = 1.5 is not valid"),
+    "seed": (ROBOT + "[simulation]\nseed = 1.5\n", r"\[simulation\] seed = 1.5 is not valid"),
+    "strength": (ROBOT + "[simulation]\nstrength_sigma = 0\n", "strength_sigma = 0 is not valid"),
+    "syntax": (ROBOT + "[tool\n", r"^cell.toml: TOML syntax error: .*line 3"),
+    "syntax at the end": (ROBOT + "[tool]\nmass_kg =", r"TOML syntax error: .*line 4"),
+    "key twice": (ROBOT + 'model = "ur5"\n', r"TOML syntax error: .*line 3"),
+}
+
+
+@pytest.mark.parametrize(("text", "message"), WRONG.values(), ids=WRONG.keys())
+def test_wrong_cell_file(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message) as raised:
+        load(tmp_path, text)
+    assert "\n" not in str(raised.value)
+    assert raised.value.exit_code == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('[robot]\nmodel = "ur11"\n', r'unknown robot "ur11".*valid: ur10, ur10e, ur16e'),
+        ('[robot]\nmodel = "none.urdf"\n', r"none\.urdf: No such file"),
+        ('[robot]\nmodel = "none.toml"\n', r"none\.toml: no such file"),
+        (ROBOT + "base_link = 'a'\n", r'base_link = "a" is only for a URDF'),
+        (
+            ROBOT + "[repeatability]\njoint_std_rad = [1e-5, 1e-5]\n",
+            r"joint_std_rad has 2 values; it must be one number or 6, one per joint",
+        ),
+    ],
+)
+def test_wrong_cell(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        cell_from_config(load(tmp_path, text), tmp_path)
+
+
+def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"absent\.toml: no such file; expected a TOML file"):
+        load_config(tmp_path / "absent.toml")
+    with pytest.raises(InputError, match="cannot be read"):
+        load_config(tmp_path)
+    (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(InputError, match="not UTF-8"):
+        load_config(tmp_path / "binary.toml")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", r"stored cell configuration: not JSON.*line 1"),
+        ("[]", "stored cell configuration: "),
+        ('{"robot": {"model": "ur10", "x": 1}}', r'\[robot\] has no key "x"'),
+    ],
+)
+def test_wrong_json(text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message) as raised:
+        CellConfig.from_json(text)
+    assert "\n" not in str(raised.value)

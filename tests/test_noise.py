@@ -1,0 +1,89 @@
+"""The tracker's covariance is an ellipsoid along the line of sight."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from hilcal.data.noise import TrackerNoise, tracker_covariance, tracker_pose_covariance
+from hilcal.errors import InputError
+from hilcal.robot import se3
+from hilcal.types import Floats
+
+NOISE = TrackerNoise(10e-6, 0.3e-6, 15e-6, 6e-6, 1e-4)
+
+points = arrays(np.float64, (4, 3), elements=st.floats(-10, 10)).filter(
+    lambda p: np.linalg.norm(p, axis=1).min() > 0.1
+)
+vectors = arrays(np.float64, 3, elements=st.floats(-3, 3))
+
+
+@given(points)
+def test_beam_and_its_normals_are_the_principal_axes(p: Floats) -> None:
+    cov = tracker_covariance(p, NOISE)
+    d = np.linalg.norm(p, axis=1)
+    along = (10e-6 + 0.3e-6 * d) ** 2
+    across = (15e-6 + 6e-6 * d) ** 2
+    beam = np.einsum("nij,nj->ni", cov, p)
+    np.testing.assert_allclose(beam, along[:, None] * p, rtol=0, atol=1e-9 * across.max() * 10)
+    eigenvalues = np.linalg.eigvalsh(cov)
+    np.testing.assert_allclose(eigenvalues, np.stack([along, across, across], 1), rtol=1e-9)
+    np.testing.assert_array_equal(cov, np.swapaxes(cov, 1, 2))
+
+
+@given(points, vectors)
+def test_turning_the_scene_turns_the_covariance(p: Floats, w: Floats) -> None:
+    r = se3.rotation(w)
+    turned = tracker_covariance(p @ r.T, NOISE)
+    np.testing.assert_allclose(turned, r @ tracker_covariance(p, NOISE) @ r.T, atol=1e-20)
+
+
+@given(points, vectors)
+def test_only_the_position_from_the_station_matters(p: Floats, station: Floats) -> None:
+    moved = tracker_covariance(p + station, NOISE, station)
+    np.testing.assert_allclose(moved, tracker_covariance(p, NOISE), rtol=1e-9, atol=1e-20)
+
+
+def test_it_is_the_first_order_covariance_of_azimuth_elevation_and_range() -> None:
+    p = np.array([[2.0, -1.0, 0.5]])
+    d = np.linalg.norm(p)
+    azimuth, elevation = np.arctan2(p[0, 1], p[0, 0]), np.arcsin(p[0, 2] / d)
+
+    def point(az: float, el: float, r: float) -> Floats:
+        c = np.cos(el)
+        return r * np.array([c * np.cos(az), c * np.sin(az), np.sin(el)])
+
+    h, at = 1e-6, np.array([azimuth, elevation, d])
+    jac = np.stack([(point(*(at + e)) - point(*(at - e))) / (2 * h) for e in h * np.eye(3)], axis=1)
+    t, r = 15e-6 + 6e-6 * d, 10e-6 + 0.3e-6 * d
+    sigma = np.array([t / (d * np.cos(elevation)), t / d, r])
+    np.testing.assert_allclose(
+        tracker_covariance(p, NOISE)[0], jac @ np.diag(sigma**2) @ jac.T, rtol=1e-7, atol=1e-18
+    )
+
+
+def test_at500_at_three_metres_is_a_three_to_one_ellipsoid() -> None:
+    std = np.sqrt(np.diag(tracker_covariance(np.array([[3.0, 0.0, 0.0]]), NOISE)[0]))
+    np.testing.assert_allclose(std, [10.9e-6, 33e-6, 33e-6], rtol=1e-12)
+
+
+def test_pose_covariance_adds_the_rotation_block() -> None:
+    p = np.array([[1.0, 2.0, 3.0], [0.0, -1.0, 0.0]])
+    cov = tracker_pose_covariance(p, NOISE)
+    np.testing.assert_array_equal(cov[:, :3, :3], tracker_covariance(p, NOISE))
+    np.testing.assert_array_equal(cov[:, 3:, 3:], np.tile(1e-8 * np.eye(3), (2, 1, 1)))
+    assert not cov[:, :3, 3:].any()
+
+
+def test_what_no_instrument_has_is_refused() -> None:
+    with pytest.raises(InputError, match="range_std = -1"):
+        TrackerNoise(-1.0, 0.0, 1e-5, 0.0)
+    with pytest.raises(InputError, match="transverse_std"):
+        TrackerNoise(1e-5, 0.0, 0.0, 0.0)
+    with pytest.raises(InputError, match="orientation_std = nan"):
+        TrackerNoise(1e-5, 0.0, 1e-5, 0.0, float("nan"))
+    with pytest.raises(InputError, match="reading 2 lies at the tracker's station"):
+        tracker_covariance(np.array([[1.0, 0, 0], [1.0, 1, 1]]), NOISE, (1.0, 1.0, 1.0))
+    with pytest.raises(InputError, match="orientation_std is 0"):
+        tracker_pose_covariance(np.ones((1, 3)), TrackerNoise(1e-5, 0.0, 1e-5, 0.0))

@@ -1,0 +1,115 @@
+"""Gross errors: set aside, listed, without effect; and good readings are left alone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import poisson
+
+from campaigns import campaign, noiseless, plan, with_noise
+from hilcal.identify.baseline import baseline
+from hilcal.identify.document import outliers
+from hilcal.identify.fit import fit
+from hilcal.identify.outliers import FALSE_ALARMS, find_outliers
+
+MODES = ("absolute", "deflection")
+
+
+def spoilt(readings, rows, size):
+    value = readings.value.copy()
+    rng = np.random.default_rng(3)
+    direction = rng.normal(size=(len(rows), readings.m))
+    value[rows] += size * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    return replace(readings, value=value)
+
+
+@pytest.mark.parametrize("size", [3e-4, 2e-3, 0.5])
+@pytest.mark.parametrize("mode", MODES)
+def test_three_gross_errors_are_set_aside_and_listed(mode, size):
+    c = campaign(plan_seed=0, poses=30, registration_known=True)
+    rows = np.array([7, 68, 134])
+    assert not c.readings.unloaded[rows].any()
+    found = fit(baseline(c.cell, c.readings, mode), spoilt(c.readings, rows, size), mode)
+    np.testing.assert_array_equal(np.flatnonzero(found.outlier), rows)
+    kept = np.delete(np.arange(150), rows)
+    clean = fit(baseline(c.cell, c.readings, mode), c.readings[kept], mode)
+    assert np.abs((found.theta - clean.theta) / clean.uncertainty.formal).max() < 1e-4
+    assert found.chi2 == pytest.approx(clean.chi2, rel=1e-6)
+    assert found.dof == clean.dof
+    listed = outliers(found)
+    names = {(o["pose"], o["load"]) for o in listed}
+    r = c.readings
+    assert names == {(r.pose_names[r.pose[k]], r.load_names[r.load[k]]) for k in rows}
+    assert min(o["sigma"] for o in listed) > 5
+    # They are data all the same: the errors count them.
+    assert found.error.max_m > 0.9 * size
+
+
+def test_a_gross_error_of_an_unloaded_reading_does_not_spoil_deflections():
+    c = campaign(plan_seed=0, poses=30, registration_known=True)
+    row = 45
+    assert c.readings.unloaded[row]
+    pose = c.readings.pose[row]
+    found = fit(baseline(c.cell, c.readings, "deflection"), spoilt(c.readings, [row], 5e-3),
+                "deflection")  # fmt: skip
+    clean = fit(baseline(c.cell, c.readings, "deflection"), c.readings, "deflection")
+    assert set(c.readings.pose[found.outlier]) == {pose}
+    # Four of 120 deflections less.
+    assert np.abs((found.theta - clean.theta) / clean.uncertainty.formal).max() < 1.5
+
+
+def test_a_twentieth_at_most_is_set_aside():
+    """More than that is no accident: the errors stay in the residual, to be diagnosed."""
+    c = campaign(plan_seed=0, poses=30, registration_known=True)
+    rows = np.flatnonzero(~c.readings.unloaded)[::6]
+    found = fit(baseline(c.cell, c.readings, "absolute"), spoilt(c.readings, rows, 2e-3),
+                "absolute")  # fmt: skip
+    assert found.outlier.sum() <= 0.05 * 150
+    assert found.variance_factor > 10
+
+
+@pytest.mark.parametrize("m", [3, 6])
+def test_good_readings_are_called_gross_once_in_a_thousand_campaigns(m):
+    rng = np.random.default_rng(m)
+    campaigns, count = 5000, 150
+    alarms = sum(bool(find_outliers(rng.chisquare(m, count), m).any()) for _ in range(campaigns))
+    expected = FALSE_ALARMS * campaigns
+    assert poisson.ppf(1e-4, expected) <= alarms <= poisson.isf(1e-4, expected)
+
+
+def test_a_misfit_twice_as_wide_as_the_noise_is_not_gross():
+    rng = np.random.default_rng(0)
+    alarms = sum(
+        bool(find_outliers(4 * rng.chisquare(3, 150), 3).any()) for _ in range(2000)
+    )
+    assert alarms <= poisson.isf(1e-4, FALSE_ALARMS * 2000)
+
+
+def false_alarms(count: int) -> int:
+    c = campaign(plan_seed=0, registration_known=True)
+    model = baseline(c.cell, c.readings, "absolute")
+    clean = noiseless(c.world, plan())
+    rng = np.random.default_rng(1)
+    alarms = 0
+    for _ in range(count):
+        found = fit(model, with_noise(clean, rng), "absolute", start=np.zeros(model.size))
+        alarms += int(found.outlier.any())
+    return alarms
+
+
+def test_clean_campaigns_keep_all_their_readings():
+    count = 50
+    assert false_alarms(count) <= poisson.isf(1e-3, FALSE_ALARMS * count)
+
+
+@pytest.mark.slow
+def test_two_hundred_clean_campaigns_keep_all_their_readings():
+    count = 200
+    assert false_alarms(count) <= poisson.isf(1e-3, FALSE_ALARMS * count)
+
+
+def test_a_true_effect_is_not_mistaken_for_gross_errors():
+    for seed, effect in enumerate(("transmission_error", "link_geometry", "hysteresis")):
+        c = campaign(effect, seed=seed, plan_seed=0, poses=20, strength=8.0)
+        found = fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute")
+        assert not found.outlier.any()

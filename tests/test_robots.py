@@ -1,0 +1,368 @@
+"""The catalogue, URDF files and Pinocchio models describe the same arms."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hilcal.errors import InputError
+from hilcal.robot.arm import Arm
+from hilcal.robot.catalogue import configs_dir, load_arm, robot_names
+from hilcal.robot.pinocchio_model import pinocchio_model
+from hilcal.robot.urdf import arm_from_urdf
+from hilcal.types import Floats
+
+PI2 = math.pi / 2
+ALPHA = [PI2, 0.0, 0.0, PI2, -PI2, 0.0]
+# (d1, a2, a3, d4, d5, d6) of the published tables, and the weight of the whole arm, kg
+PUBLISHED = {
+    "ur3": (0.1519, -0.24365, -0.21325, 0.11235, 0.08535, 0.0819, 11.0),
+    "ur5": (0.089159, -0.425, -0.39225, 0.10915, 0.09465, 0.0823, 18.4),
+    "ur10": (0.1273, -0.612, -0.5723, 0.163941, 0.1157, 0.0922, 28.9),
+    "ur3e": (0.15185, -0.24355, -0.2132, 0.13105, 0.08535, 0.0921, 11.2),
+    "ur5e": (0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996, 20.6),
+    "ur10e": (0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655, 33.5),
+    "ur16e": (0.1807, -0.4784, -0.36, 0.17415, 0.11985, 0.11655, 33.1),
+    "ur20": (0.2363, -0.862, -0.7287, 0.201, 0.1593, 0.1543, 64.0),
+    "ur30": (0.2363, -0.637, -0.5037, 0.201, 0.1593, 0.1543, 63.5),
+}
+PAYLOAD = {
+    "ur3": 3, "ur5": 5, "ur10": 10, "ur3e": 3, "ur5e": 5,
+    "ur10e": 12.5, "ur16e": 16, "ur20": 20, "ur30": 30,
+}  # fmt: skip
+
+
+def rz(angle: float) -> Floats:
+    return pin.SE3(
+        pin.AngleAxis(angle, np.array([0.0, 0.0, 1.0])).matrix(), np.zeros(3)
+    ).homogeneous
+
+
+def dh_frames(name: str, q: Floats) -> list[Floats]:
+    """Frames after each row, from the closed form of a classic DH matrix."""
+    d1, a2, a3, d4, d5, d6, _ = PUBLISHED[name]
+    frames, pose = [], np.eye(4)
+    for t, a, d, al in zip(q, [0, a2, a3, 0, 0, 0], [d1, 0, 0, d4, d5, d6], ALPHA, strict=True):
+        c, s, ca, sa = math.cos(t), math.sin(t), math.cos(al), math.sin(al)
+        row = [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d]]
+        pose = pose @ np.array([*row, [0, 0, 0, 1]], dtype=float)
+        frames.append(pose)
+    return frames
+
+
+def flange(arm: Arm, q: Floats) -> Floats:
+    pose = arm.links[0]
+    for angle, link in zip(q, arm.links[1:], strict=True):
+        pose = pose @ rz(angle) @ link
+    return pose
+
+
+def gravity_torques(arm: Arm, q: Floats) -> Floats:
+    """Torques that hold the arm, from the change of its potential energy (central difference)."""
+
+    def energy(q: Floats) -> float:
+        pose, total = arm.links[0], 0.0
+        for i in range(arm.n):
+            pose = pose @ rz(q[i])
+            total += 9.81 * arm.masses[i] * (pose[:3, :3] @ arm.coms[i] + pose[:3, 3])[2]
+            pose = pose @ arm.links[i + 1]
+        return total
+
+    h, unit = 1e-4, np.eye(arm.n)
+    return np.array([(energy(q + h * u) - energy(q - h * u)) / (2 * h) for u in unit])
+
+
+def test_catalogue_is_complete() -> None:
+    assert set(robot_names()) == set(PUBLISHED)
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_forward_kinematics_is_the_published_dh_product(name: str) -> None:
+    arm, rng = load_arm(name), np.random.default_rng(1)
+    for q in rng.uniform(-np.pi, np.pi, (20, 6)):
+        np.testing.assert_allclose(flange(arm, q), dh_frames(name, q)[-1], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_pinocchio_agrees(name: str) -> None:
+    arm, rng = load_arm(name), np.random.default_rng(2)
+    model = pinocchio_model(arm)
+    data = model.createData()
+    for q in rng.uniform(-np.pi, np.pi, (20, 6)):
+        pin.framesForwardKinematics(model, data, q)
+        placement = data.oMf[model.getFrameId("flange")].homogeneous
+        np.testing.assert_allclose(placement, dh_frames(name, q)[-1], rtol=0, atol=1e-12)
+        torques = pin.computeGeneralizedGravity(model, data, q)
+        np.testing.assert_allclose(torques, gravity_torques(arm, q), rtol=0, atol=1e-4)
+    np.testing.assert_array_equal(model.lowerPositionLimit, arm.q_min)
+    np.testing.assert_array_equal(model.upperPositionLimit, arm.q_max)
+    np.testing.assert_array_equal(model.upperEffortLimit, arm.torque_max)
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_masses_and_limits_are_plausible(name: str) -> None:
+    arm, weight = load_arm(name), PUBLISHED[name][-1]
+    # the foot does not move: the rest weighs less than the whole, but is most of it
+    assert 0.75 * weight < arm.masses.sum() < weight
+    assert np.all(arm.masses > 0)
+    assert arm.payload == PAYLOAD[name]
+    assert np.all(arm.q_min == -arm.q_max)
+    assert np.degrees(arm.q_max).round(9).tolist() == [360, 360, 180, 360, 360, 360]
+    assert "Universal Robots" in arm.source
+    # the arm holds itself and its payload stretched out, with the joints it has
+    stretched = gravity_torques(arm, np.zeros(6))
+    reach = np.linalg.norm(flange(arm, np.zeros(6))[:2, 3])
+    assert abs(stretched[1]) + 9.81 * arm.payload * reach < arm.torque_max[1]
+    assert np.all(np.abs(stretched) < 0.6 * arm.torque_max)
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_centres_of_mass_lie_within_their_links(name: str) -> None:
+    # The middle of the upper arm's tube runs beside the axes: its centre lies between
+    # shoulder and elbow seen along the axis, and so does the forearm's.
+    arm = load_arm(name)
+    for body in (1, 2):
+        length = arm.links[body + 1][0, 3]
+        assert 0.2 < arm.coms[body][0] / length < 0.8
+    assert np.all(np.abs(arm.coms[[0, 3, 4, 5]]) < 0.25)
+
+
+def test_ur10_centre_of_the_upper_arm_in_body_axes() -> None:
+    # DH frame 2 sits at the elbow: 0.38 m back towards the shoulder leaves -0.232 m.
+    np.testing.assert_allclose(load_arm("ur10").coms[1], [-0.232, 0.0, 0.158], atol=1e-12)
+    # DH frame 4 is turned by +90° about x: its (y, z) are the body's (z, -y).
+    np.testing.assert_allclose(load_arm("ur10").coms[3], [0.0, -0.018, 0.170941], atol=1e-12)
+
+
+def test_a_dh_table_of_ones_own(tmp_path: Path) -> None:
+    text = (configs_dir() / "robots" / "ur5e.toml").read_text()
+    rows = text.split("[[joints]]")
+    shifted = rows[1].replace("alpha_deg = 90.0", "alpha_deg = 90.0\noffset_deg = 90.0")
+    (tmp_path / "mine.toml").write_text("[[joints]]".join([rows[0], shifted, *rows[2:]]))
+    arm, q = load_arm("mine.toml", tmp_path), np.array([0.3, -1.0, 1.2, 0.1, 0.5, 2.0])
+    turned = dh_frames("ur5e", q + np.array([PI2, 0, 0, 0, 0, 0]))[-1]
+    np.testing.assert_allclose(flange(arm, q), turned, rtol=0, atol=1e-12)
+    assert arm.name == "mine"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (
+            "mass_kg = 3.761",
+            "mass_kg = -1.0",
+            r"\[\[joints\]\] number 1 mass_kg = -1.0 is not valid",
+        ),
+        ("q_min_deg = -360.0", "q_min_deg = 400.0", "q_min_deg = 400.0 must be less than"),
+        ("a_m = 0.0", "a_mm = 0.0", r'number 1 has no key "a_mm".*did you mean "a_m".*d_m'),
+        ("payload_kg = 5.0", "", 'lacks "payload_kg"'),
+    ],
+)
+def test_a_wrong_dh_table_is_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
+    text = (configs_dir() / "robots" / "ur5e.toml").read_text()
+    assert old in text
+    (tmp_path / "mine.toml").write_text(text.replace(old, new, 1))
+    with pytest.raises(InputError, match=message):
+        load_arm("mine.toml", tmp_path)
+
+
+def test_unknown_robot_lists_the_valid_names() -> None:
+    with pytest.raises(
+        InputError, match=r'unknown robot "ur10f" \(did you mean "ur10.*ur3, .*ur5e'
+    ):
+        load_arm("ur10f")
+
+
+def test_link_names_need_a_urdf() -> None:
+    with pytest.raises(InputError, match=r'tip_link = "tool0" is only for a URDF'):
+        load_arm("ur10", tip_link="tool0")
+
+
+# URDF
+
+
+def urdf(arm: Arm, turns: list[Floats], extra: str = "") -> str:
+    """Write an arm as URDF; turns[i] is how the file's joint frame i lies in the slot.
+
+    Every body is split into two links joined rigidly, so that merging is tested as well.
+    """
+    lines = ['<robot name="test"><link name="base_link"/>']
+    parent, before = "base_link", np.eye(4)
+    for i, turn in enumerate(turns):
+        origin = before.T @ arm.links[i] @ turn if i else arm.links[i] @ turn
+        axis = turn[2, :3]  # the slot's z in the file's joint frame
+        com = turn[:3, :3].T @ arm.coms[i]
+        lines += [
+            f'<joint name="{arm.joint_names[i]}" type="revolute">{_origin(origin)}'
+            f'<parent link="{parent}"/><child link="link{i}"/><axis xyz="{_numbers(axis)}"/>'
+            f'<limit lower="{float(arm.q_min[i])!r}" upper="{float(arm.q_max[i])!r}"'
+            f' effort="{float(arm.torque_max[i])!r}" velocity="1"/></joint>',
+            _link(f"link{i}", 0.75 * arm.masses[i], com),
+            f'<joint name="fixed{i}" type="fixed"><origin xyz="0 0 0.5" rpy="0.1 0.2 0.3"/>'
+            f'<parent link="link{i}"/><child link="half{i}"/></joint>',
+        ]
+        half = pin.SE3(pin.rpy.rpyToMatrix(0.1, 0.2, 0.3), np.array([0.0, 0.0, 0.5]))
+        lines.append(_link(f"half{i}", 0.25 * arm.masses[i], half.actInv(com)))
+        parent, before = f"link{i}", turn
+    lines += [
+        f'<joint name="last" type="fixed">{_origin(before.T @ arm.links[-1])}'
+        f'<parent link="{parent}"/><child link="tool0"/></joint><link name="tool0"/>',
+        extra,
+        "</robot>",
+    ]
+    return "\n".join(lines)
+
+
+def _numbers(values: Floats) -> str:
+    return " ".join(repr(float(v)) for v in values)
+
+
+def _origin(pose: Floats) -> str:
+    rpy = _numbers(pin.rpy.matrixToRpy(pose[:3, :3]))
+    return f'<origin xyz="{_numbers(pose[:3, 3])}" rpy="{rpy}"/>'
+
+
+def _link(name: str, mass: float, com: Floats) -> str:
+    return (
+        f'<link name="{name}"><inertial><origin xyz="{_numbers(com)}"/>'
+        f'<mass value="{float(mass)!r}"/>'
+        '<inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial></link>'
+    )
+
+
+def turn_of(seed: int, n: int) -> list[Floats]:
+    rng = np.random.default_rng(seed)
+    return [pin.SE3(pin.Quaternion(rng.normal(size=4)).normalized(), np.zeros(3)).homogeneous
+            for _ in range(n)]  # fmt: skip
+
+
+@given(name=st.sampled_from(sorted(PUBLISHED)), seed=st.integers(0, 2**32 - 1))
+def test_urdf_round_trip(tmp_path_factory: pytest.TempPathFactory, name: str, seed: int) -> None:
+    arm, path = load_arm(name), tmp_path_factory.mktemp("urdf") / "arm.urdf"
+    path.write_text(urdf(arm, turn_of(seed, 6)))
+    back = arm_from_urdf(path, tip_link="tool0")
+    assert back.joint_names == arm.joint_names
+    np.testing.assert_allclose(back.masses, arm.masses, rtol=1e-12)
+    for field in ("q_min", "q_max", "torque_max"):
+        np.testing.assert_allclose(getattr(back, field), getattr(arm, field), rtol=1e-12)
+    for q in np.random.default_rng(seed).uniform(-np.pi, np.pi, (3, 6)):
+        np.testing.assert_allclose(flange(back, q), flange(arm, q), rtol=0, atol=1e-12)
+        models = [pinocchio_model(a) for a in (arm, back)]
+        one, two = (pin.computeGeneralizedGravity(m, m.createData(), q) for m in models)
+        np.testing.assert_allclose(two, one, rtol=0, atol=1e-9)
+
+
+TURNS = turn_of(3, 6)
+FINGER = (
+    '<joint name="slide" type="prismatic"><origin xyz="0 0 0.1"/><parent link="{parent}"/>'
+    '<child link="finger"/><axis xyz="1 0 0"/>'
+    '<limit lower="0" upper="0.1" effort="1" velocity="1"/></joint>'
+) + _link("finger", 0.5, np.zeros(3))
+
+
+def write(tmp_path: Path, extra: str = "", parent: str = "tool0") -> Path:
+    path = tmp_path / "arm.urdf"
+    path.write_text(urdf(load_arm("ur5e"), TURNS, extra.format(parent=parent)))
+    return path
+
+
+def test_urdf_by_its_path_in_a_cell(tmp_path: Path) -> None:
+    write(tmp_path)
+    arm = load_arm("arm.urdf", tmp_path, tip_link="tool0")
+    assert arm.n == 6
+    assert arm.payload == math.inf
+
+
+def test_part_of_a_urdf(tmp_path: Path) -> None:
+    whole = load_arm("ur5e")
+    arm = arm_from_urdf(write(tmp_path), base_link="link1", tip_link="link4")
+    assert arm.joint_names == whole.joint_names[2:5]
+    q = np.array([0.4, -0.3, 1.1])
+    expected = TURNS[1].T @ whole.links[2]
+    for angle, link in zip(q, [*whole.links[3:5], TURNS[4]], strict=True):
+        expected = expected @ rz(angle) @ link
+    np.testing.assert_allclose(flange(arm, q), expected, rtol=0, atol=1e-12)
+    # what hangs on link4 (wrist 3) is held and weighs on it
+    np.testing.assert_allclose(arm.masses.sum(), whole.masses[2:].sum(), rtol=1e-12)
+
+
+def test_mass_of_a_gripper_beyond_the_tip_is_kept(tmp_path: Path) -> None:
+    whole = load_arm("ur5e")
+    arm = arm_from_urdf(write(tmp_path, FINGER), tip_link="tool0")
+    assert arm.n == 6
+    np.testing.assert_allclose(arm.masses[5], whole.masses[5] + 0.5, rtol=1e-12)
+    tool = whole.links[6] @ np.array([0.0, 0.0, 0.1, 1.0])
+    com = (whole.masses[5] * whole.coms[5] + 0.5 * tool[:3]) / arm.masses[5]
+    np.testing.assert_allclose(
+        np.linalg.inv(arm.links[6]) @ [*arm.coms[5], 1.0],  # both seen from the flange
+        np.linalg.inv(whole.links[6]) @ [*com, 1.0],
+        atol=1e-12,
+    )
+
+
+def test_continuous_joint_turns_freely(tmp_path: Path) -> None:
+    path = write(tmp_path)
+    text = path.read_text().replace('type="revolute"', 'type="continuous"')
+    path.write_text(text)
+    arm, q = arm_from_urdf(path, tip_link="tool0"), np.array([0.3, -1.0, 1.2, 0.1, 0.5, 2.0])
+    np.testing.assert_allclose(arm.q_max, 2 * np.pi)
+    np.testing.assert_allclose(flange(arm, q), dh_frames("ur5e", q)[-1], rtol=0, atol=1e-12)
+
+
+def test_branching_urdf_lists_its_leaves(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"branches; set tip_link .*half0, .*half5, .*tool0"):
+        arm_from_urdf(write(tmp_path))
+
+
+def test_prismatic_joint_in_the_arm_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r'joint "slide" is not revolute'):
+        arm_from_urdf(write(tmp_path, FINGER), tip_link="finger")
+
+
+@pytest.mark.parametrize(
+    ("base", "tip", "message"),
+    [
+        ("base_link", "tool1", r'tip_link = "tool1" is no link \(did you mean "tool0"\?\)'),
+        ("bose", "tool0", r'base_link = "bose" is no link.*valid: base_link, link0'),
+        ("tool0", "link0", r'no moving joint leads from link "tool0" to link "link0"'),
+        ("link5", "tool0", r'no moving joint leads from link "link5" to link "tool0"'),
+    ],
+)
+def test_wrong_link_names(tmp_path: Path, base: str, tip: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        arm_from_urdf(write(tmp_path), base_link=base, tip_link=tip)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", "not XML"),
+        ("robot", "not XML.*line 1"),
+        ("<robot><link></robot>", "not XML: mismatched tag: line 1"),
+        ("<world/>", "Could not find the 'robot' element"),
+        ('<robot name="x"><link name="a"/></robot>', "no moving joint"),
+        (
+            '<robot name="x"><link name="a"/><link name="b"/><joint name="j" type="revolute">'
+            '<parent link="a"/><child link="b"/></joint></robot>',
+            r"Joint \[j\] is of type REVOLUTE but it does not specify limits",
+        ),
+    ],
+)
+def test_not_a_urdf(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], content: str, message: str
+) -> None:
+    path = tmp_path / "arm.urdf"
+    path.write_text(content)
+    with pytest.raises(InputError, match=message) as raised:
+        arm_from_urdf(path)
+    assert "\n" not in str(raised.value)
+    assert capfd.readouterr() == ("", "")  # the C++ parser's own output is in the message
+
+
+def test_missing_urdf() -> None:
+    with pytest.raises(InputError, match=r"nowhere\.urdf: No such file"):
+        load_arm("nowhere.urdf")

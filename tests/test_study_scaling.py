@@ -1,0 +1,334 @@
+"""`study scaling`: what it claims about none, gu and gc, checked against dense linear algebra."""
+
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+from scipy import stats
+
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.robot.catalogue import load_arm
+from hilcal.robot.chain import evaluate
+from hilcal.robot.deviation import Deviation
+from hilcal.robot.se3 import rotation_vector
+from hilcal.study.chart import spread
+from hilcal.study.picture import picture
+from hilcal.study.scaling import CORRELATIONS, UNITS, ScalingStudy, scaling_study
+from hilcal.study.scaling_design import JOINT_STD, TARGET, WRENCHES, Design, bound, make_design
+from hilcal.study.scaling_table import CURVES, table
+from hilcal.types import Floats
+
+SEED = 7
+
+
+@pytest.fixture(scope="module")
+def study() -> ScalingStudy:
+    """The study as the command runs it."""
+    return scaling_study(np.random.default_rng(SEED))
+
+
+@pytest.fixture(scope="module")
+def design() -> Design:
+    """What the study draws first."""
+    return make_design(np.random.default_rng(SEED), load_arm("ur10e"), 30)
+
+
+def dense(design: Design, rho: float, shared: bool) -> tuple[Floats, Floats]:
+    """Observation matrix (D, n) and covariance (D, D) of all deflections, written out."""
+    poses, loads = design.observation.shape[:2]
+    between = np.eye(loads) + np.ones((loads, loads)) if shared else 2 * np.eye(loads)
+    size = loads * 6
+    v = np.zeros((poses * size, poses * size))
+    for p, one in enumerate(design.covariance(rho)):
+        v[p * size : (p + 1) * size, p * size : (p + 1) * size] = np.kron(between, one)
+    return design.observation.reshape(poses * size, -1), v
+
+
+def linear_estimator(a: Floats, weight: Floats) -> tuple[Floats, Floats]:
+    """K with ĉ = K ΔX for a weight (D, D), and (Aᵀ W A)⁻¹."""
+    normal = np.linalg.inv(a.T @ weight @ a)
+    return np.asarray(normal @ a.T @ weight), np.asarray(normal)
+
+
+# --- what issue and report claim -------------------------------------------------------------
+
+
+def test_gc_attains_the_cramer_rao_bound(study: ScalingStudy) -> None:
+    ratios = {c.error_over_bound for c in study.cells if c.scaling == "gc"}
+    assert study.runs == 2000
+    assert max(abs(r - 1) for r in ratios) < 0.03
+
+
+def test_gc_intervals_cover(study: ScalingStudy) -> None:
+    for c in study.cells:
+        if c.scaling == "gc":
+            assert 0.94 <= c.coverage <= 0.96
+
+
+@pytest.mark.parametrize("seed", [100, 101, 102])
+def test_neither_is_luck(seed: int) -> None:
+    """Other poses, other noise."""
+    other = scaling_study(np.random.default_rng(seed), correlations=(0.95,))
+    for c in other.cells:
+        if c.scaling == "gc":
+            assert abs(c.error_over_bound - 1) < 0.03
+            assert 0.94 <= c.coverage <= 0.96
+            assert c.error_over_bound_mc < 0.01
+            assert c.coverage_mc < 0.004
+
+
+@pytest.mark.slow
+def test_stated_monte_carlo_uncertainty_is_true() -> None:
+    """Over 60 seeds, gc's deviations from 1 and 95 % in stated units are standard normal."""
+    cells = [
+        c
+        for seed in range(1000, 1060)
+        for c in scaling_study(np.random.default_rng(seed), correlations=(0.8,)).cells
+        if c.scaling == "gc" and c.unit == UNITS[0][0]
+    ]
+    for z in (
+        np.array([(c.error_over_bound - 1) / c.error_over_bound_mc for c in cells]),
+        np.array([(c.coverage - 0.95) / c.coverage_mc for c in cells]),
+    ):
+        assert abs(z.mean()) < 4 / np.sqrt(len(z))
+        chi2 = np.sum((z - z.mean()) ** 2)
+        assert 1e-4 < stats.chi2.sf(chi2, len(z) - 1) < 1 - 1e-4
+
+
+@pytest.mark.parametrize("shared", [False, True])
+@pytest.mark.parametrize("rho", [0.0, 0.6, 0.99])
+def test_monte_carlo_agrees_with_the_exact_law(
+    study: ScalingStudy, design: Design, rho: float, shared: bool
+) -> None:
+    """Cov(ĉ) = K V Kᵀ for every scaling and unit; coverage of stated normal intervals."""
+    a, v = dense(design, rho, shared)
+    limit = np.asarray(np.linalg.inv(a.T @ np.linalg.solve(v, a)))
+    cells = [c for c in study.cells if c.correlation == rho and c.shared_unloaded == shared]
+    assert len(cells) == 3 * len(UNITS)
+    for c in cells:
+        _, length, angle = next(u for u in UNITS if u[0] == c.unit)
+        unit = np.tile([length] * 3 + [angle] * 3, len(v) // 6)
+        weight = {
+            "none": np.diag(unit**2),
+            "gu": np.diag(1 / np.diag(v)),
+            "gc": np.linalg.inv(v),
+        }[c.scaling]
+        k, stated = linear_estimator(a, weight)
+        actual = np.diag(k @ v @ k.T)
+        exact = np.sqrt(np.mean(actual / np.diag(limit)))
+        assert abs(c.error_over_bound - exact) < 4.5 * c.error_over_bound_mc
+        if c.scaling != "none":
+            z = stats.norm.ppf(0.975) * np.sqrt(np.diag(stated) / actual)
+            covered = float(np.mean(2 * stats.norm.cdf(z) - 1))
+            assert abs(c.coverage - covered) < 4.5 * c.coverage_mc
+
+
+def test_none_depends_on_units_and_the_others_do_not(study: ScalingStudy) -> None:
+    first = UNITS[0][0]
+    for c in study.cells:
+        if c.unit == first:
+            assert c.unit_shift == 0
+        elif c.scaling == "none":
+            assert c.unit_shift > 1
+        else:
+            assert c.unit_shift < 1e-10
+
+
+def test_gu_is_gc_without_correlation(study: ScalingStudy) -> None:
+    for unit, _, _ in UNITS:
+        gu, gc = (study.of(s, unit, False)[0] for s in ("gu", "gc"))
+        assert gu.correlation == 0
+        assert gu.error_over_bound == pytest.approx(gc.error_over_bound, rel=1e-12)
+        assert gu.coverage == gc.coverage
+
+
+def test_gu_loses_and_its_intervals_fail_where_correlation_is_high(study: ScalingStudy) -> None:
+    for shared in (False, True):
+        curve = study.of("gu", UNITS[0][0], shared)
+        errors = [c.error_over_bound for c in curve]
+        assert errors == sorted(errors)
+        assert errors[-1] > 1.5
+        assert curve[-1].coverage < 0.92
+        # and the variance factor does not warn
+        assert curve[-1].variance_factor == pytest.approx(1, abs=0.02)
+
+
+def test_none_never_attains_the_bound(study: ScalingStudy) -> None:
+    for c in study.cells:
+        if c.scaling == "none":
+            assert c.error_over_bound > 1.2
+            assert c.coverage < 0.94
+            assert c.variance_factor is None
+
+
+def test_shared_unloaded_reading_is_used_by_gc_alone(study: ScalingStudy) -> None:
+    """At ρ = 0 the pose group's block is all that sets gc apart from gu."""
+    gu, gc = (study.of(s, UNITS[0][0], True)[0] for s in ("gu", "gc"))
+    assert gu.error_over_bound > 1.1
+    assert abs(gc.error_over_bound - 1) < 0.03
+
+
+# --- the experiment -------------------------------------------------------------------------
+
+
+def test_poses_are_feasible_and_the_arm_repeats_as_said(design: Design) -> None:
+    arm = design.arm
+    assert np.all((design.q >= arm.q_min) & (design.q <= arm.q_max))
+    chain = evaluate(arm, design.q)
+    assert chain.position[1:, :, 2].min() > 0
+    jacobian_std = design.std[:, :3].mean()
+    assert 1e-5 < jacobian_std < 1e-4
+    for rho in (0.0, 0.5, 0.99):
+        v = design.covariance(rho)
+        np.testing.assert_allclose(np.diagonal(v, axis1=1, axis2=2), design.std**2, rtol=1e-12)
+        assert np.linalg.eigvalsh(v / (design.std[:, :, None] * design.std[:, None])).min() > 0.005
+
+
+def test_observation_matrix_is_the_motion_under_load(design: Design) -> None:
+    """Joints turned by c τ, with τ from virtual work, move the target by A c."""
+    c = np.array([2, 3, 4, 10, 12, 15]) * 1e-9
+    zero = evaluate(design.arm, design.q)
+    start, axes = zero.point(TARGET), zero.rotation[-1]
+    for k, w in enumerate(WRENCHES):
+        z, p = zero.rotation[:6, :, :, 2], zero.position[:6]
+        torque = np.cross(z, start - p) @ w[:3] + z @ w[3:]
+        moved = evaluate(design.arm, design.q, Deviation(dq=c * torque.T))
+        turned = rotation_vector(moved.rotation[-1] @ np.swapaxes(axes, 1, 2))
+        motion = np.concatenate([moved.point(TARGET) - start, turned], axis=1)
+        expected = design.observation[:, k] @ c
+        np.testing.assert_allclose(expected, motion, atol=1e-5 * np.abs(motion).max())
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_bound_is_the_inverse_of_the_dense_information(design: Design, shared: bool) -> None:
+    a, v = dense(design, 0.9, shared)
+    expected = np.linalg.inv(a.T @ np.linalg.solve(v, a))
+    found = bound(design, design.covariance(0.9), shared)
+    np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-10 * expected.max())
+
+
+def test_common_correlation_is_that_of_the_joints(design: Design) -> None:
+    """Poses of an arm whose joints scatter, by drawing."""
+    rng = np.random.default_rng(0)
+    draws = 20_000
+    q = np.repeat(design.q[:1], draws, axis=0)
+    moved = evaluate(design.arm, q + JOINT_STD * rng.standard_normal(q.shape))
+    rest = evaluate(design.arm, design.q[:1])
+    turned = rotation_vector(moved.rotation[-1] @ rest.rotation[-1, 0].T)
+    sample = np.corrcoef(np.concatenate([moved.point(TARGET), turned], axis=1).T)
+    assert np.abs(sample - design.common[0]).max() < 4.5 / np.sqrt(draws)
+
+
+def test_arm_too_weak_is_said() -> None:
+    arm = replace(load_arm("ur3e"), torque_max=np.full(6, 1.0))
+    with pytest.raises(CannotAnswerError, match=r"ur3e: only 0 feasible poses of 30"):
+        scaling_study(np.random.default_rng(0), arm=arm)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"runs": 1}, "runs = 1"),
+        ({"poses": 1}, "poses = 1"),
+        ({"correlations": ()}, "none given"),
+        ({"correlations": (0.5, 1.0)}, r"correlation 1: must be in \[0, 1\)"),
+        ({"correlations": (-0.1,)}, r"correlation -0.1: must be"),
+        ({"correlations": (float("nan"),)}, "correlation nan: must be"),
+    ],
+)
+def test_wrong_options_are_named(options: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        scaling_study(np.random.default_rng(0), **options)  # type: ignore[arg-type]
+    assert "\n" not in str(caught.value)
+
+
+def test_same_seed_same_study() -> None:
+    first, second = (
+        scaling_study(np.random.default_rng(3), runs=50, correlations=(0.5,)) for _ in range(2)
+    )
+    assert first == second
+
+
+# --- what people and scripts get ------------------------------------------------------------
+
+
+def test_json_holds_every_cell(study: ScalingStudy) -> None:
+    document = json.loads(json.dumps(study.to_json(), allow_nan=False))
+    assert len(document["cells"]) == len(study.cells) == 3 * 3 * 2 * len(CORRELATIONS)
+    for key in ("scaling", "correlation", "unit", "error_over_bound", "error_over_bound_mc"):
+        assert key in document["cells"][0]
+    gc = document["summary"]["gc"]
+    assert gc["coverage_min"] == min(c.coverage for c in study.cells if c.scaling == "gc")
+    assert gc["unit_shift_max"] < 1e-10 < document["summary"]["none"]["unit_shift_max"]
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_table_shows_every_correlation_and_scaling(study: ScalingStudy, width: int) -> None:
+    out = io.StringIO()
+    Console(file=out, width=width).print(table(study))
+    words = out.getvalue()
+    assert "…" not in words
+    for word in ("none", "gu", "gc", "mm, rad", "0.99", "Cramér–Rao", "own", "shared"):
+        assert word in words
+    shown = words.split()
+    for scaling, unit in CURVES:
+        for c in study.of(scaling, unit, True):
+            assert f"{c.error_over_bound:.2f}x" in shown
+            assert f"{100 * c.coverage:.1f}%" in shown
+
+
+def test_picture_is_a_drawing_of_all_curves(study: ScalingStudy, tmp_path: Path) -> None:
+    path = tmp_path / "scaling.svg"
+    picture(study, path)
+    root = ElementTree.parse(path).getroot()
+    curves = [e for e in root.iter() if e.tag.endswith("polyline")]
+    assert len(curves) == 4 * 5
+    width, height = float(root.attrib["width"]), float(root.attrib["height"])
+    for curve in curves:
+        points = np.array([p.split(",") for p in curve.attrib["points"].split()], dtype=float)
+        assert len(points) == len(CORRELATIONS)
+        assert np.all((points > 0) & (points < (width, height)))
+    words = " ".join(e.text or "" for e in root.iter() if e.tag.endswith("text"))
+    for word in ("none, in mm and rad", "gu", "gc", "Cramér–Rao bound", "94 to 96 %"):
+        assert word in words
+
+
+def test_picture_draws_larger_errors_higher(study: ScalingStudy, tmp_path: Path) -> None:
+    """In the first panel: none in mm above none in m above gu above gc, at the right end."""
+    path = tmp_path / "scaling.svg"
+    picture(study, path)
+    curves = [e for e in ElementTree.parse(path).iter() if e.tag.endswith("polyline")][:5]
+    ends = [float(c.attrib["points"].split()[-1].split(",")[1]) for c in curves]
+    shown = [study.of(scaling, unit, False)[-1].error_over_bound for scaling, unit in CURVES]
+    assert list(np.argsort(ends)) == list(np.argsort(shown)[::-1])
+
+
+def test_picture_of_one_correlation(tmp_path: Path) -> None:
+    path = tmp_path / "one.svg"
+    picture(scaling_study(np.random.default_rng(0), runs=20, correlations=(0.0,)), path)
+    assert "nan" not in path.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", ["scaling.png", "missing/scaling.svg"])
+def test_picture_that_cannot_be_written(study: ScalingStudy, tmp_path: Path, name: str) -> None:
+    with pytest.raises(InputError, match="scaling"):
+        picture(study, tmp_path / name)
+
+
+@given(st.lists(st.floats(-500, 500), min_size=1, max_size=8), st.floats(1, 40))
+def test_labels_stand_apart_in_the_order_of_their_curves(places: list[float], gap: float) -> None:
+    moved = np.array(spread(places, gap))
+    order = np.argsort(places, kind="stable")
+    assert np.all(np.diff(moved[order]) > gap - 1e-6)
+    assert moved.mean() == pytest.approx(np.mean(places), abs=1e-6)
+
+
+def test_labels_that_are_apart_stay() -> None:
+    assert spread([50.0, 10.0, 30.0], 16.0) == [50.0, 10.0, 30.0]

@@ -1,0 +1,351 @@
+"""Scaling of measurements: the laws of `hilcal.data.whitening`."""
+
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from hilcal.data.readings import Readings, States
+from hilcal.data.whitening import (
+    MODES,
+    SCALINGS,
+    Mode,
+    Scaling,
+    inverse_root,
+    measured,
+    whitening,
+)
+from hilcal.robot import se3
+from hilcal.types import Floats, Ints
+
+seeds = st.integers(0, 2**32 - 1)
+sizes = st.sampled_from([3, 6])
+
+
+def spd(rng: np.random.Generator, count: int, k: int, decades: float = 3.0) -> Floats:
+    """Covariances (count, k, k) of full rank; standard deviations over some decades."""
+    b = rng.standard_normal((count, k, k))
+    std = 10 ** rng.uniform(-decades, decades, (count, k))
+    return std[:, :, None] * (b @ np.swapaxes(b, 1, 2) + 0.1 * np.eye(k)) * std[:, None, :]
+
+
+def random_units(rng: np.random.Generator, k: int) -> Floats:
+    """Factors (k,) such as from m to mm."""
+    return np.asarray(10 ** rng.uniform(-6, 6, k))
+
+
+def make_readings(
+    pose: Ints, cycle: Ints, load: Ints, value: Floats, covariance: Floats
+) -> Readings:
+    """Readings with load 0 the unloaded state."""
+    count = len(pose)
+    return Readings(
+        states=States(q=np.zeros((count, 6)), wrench=np.zeros((count, 6))),
+        pose=pose,
+        load=load,
+        cycle=cycle,
+        value=value,
+        covariance=covariance,
+        load_names=("none", *(f"w{k}" for k in range(1, int(load.max(initial=0)) + 1))),
+        pose_names=tuple(f"P{k}" for k in range(int(pose.max(initial=0)) + 1)),
+    )
+
+
+def random_readings(rng: np.random.Generator, m: int, decades: float = 3.0) -> Readings:
+    """Poses in random order, 1-2 cycles, 1-3 unloaded and 1-4 loaded readings in each."""
+    rows = []
+    for pose in range(int(rng.integers(1, 6))):
+        for cycle in range(int(rng.integers(1, 3))):
+            rows += [(pose, cycle, 0)] * int(rng.integers(1, 4))
+            rows += [(pose, cycle, load) for load in range(1, int(rng.integers(2, 6)))]
+    table = rng.permutation(np.array(rows, dtype=np.int64))
+    value = rng.standard_normal((len(rows), m))
+    value[:, 3:] *= 0.1
+    return make_readings(
+        table[:, 0], table[:, 1], table[:, 2], value, spd(rng, len(rows), m, decades)
+    )
+
+
+# --- one covariance ------------------------------------------------------------------------
+
+
+@given(seeds, sizes)
+def test_root_gives_the_covariance_back(seed: int, k: int) -> None:
+    v = spd(np.random.default_rng(seed), 4, k)
+    s = np.linalg.inv(inverse_root(v, "gc"))
+    std = np.sqrt(np.diagonal(v, axis1=1, axis2=2))
+    error = (s @ np.swapaxes(s, 1, 2) - v) / (std[:, :, None] * std[:, None, :])
+    assert np.abs(error).max() < 1e-11
+
+
+@given(seeds, sizes)
+def test_gc_whitens(seed: int, k: int) -> None:
+    v = spd(np.random.default_rng(seed), 4, k)
+    f = inverse_root(v, "gc")
+    np.testing.assert_allclose(
+        f @ v @ np.swapaxes(f, 1, 2), np.tile(np.eye(k), (4, 1, 1)), atol=1e-9
+    )
+
+
+@given(seeds, sizes)
+def test_gu_divides_by_the_standard_deviations(seed: int, k: int) -> None:
+    v = spd(np.random.default_rng(seed), 4, k)
+    eps = np.random.default_rng(seed).standard_normal((4, k))
+    white = (inverse_root(v, "gu") @ eps[:, :, None])[:, :, 0]
+    std = np.sqrt(np.stack([np.diag(one) for one in v]))
+    np.testing.assert_allclose(white, eps / std, rtol=1e-14)
+
+
+def test_none_leaves_everything_as_it_is() -> None:
+    v = spd(np.random.default_rng(0), 2, 6)
+    np.testing.assert_array_equal(inverse_root(v, "none"), np.tile(np.eye(6), (2, 1, 1)))
+
+
+@given(seeds, sizes)
+def test_gc_is_gu_where_elements_are_uncorrelated(seed: int, k: int) -> None:
+    rng = np.random.default_rng(seed)
+    v = 10 ** rng.uniform(-12, 6, (5, k))[:, :, None] * np.eye(k)
+    a, y = rng.standard_normal((5 * k, 4)), rng.standard_normal(5 * k)
+    gu, gc = (estimate(inverse_root(v, s), a, y) for s in ("gu", "gc"))
+    np.testing.assert_allclose(gc[0], gu[0], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(gc[1], gu[1], rtol=1e-9)
+
+
+def estimate(factor: Floats, a: Floats, y: Floats) -> tuple[Floats, float]:
+    """Least squares of the scaled regression, and its χ²; one measurement per factor."""
+    count, k = factor.shape[:2]
+    ga = (factor @ a.reshape(count, k, -1)).reshape(count * k, -1)
+    gy = (factor @ y.reshape(count, k, 1)).ravel()
+    c = np.linalg.lstsq(ga, gy, rcond=None)[0]
+    return np.asarray(c), float(np.sum((gy - ga @ c) ** 2))
+
+
+@pytest.mark.parametrize("scaling", ["gu", "gc"])
+@given(seeds, sizes)
+def test_change_of_units_changes_nothing(scaling: Scaling, seed: int, k: int) -> None:
+    rng = np.random.default_rng(seed)
+    v, u = spd(rng, 6, k, decades=1.0), random_units(rng, k)
+    a, y = rng.standard_normal((6, k, 3)), rng.standard_normal((6, k))
+    c, chi2 = estimate(inverse_root(v, scaling), a, y)
+    c_u, chi2_u = estimate(inverse_root(u[:, None] * v * u, scaling), u[:, None] * a, u * y)
+    np.testing.assert_allclose(c_u, c, rtol=1e-7, atol=1e-7 * np.abs(c).max())
+    assert chi2_u == pytest.approx(chi2, rel=1e-8)
+
+
+@given(seeds)
+def test_units_matter_without_scaling(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    a, y = rng.standard_normal((6, 6, 3)), rng.standard_normal((6, 6))
+    u = np.array([1e3] * 3 + [1.0] * 3)
+    f = inverse_root(spd(rng, 6, 6), "none")
+    c, c_u = estimate(f, a, y)[0], estimate(f, u[:, None] * a, u * y)[0]
+    assert np.abs(c - c_u).max() > 1e-6
+
+
+@pytest.mark.parametrize("scaling", ["gu", "gc"])
+@given(seeds, sizes)
+def test_whitened_errors_are_the_same_pure_numbers_in_all_units(
+    scaling: Scaling, seed: int, k: int
+) -> None:
+    """Row by row, up to the sign that an eigenvector is free to have."""
+    rng = np.random.default_rng(seed)
+    v, u, eps = spd(rng, 1, k)[0], random_units(rng, k), rng.standard_normal(k)
+    std = np.sqrt(np.diag(v))
+    gaps = np.diff(np.linalg.eigvalsh(v / (std[:, None] * std)))
+    assume(gaps.min() > 1e-3)
+    eps *= std
+    white = inverse_root(v, scaling) @ eps
+    other = inverse_root(u[:, None] * v * u, scaling) @ (u * eps)
+    np.testing.assert_allclose(np.abs(other), np.abs(white), rtol=1e-7, atol=1e-8)
+
+
+# --- rank-deficient covariances ------------------------------------------------------------
+
+
+@given(seeds, sizes, st.data())
+def test_direction_without_noise_is_left_out(seed: int, k: int, data: st.DataObject) -> None:
+    rank = data.draw(st.integers(1, k - 1))
+    rng = np.random.default_rng(seed)
+    b = rng.standard_normal((k, rank)) * random_units(rng, k)[:, None]
+    v = b @ b.T
+    f = inverse_root(v, "gc")
+    kept = np.any(f != 0, axis=1)
+    assert np.all(np.isfinite(f))
+    assert kept.sum() == rank
+    np.testing.assert_allclose(f[kept] @ v @ f[kept].T, np.eye(rank), atol=1e-6)
+
+
+@pytest.mark.parametrize("scaling", ["gu", "gc"])
+@given(seeds, st.data())
+def test_element_without_noise_is_left_out(
+    scaling: Scaling, seed: int, data: st.DataObject
+) -> None:
+    dead = data.draw(st.lists(st.integers(0, 5), min_size=1, max_size=6, unique=True))
+    v = spd(np.random.default_rng(seed), 1, 6)[0]
+    v[dead], v[:, dead] = 0.0, 0.0
+    f = inverse_root(v, scaling)
+    assert np.all(np.isfinite(f))
+    assert np.all(f[:, dead] == 0)
+    assert np.any(f != 0, axis=1).sum() == 6 - len(dead)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_rank_counts_what_carries_information(mode: Mode) -> None:
+    """Three elements that lie in a plane that the instrument sees: two rows per measurement."""
+    rng = np.random.default_rng(3)
+    b = rng.standard_normal((3, 2)) * 1e-5
+    covariance = np.tile(b @ b.T, (6, 1, 1))
+    pose, load = np.repeat(np.arange(2), 3), np.tile(np.arange(3), 2)
+    readings = make_readings(pose, np.zeros(6, np.int64), load, rng.random((6, 3)), covariance)
+    w = whitening(readings, mode)
+    assert w.rank == 2 * len(w)
+    white = w.whiten(w.raw(readings.value))
+    assert np.all(np.isfinite(white))
+    assert np.count_nonzero(white) == w.rank
+
+
+# --- readings and deflections --------------------------------------------------------------
+
+
+def whitened_covariance(readings: Readings, mode: Mode, scaling: Scaling = "gc") -> Floats:
+    """Covariance (D·m, D·m) of the whitened rows, by propagation from independent readings."""
+    w = whitening(readings, mode, scaling)
+    count, m = readings.value.shape
+    unit_errors = np.eye(count * m).reshape(count, m, count * m)
+    effect = w.whiten(w.raw(unit_errors)).reshape(-1, count, m)
+    v = readings.covariance
+    return np.asarray(np.einsum("anj,njk,bnk->ab", effect, v, effect, optimize=True))
+
+
+@pytest.mark.parametrize("mode", MODES)
+@given(seeds, sizes)
+def test_all_whitened_rows_are_independent_with_unit_variance(
+    mode: Mode, seed: int, m: int
+) -> None:
+    """Exactly, by propagation from the readings: shared, repeated and uneven unloaded readings."""
+    readings = random_readings(np.random.default_rng(seed), m, decades=1.0)
+    w = whitening(readings, mode)
+    total = whitened_covariance(readings, mode)
+    np.testing.assert_allclose(total, np.eye(len(w) * m), atol=1e-8)
+    assert w.rank == len(w) * m
+
+
+def test_simulated_deflections_are_white() -> None:
+    """By drawing: 20,000 sets of readings, 2 poses, shared unloaded readings."""
+    rng = np.random.default_rng(11)
+    pose = np.array([0, 0, 0, 0, 1, 1, 1])
+    load = np.array([0, 1, 2, 3, 0, 0, 1])
+    readings = make_readings(pose, np.zeros(7, np.int64), load, np.zeros((7, 3)), spd(rng, 7, 3))
+    draws = 20_000
+    noise = np.linalg.cholesky(readings.covariance) @ rng.standard_normal((7, 3, draws))
+    w = whitening(readings, "deflection")
+    white = w.whiten(w.raw(noise)).reshape(-1, draws)
+    sample = white @ white.T / draws
+    # Entries of a sample covariance of white noise: standard error sqrt(1/n), sqrt(2/n) on the
+    # diagonal; 78 different entries.
+    assert np.abs(sample - np.eye(12)).max() < 4.5 * np.sqrt(2 / draws)
+
+
+@given(seeds)
+def test_gu_forgets_what_deflections_share(seed: int) -> None:
+    readings = random_readings(np.random.default_rng(seed), 3, decades=1.0)
+    total = whitened_covariance(readings, "deflection", "gu")
+    np.testing.assert_allclose(np.diag(total), 1.0, rtol=1e-9)
+    assert np.abs(total - np.eye(len(total))).max() > 1e-3
+
+
+@given(seeds, sizes)
+def test_deflection_is_loaded_minus_mean_unloaded_of_pose_and_cycle(seed: int, m: int) -> None:
+    r = random_readings(np.random.default_rng(seed), m)
+    w = whitening(r, "deflection")
+    raw = w.raw(r.value)
+    assert sorted(w.reading) == list(np.flatnonzero(~r.unloaded))
+    np.testing.assert_array_equal(w.group, r.pose[w.reading])
+    for k, row in enumerate(w.reading):
+        own = r.unloaded & (r.pose == r.pose[row]) & (r.cycle == r.cycle[row])
+        np.testing.assert_allclose(raw[k], r.value[row] - r.value[own].mean(axis=0), atol=1e-12)
+        expected = r.covariance[row] + r.covariance[own].sum(axis=0) / own.sum() ** 2
+        np.testing.assert_allclose(w.covariance[k], expected, rtol=1e-12)
+
+
+@given(seeds, sizes)
+def test_absolute_readings_stand_for_themselves(seed: int, m: int) -> None:
+    r = random_readings(np.random.default_rng(seed), m)
+    w = whitening(r, "absolute")
+    np.testing.assert_array_equal(w.reading, np.arange(len(r)))
+    np.testing.assert_array_equal(w.raw(r.value), r.value)
+    np.testing.assert_array_equal(measured(r, w), r.value)
+    np.testing.assert_array_equal(w.covariance, r.covariance)
+
+
+@pytest.mark.parametrize("scaling", SCALINGS)
+@given(seeds)
+def test_rows_and_columns_are_whitened_alike(scaling: Scaling, seed: int) -> None:
+    """(D, m) and (D, m, P) go through the same G, which is linear."""
+    rng = np.random.default_rng(seed)
+    w = whitening(random_readings(rng, 3), "deflection", scaling)
+    a, c = rng.standard_normal((len(w), 3, 4)), rng.standard_normal(4)
+    size = np.abs(w.whiten(np.abs(a))).max()
+    np.testing.assert_allclose(w.whiten(a @ c), w.whiten(a) @ c, atol=1e-12 * max(size, 1))
+
+
+@given(seeds)
+def test_order_of_the_readings_does_not_matter(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    r = random_readings(rng, 3, decades=1.0)
+    order = rng.permutation(len(r))
+    chi2 = []
+    for readings in (r, r[order]):
+        w = whitening(readings, "deflection")
+        chi2.append(np.sum(w.whiten(w.raw(readings.value)) ** 2))
+    assert chi2[1] == pytest.approx(chi2[0], rel=1e-9)
+
+
+def test_pose_measured_only_unloaded_gives_no_deflection() -> None:
+    pose, load = np.array([0, 0, 1]), np.array([0, 1, 0])
+    covariance = spd(np.random.default_rng(0), 3, 3)
+    r = make_readings(pose, np.zeros(3, np.int64), load, np.zeros((3, 3)), covariance)
+    assert list(whitening(r, "deflection").reading) == [1]
+
+
+# --- rotations -----------------------------------------------------------------------------
+
+
+@given(seeds)
+def test_measured_rotation_is_that_from_unloaded_to_loaded(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    unloaded = rng.uniform(-1.5, 1.5, 3)
+    turn = rng.uniform(-0.5, 0.5, 3)
+    loaded = se3.rotation_vector(se3.rotation(turn) @ se3.rotation(unloaded))
+    value = np.concatenate([np.zeros((2, 3)), np.stack([unloaded, loaded])], axis=1)
+    r = make_readings(
+        np.zeros(2, np.int64), np.zeros(2, np.int64), np.array([0, 1]), value, spd(rng, 2, 6)
+    )
+    np.testing.assert_allclose(measured(r, whitening(r, "deflection"))[0, 3:], turn, atol=1e-9)
+
+
+def rotation_variance(unloaded: int, count: int = 4000) -> Floats:
+    """Variances (3,) of the whitened rotations of poses with some unloaded readings each."""
+    rng = np.random.default_rng(5)
+    std = 1e-4
+    per = unloaded + 1
+    attitude = se3.rotation(np.repeat(rng.uniform(-1.5, 1.5, (count, 3)), per, axis=0))
+    noise = se3.rotation(std * rng.standard_normal((count * per, 3)))
+    value = np.zeros((count * per, 6))
+    value[:, 3:] = se3.rotation_vector(noise @ attitude)
+    r = make_readings(
+        np.repeat(np.arange(count), per),
+        np.zeros(count * per, np.int64),
+        np.tile(np.array([0] * unloaded + [1]), count),
+        value,
+        np.tile(std**2 * np.eye(6), (count * per, 1, 1)),
+    )
+    w = whitening(r, "deflection", "gu")
+    return np.asarray(w.whiten(measured(r, w)).reshape(-1, 6)[:, 3:].var(axis=0))
+
+
+def test_rotations_have_the_stated_noise() -> None:
+    assert np.abs(rotation_variance(1) - 1).max() < 4 * np.sqrt(2 / 4000)
+
+
