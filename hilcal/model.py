@@ -16,7 +16,7 @@ from hilcal.robot.batch import along_states, chunks, join, take, zeros
 from hilcal.robot.chain import Chain
 from hilcal.robot.deviation import Deviation
 from hilcal.robot.statics import Load, slot_wrenches
-from hilcal.types import Floats
+from hilcal.types import Floats, Ints
 
 EQUILIBRIUM_TOLERANCE = 1e-13
 """Motion of the flange that may be missing from the converged equilibrium, m."""
@@ -127,12 +127,22 @@ class Model:
         s = replace(s, chain=chain)
         return Prediction(s, deviation, observe(cell, chain, deviation))
 
-    def jacobian(self, prediction: Prediction, theta: Floats, m: int) -> Floats:
-        """Derivative (N, m, P) of the readings by all parameters, sensor axes."""
-        return self.jacobian_of(self.effects, prediction, theta, m)
+    def jacobian(
+        self, prediction: Prediction, theta: Floats, m: int, live: Ints | None = None
+    ) -> Floats:
+        """Derivative (N, m, P) of the readings by all parameters, sensor axes.
+
+        With `live`, an ascending list of L parameters, only those: (N, m, L).
+        """
+        return self.jacobian_of(self.effects, prediction, theta, m, live)
 
     def jacobian_of(
-        self, effects: tuple[Effect, ...], prediction: Prediction, theta: Floats, m: int
+        self,
+        effects: tuple[Effect, ...],
+        prediction: Prediction,
+        theta: Floats,
+        m: int,
+        live: Ints | None = None,
     ) -> Floats:
         """Derivative (N, m, P) of the readings by the parameters of `effects`.
 
@@ -141,30 +151,45 @@ class Model:
         smaller by deflection/reach, is left to the iteration.
         """
         count = len(prediction.situation.angle)
-        out = np.empty((count, m, sum(len(e.parameters) for e in effects)))
+        sizes = [len(e.parameters) for e in effects]
+        place = np.full(sum(sizes), -1)
+        live = np.arange(len(place)) if live is None else live
+        place[live] = np.arange(len(live))
+        places = np.split(place, np.cumsum(sizes)[:-1]) if sizes else []
+        out = np.empty((count, m, len(live)))
         for rows in chunks(count):
-            self._fill(out[rows], effects, prediction[rows], theta)
+            self._fill(out[rows], effects, places, prediction[rows], theta)
         return out
 
     def _fill(
-        self, out: Floats, effects: tuple[Effect, ...], prediction: Prediction, theta: Floats
+        self,
+        out: Floats,
+        effects: tuple[Effect, ...],
+        places: list[Ints],
+        prediction: Prediction,
+        theta: Floats,
     ) -> None:
-        """Write the derivative (N, m, P) of a chunk of states."""
+        """Write the derivative of a chunk of states; `places`: columns of `out`, −1 for none."""
         s = prediction.situation
         m = out.shape[1]
         moves = motion(self.cell, prediction.observation, s.chain, prediction.deviation, m)
-        first = 0
-        for e in effects:
-            block = zeros(len(s.states), m, len(e.parameters))
-            for c in e.columns(s):
-                block[:, :, c.parameter] += moves.by_columns(c)
+        for e, place in zip(effects, places, strict=True):
+            wanted = np.flatnonzero(place >= 0)
+            if not len(wanted):
+                continue
+            within = np.full(len(place), -1)
+            within[wanted] = np.arange(len(wanted))
+            block = zeros(len(s.states), m, len(wanted))
+            for columns in e.columns(s):
+                c = columns.only(within[columns.parameter] >= 0)
+                block[:, :, within[c.parameter]] += moves.by_columns(c)
             change = e.wrench_columns(s)
             if change is not None:
                 for other, part in zip(self.effects, self.slices(), strict=True):
                     if other.elastic:
-                        block += moves.by_response(other.response(theta[part], s, change))
-            out[:, :, first : first + block.shape[2]] = block
-            first += block.shape[2]
+                        response = other.response(theta[part], s, change[:, wanted])
+                        block += moves.by_response(response)
+            out[:, :, place[wanted]] = block
 
     def _load(self, states: States, theta: Floats) -> Load:
         cell, point = self.cell, self.cell.load_point

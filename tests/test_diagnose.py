@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from campaigns import Campaign, campaign, noiseless, plan, with_noise
 from scipy.stats import f as f_distribution
 from scipy.stats import kstest, poisson
 
-from campaigns import Campaign, campaign, noiseless, plan, with_noise
 from drivers.simulated.hidden import DEFLECTION_EFFECTS
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode
@@ -84,7 +84,9 @@ def test_p_values_are_uniform_where_nothing_is_missing(mode):
 def test_p_values_are_uniform_over_many_seeds(mode):
     found = null_p_values(mode, 600, 14, first=1)
     for name, p in found.items():
-        print(f"{mode} {name}: p < 0.05 in {np.mean(p < 0.05):.3f}, KS {kstest(p, 'uniform')[1]:.3f}")
+        print(
+            f"{mode} {name}: p < 0.05 in {np.mean(p < 0.05):.3f}, KS {kstest(p, 'uniform')[1]:.3f}"
+        )
     check_uniform(found, 1e-3)
 
 

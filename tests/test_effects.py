@@ -204,9 +204,7 @@ def test_model_jacobian_is_the_derivative_of_the_prediction(arm, m, elastic):
     cell = CELLS[arm]
     states = some_states(cell, 4)
     short = {"transmission_error": {"harmonics": 1}}
-    model = Model(
-        cell, tuple(make(n, cell, states, short.get(n, options_of(n, m))) for n in NAMES)
-    )
+    model = Model(cell, tuple(make(n, cell, states, short.get(n, options_of(n, m))) for n in NAMES))
     scale = np.array([p.scale for e in model.effects for p in e.parameters])
     theta = random_theta(model.effects, np.random.default_rng(4), elastic)
     prediction = model.predict(states, theta)
@@ -387,7 +385,8 @@ def test_harmonics_and_sides_are_what_they_say():
     for j in range(6):
         q = s.angle[:, j]
         expected = sum(
-            by_name[f"j{j + 1}.cos{k}"] * np.cos(k * q) + by_name[f"j{j + 1}.sin{k}"] * np.sin(k * q)
+            by_name[f"j{j + 1}.cos{k}"] * np.cos(k * q)
+            + by_name[f"j{j + 1}.sin{k}"] * np.sin(k * q)
             for k in range(1, 5)
         )
         np.testing.assert_allclose(dq[:, j], expected, rtol=0, atol=1e-13)
@@ -452,7 +451,9 @@ def test_an_impossible_option_is_refused(name, options, message):
         make(name, cell, some_states(cell), options).prior_std()
 
 
-@pytest.mark.parametrize(("name", "column"), [("hysteresis", "approach"), ("tracker_drift", "time")])
+@pytest.mark.parametrize(
+    ("name", "column"), [("hysteresis", "approach"), ("tracker_drift", "time")]
+)
 def test_a_missing_column_is_named(name, column):
     cell = CELLS["ur10e"]
     states = replace(some_states(cell), **{column: None})

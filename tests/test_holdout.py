@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
 from campaigns import campaign
+
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode, whitening
 from hilcal.identify.baseline import with_effects
@@ -125,9 +125,9 @@ def test_poses_are_numbered_by_first_appearance_and_order_does_not_matter():
     np.testing.assert_array_equal(pose, c.readings.pose)
     shuffle = np.random.default_rng(0).permutation(len(c.readings))
     mixed = distinct_poses(c.readings[shuffle])
-    assert np.array_equal(np.unique(mixed, return_index=True)[1], sorted(
-        np.unique(mixed, return_index=True)[1]
-    ))
+    assert np.array_equal(
+        np.unique(mixed, return_index=True)[1], sorted(np.unique(mixed, return_index=True)[1])
+    )
     same = pose[shuffle][:, None] == pose[shuffle]
     np.testing.assert_array_equal(mixed[:, None] == mixed, same)
 

@@ -168,9 +168,7 @@ def in_other_lengths(cell: Cell, readings: Readings, k: float) -> tuple[Cell, Re
     arm = cell.arm
     other = replace(
         cell,
-        arm=replace(
-            arm, links=moved(arm.links), coms=k * arm.coms, torque_max=k * arm.torque_max
-        ),
+        arm=replace(arm, links=moved(arm.links), coms=k * arm.coms, torque_max=k * arm.torque_max),
         target=moved(cell.target),
         load_point=k * cell.load_point,
         tool_com=k * cell.tool_com,
@@ -224,9 +222,7 @@ def test_units_do_not_matter(mode, m, k):
     assert np.abs((b.theta / unit - a.theta) / unit_of_noise(a)).max() < 1e-5
     seen = a.uncertainty.identifiable
     np.testing.assert_array_equal(b.uncertainty.identifiable, seen)
-    np.testing.assert_allclose(
-        (b.uncertainty.std / unit)[seen], a.uncertainty.std[seen], rtol=1e-5
-    )
+    np.testing.assert_allclose((b.uncertainty.std / unit)[seen], a.uncertainty.std[seen], rtol=1e-5)
     assert b.rank == a.rank
     assert b.chi2 == pytest.approx(a.chi2, rel=1e-6)
     assert b.dof == pytest.approx(a.dof, rel=1e-6)

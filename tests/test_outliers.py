@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from campaigns import campaign, noiseless, plan, with_noise
 from scipy.stats import poisson
 
-from campaigns import campaign, noiseless, plan, with_noise
 from hilcal.identify.baseline import baseline
 from hilcal.identify.document import outliers
 from hilcal.identify.fit import fit
@@ -79,9 +79,7 @@ def test_good_readings_are_called_gross_once_in_a_thousand_campaigns(m):
 
 def test_a_misfit_twice_as_wide_as_the_noise_is_not_gross():
     rng = np.random.default_rng(0)
-    alarms = sum(
-        bool(find_outliers(4 * rng.chisquare(3, 150), 3).any()) for _ in range(2000)
-    )
+    alarms = sum(bool(find_outliers(4 * rng.chisquare(3, 150), 3).any()) for _ in range(2000))
     assert alarms <= poisson.isf(1e-4, FALSE_ALARMS * 2000)
 
 

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
 from campaigns import campaign, cell_of, measured, plan, world_of
+
 from drivers.simulated.hidden import hide
 from hilcal.data.readings import Readings
 from hilcal.diagnose.projection import projection

@@ -151,7 +151,7 @@ def test_positions_on_a_line_cannot_answer():
 
 @pytest.mark.parametrize("noise", [0.0, 1e-5])
 def test_positions_in_one_point_cannot_answer(noise):
-    """Many poses about one tip, here on the first joint's axis, do not tell how the base is turned."""
+    """Poses about one tip, here on the first joint's axis, do not tell how the base is turned."""
     q = np.tile(np.array([0.0, -np.pi / 2, 0.1, -np.pi / 2, 0.2, 0.3]), (8, 1))
     q[:, 0] = np.linspace(-2, 2, 8)
     tip = np.linalg.inv(flanges_at(q)[0]) @ np.array([0.0, 0.0, 1.0, 1.0])

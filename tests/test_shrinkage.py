@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-
 from campaigns import campaign, noiseless, plan
+
 from hilcal.effects.catalogue import make
 from hilcal.identify.baseline import baseline, with_effects
 from hilcal.identify.fit import Fit, fit

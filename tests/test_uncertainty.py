@@ -4,9 +4,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from campaigns import campaign, with_noise
 from scipy.stats import chi2
 
-from campaigns import campaign, with_noise
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode
 from hilcal.effects.catalogue import make

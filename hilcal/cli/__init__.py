@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Annotated
 
 import typer
+from threadpoolctl import threadpool_limits
 
 from hilcal import __version__
 from hilcal.cli.catalogue import effects, scaling
@@ -87,7 +88,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")
     debug = os.environ.get(DEBUG, "") not in ("", "0")
-    with warnings.catch_warnings():
+    # The matrices are small: more threads gain nothing, and on a busy machine cost tenfold.
+    with warnings.catch_warnings(), threadpool_limits(limits=1, user_api="blas"):
         if not debug:
             warnings.simplefilter("ignore")
         sys.exit(_run(sys.argv[1:] if arguments is None else list(arguments), debug))

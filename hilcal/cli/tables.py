@@ -59,7 +59,7 @@ def import_(
             campaign.append_readings(readings)
     loads = [readings.load_names[k] for k in np.unique(readings.load)]
     poses = len(np.unique(readings.pose))
-    t.show(text.heading(f"{output}: {len(readings)} readings of {poses} poses"))
+    t.show(text.heading(f"{len(readings)} readings of {poses} poses"))
     t.show(
         f"  robot {settings.robot.model}; each reading is a "
         f"{'position' if readings.m == 3 else 'position and an orientation'}\n"

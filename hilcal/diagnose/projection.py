@@ -1,5 +1,6 @@
 """Columns of a family, whitened, and freed of what the fitted model can do itself."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,24 @@ from hilcal.diagnose.score import Score, score
 from hilcal.identify.fit import Fit
 from hilcal.identify.holdout import fold_ridge
 from hilcal.identify.poses import random_folds
-from hilcal.types import Floats
+from hilcal.types import Bools, Floats
+
+ROUNDING = 1e-10
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fold:
+    """The model's normal equations without one fold.
+
+    Attributes:
+        mine: (R,) rows of the fold.
+        factor: Cholesky factor of H without them.
+        rhs: (K,) right-hand side without them, for a step from the fit.
+    """
+
+    mine: Bools
+    factor: tuple[Floats, bool]
+    rhs: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,6 +40,7 @@ class Projection:
         factor: Cholesky factor of H.
         yy: ‖r‖².
         left_out: the same of poses predicted without themselves.
+        folds: the model without each fold of poses.
     """
 
     fit: Fit
@@ -29,6 +48,7 @@ class Projection:
     factor: tuple[Floats, bool]
     yy: float
     left_out: float
+    folds: tuple[Fold, ...]
 
     def free(self, x: Floats) -> Floats:
         """Return X − B H⁻¹ Bᵀ X for whitened columns X (R, P)."""
@@ -61,28 +81,22 @@ class Projection:
         """
         if found.rank == 0:
             return 0.0
-        fit, s = self.fit, self.fit.solution
-        ridge = np.concatenate(
-            [
-                fold_ridge(s.equations, s.beta),
-                np.full(x.shape[1], self.yy / (fit.dof * found.strength**2)),
-            ]
-        )
-        rows = np.concatenate([self.rows, x], axis=1)
-        gram = rows.T @ rows
-        rhs = rows.T @ fit.white
-        # Steps start from the fit, where its priors pull already.
-        pull = s.beta * s.equations.basis.prior_precision * s.equations.solve(s.beta)
-        rhs[: len(pull)] -= pull
-        gram[np.diag_indices_from(gram)] += ridge
-        fold = fit.whitening.rows_of(random_folds(fit.pose))
+        white = self.fit.white
+        across, gram, rhs = self.rows.T @ x, x.T @ x, x.T @ white
+        precision = self.yy / (self.fit.dof * found.strength**2)
+        gram[np.diag_indices_from(gram)] += max(precision, ROUNDING * float(gram.max()))
         left = 0.0
-        for f in range(int(fold.max()) + 1):
-            out, r = rows[fold == f], fit.white[fold == f]
-            h, b = gram - out.T @ out, rhs - out.T @ r
+        for fold in self.folds:
+            out, own, r = x[fold.mine], self.rows[fold.mine], white[fold.mine]
+            # Eliminate the model's own coordinates, then solve for the family.
+            c = across - own.T @ out
+            solved = sl.cho_solve(fold.factor, np.column_stack([c, fold.rhs]), check_finite=False)
+            h = gram - out.T @ out - c.T @ solved[:, :-1]
+            b = rhs - out.T @ r - c.T @ solved[:, -1]
             step = sl.solve(h, b, assume_a="pos", check_finite=False)
-            left += float(np.sum((r - out @ step) ** 2))
-        noise = fit.whitening.rank
+            model_step = solved[:, -1] - solved[:, :-1] @ step
+            left += float(np.sum((r - own @ model_step - out @ step) ** 2))
+        noise = self.fit.whitening.rank
         misfit = max(self.left_out - noise, 3 * np.sqrt(2 * noise))
         return float(np.clip((self.left_out - left) / misfit, -1.0, 1.0))
 
@@ -97,4 +111,20 @@ def projection(fit: Fit) -> Projection:
         s.equations.factor(s.beta),
         float(fit.white @ fit.white),
         float(np.sum(left_out**2)),
+        tuple(_folds(fit)),
     )
+
+
+def _folds(fit: Fit) -> Iterator[Fold]:
+    s = fit.solution
+    equations = s.equations
+    full = equations.gram + np.diag(fold_ridge(equations, s.beta))
+    # Steps start from the fit, where its priors pull already.
+    pull = s.beta * equations.basis.prior_precision * equations.solve(s.beta)
+    rhs = s.rows.T @ fit.white - pull
+    of_row = fit.whitening.rows_of(random_folds(fit.pose))
+    for f in range(int(of_row.max()) + 1):
+        mine = of_row == f
+        out = s.rows[mine]
+        factor, low = sl.cho_factor(full - out.T @ out, check_finite=False)
+        yield Fold(mine, (factor, bool(low)), rhs - out.T @ fit.white[mine])

@@ -126,12 +126,9 @@ def _judge(
         return "noise_misjudged", (
             f"Residuals are only {spread}: the stated covariance is too large"
         )
-    if share > PREDICTABLE or repeats is not None:
-        follow = [
-            v.variable
-            for v in places
-            if v.p_value < FALSE_ALARM and v.variable.split()[0] not in ("pose", "direction")
-        ][:2]
+    kinds = [v for v in places if v.variable.split()[0] not in ("pose", "direction")]
+    follow = [v.variable for v in kinds if v.p_value * len(kinds) < FALSE_ALARM][:2]
+    if share > PREDICTABLE or repeats is not None or follow:
         follows = f"; it follows {' and '.join(follow)}" if follow else ""
         return "unknown_effect", (
             f"Residuals are {spread}, a generic learner predicts {share:.0%} of the misfit, and no "

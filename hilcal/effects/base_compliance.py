@@ -30,8 +30,8 @@ class BaseCompliance(Effect):
         """Moment about the base origin, base axes, of slot-0 wrenches (..., 6)."""
         l0 = self.cell.arm.links[0]
         r, p = l0[:3, :3], l0[:3, 3]
-        f = wrench[..., :3] @ r.T
-        return np.asarray(wrench[..., 3:] @ r.T + np.cross(p, f))
+        f, t = se3.apply(r, wrench[..., :3]), se3.apply(r, wrench[..., 3:])
+        return t + se3.cross(p, f)
 
     def _twists(self) -> Floats:
         """(3, 6) twist in slot-0 axes of a unit rotation about each base axis."""

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from hilcal.effects.options import rated_torques
 from hilcal.effects.protocol import Columns, Effect, Parameter, Response, Situation
 from hilcal.types import Floats
 
@@ -15,10 +16,10 @@ class JointCompliance(Effect):
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """One compliance per joint."""
+        """One compliance per joint; 3 mrad at the joint's rated torque are ordinary."""
         return tuple(
-            Parameter(f"j{j + 1}", "rad/(N·m)", 2e-5, f"compliance of joint {j + 1}")
-            for j in range(self.cell.arm.n)
+            Parameter(f"j{j + 1}", "rad/(N·m)", 3e-3 / rated, f"compliance of joint {j + 1}")
+            for j, rated in enumerate(rated_torques(self.cell))
         )
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from hilcal.effects.options import rated_torques
 from hilcal.effects.protocol import Columns, Effect, Parameter, Response, Situation
 from hilcal.types import Floats
 
@@ -15,10 +16,10 @@ class JointStiffening(Effect):
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """One coefficient per joint; 20 % of the compliance at the joint's rated torque."""
+        """One coefficient per joint; as much as the compliance at the joint's rated torque."""
         return tuple(
-            Parameter(f"j{j + 1}", "rad/(N·m)³", 4e-6 / rated**2, f"stiffening of joint {j + 1}")
-            for j, rated in enumerate(self.cell.arm.torque_max)
+            Parameter(f"j{j + 1}", "rad/(N·m)³", 3e-3 / rated**3, f"stiffening of joint {j + 1}")
+            for j, rated in enumerate(rated_torques(self.cell))
         )
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:

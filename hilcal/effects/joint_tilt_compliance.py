@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from hilcal.effects.options import rated_torques
 from hilcal.effects.protocol import Columns, Effect, Parameter, Response, Situation
 from hilcal.types import Floats
 
@@ -17,10 +18,10 @@ class JointTiltCompliance(Effect):
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """One tilt compliance per joint."""
+        """One tilt compliance per joint; 1 mrad at the joint's rated torque is ordinary."""
         return tuple(
-            Parameter(f"j{j + 1}", "rad/(N·m)", 3e-6, f"tilt compliance of joint {j + 1}")
-            for j in range(self.cell.arm.n)
+            Parameter(f"j{j + 1}", "rad/(N·m)", 1e-3 / rated, f"tilt compliance of joint {j + 1}")
+            for j, rated in enumerate(rated_torques(self.cell))
         )
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:

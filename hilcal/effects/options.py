@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from hilcal.cell import Cell
 from hilcal.errors import InputError
 from hilcal.types import Floats
 
@@ -20,6 +21,12 @@ def number(effect: str, options: Options, key: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
         raise InputError(f"effect {effect}: {key} = {value!r}; valid: a finite number")
     return float(value)
+
+
+def rated_torques(cell: Cell) -> Floats:
+    """(n,) rated torques, the measure of how stiff a joint is built; 150 N·m where unknown."""
+    rated = cell.arm.torque_max
+    return np.where(np.isfinite(rated) & (rated > 0), rated, 150.0)
 
 
 def prior_of_lengths_and_turns(effect: str, options: Options, size: int) -> Floats | None:

@@ -15,9 +15,10 @@ from hilcal.cell import Cell
 from hilcal.data.readings import States
 from hilcal.effects.options import Options
 from hilcal.errors import InputError
+from hilcal.robot.batch import zeros
 from hilcal.robot.chain import Chain
 from hilcal.robot.deviation import Deviation
-from hilcal.types import Floats, Ints
+from hilcal.types import Bools, Floats, Ints
 
 Field = Literal["dq", "twist", "base", "station", "target", "scale"]
 
@@ -80,6 +81,14 @@ class Columns:
     parameter: Ints
     element: Ints
     values: Floats
+
+    def only(self, wanted: Bools) -> "Columns":
+        """Return the columns of some of the parameters."""
+        if wanted.all():
+            return self
+        return Columns(
+            self.field, self.parameter[wanted], self.element[wanted], self.values[:, wanted]
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -189,17 +198,15 @@ class Effect(ABC):
     def deviation(self, theta: Floats, s: Situation) -> Deviation:
         """Deviation of N states at parameters theta (P,)."""
         count, n = s.angle.shape
+        width = {"dq": (n,), "twist": (n + 1, 6), "scale": ()}
         fields: dict[str, Floats] = {}
         for c in self.columns(s):
+            total = fields.setdefault(c.field, zeros(count, *width.get(c.field, (6,))))
             t = theta[c.parameter]
             if c.field in ("dq", "twist"):
-                width = (n,) if c.field == "dq" else (n + 1, 6)
-                out = fields.setdefault(c.field, np.zeros((count, *width)))
                 for e in np.unique(c.element):
                     mine = c.element == e
-                    out[:, e] += np.einsum("np...,p->n...", c.values[:, mine], t[mine])
+                    total[:, e] += np.einsum("np...,p->n...", c.values[:, mine], t[mine])
             else:
-                value = np.einsum("np...,p->n...", c.values, t)
-                shape = (count, *value.shape[1:])
-                fields[c.field] = fields.get(c.field, 0.0) + np.broadcast_to(value, shape)
+                total += np.einsum("np...,p->n...", c.values, t)
         return Deviation(**fields)

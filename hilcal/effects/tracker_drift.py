@@ -34,9 +34,9 @@ class TrackerDrift(Effect):
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """Rates of displacement and rotation; 50 µm and 50 µrad over the campaign."""
-        return tuple(Parameter(a, "m/s", 5e-5 / self.span) for a in "xyz") + tuple(
-            Parameter(f"r{a}", "rad/s", 5e-5 / self.span) for a in "xyz"
+        """Rates of displacement and rotation; 0.2 mm and 0.2 mrad over the campaign."""
+        return tuple(Parameter(a, "m/s", 2e-4 / self.span) for a in "xyz") + tuple(
+            Parameter(f"r{a}", "rad/s", 2e-4 / self.span) for a in "xyz"
         )
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:

@@ -6,6 +6,7 @@ import numpy as np
 
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Whitening
+from hilcal.errors import CannotAnswerError
 from hilcal.identify.linear import Basis, NormalEquations, find_basis, normal_equations
 from hilcal.identify.residual import residual
 from hilcal.identify.shrinkage import shrink
@@ -19,6 +20,7 @@ SETTLED = 0.02
 """Priors and rank are decided anew until the residual changes by less than this share from
 one step to the next, or is within the noise; then they are kept, so that the steps converge."""
 FIRST_GUESS = 0.3
+HALVINGS = 8
 NOISE_STEPS = 50
 
 
@@ -110,15 +112,19 @@ def solve(
     basis: Basis  # set in the first step
     prediction = model.predict(readings.states, theta)
     raw = residual(readings, prediction, w)
-    settled, square = False, np.finfo(float).max
-    for iteration in range(1, MAX_ITERATIONS + 1):
+    settled, square = False, float(np.finfo(float).max)
+    for iterations in range(1, MAX_ITERATIONS + 1):  # noqa: B007 - reported
         live = np.flatnonzero(sigma > 0)
         a = whitened_jacobian(model, prediction, theta, w, live)
-        target = w.whiten(raw).reshape(-1) + a @ theta[live]
+        # Flat parameters step from where they are, so that what cannot be seen stays put;
+        # those with a prior are solved for as a whole, since the prior pulls to zero.
+        resting = np.where(np.isinf(sigma), theta, 0.0)
+        target = w.whiten(raw).reshape(-1) + a @ (theta - resting)[live]
         gram = a.T @ a
         if not settled:
             problem = _Problem(a, gram, target, w.rank, live)
-            spread = _attainable_spread(problem, sigma, scale, whitened)
+            now = _mean_square(w.whiten(raw), 0)
+            spread = _attainable_spread(problem, sigma, scale, 1.0 if whitened else now, whitened)
             beta = 1.0 if whitened else spread**2
             if choose:
                 sigma, beta = _choose_prior(problem, sigma, scale, groups, spread, whitened)
@@ -128,51 +134,93 @@ def solve(
         equations = normal_equations(a, target, basis, gram)
         if bool((groups[live] >= 0).any()):
             beta = _noise_factor(equations, float(target @ target), w.rank)
-        updated = np.zeros(model.size)
-        updated[live] = basis.transform @ equations.solve(beta)
+        updated = resting.copy()
+        updated[live] += basis.transform @ equations.solve(beta)
         step = a @ (updated - theta)[live]
-        theta = updated
-        prediction = model.predict(readings.states, theta)
-        raw = residual(readings, prediction, w)
+        goal = _Goal(model, readings, w, sigma, beta)
+        theta, prediction, raw = _walk(goal, theta, raw, updated)
         before, square = square, _mean_square(w.whiten(raw), len(basis.singular))
         converged = settled and float(step @ step) <= CONVERGED**2 * max(square, beta) * len(step)
         if converged:
             break
-        settled = (whitened and square < 1) or abs(square - before) <= SETTLED * before
+        settled = bool((whitened and square < 1) or abs(square - before) <= SETTLED * before)
     del a, gram
-    jacobian = w.raw(model.jacobian(prediction, theta, w.m)[:, :, live])
+    jacobian = w.raw(model.jacobian(prediction, theta, w.m, live))
     rows = w.whiten(jacobian).reshape(-1, len(live)) @ basis.transform
+    white = w.whiten(raw).reshape(-1)
     if not whitened:
-        beta = _mean_square(w.whiten(raw), len(basis.singular))
+        beta = _mean_square(white, len(basis.singular))
+    # Formed anew at the solution, so that folds can be taken out of them exactly.
+    z = np.zeros(basis.transform.shape[1])
+    z[len(basis.singular) :] = theta[live[basis.held]] / sigma[live[basis.held]]
+    everywhere = _all_parameters(basis, live, model.size)
+    equations = NormalEquations(everywhere, rows.T @ rows, rows.T @ (white + rows @ z))
     return Solution(
         theta=theta,
         prior=sigma,
         beta=beta,
-        equations=replace(equations, basis=_all_parameters(basis, live, model.size)),
+        equations=equations,
         live=live,
         rows=rows,
         prediction=prediction,
         raw=raw,
-        white=w.whiten(raw).reshape(-1),
+        white=white,
         jacobian=jacobian,
         effective=len(basis.singular) + _effective(equations, beta),
-        iterations=iteration,
+        iterations=iterations,
         converged=converged,
     )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Goal:
+    """What Gauss-Newton makes small: ‖r‖² + β ‖θ/σ‖² over the parameters with a prior."""
+
+    model: Model
+    readings: Readings
+    w: Whitening
+    sigma: Floats
+    beta: float
+
+    def __call__(self, theta: Floats, raw: Floats) -> float:
+        held = np.isfinite(self.sigma) & (self.sigma > 0)
+        pull = self.beta * float(np.sum((theta[held] / self.sigma[held]) ** 2))
+        return float(np.sum(self.w.whiten(raw) ** 2)) + pull
+
+
+def _walk(
+    goal: _Goal, theta: Floats, raw: Floats, aim: Floats
+) -> tuple[Floats, Prediction, Floats]:
+    """Go towards `aim`, half as far each time while the goal grows.
+
+    A weakly determined direction can be so long a way that the chain bends on it.
+    """
+    now = goal(theta, raw)
+    share = 1.0
+    for _ in range(HALVINGS):
+        trial = aim if share == 1 else theta + share * (aim - theta)
+        try:
+            prediction = goal.model.predict(goal.readings.states, trial)
+        except CannotAnswerError:
+            share /= 2
+            continue
+        left = residual(goal.readings, prediction, goal.w)
+        if goal(trial, left) <= now * (1 + 1e-9) + 1e-12:
+            return trial, prediction, left
+        share /= 2
+    return theta, goal.model.predict(goal.readings.states, theta), raw
 
 
 def whitened_jacobian(
     model: Model, prediction: Prediction, theta: Floats, w: Whitening, live: Ints
 ) -> Floats:
     """Whitened derivative (R, L) of the measurements by the live parameters."""
-    jacobian = model.jacobian(prediction, theta, w.m)
-    if len(live) < jacobian.shape[2]:
-        jacobian = jacobian[:, :, live]
+    jacobian = model.jacobian(prediction, theta, w.m, live)
     return w.whiten(w.raw(jacobian)).reshape(-1, len(live))
 
 
 def _attainable_spread(
-    p: "_Problem", sigma: Floats, scale: Floats, whitened: bool
+    p: "_Problem", sigma: Floats, scale: Floats, beta: float, whitened: bool
 ) -> float:
     """Root mean square of the residual that the linear problem leaves.
 
@@ -180,7 +228,7 @@ def _attainable_spread(
     """
     basis = find_basis(p.a, scale[p.live], sigma[p.live], 1.0 if whitened else None)
     equations = normal_equations(p.a, p.target, basis, p.gram)
-    z = equations.solve(1.0 if whitened else 0.0)
+    z = equations.solve(beta)
     left = float(p.target @ p.target) - 2 * float(equations.rhs @ z) + float(z @ equations.gram @ z)
     return float(np.sqrt(max(left, 1e-30) / max(p.rank - len(basis.singular), 1)))
 

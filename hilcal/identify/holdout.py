@@ -15,6 +15,7 @@ from hilcal.identify.gauss_newton import Solution
 from hilcal.identify.linear import NormalEquations
 from hilcal.types import Floats, Ints
 
+ROUNDING = 1e-6
 WEAK = 1e-6
 """Weight that holds a direction which a fold cannot see near the full fit: its prior is a
 thousand times the ordinary magnitude."""
@@ -37,7 +38,7 @@ def fold_ridge(equations: NormalEquations, beta: float) -> Floats:
     """(K,) what is added to the diagonal of a fold's normal equations."""
     basis = equations.basis
     ridge = beta * basis.prior_precision
-    ridge[: len(basis.singular)] = WEAK * beta / basis.singular**2
+    ridge[: len(basis.singular)] = np.maximum(WEAK * beta / basis.singular**2, ROUNDING)
     return ridge
 
 

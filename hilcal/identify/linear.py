@@ -20,8 +20,8 @@ import scipy.linalg as sl
 
 from hilcal.types import Bools, Floats, Ints
 
-INFORMATION = 0.05
-"""In units of the residual's spread: a direction is estimated where 20 times the ordinary
+INFORMATION = 0.2
+"""In units of the residual's spread: a direction is estimated where five times the ordinary
 magnitude along it would move all data together by one σ."""
 ROUNDING = 1e-10
 
@@ -105,7 +105,7 @@ class NormalEquations:
     Attributes:
         basis: the coordinates.
         gram: (K, K) Tᵀ AᵀA T.
-        rhs: (K,) Tᵀ Aᵀ (r + A θ_0), the data's part for z itself (not its step).
+        rhs: (K,) Tᵀ Aᵀ target; z is a step for flat directions, absolute for those with a prior.
     """
 
     basis: Basis

@@ -88,7 +88,8 @@ def solve(p: Problem, prediction: Prediction, w: Whitening, a: Floats) -> Floats
     """Rank analysis, normal equations and solution."""
     target = w.whiten(residual(p.readings, prediction, w)).reshape(-1) + a @ p.theta
     basis = find_basis(a, scales_of(p.model), prior_of(p.model)[0])
-    return np.asarray(basis.transform @ normal_equations(a.T @ a, a.T @ target, basis).solve())
+    equations = normal_equations(a, target, basis, a.T @ a)
+    return np.asarray(basis.transform @ equations.solve())
 
 
 def step(p: Problem, prediction: Prediction) -> Floats:
