@@ -1,6 +1,5 @@
 """Scaling of measurements: the laws of `hilcal.data.whitening`."""
 
-
 import numpy as np
 import pytest
 from hypothesis import assume, given
@@ -347,5 +346,3 @@ def rotation_variance(unloaded: int, count: int = 4000) -> Floats:
 
 def test_rotations_have_the_stated_noise() -> None:
     assert np.abs(rotation_variance(1) - 1).max() < 4 * np.sqrt(2 / 4000)
-
-

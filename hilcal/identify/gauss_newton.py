@@ -196,6 +196,7 @@ def _walk(
     A weakly determined direction can be so long a way that the chain bends on it.
     """
     now = goal(theta, raw)
+    theta = np.where(goal.sigma > 0, theta, 0.0)
     share = 1.0
     for _ in range(HALVINGS):
         trial = aim if share == 1 else theta + share * (aim - theta)
@@ -208,7 +209,8 @@ def _walk(
         if goal(trial, left) <= now * (1 + 1e-9) + 1e-12:
             return trial, prediction, left
         share /= 2
-    return theta, goal.model.predict(goal.readings.states, theta), raw
+    prediction = goal.model.predict(goal.readings.states, theta)
+    return theta, prediction, residual(goal.readings, prediction, goal.w)
 
 
 def whitened_jacobian(

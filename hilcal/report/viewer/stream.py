@@ -152,7 +152,13 @@ def disable_analytics() -> None:
 
 def _open(story: Story, limits: Limits | None) -> tuple[Digest, rr.RecordingStream]:
     check(story)
-    rec = rr.RecordingStream(APPLICATION, recording_id=recording_id(story), send_properties=False)
+    rec = rr.RecordingStream(
+        APPLICATION,
+        recording_id=recording_id(story),
+        send_properties=False,
+        # Chunks end where the story is flushed, not when a clock ticks: equal files.
+        batcher_config=rr.ChunkBatcherConfig.NEVER(),
+    )
     rec.set_log_time_enabled(False)
     rec.set_log_tick_enabled(False)
     return digest(story, limits or Limits()), rec
