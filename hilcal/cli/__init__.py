@@ -14,6 +14,7 @@ from hilcal import __version__
 from hilcal.cli.catalogue import effects, scaling
 from hilcal.cli.demo import demo
 from hilcal.cli.fitting import compare, identify, validate
+from hilcal.cli.hidden import hidden
 from hilcal.cli.refining import add, diagnose, refine, view
 from hilcal.cli.tables import export, import_
 from hilcal.errors import HilcalError
@@ -54,6 +55,7 @@ def _application() -> typer.Typer:
         app.command(name)(command)
     study = make("Studies of the program's own mathematics.")
     study.command("scaling")(scaling)
+    study.command("hidden")(hidden)
     study.callback()(_group)
     app.add_typer(study, name="study")
     app.callback()(_top)
