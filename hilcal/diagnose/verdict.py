@@ -127,9 +127,10 @@ def _judge(
             f"Residuals are only {spread}: the stated covariance is too large"
         )
     kinds = [v for v in places if v.variable.split()[0] not in ("pose", "direction")]
-    follow = [v.variable for v in kinds if v.p_value * len(kinds) < FALSE_ALARM][:2]
+    follow = [v for v in kinds if v.p_value * len(kinds) < FALSE_ALARM]
     if share > PREDICTABLE or repeats is not None or follow:
-        follows = f"; it follows {' and '.join(follow)}" if follow else ""
+        named = [v.variable for v in follow if v.share >= LEAST_SHARE][:2]
+        follows = f"; it follows {' and '.join(named)}" if named else ""
         return "unknown_effect", (
             f"Residuals are {spread}, a generic learner predicts {share:.0%} of the misfit, and no "
             f"effect of the catalogue explains {LEAST_SHARE:.0%} of it or more{follows}"
