@@ -13,10 +13,13 @@ from hilcal.effects.options import reading_options
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit, fit
 from hilcal.model import Model
+from hilcal.types import Floats
 
 MOST_REVISIONS = 15
 LEAST_GAIN = 0.002
-"""Share by which the error on poses left out must fall for an effect to stay."""
+"""Share by which the error on poses left out must fall for an effect to stay ..."""
+SURE = 2.0
+"""... and by how many of its standard errors, from pose to pose."""
 
 Say = Callable[[str], None]
 
@@ -93,8 +96,7 @@ def refine(model: Model, readings: Readings, mode: Mode, say: Say | None = None)
                 continue
             tell(f"adding {name}")
             trial = add(steps[-1].fit, name)
-            before = steps[-1].fit.holdout.rms_sigma
-            if trial.holdout.rms_sigma < (1 - LEAST_GAIN) * before:
+            if predicts_better(steps[-1].fit, trial):
                 same = next(s.same_as for s in diagnosis.suspects if s.effect == name)
                 if same:
                     doubts.append(f"{name} could as well be {' or '.join(same)}")
@@ -116,6 +118,23 @@ def refine(model: Model, readings: Readings, mode: Mode, say: Say | None = None)
         verdict = "ambiguous"
         message = f"{message}; but {'; '.join(doubts)}: measure what separates them"
     return Refinement(tuple(steps), verdict, message, tuple(rejected))
+
+
+def predicts_better(before: Fit, after: Fit) -> bool:
+    """Whether the error on poses left out falls, by more than it scatters from pose to pose."""
+    if after.holdout.rms_sigma >= (1 - LEAST_GAIN) * before.holdout.rms_sigma:
+        return False
+    if np.any(before.outlier != after.outlier):
+        return True
+    gain = _squares_by_pose(before) - _squares_by_pose(after)
+    error = float(np.std(gain)) / np.sqrt(max(len(gain) - 1, 1))
+    return bool(np.mean(gain) > SURE * error)
+
+
+def _squares_by_pose(f: Fit) -> Floats:
+    """Squared whitened residual of each pose, predicted without it."""
+    white = f.whitening.whiten(f.left_out).reshape(len(f.left_out), -1)
+    return np.asarray(np.bincount(f.pose, weights=np.sum(white**2, axis=1)), dtype=float)
 
 
 def _names(model: Model) -> str:
