@@ -14,6 +14,9 @@ from scipy.stats import norm
 
 from hilcal.types import Floats
 
+NEAR_MEAN = 2e-3
+"""Distance from the mean, in standard deviations, within which the formula loses digits."""
+
 
 def ratio_tail(eigenvalues: Floats, dimension: float, c: float) -> float:
     """Probability that a ratio of quadratic forms exceeds c.
@@ -44,10 +47,13 @@ def ratio_tail(eigenvalues: Floats, dimension: float, c: float) -> float:
     curvature = 2 * float(np.sum(weight * (d / (1 - 2 * t * d)) ** 2))
     w = np.sign(t) * np.sqrt(max(-2 * cumulant, 0.0))
     v = t * np.sqrt(curvature)
-    if abs(w) < 1e-3:
-        third = 8 * float(np.sum(weight * d**3))
-        # log(v/w)/w tends to a sixth of the skewness.
-        return float(norm.sf(w + third / (6 * curvature**1.5)))
+    if abs(w) < NEAR_MEAN:
+        # The formula is 0/0 at the mean: go straight from one side of it to the other.
+        mean = float(eigenvalues.sum()) / dimension
+        spread = np.sqrt(2 * float(np.sum(weight * (scale * d + c - mean) ** 2))) / dimension
+        low, high = mean - 3 * NEAR_MEAN * spread, mean + 3 * NEAR_MEAN * spread
+        p_low, p_high = (ratio_tail(eigenvalues, dimension, at) for at in (low, high))
+        return float(p_low + (p_high - p_low) * (c - low) / (high - low))
     if w > 8:
         # Deep tail, in logarithms: sf(w) + φ(w) (1/v − 1/w)
         return float(np.exp(log_ndtr(-(w + np.log(v / w) / w))))
