@@ -1,11 +1,22 @@
-"""The cell's configuration: one frozen section per table of CELL.toml."""
+"""CELL.toml as a whole, and the sections that say what the cell is."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, Strict, model_validator
 
+from hilcal.config.rig import (
+    OPTIONS,
+    PORT,
+    ROTVEC,
+    VECTOR_M,
+    Acquire,
+    ForceSensor,
+    Motion,
+    Operator,
+    Whole,
+)
 from hilcal.errors import InputError
 from hilcal.toml import (
     NonNegative,
@@ -18,9 +29,6 @@ from hilcal.toml import (
 from hilcal.types import Floats
 
 STANDARD_GRAVITY_M_S2 = 9.80665
-
-_VECTOR_M = "three finite numbers in m, e.g. [0.0, 0.0, 0.1]"
-_ROTVEC = "a rotation vector: three finite numbers in rad, e.g. [0.0, 0.0, 1.57]"
 
 
 def _std(what: str) -> str:
@@ -37,6 +45,13 @@ class Robot(Section):
         (0.0, 0.0, -STANDARD_GRAVITY_M_S2),
         description="gravity in base axes: three finite numbers in m/s², e.g. [0.0, 0.0, -9.80665]",
     )
+    driver: str | None = Field(
+        None, min_length=1, description='the name of an arm\'s driver, e.g. "ur"'
+    )
+    host: str | None = Field(
+        None, min_length=1, description='the controller\'s address, e.g. "192.168.56.101"'
+    )
+    options: dict[str, Any] = Field(default_factory=dict, description=OPTIONS)
     base_link: str | None = Field(None, description="the name of a link of the URDF")
     tip_link: str | None = Field(None, description="the name of a link of the URDF")
 
@@ -54,12 +69,12 @@ class Tool(Section):
     """[tool]: what the flange carries, where the target sits and the load acts (flange axes)."""
 
     target_m: Vector3 | None = Field(
-        None, description=_VECTOR_M + "; leave it out to have it estimated"
+        None, description=VECTOR_M + "; leave it out to have it estimated"
     )
-    target_rotvec_rad: Vector3 | None = Field(None, description=_ROTVEC)
-    load_point_m: Vector3 = Field((0.0, 0.0, 0.0), description=_VECTOR_M)
+    target_rotvec_rad: Vector3 | None = Field(None, description=ROTVEC)
+    load_point_m: Vector3 = Field((0.0, 0.0, 0.0), description=VECTOR_M)
     mass_kg: NonNegative = Field(0.0, description="a mass in kg, 0 or more")
-    com_m: Vector3 = Field((0.0, 0.0, 0.0), description=_VECTOR_M)
+    com_m: Vector3 = Field((0.0, 0.0, 0.0), description=VECTOR_M)
 
     @model_validator(mode="after")
     def _metres(self) -> "Tool":
@@ -81,15 +96,23 @@ class Tracker(Section):
     and half of 0.01° for orientations.
     """
 
+    driver: str | None = Field(
+        None, min_length=1, description='the name of a tracker\'s driver, e.g. "geocom"'
+    )
+    port: str | None = Field(None, min_length=1, description=PORT)
+    baud: Whole | None = Field(
+        None, description="the line's rate in Bd; the driver's own if absent"
+    )
+    options: dict[str, Any] = Field(default_factory=dict, description=OPTIONS)
     frame: Literal["tracker", "base"] = Field(
         "tracker", description='"tracker" or "base": the axes in which positions are given'
     )
     base_xyz_m: Vector3 | None = Field(
-        None, description=_VECTOR_M + ": the arm's base in the tracker frame"
+        None, description=VECTOR_M + ": the arm's base in the tracker frame"
     )
-    base_rotvec_rad: Vector3 | None = Field(None, description=_ROTVEC)
+    base_rotvec_rad: Vector3 | None = Field(None, description=ROTVEC)
     station_m: Vector3 | None = Field(
-        None, description=_VECTOR_M + ": the tracker's position in base axes"
+        None, description=VECTOR_M + ": the tracker's position in base axes"
     )
     range_std_m: Positive = Field(
         5e-6, description=_std("along the beam in m, more than 0, e.g. 5e-6")
@@ -194,6 +217,28 @@ class Limits(Section):
     torque_share: Annotated[float, Strict(), Field(gt=0, le=1)] = Field(
         0.9, description="the usable share of the joint torques, more than 0, at most 1"
     )
+    workspace_min_m: Vector3 | None = Field(
+        None, description=VECTOR_M + ": a corner that flange, target and load point stay above"
+    )
+    workspace_max_m: Vector3 | None = Field(
+        None, description=VECTOR_M + ": a corner that flange, target and load point stay below"
+    )
+    joint_speed_rad_s: Positive = Field(
+        2.0, description="a measured joint speed in rad/s that stops the arm, over 0"
+    )
+
+    @model_validator(mode="after")
+    def _box(self) -> "Limits":
+        low, high = self.workspace_min_m, self.workspace_max_m
+        if (
+            low is not None
+            and high is not None
+            and not all(a < b for a, b in zip(low, high, strict=True))
+        ):
+            raise ValueError(
+                f"workspace_min_m = {list(low)} is not below workspace_max_m = {list(high)}"
+            )
+        return self
 
 
 class Simulation(Section):
@@ -205,6 +250,9 @@ class Simulation(Section):
     hide: str | None = Field(None, description='the name of an effect to hide, or "random"')
     strength_sigma: Positive = Field(
         3.0, description="the RMS strength of the hidden effect in sigmas of a reading, more than 0"
+    )
+    clock: Annotated[float, Strict(), Field(ge=1, le=200)] = Field(
+        1.0, description="how much faster than real time the simulated world goes, 1 to 200"
     )
 
 
@@ -218,6 +266,12 @@ class CellConfig(Section):
         default_factory=Repeatability, description="a section [repeatability]"
     )
     loads: tuple[Load, ...] = Field((), description="sections [[loads]], one per load")
+    force_sensor: ForceSensor | None = Field(
+        None, description='a section [force_sensor] with driver = "ft300" and port or the like'
+    )
+    operator: Operator = Field(default_factory=Operator, description="a section [operator]")
+    motion: Motion = Field(default_factory=Motion, description="a section [motion]")
+    acquire: Acquire = Field(default_factory=Acquire, description="a section [acquire]")
     limits: Limits = Field(default_factory=Limits, description="a section [limits]")
     simulation: Simulation = Field(default_factory=Simulation, description="a section [simulation]")
 

@@ -1,0 +1,69 @@
+"""The admin line of a simulated device: JSON lines over a Unix socket, for faults and tests."""
+
+import json
+import os
+import socket
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from hilcal.errors import DeviceError
+
+Handler = Callable[[str, dict[str, Any]], Any]
+
+
+def ask(path: Path, op: str, timeout: float = 5.0, **arguments: Any) -> Any:
+    """Send one request to the simulated device behind `path` and return its answer.
+
+    Raises:
+        DeviceError: nobody answers, or the device refuses the request.
+    """
+    try:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as line:
+            line.settimeout(timeout)
+            line.connect(str(path))
+            line.sendall(json.dumps({"op": op, **arguments}).encode() + b"\n")
+            with line.makefile("rb") as stream:
+                answer = json.loads(stream.readline() or b'{"error": "closed without an answer"}')
+    except (OSError, ValueError) as error:
+        raise DeviceError(f"simulated device at {path.name}: {error}") from None
+    if "error" in answer:
+        raise DeviceError(f"simulated device at {path.name}: {answer['error']}")
+    return answer["result"]
+
+
+def serve(path: Path, handler: Handler) -> None:
+    """Answer requests in a daemon thread; `handler(op, arguments)` returns what JSON can hold.
+
+    What the handler raises is told to the one who asked. The socket appears only when it
+    answers, so its existence tells that the device is ready.
+    """
+    new = path.with_name(path.name + ".new")
+    new.unlink(missing_ok=True)
+    server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    server.bind(str(new))
+    server.listen(16)
+    os.replace(new, path)
+
+    def talk(line: socket.socket) -> None:
+        with line, line.makefile("rwb") as stream:
+            for request in stream:
+                try:
+                    arguments = json.loads(request)
+                    result = handler(str(arguments.pop("op")), arguments)
+                    answer = {"result": result}
+                except Exception as error:  # whatever it is, the asker has to know
+                    answer = {"error": f"{type(error).__name__}: {error}"}
+                try:
+                    stream.write(json.dumps(answer).encode() + b"\n")
+                    stream.flush()
+                except OSError:
+                    return
+
+    def listen() -> None:
+        while True:
+            line, _ = server.accept()
+            threading.Thread(target=talk, args=(line,), daemon=True).start()
+
+    threading.Thread(target=listen, daemon=True).start()

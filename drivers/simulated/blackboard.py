@@ -1,0 +1,124 @@
+"""The one physical world, as all simulated devices see it: a small shared file.
+
+Each section has one writer and any number of readers, in other processes. A sequence number
+that is odd while the section is being written tells readers to look again (a seqlock; see
+Linux kernel documentation, "Sequence counters and sequential locks").
+"""
+
+import mmap
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+N = 6
+"""Joints of the arm in the cell."""
+
+SECTIONS: dict[str, np.dtype[Any]] = {
+    # written once by the world
+    "world": np.dtype([("start_ns", "<i8"), ("scale", "<f8")]),
+    # written by the arm's controller
+    "arm": np.dtype(
+        [
+            ("alive", "<f8"),  # 1 once the controller has written its state
+            ("q", "<f8", N),  # where the commanded trajectory is, rad
+            ("qd", "<f8", N),  # its speed, rad/s
+            ("side", "<f8", N),  # direction of each joint's last motion, -1 or +1
+            ("arrivals", "<i8"),  # motions that have ended (also by a stop)
+            ("moving", "<f8"),  # 1 while the trajectory runs
+            ("payload", "<f8"),  # what the controller has been told, kg
+            ("payload_com", "<f8", 3),  # flange axes, m
+        ]
+    ),
+    # written by the world: what is true
+    "truth": np.dtype(
+        [
+            ("time", "<f8"),  # world time of the content, s
+            ("load", "<i8"),  # number of the load in the cell's [[loads]] + 1, 0 is none
+            ("load_since", "<f8"),  # world time of its last change, s
+            ("target", "<f8", 3),  # tracked target, sensor (tracker) axes, m
+            ("target_rotation", "<f8", (3, 3)),
+            ("flange", "<f8", (4, 4)),  # T_base_flange
+            ("sensor_wrench", "<f8", 6),  # on the force sensor by tool and load, sensor axes
+            ("drive_torque", "<f8", N),  # N·m
+            ("encoder", "<f8", N),  # what the encoders read, rad
+            ("joint_temperature", "<f8", N),  # °C
+            ("air_temperature", "<f8"),  # °C
+            ("arrivals", "<i8"),  # the arm's `arrivals` that the content belongs to
+        ]
+    ),
+}
+_SEQUENCE = 8
+_TRIES = 10_000
+
+
+def _offsets() -> tuple[dict[str, int], int]:
+    at, out = 0, {}
+    for name, kind in SECTIONS.items():
+        out[name] = at
+        at += -(-(_SEQUENCE + kind.itemsize) // 64) * 64
+    return out, at
+
+
+_AT, SIZE = _offsets()
+
+
+class Blackboard:
+    """An open shared file; use `create` once and `attach` in every process."""
+
+    def __init__(self, path: Path) -> None:
+        """Map an existing file."""
+        with path.open("r+b") as stream:
+            self._map = mmap.mmap(stream.fileno(), SIZE)
+        self._sequence = {
+            name: np.frombuffer(self._map, "<i8", 1, offset) for name, offset in _AT.items()
+        }
+        self._content = {
+            name: np.frombuffer(self._map, kind, 1, _AT[name] + _SEQUENCE)
+            for name, kind in SECTIONS.items()
+        }
+
+    @classmethod
+    def create(cls, path: Path, scale: float) -> "Blackboard":
+        """Make the file and start the world's clock; `scale` is world seconds per real second."""
+        path.write_bytes(bytes(SIZE))
+        board = cls(path)
+        board.write("world", start_ns=time.monotonic_ns(), scale=scale)
+        return board
+
+    @classmethod
+    def attach(cls, path: Path) -> "Blackboard":
+        """Map the file of a running world."""
+        return cls(path)
+
+    def write(self, section: str, **fields: Any) -> None:
+        """Set fields of a section, all at once for readers; only its one writer may."""
+        sequence, content = self._sequence[section], self._content[section]
+        sequence[0] += 1
+        for name, value in fields.items():
+            content[name][0] = value
+        sequence[0] += 1
+
+    def read(self, section: str) -> Any:
+        """Return a consistent copy of a section, a record with the fields of `SECTIONS`."""
+        sequence, content = self._sequence[section], self._content[section]
+        for _ in range(_TRIES):
+            before = int(sequence[0])
+            if before % 2 == 0:
+                copy = content[0].copy()
+                if int(sequence[0]) == before:
+                    return copy
+            time.sleep(0)
+        raise RuntimeError(f"blackboard: section {section} is never at rest (its writer died?)")
+
+    @property
+    def time(self) -> float:
+        """World time, s since the world's start."""
+        world = self._content["world"][0]
+        return float((time.monotonic_ns() - int(world["start_ns"])) * 1e-9 * world["scale"])
+
+    @property
+    def scale(self) -> float:
+        """World seconds per real second."""
+        return float(self._content["world"]["scale"][0])

@@ -1,0 +1,1 @@
+"""Measuring a campaign: device protocols, limits, settling, averaging, the run itself."""

@@ -1,0 +1,290 @@
+"""What the run asks of an arm, a tracker, a force sensor and an operator.
+
+A driver is a factory `open(config: CellConfig) -> device`, found by the name that the
+configuration gives, as an entry point of the groups below. Opening connects and moves nothing;
+a device that does not answer raises `DeviceError` with one clear line, within its deadline.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from hilcal.config import Load
+from hilcal.errors import DeviceError
+from hilcal.types import Floats
+
+ARMS = "hilcal.arms"
+TRACKERS = "hilcal.trackers"
+FORCE_SENSORS = "hilcal.force_sensors"
+OPERATORS = "hilcal.operators"
+
+
+class TargetLostError(DeviceError):
+    """The tracker does not see its target; worth another try after `Tracker.find_target`."""
+
+
+class WrongLoadError(DeviceError):
+    """What hangs is not what was asked for."""
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """What a device says of itself; nothing moved for it.
+
+    Attributes:
+        device: its part in the cell: "arm", "tracker", "force sensor", "operator".
+        name: the maker's name for it, with its serial number where it tells.
+        facts: (what, value) for people: versions, modes, rates, temperatures.
+        problems: what has to be put right before a run, one clear line each.
+    """
+
+    device: str
+    name: str
+    facts: tuple[tuple[str, str], ...] = ()
+    problems: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ArmSample:
+    """One consistent sample of the arm's state, SI.
+
+    Attributes:
+        host_ns: `time.monotonic_ns` right after the sample came.
+        timestamp: the controller's own clock, s.
+        q: (n,) actual joint angles, rad.
+        q_target: (n,) commanded joint angles, rad.
+        qd: (n,) actual joint speeds, rad/s.
+        target_moment: (n,) torques that the controller computes, N·m.
+        current: (n,) actual motor currents, A.
+        target_current: (n,) commanded motor currents, A.
+        joint_temperature: (n,) °C.
+        tcp_pose: (6,) position and rotation vector of the tool point, m and rad.
+        tcp_force: (6,) wrench as the controller estimates it, N and N·m.
+        ft_raw_wrench: (6,) raw wrench of a sensor built into the arm; None where unknown.
+        payload: payload that the controller has been told, kg.
+        payload_com: (3,) its centre of mass, flange axes, m; None where unknown.
+        speed_scaling: what the controller makes of the speed, 0 to 1.
+        safety: the safety state in the maker's words, "normal" where all is well.
+    """
+
+    host_ns: int
+    timestamp: float
+    q: Floats
+    q_target: Floats
+    qd: Floats
+    target_moment: Floats
+    current: Floats
+    target_current: Floats
+    joint_temperature: Floats
+    tcp_pose: Floats
+    tcp_force: Floats
+    ft_raw_wrench: Floats | None
+    payload: float
+    payload_com: Floats | None
+    speed_scaling: float
+    safety: str
+
+
+class Arm(Protocol):
+    """An arm that moves in joint space.
+
+    Without `take_control` nothing can move. Any failure of the arm or of its link raises
+    DeviceError that names the cause, after the arm has been told to stop.
+    """
+
+    def report(self) -> Report:
+        """Say who answered, versions, state, and every problem at once; moves nothing."""
+        ...
+
+    def sample(self) -> ArmSample:
+        """Return a sample younger than 0.2 s (real time).
+
+        Raises:
+            DeviceError: the link is dead or stale.
+        """
+        ...
+
+    def take_control(self, mass: float, com: Floats) -> None:
+        """Become the one who commands the arm, and set its payload.
+
+        Args:
+            mass: payload at the flange, kg.
+            com: (3,) its centre of mass, flange axes, m.
+        """
+        ...
+
+    def set_payload(self, mass: float, com: Floats) -> None:
+        """Tell the controller what hangs at the flange, kg and m (flange axes); verified."""
+        ...
+
+    def start_move(self, q: Floats, speed: float, acceleration: float) -> None:
+        """Start a motion along a straight line in joint space and return at once.
+
+        Args:
+            q: (n,) goal, rad.
+            speed: of the leading joint, rad/s.
+            acceleration: of the leading joint, rad/s².
+        """
+        ...
+
+    def moving(self) -> bool:
+        """Whether the motion is still going on; call at least every 0.1 s (real time).
+
+        If nobody calls for 0.5 s (real time) while the arm moves, the arm stops by itself.
+
+        Raises:
+            DeviceError: the motion failed or the robot is not in a state to move: protective
+                stop, emergency stop, program stopped, link lost; the arm has been stopped.
+        """
+        ...
+
+    def stop(self) -> None:
+        """Stop the arm by every way there is; returns when it stands.
+
+        Raises:
+            DeviceError: it could not be made sure that it stands.
+        """
+        ...
+
+    def close(self) -> None:
+        """Stop, give control back, end all helpers. Never raises, may be called twice."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackerSample:
+    """One measurement of the target.
+
+    Attributes:
+        host_ns: `time.monotonic_ns` right after it came.
+        value: (m,) position in m and, for m = 6, rotation vector in rad, sensor axes.
+        covariance: (m, m) of this one measurement, from the instrument's specification and
+            what it says of itself.
+        warning: what the instrument remarked, empty where nothing.
+    """
+
+    host_ns: int
+    value: Floats
+    covariance: Floats
+    warning: str = ""
+
+
+class Tracker(Protocol):
+    """An instrument that measures the position (or pose) of one target."""
+
+    def report(self) -> Report:
+        """Say who answered, versions, lock state, and every problem at once."""
+        ...
+
+    def measure(self) -> TrackerSample:
+        """Measure once.
+
+        Raises:
+            TargetLostError: no target, beam broken, lock lost, no distance.
+            DeviceError: the instrument or its line failed.
+        """
+        ...
+
+    def find_target(self) -> None:
+        """Search and lock the target again.
+
+        Raises:
+            TargetLostError: not found.
+            DeviceError: the instrument or its line failed.
+        """
+        ...
+
+    def close(self) -> None:
+        """Give the port back. Never raises, may be called twice."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WrenchSample:
+    """The raw reading of a force sensor, averaged over a window.
+
+    Attributes:
+        host_ns: `time.monotonic_ns` right after the last frame came.
+        wrench: (6,) mean force and moment, sensor axes, N and N·m; the sensor's own zero.
+        covariance: (6, 6) of one frame in the window (not of the mean); zero for one frame.
+        frames: number of frames in the window.
+        temperature: of the sensor, °C; None where it does not tell.
+    """
+
+    host_ns: int
+    wrench: Floats
+    covariance: Floats
+    frames: int
+    temperature: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Losses:
+    """What went wrong on the line since it was opened.
+
+    Attributes:
+        frames: good frames.
+        lost: frames that should have come and did not.
+        corrupt: frames whose checksum was wrong.
+        skipped: bytes that belonged to no frame.
+    """
+
+    frames: int
+    lost: int
+    corrupt: int
+    skipped: int
+
+
+class ForceSensor(Protocol):
+    """A six-component wrench sensor that streams."""
+
+    def report(self) -> Report:
+        """Say who answered, versions, rate, temperature, and every problem at once."""
+        ...
+
+    def latest(self) -> WrenchSample:
+        """Return the newest frame, younger than 0.2 s.
+
+        Raises:
+            DeviceError: the stream is dead or stale.
+        """
+        ...
+
+    def average(self, seconds: float) -> WrenchSample:
+        """Return the mean of the frames that come in the next so many real seconds.
+
+        Raises:
+            DeviceError: the stream is dead, or gave too few frames.
+        """
+        ...
+
+    def losses(self) -> Losses:
+        """Return the counters."""
+        ...
+
+    def close(self) -> None:
+        """Stop the stream, give the port back. Never raises, may be called twice."""
+        ...
+
+
+class Operator(Protocol):
+    """The person who hangs the loads."""
+
+    def report(self) -> Report:
+        """Say who is asked."""
+        ...
+
+    def hang(self, load: Load | None, why: str) -> None:
+        """Ask for a load (None: take everything off) and wait until it is said to be done.
+
+        Args:
+            load: what to hang.
+            why: why it is asked for (again), one line; empty at the first time.
+
+        Raises:
+            DeviceError: the person gives up.
+        """
+        ...
+
+    def close(self) -> None:
+        """Give the terminal back. Never raises, may be called twice."""
+        ...

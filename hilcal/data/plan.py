@@ -1,0 +1,167 @@
+"""A plan: which states to measure, in which order. Data that a person can edit."""
+
+import json
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hilcal.errors import InputError
+from hilcal.toml import suggest
+from hilcal.types import Floats
+
+FORMAT = "hilcal-plan"
+VERSION = 1
+UNLOADED = "none"
+REFERENCE = "reference"
+"""The pose that drift checks return to, and where loads are changed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One reading to take; (pose, load, cycle) names it in the whole campaign.
+
+    Attributes:
+        pose: name of the pose.
+        load: name of the load, "none" for unloaded.
+        cycle: readings of one pose and one cycle share their unloaded reading.
+    """
+
+    pose: str
+    load: str
+    cycle: int = 0
+
+    def __str__(self) -> str:
+        """Return the step for people."""
+        return f"{self.pose}, {self.load}, cycle {self.cycle}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plan:
+    """Poses, and steps in the order in which they are taken.
+
+    Attributes:
+        pose_names: P distinct names.
+        q: (P, n) commanded joint angles, rad.
+        steps: distinct steps.
+        about: further keys of the file: how the plan was made, what it promises.
+    """
+
+    pose_names: tuple[str, ...]
+    q: Floats
+    steps: tuple[Step, ...]
+    about: dict[str, Any] = field(default_factory=dict)
+
+    def joints(self, pose: str) -> Floats:
+        """Return the (n,) joint angles of a pose by name, rad."""
+        return np.asarray(self.q[self.pose_names.index(pose)])
+
+    @property
+    def loads(self) -> tuple[str, ...]:
+        """Names of the loads in the order of their first use, "none" included."""
+        return tuple(dict.fromkeys(step.load for step in self.steps))
+
+    def without(self, done: frozenset[Step]) -> "Plan":
+        """Return the same plan with only the steps that are not in `done`."""
+        return replace(self, steps=tuple(step for step in self.steps if step not in done))
+
+    def to_json(self) -> str:
+        """Return the plan as a JSON document; `read_plan` reads it back exactly."""
+        poses = [
+            {"name": name, "q_rad": [float(x) for x in q]}
+            for name, q in zip(self.pose_names, self.q, strict=True)
+        ]
+        steps = [{"pose": s.pose, "load": s.load, "cycle": s.cycle} for s in self.steps]
+        head = {"format": FORMAT, "version": VERSION}
+        return json.dumps({**head, **self.about, "poses": poses, "steps": steps}, indent=1)
+
+
+def load_plan(path: Path) -> Plan:
+    """Read a plan file.
+
+    Raises:
+        InputError: unreadable, not a plan, or something in it that cannot be.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such plan file; make one with: hilcal plan") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read ({error})") from None
+    return read_plan(text, str(path))
+
+
+def read_plan(text: str, where: str) -> Plan:
+    """Return the plan in a JSON document; `where` names it in messages.
+
+    Raises:
+        InputError: not a plan, or something in it that cannot be.
+    """
+    try:
+        data = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise InputError(f"{where}: not JSON: {error.msg} (line {error.lineno})") from None
+    if not isinstance(data, dict) or data.get("format") != FORMAT:
+        raise InputError(f'{where}: not a plan; a plan has "format": "{FORMAT}"')
+    if data.get("version") != VERSION:
+        raise InputError(f"{where}: version {data.get('version')!r}; this hilcal reads {VERSION}")
+    names, q = _poses(data.get("poses"), where)
+    steps = _steps(data.get("steps"), names, where)
+    known = {"format", "version", "poses", "steps"}
+    about = {key: value for key, value in data.items() if key not in known}
+    return Plan(names, q, steps, about)
+
+
+def _poses(data: object, where: str) -> tuple[tuple[str, ...], Floats]:
+    """Names and joint angles of the poses."""
+    if not isinstance(data, list) or not data:
+        raise InputError(f'{where}: "poses" must be a list of at least one pose')
+    names: list[str] = []
+    rows: list[list[float]] = []
+    for k, pose in enumerate(data, start=1):
+        if not isinstance(pose, dict) or set(pose) != {"name", "q_rad"}:
+            raise InputError(f'{where}: pose {k} must have exactly the keys "name" and "q_rad"')
+        name, q = pose["name"], pose["q_rad"]
+        if not isinstance(name, str) or not name:
+            raise InputError(f"{where}: pose {k}: name {name!r} must be a text that is not empty")
+        if name in names:
+            raise InputError(f"{where}: two poses have the name {name!r}; names must differ")
+        numbers = isinstance(q, list) and all(
+            isinstance(x, int | float) and not isinstance(x, bool) and np.isfinite(x) for x in q
+        )
+        if not numbers or not q or (rows and len(q) != len(rows[0])):
+            count = f"{len(rows[0])} " if rows else ""
+            raise InputError(
+                f"{where}: pose {name!r}: q_rad must be a list of {count}finite numbers, rad"
+            )
+        names.append(name)
+        rows.append([float(x) for x in q])
+    return tuple(names), np.array(rows)
+
+
+def _steps(data: object, names: tuple[str, ...], where: str) -> tuple[Step, ...]:
+    """Steps in order."""
+    if not isinstance(data, list) or not data:
+        raise InputError(f'{where}: "steps" must be a list of at least one step')
+    steps: dict[Step, int] = {}
+    for k, step in enumerate(data, start=1):
+        if not isinstance(step, dict) or not {"pose", "load"} <= set(step) <= {
+            "pose",
+            "load",
+            "cycle",
+        }:
+            raise InputError(f'{where}: step {k} must have "pose" and "load", and may have "cycle"')
+        pose, load, cycle = step["pose"], step["load"], step.get("cycle", 0)
+        if pose not in names:
+            hint = suggest(str(pose), names)
+            raise InputError(f"{where}: step {k}: there is no pose {pose!r}{hint}")
+        if not isinstance(load, str) or not load:
+            raise InputError(f'{where}: step {k}: load {load!r} must be a name, "none" is unloaded')
+        if not isinstance(cycle, int) or isinstance(cycle, bool) or cycle < 0:
+            raise InputError(f"{where}: step {k}: cycle {cycle!r} must be a whole number from 0")
+        made = Step(pose, load, cycle)
+        if made in steps:
+            raise InputError(f"{where}: steps {steps[made]} and {k} are the same ({made})")
+        steps[made] = k
+    return tuple(steps)
