@@ -54,11 +54,14 @@ bench: $(STAMP)
 
 lock:
 	$(PYTHON) -m venv .lock
+	cp requirements.lock .lock/
 	.lock/bin/python -m pip install --quiet --disable-pip-version-check pip-tools
 	.lock/bin/pip-compile --quiet --upgrade --generate-hashes --allow-unsafe --strip-extras \
 	  --no-config --no-header --no-annotate --no-emit-index-url --no-emit-trusted-host \
 	  --no-emit-find-links --no-emit-options --pip-args "--only-binary :all:" \
-	  --extra dev --output-file requirements.lock pyproject.toml
+	  --extra dev --output-file .lock/requirements.lock pyproject.toml
+	{ head -2 requirements.lock; cat .lock/requirements.lock; } > .lock/whole
+	mv .lock/whole requirements.lock
 	rm -rf .lock
 
 clean:

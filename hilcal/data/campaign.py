@@ -3,6 +3,7 @@
 import json
 import os
 import sqlite3
+from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -39,6 +40,7 @@ class Campaign:
         source: str,
         *,
         overwrite: bool = False,
+        more: Mapping[str, str] | None = None,
     ) -> Self:
         """Make an empty campaign; the file appears only when it is complete.
 
@@ -48,6 +50,7 @@ class Campaign:
             base_dir: the directory to which its relative paths refer.
             source: where the readings come from, in words.
             overwrite: replace an existing campaign (never a file of another kind).
+            more: further texts about it, see `about`.
 
         Raises:
             InputError: the file exists, or cannot be written.
@@ -58,6 +61,7 @@ class Campaign:
             zip(_META, (config_json, base_dir, source, utc_now(), __version__), strict=True)
         )
         try:
+            meta |= more or {}
             _may_write(path, overwrite)
             for leftover in (new, *_sidecars(new)):
                 leftover.unlink(missing_ok=True)
@@ -141,6 +145,15 @@ class Campaign:
         """When the campaign was made, ISO 8601, UTC."""
         return self._meta["created"]
 
+    def about(self, key: str) -> str | None:
+        """A further text about the campaign, as given to `create`; None where there is none."""
+        return self._meta.get(key)
+
+    @property
+    def connection(self) -> sqlite3.Connection:
+        """The open file, for the other modules of this package."""
+        return self._connection
+
     def append_readings(self, readings: Readings) -> int:
         """Append readings in one transaction; names already known keep their numbers.
 
@@ -152,10 +165,14 @@ class Campaign:
                 pose with other commanded joints; not finite; the file cannot be written.
         """
         with schema.sqlite_errors(self.path), schema.transaction(self._connection):
-            if len(readings):
-                self._claim_layout(layout_of(readings))
-            rows.check_poses(self._connection, self.path, readings)
-            return rows.insert_readings(self._connection, readings)
+            return self.insert(readings)
+
+    def insert(self, readings: Readings) -> int:
+        """Do the same inside a transaction that the caller has begun."""
+        if len(readings):
+            self._claim_layout(layout_of(readings))
+        rows.check_poses(self._connection, self.path, readings)
+        return rows.insert_readings(self._connection, readings)
 
     def readings(self) -> Readings:
         """All readings in the order in which they were appended.

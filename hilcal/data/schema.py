@@ -11,10 +11,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from hilcal.errors import InputError
+from hilcal.errors import DeviceError, InputError
 
 APPLICATION_ID = 0x68696C63  # "hilc"
-VERSION = 1
+VERSION = 2
 HEADER = b"SQLite format 3\x00"
 
 _TABLES = """
@@ -31,8 +31,18 @@ CREATE TABLE readings (
 );
 CREATE INDEX readings_pose ON readings (pose);
 CREATE TABLE revisions (id INTEGER PRIMARY KEY, content TEXT NOT NULL, crc INTEGER NOT NULL);
+CREATE TABLE details (
+    id INTEGER PRIMARY KEY REFERENCES readings (id),
+    step TEXT NOT NULL UNIQUE,
+    content TEXT NOT NULL,
+    crc INTEGER NOT NULL
+);
+CREATE TABLE events (id INTEGER PRIMARY KEY, content TEXT NOT NULL, crc INTEGER NOT NULL);
 """
-_KEYS = {"meta": "key", "poses": "id", "loads": "id", "readings": "id", "revisions": "id"}
+_KEYS = {"meta": "key"} | dict.fromkeys(
+    ("poses", "loads", "readings", "revisions", "details", "events"), "id"
+)
+_SINCE = {"details": 2, "events": 2}
 
 
 def statements() -> list[str]:
@@ -67,15 +77,23 @@ def sqlite_errors(path: Path) -> Iterator[None]:
 
     Raises:
         InputError: says what is wrong with the file.
+        DeviceError: the disk is full or failed.
     """
     try:
         yield
     except UnicodeEncodeError as e:
         raise InputError(f"{path}: a text is not valid Unicode ({e.object!r})") from e
+    except UnicodeDecodeError as e:  # SQLite's own message quotes a damaged name
+        raise InputError(f"{path}: the campaign file is damaged") from e
     except sqlite3.DatabaseError as e:
         text = str(e)
         if "malformed" in text or "not a database" in text:
             raise InputError(f"{path}: the campaign file is damaged or truncated ({text})") from e
+        if "full" in text or "I/O error" in text:
+            raise DeviceError(
+                f"{path}: cannot be written ({text}); nothing that was stored is lost: "
+                "make room on the disk"
+            ) from e
         if "locked" in text or "busy" in text:
             raise InputError(f"{path}: another program is writing to the campaign") from e
         raise InputError(f"{path}: the campaign file cannot be used ({text})") from e
@@ -127,5 +145,6 @@ def check_file(connection: sqlite3.Connection, path: Path) -> None:
     if sound != "ok":
         raise InputError(f"{path}: the campaign file is damaged ({' '.join(sound.split())})")
     rows = connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
-    if missing := sorted(set(_KEYS) - {name for (name,) in rows}):
+    wanted = {table for table in _KEYS if version >= _SINCE.get(table, 1)}
+    if missing := sorted(wanted - {name for (name,) in rows}):
         raise InputError(f"{path}: the campaign file is damaged (no table '{missing[0]}')")
