@@ -25,3 +25,13 @@ def ipa_ur10() -> Path:
     if not path.is_dir():
         pytest.skip("data set ipa_ur10 is absent: set HILCAL_DATA to the directory that holds it")
     return path
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Let the drivers' tests run on real devices."""
+    parser.addoption(
+        "--hardware",
+        metavar="CELL.toml",
+        default=None,
+        help="run tests/test_devices.py on the real devices of this cell; the arm moves",
+    )

@@ -167,7 +167,8 @@ WRONG = {
     "unknown section": (
         ROBOT + "[trackers]\nframe = 'base'\n",
         r'has no section or key "trackers" \(did you mean "tracker"\?\); valid here: robot, tool, '
-        r"tracker, repeatability, loads, force_sensor, operator, motion, acquire, limits, simulation$",
+        r"tracker, repeatability, loads, force_sensor, operator, motion, acquire, limits, "
+        r"simulation$",
     ),
     "unknown key in the second load": (
         ROBOT + LOAD + "[[loads]]\nname = 'b'\nmass = 1\n",

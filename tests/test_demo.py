@@ -12,12 +12,13 @@ from hilcal.data.campaign import Campaign
 from hilcal.errors import InputError
 
 Capsys = pytest.CaptureFixture[str]
+FAST = "--without-devices"
 
 
 @pytest.mark.parametrize("effect", ["hysteresis", "encoder_offset", "base_frame"])
 def test_the_hidden_effect_is_found(effect: str, tmp_path: Path, capsys: Capsys) -> None:
     path = tmp_path / "demo.hilcal"
-    result = ok(capsys, "demo", "--hide", effect, "--seed", "1", "-o", path, "--json")
+    result = ok(capsys, "demo", FAST, "--hide", effect, "--seed", "1", "-o", path, "--json")
     d = result.document
     assert d["hidden"] == effect
     assert d["found"] is True
@@ -37,14 +38,14 @@ def test_the_hidden_effect_is_found(effect: str, tmp_path: Path, capsys: Capsys)
 
 def test_nothing_hidden_is_nothing_found(tmp_path: Path, capsys: Capsys) -> None:
     path = tmp_path / "demo.hilcal"
-    d = ok(capsys, "demo", "--hide", "nothing", "--seed", "2", "-o", path, "--json").document
+    d = ok(capsys, "demo", FAST, "--hide", "nothing", "--seed", "2", "-o", path, "--json").document
     assert (d["hidden"], d["found"], d["verdict"]) == ("nothing", True, "adequate")
     assert [r["added"] for r in d["revisions"]] == [None]
 
 
 def test_the_demo_in_words(tmp_path: Path, capsys: Capsys) -> None:
     path, recording = tmp_path / "demo.hilcal", tmp_path / "demo.rrd"
-    arguments = ("demo", "--hide", "hysteresis", "--seed", "1", "-o", path)
+    arguments = ("demo", FAST, "--hide", "hysteresis", "--seed", "1", "-o", path)
     words = ok(capsys, *arguments, "--record", recording).out
     for part in (
         "150 readings",
@@ -67,7 +68,7 @@ def test_the_demo_in_words(tmp_path: Path, capsys: Capsys) -> None:
 def test_the_demo_does_not_replace_another_file(tmp_path: Path, capsys: Capsys) -> None:
     path = tmp_path / "notes.txt"
     path.write_text("mine", encoding="utf-8")
-    line = refused(capsys, 2, "demo", "--hide", "nothing", "-o", path, "--json")
+    line = refused(capsys, 2, "demo", FAST, "--hide", "nothing", "-o", path, "--json")
     assert "notes.txt" in line
     assert path.read_text(encoding="utf-8") == "mine"
 

@@ -93,12 +93,16 @@ class Blackboard:
         return cls(path)
 
     def write(self, section: str, **fields: Any) -> None:
-        """Set fields of a section, all at once for readers; only its one writer may."""
+        """Set fields of a section, all at once for readers; only its one writer may.
+
+        A writer that was killed on the way has left the number odd; the next one mends that.
+        """
         sequence, content = self._sequence[section], self._content[section]
-        sequence[0] += 1
+        begun = int(sequence[0]) | 1
+        sequence[0] = begun + 2 if begun == int(sequence[0]) else begun
         for name, value in fields.items():
             content[name][0] = value
-        sequence[0] += 1
+        sequence[0] = int(sequence[0]) + 1
 
     def read(self, section: str) -> Any:
         """Return a consistent copy of a section, a record with the fields of `SECTIONS`."""

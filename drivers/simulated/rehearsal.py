@@ -1,5 +1,6 @@
 """The campaign of `hilcal demo`: a cell, an effect that is hidden in it, and the readings."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,11 +11,12 @@ from drivers.simulated.tracker import TrackerNoise
 from drivers.simulated.world import World
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
-from hilcal.data.readings import Readings
+from hilcal.data.readings import Readings, States
 from hilcal.data.whitening import Mode
 from hilcal.effects.catalogue import catalogue
 from hilcal.errors import InputError
 from hilcal.toml import suggest
+from hilcal.types import Ints
 
 POSES = 30
 NOTHING = "nothing"
@@ -52,6 +54,48 @@ def choices() -> tuple[str, ...]:
     return tuple(e for e in EFFECTS if e in catalogue() and e != "joint_compliance")
 
 
+def check_choice(choice: str) -> None:
+    """Refuse what cannot be hidden.
+
+    Raises:
+        InputError: lists the valid choices.
+    """
+    valid = (*choices(), RANDOM, NOTHING)
+    if choice not in valid:
+        raise InputError(f"hide {choice!r}{suggest(choice, valid)}; valid: {', '.join(valid)}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Secret:
+    """A simulated cell with something hidden in it.
+
+    Attributes:
+        config: the configuration that the program is given.
+        cell: the cell of that configuration.
+        mode: the kind of readings that shows the hidden effect.
+        world: the truth.
+        hidden: the name of the hidden effect, or "nothing".
+        strength_sigma: rms of what it does to the readings, in units of their noise.
+    """
+
+    config: CellConfig
+    cell: Cell
+    mode: Mode
+    world: World
+    hidden: str
+    strength_sigma: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Visit:
+    """States of a campaign, in order, and which pose, load and cycle they belong to."""
+
+    states: States
+    pose: Ints
+    load: Ints
+    cycle: Ints
+
+
 def rehearse(config: CellConfig, choice: str, seed: int, n_poses: int = POSES) -> Rehearsal:
     """Measure a campaign in a simulated cell: each pose unloaded, then under each load.
 
@@ -68,12 +112,55 @@ def rehearse(config: CellConfig, choice: str, seed: int, n_poses: int = POSES) -
     Raises:
         InputError: an unknown choice; lists the valid ones. No loads in the configuration.
     """
-    valid = (*choices(), RANDOM, NOTHING)
-    if choice not in valid:
-        raise InputError(f"hide {choice!r}{suggest(choice, valid)}; valid: {', '.join(valid)}")
+    rng = np.random.default_rng(seed)
+    visits: list[Visit] = []
+
+    def visit(cell: Cell) -> Visit:
+        pulls = [(load.name, load.wrench(cell.gravity)) for load in config.loads]
+        visits.append(Visit(*rehearsal_states(cell, n_poses, pulls, rng)))
+        return visits[0]
+
+    s = conceal(config, choice, rng, visit, measurement_noise(config))
+    names = ("none", *(load.name for load in config.loads))
+    v = visits[0]
+    readings = simulate(s.world, v.states, v.pose, v.load, v.cycle, names, rng)
+    return Rehearsal(s.config, s.cell, s.mode, s.world, s.hidden, s.strength_sigma, readings)
+
+
+def measurement_noise(config: CellConfig, samples: int = 1) -> TrackerNoise:
+    """Return the tracker's noise of the configuration, of the mean of so many measurements."""
+    t = config.tracker
+    share = config.acquire.systematic_share if samples > 1 else 0.0
+    less = float(np.sqrt(share + (1.0 - share) / samples))
+    return TrackerNoise(
+        (less * t.range_std_m, less * t.range_std_per_m),
+        (less * t.transverse_std_m, less * t.transverse_std_per_m),
+        less * t.orientation_std_rad,
+    )
+
+
+def conceal(
+    config: CellConfig,
+    choice: str,
+    rng: np.random.Generator,
+    visit: Callable[[Cell], Visit],
+    noise: TrackerNoise,
+) -> Secret:
+    """Make a simulated cell and hide an effect in it at the configured strength.
+
+    Args:
+        config: the cell; `[simulation]` tells the strength.
+        choice: an effect of `choices()`, "random" or "nothing".
+        rng: generator.
+        visit: returns the states at which the strength holds.
+        noise: the tracker's noise of one reading.
+
+    Raises:
+        InputError: an unknown choice; lists the valid ones. No loads in the configuration.
+    """
+    check_choice(choice)
     if not config.loads:
         raise InputError("the cell has no [[loads]]; a rehearsal needs at least one")
-    rng = np.random.default_rng(seed)
     hidden = choice
     if choice == RANDOM:  # a wrong registration shows only where one is believed
         hidden = str(rng.choice([e for e in choices() if e != "base_frame"]))
@@ -83,14 +170,7 @@ def rehearse(config: CellConfig, choice: str, seed: int, n_poses: int = POSES) -
         config = config.model_copy(update={"tracker": tracker})
     mode: Mode = "deflection" if choice in DEFLECTION_EFFECTS else "absolute"
     cell = cell_from_config(config)
-    pulls = [(load.name, load.wrench(cell.gravity)) for load in config.loads]
-    states, pose, load, cycle = rehearsal_states(cell, n_poses, pulls, rng)
-    t = config.tracker
-    noise = TrackerNoise(
-        (t.range_std_m, t.range_std_per_m),
-        (t.transverse_std_m, t.transverse_std_per_m),
-        t.orientation_std_rad,
-    )
+    v = visit(cell)
     joint_std = config.repeatability.per_joint(cell.arm.n)
     world = nothing_hidden(cell, rng, noise=noise, joint_std=joint_std)
     strength = 0.0
@@ -99,7 +179,7 @@ def rehearse(config: CellConfig, choice: str, seed: int, n_poses: int = POSES) -
         if hidden == "joint_stiffening":
             softer = _SOFTER * world.physics.joint_compliance
             world = replace(world, physics=world.physics.with_effect("joint_compliance", softer))
-        world = hide(hidden, cell, states, strength, mode, rng, world=world, pose=pose, cycle=cycle)
-    names = ("none", *(name for name, _ in pulls))
-    readings = simulate(world, states, pose, load, cycle, names, rng)
-    return Rehearsal(config, cell, mode, world, hidden, strength, readings)
+        world = hide(
+            hidden, cell, v.states, strength, mode, rng, world=world, pose=v.pose, cycle=v.cycle
+        )
+    return Secret(config, cell, mode, world, hidden, strength)

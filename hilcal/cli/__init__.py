@@ -15,7 +15,10 @@ from hilcal.cli.catalogue import effects, scaling
 from hilcal.cli.demo import demo
 from hilcal.cli.fitting import compare, identify, validate
 from hilcal.cli.hidden import hidden
+from hilcal.cli.planning import check, plan
 from hilcal.cli.refining import add, diagnose, refine, view
+from hilcal.cli.running import run
+from hilcal.cli.simulating import simulate
 from hilcal.cli.tables import export, import_
 from hilcal.errors import HilcalError
 
@@ -40,6 +43,10 @@ def _application() -> typer.Typer:
     )
     commands: dict[str, Callable[..., None]] = {
         "demo": demo,
+        "simulate": simulate,
+        "check": check,
+        "plan": plan,
+        "run": run,
         "import": import_,
         "identify": identify,
         "compare": compare,

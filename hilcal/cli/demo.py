@@ -7,12 +7,15 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from drivers.simulated.rehearsal import NOTHING, RANDOM, Rehearsal, rehearse
+from drivers.simulated.rehearsal import NOTHING, RANDOM, Rehearsal, check_choice
 from hilcal.cli.files import check_record, record_story
+from hilcal.cli.planning import POSES
 from hilcal.cli.refining import Row, revisions_json
+from hilcal.cli.rehearsing import in_process, on_devices
 from hilcal.cli.terminal import Json, Record, Terminal, terminal
 from hilcal.config import load_config
 from hilcal.data.campaign import Campaign
+from hilcal.data.records import content_hash
 from hilcal.diagnose.document import to_json
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
@@ -20,7 +23,7 @@ from hilcal.refine import Refinement
 from hilcal.refine import refine as refine_model
 from hilcal.report import numbers, text, text_demo, text_refine
 from hilcal.report.build_story import Chapter
-from hilcal.report.progress import counting, working
+from hilcal.report.progress import working
 from hilcal.revisions import to_record
 from hilcal.robot.catalogue import configs_dir
 
@@ -36,10 +39,15 @@ def demo(
         Path,
         typer.Option("-o", "--output", metavar="RUN.hilcal", help="The campaign file to make."),
     ] = Path("demo.hilcal"),
+    poses: Annotated[int, typer.Option("--poses", help="Poses beside the reference.")] = POSES,
+    without_devices: Annotated[
+        bool,
+        typer.Option("--without-devices", help="Draw the readings at once, through no wire."),
+    ] = False,
     record: Record = None,
     as_json: Json = False,
 ) -> None:
-    """Rehearse the whole story on a simulated cell."""
+    """Rehearse the whole story on a simulated cell, through real drivers and wires."""
     t = terminal(as_json)
     check_record(record)
     path = configs_dir() / "cells" / CELL
@@ -48,8 +56,14 @@ def demo(
     number = config.simulation.seed if seed is None else seed
     if number < 0:
         raise InputError(f"--seed {number}; valid: a whole number, 0 or more")
-    r = rehearse(config, choice, number)
-    hashed = _measure(t, r, output, path.parent)
+    check_choice(choice)
+    if output.exists():
+        t.notice(f"{output} exists and is replaced")
+    if without_devices:
+        r = in_process(t, config, choice, number, output, path.parent)
+    else:
+        r = on_devices(t, config, choice, number, output, path.parent, poses)
+    hashed = content_hash(r.readings)
     _introduce(t, r, choice, number)
     with working(t.progress) as say:
         model = baseline(r.cell, r.readings, r.mode)
@@ -105,30 +119,11 @@ def _introduce(t: Terminal, r: Rehearsal, choice: str, seed: int) -> None:
     }.get(choice, f"The effect {r.hidden} is hidden in it; the program is not told.")
     t.show(text.heading(f"A simulated {r.cell.arm.name} and a laser tracker, seed {seed}"))
     t.show(
-        f"{poses} poses, each unloaded and under {len(loads)} loads ({', '.join(loads)}): "
+        f"{poses} poses, unloaded and under {len(loads)} loads ({', '.join(loads)}): "
         f"{len(r.readings)} readings.\n{what}"
     )
     kind = "deflections: loaded minus unloaded" if r.mode == "deflection" else "absolute positions"
     t.show(f"The model is fitted to {kind}.\n")
-
-
-def _measure(t: Terminal, r: Rehearsal, output: Path, base_dir: Path) -> str:
-    """Write the campaign, pose by pose, as a real one would grow; returns the data's hash."""
-    there = output.exists()
-    source = "rehearsal in a simulated cell"
-    poses = list(dict.fromkeys(r.readings.pose.tolist()))
-    with (
-        Campaign.create(
-            output, r.config.to_json(), str(base_dir), source, overwrite=True
-        ) as campaign,
-        counting(t.progress, "measuring poses", len(poses)) as advance,
-    ):
-        if there:
-            t.notice(f"{output} existed and is replaced")
-        for pose in poses:
-            campaign.append_readings(r.readings[r.readings.pose == pose])
-            advance(1)
-        return campaign.data_hash()
 
 
 def _judge(r: Rehearsal, found: Refinement) -> tuple[bool, str]:

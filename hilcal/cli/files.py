@@ -10,6 +10,7 @@ from hilcal.cli.terminal import Terminal
 from hilcal.config import CellConfig
 from hilcal.data.campaign import Campaign
 from hilcal.data.readings import Readings
+from hilcal.data.records import content_hash
 from hilcal.data.revision import RevisionRecord
 from hilcal.data.whitening import MODES, SCALINGS, Mode, Scaling
 from hilcal.diagnose.verdict import Diagnosis, diagnose
@@ -17,9 +18,15 @@ from hilcal.effects.catalogue import effect_class
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
+from hilcal.identify.repeatability import with_repeatability
 from hilcal.report.build_story import Chapter, build_story
 from hilcal.report.progress import Say, working
 from hilcal.revisions import chain, mode_of, restore, to_record, usual_mode
+
+COVARIANCE = "covariance"
+"""Key among the texts about a campaign: what the stored covariances cover."""
+INSTRUMENT = "instrument"
+"""They cover the instrument alone, not the arm's repeatability."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,7 +65,7 @@ class Opened:
 
     def store(self, found: Fit, diagnosis: Diagnosis | None, added: str | None) -> int:
         """Append a fit; returns its revision number."""
-        record = to_record(found, diagnosis, added, self.campaign.data_hash())
+        record = to_record(found, diagnosis, added, content_hash(self.readings))
         return self.campaign.append_revision(record)
 
     def latest_fit(self, t: Terminal, say: Say) -> tuple[int, Fit]:
@@ -104,7 +111,11 @@ def open_run(path: Path) -> Iterator[Opened]:
     with Campaign.open(path) as campaign:
         config = CellConfig.from_json(campaign.config_json)
         cell = cell_from_config(config, Path(campaign.base_dir))
-        yield Opened(path, campaign, config, cell, campaign.readings())
+        readings = campaign.readings()
+        if campaign.about(COVARIANCE) == INSTRUMENT:
+            scatter = config.repeatability.per_joint(cell.arm.n)
+            readings = with_repeatability(cell, readings, scatter)
+        yield Opened(path, campaign, config, cell, readings)
 
 
 def choice(name: str, valid: tuple[Mode, ...], option: str) -> Mode:

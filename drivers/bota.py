@@ -1,0 +1,57 @@
+"""Bota Systems Rokubi and SensONE over serial: they stream from power-on.
+
+Frame (Bota Systems' public ROS drivers): `AA`; `<H6fIf` of status, wrench in N and N·m, device
+time in µs, temperature in °C; CRC-16/X-25 of these 34 bytes, little-endian: 37 bytes. Bits of
+the status: 0 skipped samples, 1 over range, 2 invalid measurement, 3 raw values.
+"""
+
+import numpy as np
+
+from drivers.force_sensor import checked_config, open_streaming
+from drivers.force_stream import Sensor
+from drivers.frame_losses import ByDeviceClock
+from drivers.frames import FrameFormat, crc_x25
+from hilcal.acquire.devices import ForceSensor
+from hilcal.config import CellConfig
+from hilcal.types import Floats
+
+BAUD = 460800
+SKIPPED = 1
+_STATUS = ((2, "is loaded over its range; take the load off"), (4, "measures nothing valid"),
+           (8, "sends raw values; configure it to send N and N·m"))  # fmt: skip
+
+
+def _checksum(frame: bytes) -> bytes:
+    return crc_x25(frame[1:]).to_bytes(2, "little")
+
+
+def _overload(wrench: Floats, status: int) -> str:
+    """What the status says; bit 0 (fewer samples behind a value) does not make it wrong."""
+    for bit, words in _STATUS:
+        if status & bit:
+            return f"the Bota sensor {words} (status {status:#06x})"
+    if status & ~SKIPPED:
+        return f"the Bota sensor reports the unknown status {status:#06x}"
+    return ""
+
+
+SENSOR = Sensor(
+    name="Bota sensor",
+    frame=FrameFormat(b"\xaa", 37, _checksum),
+    body=np.dtype(
+        [("status", "<u2"), ("wrench", "<f4", 6), ("ticks", "<u4"), ("temperature", "<f4")]
+    ),
+    unit=np.ones(6),
+    losses=lambda: ByDeviceClock(1e-6, 32),
+    overload=_overload,
+)
+
+
+def open_force_sensor(config: CellConfig) -> ForceSensor:
+    """Open the port of [force_sensor] and wait for the first frame.
+
+    Raises:
+        DeviceError: no such port, in use, nothing or nothing sensible comes.
+        InputError: no [force_sensor], or an unknown option.
+    """
+    return open_streaming(checked_config(config), BAUD, SENSOR)

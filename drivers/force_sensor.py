@@ -1,0 +1,113 @@
+"""What the drivers of streaming force sensors share: the device that they return."""
+
+from collections.abc import Callable
+
+import serial
+
+from drivers.force_stream import DEVICE, ForceStream, Sensor
+from drivers.serial_line import close_port, open_port
+from hilcal.acquire.devices import Losses, Report, WrenchSample
+from hilcal.config import CellConfig
+from hilcal.config.rig import ForceSensor as Section
+from hilcal.errors import InputError
+
+FIRST_FRAME_S = 1.0
+
+
+class StreamingSensor:
+    """A force sensor that sends by itself; see `hilcal.acquire.devices.ForceSensor`."""
+
+    def __init__(
+        self,
+        port: serial.Serial,
+        stream: ForceStream,
+        name: str,
+        facts: tuple[tuple[str, str], ...] = (),
+        before_close: Callable[[serial.Serial], None] = lambda port: None,
+    ) -> None:
+        """Own an open port and the stream on it.
+
+        Args:
+            port: closed by `close`.
+            stream: already running.
+            name: the maker's, with the serial number where known.
+            facts: for the report, besides those of the stream.
+            before_close: what to tell the sensor at the end; must not raise.
+        """
+        self._port, self._stream, self._name, self._facts = port, stream, name, facts
+        self._before_close = before_close
+        self._open = True
+
+    def report(self) -> Report:
+        """Say who answered, rate, temperature, counters, and every problem."""
+        facts = (*self._facts, *self._stream.facts())
+        return Report(DEVICE, self._name, facts, tuple(self._stream.problems()))
+
+    def latest(self) -> WrenchSample:
+        """Return the newest frame, younger than 0.2 s.
+
+        Raises:
+            DeviceError: the stream is dead or stale, or the sensor is loaded over its range.
+        """
+        return self._stream.latest()
+
+    def average(self, seconds: float) -> WrenchSample:
+        """Return the mean of the frames of the next so many real seconds.
+
+        Raises:
+            DeviceError: the stream is dead, gave under half of its frames, or the sensor was
+                loaded over its range meanwhile.
+        """
+        return self._stream.average(seconds)
+
+    def losses(self) -> Losses:
+        """Return the counters."""
+        return self._stream.losses()
+
+    def close(self) -> None:
+        """Stop the stream, give the port back. Never raises, may be called twice."""
+        if self._open:
+            self._open = False
+            self._stream.stop()
+            self._before_close(self._port)
+            close_port(self._port)
+
+
+def open_streaming(section: Section, baud: int, sensor: Sensor) -> StreamingSensor:
+    """Open the port of a sensor that streams from power-on, and wait for the first frame.
+
+    Args:
+        section: the configuration; its own rate comes before `baud`.
+        baud: the sensor's rate as delivered, Bd.
+        sensor: what it sends.
+
+    Raises:
+        DeviceError: no such port, in use, nothing or nothing sensible comes.
+    """
+    port = open_port(DEVICE, section.port, section.baud or baud)
+    stream = ForceStream(port, sensor)
+    try:
+        stream.wait_for_first(FIRST_FRAME_S)
+    except BaseException:
+        stream.stop()
+        close_port(port)
+        raise
+    return StreamingSensor(port, stream, sensor.name)
+
+
+def checked_config(config: CellConfig, options: tuple[str, ...] = ()) -> Section:
+    """Return [force_sensor], with no option that the driver does not know.
+
+    Raises:
+        InputError: the section is missing, or has an unknown option.
+    """
+    section = config.force_sensor
+    if section is None:
+        raise InputError("[force_sensor] is missing; give driver and port")
+    for name in section.options:
+        if name not in options:
+            valid = f"valid: {', '.join(options)}" if options else "it has none"
+            raise InputError(
+                f'[force_sensor] options: driver "{section.driver}" has no option "{name}"; {valid}'
+            )
+    return section

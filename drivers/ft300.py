@@ -1,0 +1,128 @@
+"""Robotiq FT 300 and FT 300-S over serial: asked over Modbus RTU, then told to stream.
+
+Robotiq FT 300 Instruction Manual: 19200 Bd, slave 9, registers 500 firmware, 510 to 513 serial
+number; 0x0200 in register 410 starts the stream of 100 frames per second, fifty bytes FF end
+it. Frame: `20 4E`; six int16, N × 100 and N·m × 1000; CRC-16/MODBUS; all little-endian. While
+it streams it answers no request, and it streams on when the program that started it has died.
+"""
+
+import contextlib
+import termios
+
+import numpy as np
+import serial
+
+from drivers.force_sensor import StreamingSensor, checked_config
+from drivers.force_stream import DEVICE, ForceStream, Sensor
+from drivers.frame_losses import ByArrival
+from drivers.frames import FrameFormat, crc_modbus
+from drivers.modbus_rtu import NoAnswerError, RefusedError, read_registers, write_register
+from drivers.serial_line import close_port, drain, line_failures, open_port
+from hilcal.acquire.devices import ForceSensor
+from hilcal.config import CellConfig
+from hilcal.errors import DeviceError
+from hilcal.types import Floats
+
+BAUD = 19200
+SLAVE = 9
+RATE_HZ = 100.0
+FIRMWARE, SERIAL_NUMBER = (500, 6), (510, 4)
+STREAM_REGISTER, STREAM = 410, 0x0200
+STOP = b"\xff" * 50
+RANGE = np.repeat((300.0, 30.0), 3)
+"""Full scale, N and N·m."""
+COMPONENTS = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
+FIRST_FRAME_S = 0.5
+
+
+def _checksum(frame: bytes) -> bytes:
+    return crc_modbus(frame).to_bytes(2, "little")
+
+
+def _overload(wrench: Floats, status: int) -> str:
+    """Whether a component is at the end of its range, where it tells no more."""
+    worst = int(np.argmax(np.abs(wrench) / RANGE))
+    if abs(wrench[worst]) < 0.9999 * RANGE[worst]:
+        return ""
+    unit = "N" if worst < 3 else "N·m"
+    return (
+        f"the FT 300 is loaded over its range: {COMPONENTS[worst]} = {wrench[worst]:.4g} {unit} "
+        f"of ±{RANGE[worst]:.0f} {unit}; take the load off"
+    )
+
+
+SENSOR = Sensor(
+    name="Robotiq FT 300",
+    frame=FrameFormat(b"\x20\x4e", 16, _checksum),
+    body=np.dtype([("wrench", "<i2", 6)]),
+    unit=1.0 / np.repeat((100.0, 1000.0), 3),
+    losses=lambda: ByArrival(RATE_HZ),
+    overload=_overload,
+)
+
+
+def open_force_sensor(config: CellConfig) -> ForceSensor:
+    """Open the port of [force_sensor], ask who is there, and start the stream.
+
+    Raises:
+        DeviceError: no such port, in use, no answer, a wrong one, or no stream.
+        InputError: no [force_sensor], or an unknown option.
+    """
+    section = checked_config(config)
+    port = open_port(DEVICE, section.port, section.baud or BAUD, timeout=0.1)
+    stream: ForceStream | None = None
+    try:
+        with line_failures(DEVICE, section.port):
+            firmware, number = _begin(port)
+        stream = ForceStream(port, SENSOR)
+        stream.wait_for_first(FIRST_FRAME_S)
+    except BaseException:
+        if stream is not None:
+            stream.stop()
+        _end(port)
+        close_port(port)
+        raise
+    name = f"{SENSOR.name}, serial number {number}"
+    return StreamingSensor(port, stream, name, (("firmware", firmware),), _end)
+
+
+def _begin(port: serial.Serial) -> tuple[str, str]:
+    """Return firmware and serial number, with the stream started."""
+    for _ in range(2):
+        port.write(STOP)  # it may be streaming still, for a program that was killed
+        if drain(port, quiet=0.06, limit=0.4):
+            break
+    try:
+        firmware = _words(port, *FIRMWARE)
+        number = _words(port, *SERIAL_NUMBER)
+        write_register(port, SLAVE, STREAM_REGISTER, STREAM)
+    except NoAnswerError as error:
+        said = (
+            "what comes is no answer; the rate is wrong, the line is disturbed, or it is no FT 300"
+            if error.heard
+            else "nobody answers; check the sensor's power, its cable and the rate"
+        )
+        raise DeviceError(f"{DEVICE}: port {port.port} at {port.baudrate} Bd: {said}") from None
+    except RefusedError as error:
+        raise DeviceError(
+            f"{DEVICE}: port {port.port}: it does not stream, {error}; is it an FT 300?"
+        ) from None
+    return firmware, number
+
+
+def _words(port: serial.Serial, address: int, count: int) -> str:
+    """Registers as text, two letters in each; in hexadecimal digits where they are none."""
+    try:
+        words = read_registers(port, SLAVE, address, count)
+    except RefusedError:
+        return "unknown"
+    data = b"".join(word.to_bytes(2, "big") for word in words)
+    text = data.rstrip(b"\0 ").decode("latin-1")
+    return text if text and text.isascii() and text.isprintable() else data.hex()
+
+
+def _end(port: serial.Serial) -> None:
+    """Tell it to be silent; never raises."""
+    with contextlib.suppress(OSError, termios.error):
+        port.write(STOP)
+        port.flush()

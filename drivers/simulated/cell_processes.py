@@ -1,0 +1,294 @@
+"""A whole simulated cell: one process per device, all looking into one physical world."""
+
+import contextlib
+import secrets
+import socket
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from drivers.simulated import admin
+from drivers.simulated.blackboard import Blackboard, N
+from drivers.simulated.device_process import DeviceProcess
+from drivers.simulated.world import World
+from drivers.simulated.world_file import write_world
+from drivers.simulated.world_server import open_board
+from hilcal.config import CellConfig
+from hilcal.errors import DeviceError, InputError
+
+START_TIMEOUT = 20.0
+"""Real time in which every simulated device has to be ready, s."""
+
+UR_PORTS = (29999, 30003, 30004)
+FORCE_SENSORS = ("ft300", "bota", "hex")
+_STALE = (
+    "world.json",
+    "world.bin",
+    *(f"{name}.sock" for name in ("world", "arm", "tracker", "force")),
+    "tracker",
+    "force",
+)
+_SOCKET_PATH = 100  # bytes; Linux allows 107 (unix(7)), and the line is made as "*.sock.new"
+_HOSTS = 3  # addresses tried when another program is faster
+_POLL = 0.01  # s
+
+
+class SimulatedCell:
+    """The running processes of a simulated cell, and the configuration that leads to them.
+
+    Attributes:
+        config: the given configuration, with the simulated devices filled in.
+        directory: where the devices meet.
+    """
+
+    def __init__(
+        self,
+        config: CellConfig,
+        directory: Path,
+        devices: dict[str, DeviceProcess],
+        board: Blackboard,
+    ) -> None:
+        """Take over processes that have not been started; use `start`."""
+        self.config = config
+        self.directory = directory
+        self._devices = devices
+        self._board = board
+
+    @classmethod
+    def start(
+        cls,
+        world: World,
+        config: CellConfig,
+        directory: Path,
+        seed: int,
+        *,
+        base_dir: Path | None = None,
+    ) -> Self:
+        """Start every device of the cell, and return when all of them are ready.
+
+        Args:
+            world: what is true.
+            config: what the program is told; the world's cell was made from it.
+            directory: a directory for this cell alone; made where it is missing.
+            seed: of everything random.
+            base_dir: directory that a robot's file path in `config` is relative to.
+
+        Raises:
+            InputError: a cell that cannot be simulated.
+            DeviceError: a device ended early or was not ready in time.
+        """
+        _check(world, config, directory)
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+            for name in _STALE:
+                (directory / name).unlink(missing_ok=True)
+            write_world(directory / "world.json", world, config, base_dir)
+            board = open_board(directory, config.simulation.clock)
+        except OSError as error:
+            raise InputError(
+                f"simulated cell: {directory} cannot be used ({error}); "
+                "valid: a directory for it alone"
+            ) from None
+        for attempt in range(1, _HOSTS + 1):
+            host = free_host()
+            devices = _devices(world, config, directory, seed, host)
+            cell = cls(_filled_in(config, directory, host), directory, devices, board)
+            try:
+                cell._begin(devices.values())
+            except BaseException as error:
+                taken = devices["arm"].ended and "in use" in str(error)
+                cell.close()
+                if attempt == _HOSTS or not taken:
+                    raise
+            else:
+                return cell
+        raise AssertionError("unreachable")
+
+    def ask(self, device: str, op: str, **arguments: Any) -> Any:
+        """Send a request to a device's admin line: "world", "arm", "tracker" or "force".
+
+        Raises:
+            InputError: no such device.
+            DeviceError: it does not answer, or refuses.
+        """
+        return admin.ask(self._device(device).socket, op, **arguments)
+
+    def kill(self, device: str) -> None:
+        """End a device at once, as kill -9 or a power cut does."""
+        self._device(device).kill()
+
+    def restart(self, device: str) -> None:
+        """Start a device again, after ending it where it still runs; returns when it is ready.
+
+        Raises:
+            DeviceError: it ended early or was not ready in time.
+        """
+        process = self._device(device)
+        process.kill()
+        self._begin([process])
+
+    def processes(self) -> dict[str, int]:
+        """Return the process numbers of the devices that run."""
+        return {name: d.pid for name, d in self._devices.items() if d.pid is not None}
+
+    def close(self) -> None:
+        """End every process. Never raises, may be called twice."""
+        for device in self._devices.values():
+            device.let_go()
+        for device in self._devices.values():
+            device.end()
+
+    def __enter__(self) -> Self:
+        """Return the running cell."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """End every process."""
+        self.close()
+
+    def _begin(self, devices: Iterable[DeviceProcess]) -> None:
+        """Start devices side by side, and wait until they are ready and agree."""
+        deadline = time.monotonic() + START_TIMEOUT
+        for device in devices:
+            device.start()
+        while waiting := [d for d in self._devices.values() if d.running_unready()]:
+            for device in waiting:
+                device.check()
+            if time.monotonic() > deadline:
+                names = ", ".join(d.name for d in waiting)
+                raise DeviceError(
+                    f"simulated {names}: not ready within {START_TIMEOUT:g} s; see {waiting[0].log}"
+                )
+            time.sleep(_POLL)
+        while not self._agree():
+            for device in devices:
+                device.check()
+            if time.monotonic() > deadline:
+                raise DeviceError(
+                    "simulated cell: the arm or the world is ready but does not write its state"
+                )
+            time.sleep(_POLL)
+
+    def _agree(self) -> bool:
+        """Whether the truth belongs to what the arm does (where both run)."""
+        if not {"world", "arm"} <= set(self.processes()):
+            return True
+        arm, truth = self._board.read("arm"), self._board.read("truth")
+        near = np.abs(truth["encoder"] - arm["q"]).max() < 1e-3
+        return bool(arm["alive"] and (near or arm["moving"]))
+
+    def _device(self, name: str) -> DeviceProcess:
+        if name not in self._devices:
+            raise InputError(
+                f"simulated cell: no device {name!r}; valid: {', '.join(self._devices)}"
+            )
+        return self._devices[name]
+
+
+def free_host() -> str:
+    """Return a loopback address whose robot ports are free now.
+
+    Raises:
+        DeviceError: none was found.
+    """
+    for _ in range(50):
+        host = f"127.{secrets.randbelow(254) + 1}.{secrets.randbelow(256)}"
+        host = f"{host}.{secrets.randbelow(254) + 1}"
+        try:
+            with contextlib.ExitStack() as stack:
+                for port in UR_PORTS:
+                    line = stack.enter_context(socket.socket())
+                    line.bind((host, port))
+        except OSError:
+            continue
+        return host
+    raise DeviceError(
+        "simulated arm: no free loopback address 127.x.y.z with the ports "
+        f"{', '.join(map(str, UR_PORTS))}; is the loopback network up?"
+    )
+
+
+def _check(world: World, config: CellConfig, directory: Path) -> None:
+    """Refuse what the wire-level devices cannot be."""
+    arm = world.cell.arm
+    if arm.n != N:
+        raise InputError(
+            f"simulated cell: the arm {arm.name} has {arm.n} joints; valid: arms of {N} joints"
+        )
+    if not np.array_equal(world.station, np.eye(4)):
+        raise InputError(
+            "simulated cell: a station measures from where it stands, but the readings' origin "
+            'lies within the arm\'s reach; valid: [tracker] frame = "tracker", with a base that '
+            "is unknown or farther away than the arm reaches"
+        )
+    sensor = config.force_sensor
+    if sensor is not None and sensor.driver not in FORCE_SENSORS:
+        raise InputError(
+            f"simulated cell: no simulated force sensor {sensor.driver!r}; "
+            f"valid: {', '.join(FORCE_SENSORS)}"
+        )
+    longest = len(str((directory / "tracker.sock").absolute()).encode())
+    if longest > _SOCKET_PATH:
+        raise InputError(
+            f"simulated cell: the path {directory} is too long for its sockets by "
+            f"{longest - _SOCKET_PATH} bytes; valid: a directory nearer to the root"
+        )
+    with contextlib.suppress(DeviceError):
+        admin.ask(directory / "world.sock", "state", timeout=1.0)
+        raise InputError(f"simulated cell: another one runs in {directory}; valid: another one")
+
+
+def _devices(
+    world: World, config: CellConfig, directory: Path, seed: int, host: str
+) -> dict[str, DeviceProcess]:
+    """Return what has to be started."""
+    noise = world.noise
+
+    def device(name: str, server: str, *arguments: str) -> DeviceProcess:
+        return DeviceProcess(name, f"drivers.simulated.{server}", directory, arguments)
+
+    out = {
+        "world": device("world", "world_server", "--seed", str(seed)),
+        "arm": device(
+            "arm",
+            "ur_server",
+            *("--host", host, "--robot", config.robot.model),
+            *("--seed", str(seed + 3)),
+        ),
+        "tracker": device(
+            "tracker",
+            "geocom_server",
+            *("--range-std", *map(repr, map(float, noise.range_std))),
+            *("--transverse-std", *map(repr, map(float, noise.transverse_std))),
+            *("--seed", str(seed + 1)),
+        ),
+    }
+    if config.force_sensor is not None:
+        kind = ("--kind", config.force_sensor.driver)
+        out["force"] = device("force", "force_server", *kind, "--seed", str(seed + 2))
+    return out
+
+
+def _filled_in(config: CellConfig, directory: Path, host: str) -> CellConfig:
+    """Return the configuration that leads to the simulated devices; what it gives stays."""
+    robot = {"host": host, "driver": config.robot.driver or "ur"}
+    tracker = {"port": str(directory / "tracker"), "driver": config.tracker.driver or "geocom"}
+    options = {**config.operator.options, "socket": str(directory / "world.sock")}
+    changes: dict[str, Any] = {
+        "robot": config.robot.model_copy(update=robot),
+        "tracker": config.tracker.model_copy(update=tracker),
+        "operator": config.operator.model_copy(update={"driver": "simulated", "options": options}),
+    }
+    if config.force_sensor is not None:
+        port = {"port": str(directory / "force")}
+        changes["force_sensor"] = config.force_sensor.model_copy(update=port)
+    return config.model_copy(update=changes)

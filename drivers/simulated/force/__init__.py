@@ -1,0 +1,1 @@
+"""Simulated wrench sensors that stream over a serial line."""

@@ -1,0 +1,1 @@
+"""A simulated laser station that speaks GeoCOM."""

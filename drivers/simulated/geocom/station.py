@@ -1,0 +1,148 @@
+"""The state of a GeoCOM laser station, and the procedures of `rpc.py` by number."""
+
+import time
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from drivers.simulated.blackboard import Blackboard
+from drivers.simulated.geocom.optics import Beam, Polar
+
+AIM_S = 0.3
+"""World time of a search, a fine adjustment, a lock-in or a turn, s."""
+FIELD_OF_VIEW = 0.026
+"""Half angle in which the camera sees its target, rad (1.5°)."""
+LEVEL_STD = 1e-6
+"""Noise of the inclinations, rad."""
+
+
+@dataclass(slots=True, eq=False)
+class Station:
+    """A tracking station: it holds its target through jumps as long as the beam is free.
+
+    Attributes:
+        board: the one physical world.
+        beam: its noise.
+        rng: generator.
+        meas_s: world time of one distance measurement, s.
+        locked: whether the target is held; no lock, no distance.
+        broken: whether something stands in the beam.
+        dist_error: whether distance measurements fail (1292).
+        warning: code given instead of 0 with a good measurement, 0 is none.
+        busy: whether measurements are refused (1293).
+        delays: by procedure, s of real time and how many answers are late.
+        wrong_transactions: so many next answers carry a wrong transaction number.
+        lock_enabled: what 9020 has set.
+        atr_enabled: what 9018 has set.
+        digits: decimals of floating-point numbers.
+        atmosphere: wavelength m, pressure mbar, dry and wet temperature °C.
+        settings: values of plain settings by the procedure that sets them.
+        pointing: where the telescope looks.
+        distance: the last distance, m; 0 is none.
+        distance_ms: station time of it, ms.
+        ranging: until when a distance measurement runs, `time.monotonic`; None is not.
+        tracking: whether the distance meter goes on by itself.
+        requests: the last requests: number and parameters.
+        measured: number of target measurements.
+    """
+
+    board: Blackboard
+    beam: Beam
+    rng: np.random.Generator
+    meas_s: float = 0.3
+    locked: bool = True
+    broken: bool = False
+    dist_error: bool = False
+    warning: int = 0
+    busy: bool = False
+    delays: dict[int, tuple[float, int]] = field(default_factory=dict)
+    wrong_transactions: int = 0
+    lock_enabled: bool = True
+    atr_enabled: bool = True
+    digits: int = 15
+    atmosphere: tuple[float, ...] = (658e-9, 1013.25, 20.0, 20.0)
+    settings: dict[int, str] = field(
+        default_factory=lambda: {2020: "2", 17019: "0", 17021: "0", 17008: "0"}
+    )
+    pointing: Polar = field(default_factory=lambda: Polar(0.0, np.pi / 2, 0.0))
+    distance: float = 0.0
+    distance_ms: int = 0
+    ranging: float | None = None
+    tracking: bool = False
+    requests: deque[tuple[int, tuple[str, ...]]] = field(
+        default_factory=lambda: deque(maxlen=10_000)
+    )
+    measured: int = 0
+
+    def target(self) -> Polar | None:
+        """Return where the target truly is at this moment; None where none can be seen."""
+        if self.broken:
+            return None
+        point = self.board.read("truth")["target"]
+        if not np.all(np.isfinite(point)) or not np.any(point):
+            return None  # the world has not begun
+        return Polar.of(point)
+
+    def held(self) -> Polar | None:
+        """Return where the held target truly is; None without lock or sight."""
+        return self.target() if self.locked else None
+
+    def look(self) -> Polar | None:
+        """Measure the held target once and turn the telescope to it; None without one."""
+        true = self.held()
+        if true is None:
+            return None
+        seen = self.beam.observe(true, self.rng)
+        self.pointing = seen
+        self.measured += 1
+        return seen
+
+    def wait(self, world_seconds: float) -> None:
+        """Take so much world time."""
+        time.sleep(max(0.0, world_seconds) / self.board.scale)
+
+    def acquire(self) -> bool:
+        """Search and hold the target: whether it is there."""
+        self.wait(AIM_S)
+        self.locked = self.target() is not None
+        self.look()
+        return self.locked
+
+    def start_ranging(self) -> None:
+        """Start a distance measurement; it takes `meas_s` of world time."""
+        self.distance, self.distance_ms = 0.0, 0
+        self.ranging = time.monotonic() + self.meas_s / self.board.scale
+
+    def finish_ranging(self, patience: float) -> None:
+        """Wait for a running distance measurement, at most `patience` s of world time."""
+        if self.ranging is not None:
+            left = self.ranging - time.monotonic()
+            time.sleep(max(0.0, min(left, patience / self.board.scale)))
+            self.tick()
+
+    def tick(self) -> None:
+        """Take the distance if its time has come: where the target is at that moment."""
+        if self.ranging is None or time.monotonic() < self.ranging:
+            return
+        self.ranging = None
+        seen = self.look()
+        if seen is not None and not self.dist_error:
+            self.distance, self.distance_ms = seen.distance, int(self.board.time * 1e3)
+
+    def turn(self, hz: float, v: float) -> None:
+        """Point elsewhere; the lock ends unless the target is in the field of view there."""
+        self.pointing = Polar(hz % (2 * np.pi), v, 0.0)
+        true = self.target()
+        if true is None or true.angle_to(self.pointing) > FIELD_OF_VIEW:
+            self.locked = False
+
+    def inclination(self) -> tuple[float, float, float]:
+        """Return cross and lengthwise inclination and their accuracy, rad: it stands level."""
+        cross, length = self.rng.normal(0.0, LEVEL_STD, 2)
+        return float(cross), float(length), LEVEL_STD
+
+    def temperature(self) -> float:
+        """Return the temperature inside, °C: some kelvins above the air's."""
+        air = float(self.board.read("truth")["air_temperature"])
+        return (air if air != 0.0 else 20.0) + 6.0

@@ -1,0 +1,294 @@
+"""The physical world as time goes by: what hangs, where the arm rests, what instruments see."""
+
+import contextlib
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from drivers.simulated.blackboard import Blackboard, N
+from drivers.simulated.elastic_tree import build
+from drivers.simulated.sensor_mount import SensorMount
+from drivers.simulated.world import World
+from hilcal.config import CellConfig
+from hilcal.data.readings import States
+from hilcal.errors import InputError
+from hilcal.toml import suggest
+from hilcal.types import Floats, Ints
+
+ENCODER_STD = 2e-6
+"""Noise of a motor-side encoder at the joint, rad."""
+
+AIR = 22.0
+"""Air temperature, °C."""
+
+_REFRESH_NS = 10_000_000  # real time between two publications of an unchanged arm
+_STRONGEST = 2000.0  # N and N·m that may push or swing
+_WARM_START = 4.0  # °C above the air at the world's start
+_WARM_RISE = np.array([9.0, 11.0, 10.0, 8.0, 8.0, 7.0])  # °C above the air in the end
+_WARM_TIME = 2400.0  # s, time constant of the warm-up
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Swing:
+    """A load that swings after it was hung, ever less.
+
+    Attributes:
+        wrench: (6,) in the beginning, base axes, N and N·m.
+        period: s.
+        decay: time constant, s.
+    """
+
+    wrench: Floats
+    period: float
+    decay: float
+
+    def at(self, time: float) -> Floats:
+        """Return the (6,) wrench so long after the load was hung, s."""
+        phase = 2.0 * np.pi * time / self.period
+        return np.asarray(self.wrench * np.exp(-time / self.decay) * np.cos(phase))
+
+    def lasts(self, time: float) -> bool:
+        """Whether it is more than a millionth of what it was, so long after the start, s."""
+        return time < 14.0 * self.decay
+
+
+class LivingWorld:
+    """Looks at the arm, computes where it rests, and publishes what is true.
+
+    The arm's repeatability: with every arrival the joints miss their command anew by
+    `joint_std`; the miss stays until the next arrival. Encoders sit at the motors, so they
+    see neither it nor the elastic deflection.
+
+    Every public method may be called from any thread.
+    """
+
+    def __init__(self, world: World, config: CellConfig, board: Blackboard, seed: int) -> None:
+        """Take over the board's truth, which a world before this one may have left.
+
+        Raises:
+            InputError: the arm has another number of joints than the blackboard.
+        """
+        if world.cell.arm.n != N:
+            raise InputError(
+                f"simulated cell: the arm {world.cell.arm.name} has {world.cell.arm.n} joints; "
+                f"valid: arms of {N} joints"
+            )
+        self._world, self._board, self._seed = world, board, seed
+        self._loads = config.loads
+        self._mount = SensorMount.of(config)
+        self._drive = _drives(world)
+        self._drifts = bool(np.any(world.physics.tracker_drift))
+        self._rng = np.random.default_rng([seed, 0])
+        self._lock = threading.RLock()
+        left = board.read("truth")
+        self._load, self._since = int(left["load"]), float(left["load_since"])
+        self._push = np.zeros(6)
+        self._swing: Swing | None = None
+        self._mistakes: list[int] = []
+        self._log: list[dict[str, Any]] = []
+        self._known: tuple[bytes, bytes, bool, int, bool] | None = None
+        self._computed_ns = self._written_ns = 0
+        self._arm = board.read("arm")
+
+    def step(self, now_ns: int) -> None:
+        """Publish what has changed; `now_ns` is the real time, `time.monotonic_ns`."""
+        with self._lock:
+            arm = self._look()
+            seen = (arm["q"].tobytes(), arm["side"].tobytes(), self._swings())
+            known = (*seen, int(arm["arrivals"]), bool(arm["moving"]))
+            before = self._known
+            due = now_ns - self._computed_ns >= _REFRESH_NS
+            arrived = before is None or before[3:] != known[3:]
+            if arrived or (due and (self._drifts or known[2] or before != known)):
+                try:
+                    self._publish(arm)
+                except InputError as error:  # the truth stays what it was
+                    if not self._log or self._log[-1]["event"] != str(error):
+                        self._note(str(error))
+                self._known, self._computed_ns = known, now_ns
+                self._written_ns = now_ns
+            elif now_ns - self._written_ns >= _REFRESH_NS:
+                self._board.write("truth", **self._passing(arm))
+                self._written_ns = now_ns
+
+    def hang(self, name: str | None) -> str | None:
+        """Hang a load, or take it off (None); return what truly hangs: there are mistakes.
+
+        Raises:
+            InputError: an unknown name, or a load that the arm does not bear.
+        """
+        with self._lock:
+            wanted = self._number(name)
+            load = self._mistakes.pop(0) if self._mistakes else wanted
+            before = self._load, self._since
+            self._load, self._since = load, self._board.time
+            try:
+                self._publish(self._look())
+            except InputError:
+                self._load, self._since = before
+                raise
+            self._note(f"asked for {self._name(wanted)}, hung {self._name(load)}")
+            return None if load == 0 else self._name(load)
+
+    def mistake(self, name: str | None) -> None:
+        """Let the next `hang` hang this load instead, whatever it is asked for.
+
+        Raises:
+            InputError: an unknown name.
+        """
+        with self._lock:
+            self._mistakes.append(self._number(name))
+
+    def push(self, wrench: Sequence[float]) -> None:
+        """Let somebody lean on the load point, base axes, N and N·m, until told otherwise.
+
+        Raises:
+            InputError: not six numbers, or a wrench that the arm does not bear.
+        """
+        pushed = _six("push", wrench)
+        with self._lock:
+            before, self._push = self._push, pushed
+            try:
+                self._publish(self._look())
+            except InputError:
+                self._push = before
+                raise
+            self._note(f"push {pushed.tolist()}")
+
+    def swing(self, wrench: Sequence[float], period: float, decay: float) -> None:
+        """Let every load that is hung from now on swing for a while; zeros: hang still.
+
+        w(t) = w exp(-t / decay) cos(2 pi t / period) adds to the load, t after its change.
+
+        Args:
+            wrench: (6,) at the start, base axes, N and N·m.
+            period: s of world time, over 0.
+            decay: s of world time, over 0.
+
+        Raises:
+            InputError: another number.
+        """
+        start = _six("swing", wrench)
+        if not (period > 0.0 and decay > 0.0):
+            raise InputError(f"swing: period {period} s, decay {decay} s; valid: over 0")
+        with self._lock:
+            self._swing = Swing(start, period, decay) if start.any() else None
+
+    def state(self) -> dict[str, Any]:
+        """Return what is true now, as JSON can hold it."""
+        with self._lock:
+            truth = self._board.read("truth")
+            out = {name: truth[name].tolist() for name in truth.dtype.names}
+            arrivals = int(truth["arrivals"])
+            return {
+                **out,
+                "load": None if self._load == 0 else self._name(self._load),
+                "push": self._push.tolist(),
+                "slip": self.slip(arrivals).tolist(),
+            }
+
+    def log(self) -> list[dict[str, Any]]:
+        """Return what happened to the load, and when."""
+        with self._lock:
+            return list(self._log)
+
+    def slip(self, arrivals: int) -> Floats:
+        """Return (n,) how far the joints missed their command at this arrival, rad."""
+        rng = np.random.default_rng([self._seed, 1, arrivals])
+        return np.asarray(self._world.joint_std * rng.standard_normal(N))
+
+    def _publish(self, arm: Any) -> None:
+        """Compute where the arm rests now, and write all of the truth."""
+        world, now = self._world, self._board.time
+        wrench = self._push.copy()
+        if self._swing is not None and self._swings():
+            wrench += self._swing.at(now - self._since)
+        if self._load:
+            wrench += self._loads[self._load - 1].wrench(world.cell.gravity)
+        states = States(
+            q=arm["q"][None].copy(),
+            wrench=wrench[None],
+            time=np.array([now]),
+            load_time=np.array([now - self._since]),
+            approach=arm["side"][None].copy(),
+        )
+        slip = self.slip(int(arm["arrivals"]))[None]
+        rest = world.rest(states, slip)
+        sight = world.sight(states, slip)
+        flange = rest.flange[0]
+        self._board.write(
+            "truth",
+            load=self._load,
+            load_since=self._since,
+            target=sight.position[0],
+            target_rotation=sight.rotation[0],
+            flange=flange,
+            sensor_wrench=self._mount.feels(world, flange[:3, :3], wrench),
+            drive_torque=rest.torque[0, self._drive],
+            arrivals=int(arm["arrivals"]),
+            **self._passing(arm, now),
+        )
+
+    def _look(self) -> Any:
+        """Return the arm's section, or what it was before its writer died while writing."""
+        with contextlib.suppress(RuntimeError):
+            self._arm = self._board.read("arm")
+        return self._arm
+
+    def _swings(self) -> bool:
+        """Whether the load has not come to rest yet."""
+        swing = self._swing
+        if swing is None or self._load == 0:
+            return False
+        return swing.lasts(self._board.time - self._since)
+
+    def _passing(self, arm: Any, now: float | None = None) -> dict[str, Any]:
+        """Return the fields that change while the arm rests."""
+        time = self._board.time if now is None else now
+        warm = _WARM_RISE + (_WARM_START - _WARM_RISE) * np.exp(-time / _WARM_TIME)
+        return {
+            "time": time,
+            "encoder": arm["q"] + ENCODER_STD * self._rng.standard_normal(N),
+            "joint_temperature": AIR + warm,
+            "air_temperature": AIR,
+        }
+
+    def _number(self, name: str | None) -> int:
+        """Return the number of a load by name, 0 for none."""
+        if name is None or name == "none":
+            return 0
+        names = [load.name for load in self._loads]
+        if name not in names:
+            raise InputError(
+                f"there is no load {name!r}{suggest(name, names)}; valid: none, {', '.join(names)}"
+            )
+        return names.index(name) + 1
+
+    def _name(self, number: int) -> str:
+        """Return the name of a load by number."""
+        return self._loads[number - 1].name if number else "none"
+
+    def _note(self, event: str) -> None:
+        """Remember an event."""
+        self._log.append({"time": self._board.time, "event": event})
+
+
+def _six(what: str, wrench: Sequence[float]) -> Floats:
+    """Return a wrench that a person could exert."""
+    given = np.asarray(wrench, dtype=float)
+    if given.shape != (6,) or not np.all(np.abs(given) <= _STRONGEST):
+        raise InputError(
+            f"{what} {list(wrench)}; valid: six numbers, N and N·m, at most {_STRONGEST:g}"
+        )
+    return given
+
+
+def _drives(world: World) -> Ints:
+    """Return the (n,) numbers of the drives among the elastic degrees of freedom."""
+    cell, bends = world.cell, bool(np.any(world.physics.link_compliance))
+    return build(
+        cell.arm, cell.arm.links, cell.tool_mass, cell.tool_com, cell.gravity, beams=bends
+    ).drive

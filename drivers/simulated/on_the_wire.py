@@ -1,0 +1,59 @@
+"""A simulated cell with something hidden in it, behind real wires."""
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from drivers.simulated.cell_processes import SimulatedCell
+from drivers.simulated.planned import planned_states
+from drivers.simulated.rehearsal import Secret, conceal, measurement_noise
+from hilcal.config import CellConfig
+from hilcal.data.plan import Plan
+
+
+def secret_of(config: CellConfig, plan: Plan, choice: str, seed: int) -> Secret:
+    """Hide an effect in the simulated cell of a configuration.
+
+    Its strength holds for the readings of the plan, each the mean of several measurements; the
+    world's tracker has the noise of a single one.
+
+    Args:
+        config: the cell; `[simulation]` tells the strength.
+        plan: what will be measured.
+        choice: an effect, "random" or "nothing".
+        seed: of everything random.
+
+    Raises:
+        InputError: an unknown choice, or a cell without loads.
+    """
+    rng = np.random.default_rng(seed)
+    mean = measurement_noise(config, config.acquire.samples)
+    secret = conceal(config, choice, rng, lambda cell: planned_states(cell, config, plan), mean)
+    return replace(secret, world=replace(secret.world, noise=measurement_noise(config)))
+
+
+@contextmanager
+def simulated_cell(
+    secret: Secret, seed: int, base_dir: Path, directory: Path | None = None
+) -> Iterator[SimulatedCell]:
+    """Run the simulated devices of a cell; they end with the block.
+
+    Args:
+        secret: what is told and what is true.
+        seed: of the devices' noise.
+        base_dir: directory that a robot's file path is relative to.
+        directory: where the devices meet; a temporary one if None.
+
+    Raises:
+        DeviceError: a device did not start.
+    """
+    with tempfile.TemporaryDirectory(prefix="hilcal-") as made:
+        where = directory or Path(made)
+        with SimulatedCell.start(
+            secret.world, secret.config, where, seed, base_dir=base_dir
+        ) as cell:
+            yield cell

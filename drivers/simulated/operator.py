@@ -1,0 +1,79 @@
+"""The person of a simulated cell: hangs in the simulated world what is asked for."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from drivers.simulated import admin
+from hilcal.acquire.clock import Clock
+from hilcal.acquire.devices import Report
+from hilcal.config import CellConfig, Load
+from hilcal.errors import DeviceError, InputError
+
+HAND_S = 20.0
+"""Time that a person takes to change a load, s."""
+
+_OPTIONS = ("socket", "hand_s")
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedOperator:
+    """A diligent person, who errs only where the world's admin line says so.
+
+    Attributes:
+        socket: the world's admin socket.
+        hand: time that a change of the load takes, s of cell time.
+        clock: cell time.
+    """
+
+    socket: Path
+    hand: float
+    clock: Clock
+
+    def report(self) -> Report:
+        """Say who is asked, and whether the world is there to hang anything in."""
+        facts = (("takes", f"{self.hand:g} s for a load"),)
+        problems: tuple[str, ...] = ()
+        try:
+            admin.ask(self.socket, "state")
+        except DeviceError as error:
+            problems = (f"operator: {error}",)
+        return Report("operator", "simulated operator", facts, problems)
+
+    def hang(self, load: Load | None, why: str) -> None:
+        """Hang a load in the simulated world, or take it off.
+
+        Raises:
+            DeviceError: the simulated world is gone, or does not have this load.
+        """
+        self.clock.sleep(self.hand)
+        admin.ask(self.socket, "hang", name=None if load is None else load.name)
+
+    def close(self) -> None:
+        """Nothing to give back."""
+
+
+def open_operator(config: CellConfig) -> SimulatedOperator:
+    """Return the simulated operator of a configuration.
+
+    Its [operator] options are `socket`, the admin socket of the simulated world, and
+    `hand_s`, how long a change of the load takes, s of cell time.
+
+    Raises:
+        InputError: a missing or bad option.
+    """
+    options = config.operator.options
+    for key in options:
+        if key not in _OPTIONS:
+            raise InputError(
+                f"[operator] options has no key {key!r} for the simulated operator; "
+                f"valid: {', '.join(_OPTIONS)}"
+            )
+    socket, hand = options.get("socket"), options.get("hand_s", HAND_S)
+    if not isinstance(socket, str) or not socket:
+        raise InputError(
+            "[operator] options lacks socket: the simulated operator lives in a simulated cell "
+            '(hilcal demo); with a real one use driver = "terminal"'
+        )
+    if isinstance(hand, bool) or not isinstance(hand, int | float) or not 0 <= hand <= 3600:
+        raise InputError(f"[operator] options hand_s = {hand!r}; valid: a time in s, 0 to 3600")
+    return SimulatedOperator(Path(socket), float(hand), Clock(config.simulation.clock))

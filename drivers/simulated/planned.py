@@ -1,0 +1,44 @@
+"""The states that a plan visits, as far as they are known before it is run."""
+
+import numpy as np
+
+from drivers.simulated.rehearsal import Visit
+from hilcal.cell import Cell
+from hilcal.config import CellConfig
+from hilcal.data.plan import UNLOADED, Plan
+from hilcal.data.readings import States
+
+_LOADING = 60.0  # s, to change a load
+_MEASURING = 5.0  # s, to settle and to measure
+
+
+def planned_states(cell: Cell, config: CellConfig, plan: Plan) -> Visit:
+    """Return the N states of a plan's steps in order, with times as they will about be.
+
+    A joint's approach side is the direction of its last motion; the first step is reached by
+    a move in the positive direction of every joint.
+
+    Args:
+        cell: the cell.
+        config: its loads and motion.
+        plan: what is visited.
+    """
+    names = [UNLOADED, *(load.name for load in config.loads)]
+    pulls = {load.name: load.wrench(cell.gravity) for load in config.loads}
+    q = np.array([plan.joints(step.pose) for step in plan.steps])
+    wrench = np.array([pulls.get(step.load, np.zeros(6)) for step in plan.steps])
+    load = np.array([names.index(step.load) for step in plan.steps])
+    moved = np.diff(q, axis=0, prepend=q[:1] - 1.0)
+    side = np.sign(moved)
+    for k in range(1, len(side)):
+        side[k] = np.where(side[k] == 0.0, side[k - 1], side[k])
+    speed, acceleration = config.motion.speed_rad_s, config.motion.acceleration_rad_s2
+    changed = np.diff(load, prepend=0) != 0
+    lasts = np.abs(moved).max(axis=1) / speed + speed / acceleration + _MEASURING
+    time = np.cumsum(lasts + _LOADING * changed)
+    begun = np.maximum.accumulate(np.where(changed, time - _MEASURING, 0.0))
+    states = States(
+        q=q, wrench=wrench, time=time, load_time=np.maximum(time - begun, 1.0), approach=side
+    )
+    pose = np.array([plan.pose_names.index(step.pose) for step in plan.steps])
+    return Visit(states, pose, load, np.array([step.cycle for step in plan.steps]))

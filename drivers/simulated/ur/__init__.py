@@ -1,0 +1,1 @@
+"""A simulated Universal Robots controller, as it is seen from the network."""

@@ -1,0 +1,233 @@
+"""The state machine: programs, stops, power, and the step that keeps them going."""
+
+import time
+from enum import Enum
+
+import numpy as np
+
+from drivers.simulated.blackboard import Blackboard
+from drivers.simulated.ur.script import PROGRAM_STOP, ControlScript, ProtectiveStop
+from drivers.simulated.ur.state import ArmState, RobotMode, Runtime, SafetyMode
+from hilcal.types import Floats
+
+SAFETY_STOP = 15.0
+"""Deceleration of protective and emergency stops, rad/s²."""
+STOP_TIME = 0.25
+"""World time in which any program's end brings the arm to rest, s."""
+UNLOCK_AFTER = 5.0
+"""Real time before a protective stop can be unlocked, s (the dashboard's own words)."""
+
+_COMPILE = 0.05  # s of real time from the upload of a program to its start
+_POWER_UP = 0.3  # s of real time for each step of powering up; real arms take some seconds
+_MOST_OFTEN = 0.004  # s of real time between two writes to the blackboard
+
+
+class Answer(Enum):
+    """What became of an order."""
+
+    DONE = "done"
+    TOO_EARLY = "too early"
+    REFUSED = "refused"
+
+
+class Controller:
+    """Runs one program at a time, and stops it for every reason there is.
+
+    Attributes:
+        arm: the shared state.
+        scripts: programs received.
+        unlock_after: real time before a protective stop can be unlocked, s.
+    """
+
+    def __init__(self, arm: ArmState, board: Blackboard) -> None:
+        """Take over the state; publishes it."""
+        self.arm = arm
+        self.scripts = 0
+        self.unlock_after = UNLOCK_AFTER
+        self._board = board
+        self._program: ControlScript | None = None
+        self._compiling: tuple[float, str] | None = None
+        self._powering: tuple[float, RobotMode] | None = None
+        self._interrupted: tuple[Floats, float, float] | None = None
+        self._stopped_at = 0.0  # real time of the last protective stop
+        self._published: tuple[object, ...] = ()
+        self._published_at = 0.0
+        self.publish()
+
+    @property
+    def program_runs(self) -> bool:
+        """Whether there is a program, also a paused one."""
+        return self._program is not None or self._compiling is not None
+
+    @property
+    def watchdog(self) -> float:
+        """The program's watchdog, Hz; 0 is none."""
+        return self._program.watchdog if self._program is not None else 0.0
+
+    def step(self) -> None:
+        """Bring everything up to now."""
+        arm, real = self.arm, time.monotonic()
+        motion = arm.trajectory
+        rate = arm.slider * arm.scaling
+        motion.advance(arm.clock.now)
+        motion.rate = rate
+        if self._powering is not None and real >= self._powering[0]:
+            arm.robot_mode, self._powering = self._powering[1], None
+            arm.note(f"robot mode {arm.robot_mode.name}")
+        if self._compiling is not None and real >= self._compiling[0] and not motion.moving:
+            self._start_program(self._compiling[1])
+        if arm.runtime is Runtime.PAUSING and not motion.moving:
+            arm.runtime = Runtime.PAUSED
+        if self._program is not None and arm.runtime is Runtime.PLAYING:
+            if self._program.late:
+                self.stop_program("watchdog: no input package in time")
+            else:
+                self._poll()
+        self.publish()
+
+    def run(self, text: str) -> None:
+        """Replace the running program by another one, where that is allowed."""
+        arm = self.arm
+        self.scripts += 1
+        if not arm.remote or not arm.able:
+            why = "local mode" if not arm.remote else "the robot is not ready"
+            arm.note(f"script ignored: {why}")
+            return
+        if text.startswith("sec"):  # a secondary program moves nothing and stops nothing
+            arm.note("secondary program")
+            return
+        self.stop_program("replaced by a new script")
+        self._compiling = time.monotonic() + _COMPILE, text
+
+    def stop_program(self, why: str) -> None:
+        """End the program; the arm decelerates by itself."""
+        arm = self.arm
+        was = arm.runtime
+        if self.program_runs or arm.trajectory.moving:
+            arm.note(f"program stopped: {why}")
+        self._program = self._compiling = self._interrupted = None
+        arm.runtime = Runtime.STOPPED
+        speed = float(np.max(np.abs(arm.trajectory.qd)))
+        arm.trajectory.stop(max(PROGRAM_STOP, speed / STOP_TIME), arm.clock.now)
+        if was is not arm.runtime:
+            self.publish()
+
+    def play(self) -> Answer:
+        """Go on with a paused program, and with the motion that was cut short."""
+        arm = self.arm
+        if arm.runtime is not Runtime.PAUSED or self._program is None or not arm.able:
+            return Answer.REFUSED
+        arm.runtime = Runtime.PLAYING
+        arm.note("program resumed")
+        if self._interrupted is not None:
+            arm.trajectory.start(*self._interrupted, arm.clock.now)
+            self._interrupted = None
+        return Answer.DONE
+
+    def protective_stop(self, why: str) -> None:
+        """Stop at once and pause the program, until somebody unlocks it."""
+        arm = self.arm
+        if arm.safety_mode is not SafetyMode.NORMAL:
+            return
+        arm.note(f"protective stop: {why}")
+        self._stopped_at = time.monotonic()
+        arm.safety_mode = SafetyMode.PROTECTIVE_STOP
+        self._compiling = None
+        arm.runtime = Runtime.STOPPED if self._program is None else Runtime.PAUSING
+        self._interrupted = arm.trajectory.told or self._interrupted
+        arm.trajectory.stop(SAFETY_STOP, arm.clock.now)
+        self.step()
+
+    def unlock(self) -> Answer:
+        """Release a protective stop; the program stays paused."""
+        arm = self.arm
+        if arm.safety_mode is SafetyMode.ROBOT_EMERGENCY_STOP:
+            return Answer.REFUSED
+        if arm.safety_mode is SafetyMode.PROTECTIVE_STOP:
+            if time.monotonic() - self._stopped_at < self.unlock_after:
+                return Answer.TOO_EARLY
+            arm.safety_mode = SafetyMode.NORMAL
+            arm.note("protective stop unlocked")
+        return Answer.DONE
+
+    def emergency_stop(self) -> None:
+        """Stop at once, end the program, cut the power."""
+        arm = self.arm
+        arm.note("emergency stop")
+        arm.safety_mode = SafetyMode.ROBOT_EMERGENCY_STOP
+        arm.trajectory.stop(SAFETY_STOP, arm.clock.now)
+        self.stop_program("emergency stop")
+        arm.robot_mode, self._powering = RobotMode.POWER_OFF, None
+        self.step()
+
+    def release_emergency_stop(self) -> None:
+        """Pull the button; the power stays off."""
+        if self.arm.safety_mode is SafetyMode.ROBOT_EMERGENCY_STOP:
+            self.arm.safety_mode = SafetyMode.NORMAL
+            self.arm.note("emergency stop released")
+
+    def power(self, mode: RobotMode) -> Answer:
+        """Go towards a power mode: on (idle), brakes released (running), or off."""
+        arm = self.arm
+        if mode is RobotMode.POWER_OFF:
+            self.stop_program("power off")
+            arm.robot_mode, self._powering = mode, None
+            return Answer.DONE
+        if arm.safety_mode is not SafetyMode.NORMAL:
+            return Answer.REFUSED
+        if arm.robot_mode < mode:
+            if arm.robot_mode is RobotMode.POWER_OFF:
+                arm.robot_mode = RobotMode.POWER_ON
+            self._powering = time.monotonic() + _POWER_UP, mode
+        return Answer.DONE
+
+    def set_remote(self, remote: bool) -> None:
+        """Turn remote control on or off; turning it off ends the network's program."""
+        arm = self.arm
+        if remote is arm.remote:
+            return
+        arm.remote = remote
+        arm.note("remote mode" if remote else "local mode")
+        if not remote:
+            self.stop_program("local mode")
+        self.step()
+
+    def publish(self) -> None:
+        """Write the state to the blackboard where it has changed."""
+        arm, motion = self.arm, self.arm.trajectory
+        state = (motion.arrivals, motion.moving, arm.payload, *arm.payload_com.tolist())
+        same = state == self._published
+        if same and (not motion.moving or time.monotonic() - self._published_at < _MOST_OFTEN):
+            return
+        self._published, self._published_at = state, time.monotonic()
+        self._board.write(
+            "arm",
+            alive=1.0,
+            q=motion.q,
+            qd=motion.qd,
+            side=motion.side,
+            arrivals=motion.arrivals,
+            moving=float(motion.moving),
+            payload=arm.payload,
+            payload_com=arm.payload_com,
+        )
+
+    def _start_program(self, text: str) -> None:
+        self._compiling = None
+        try:
+            self._program = ControlScript(text, self.arm)
+        except ValueError:  # somebody else's: it stops whatever moved, does its work and ends
+            self.arm.note(f"foreign program: {text[:60]!r}")
+            return
+        self.arm.runtime = Runtime.PLAYING
+        self.arm.note("control script plays")
+
+    def _poll(self) -> None:
+        assert self._program is not None  # noqa: S101 - for the type checker
+        try:
+            if not self._program.poll():
+                self.stop_program("it ended")
+        except ProtectiveStop:
+            self.protective_stop("asked for by the program")
+        except ValueError as error:
+            self.stop_program(str(error))

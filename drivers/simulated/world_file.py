@@ -1,0 +1,120 @@
+"""A simulated world as a JSON file, so that its own process can be given it, exactly."""
+
+import json
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivers.simulated.tracker import TrackerNoise
+from drivers.simulated.truth import Truth
+from drivers.simulated.world import World
+from hilcal.cell import Cell, cell_from_config
+from hilcal.config import CellConfig
+from hilcal.errors import InputError
+from hilcal.types import Floats
+
+FORMAT = "hilcal-world"
+VERSION = 1
+_CELL = ("target", "load_point", "tool_mass", "tool_com", "gravity")
+_ARM = ("links", "masses", "coms", "q_min", "q_max", "torque_max")
+
+
+def write_world(path: Path, world: World, config: CellConfig, base_dir: Path | None = None) -> None:
+    """Write the world and the configuration of its cell; floats keep every bit.
+
+    Args:
+        path: the file to make; it appears whole or not at all.
+        world: the simulated world.
+        config: the configuration that `world.cell` was made from.
+        base_dir: directory that a robot's file path in it is relative to.
+
+    Raises:
+        InputError: the configuration describes another cell than the world's.
+    """
+    other = _differences(world.cell, cell_from_config(config, base_dir))
+    if other:
+        raise InputError(
+            f"simulated world: its cell and the configuration differ in {', '.join(other)}; "
+            "valid: the configuration that the world was made from"
+        )
+    noise = world.noise
+    content = {
+        "format": FORMAT,
+        "version": VERSION,
+        "config": json.loads(config.to_json()),
+        "base_dir": None if base_dir is None else str(base_dir.resolve()),
+        "physics": {f.name: _listed(getattr(world.physics, f.name)) for f in fields(Truth)},
+        "registration": _listed(world.registration),
+        "station": _listed(world.station),
+        "joint_std": _listed(world.joint_std),
+        "noise": {
+            "range_std": list(noise.range_std),
+            "transverse_std": list(noise.transverse_std),
+            "orientation_std": noise.orientation_std,
+        },
+    }
+    new = path.with_name(path.name + ".new")
+    new.write_text(json.dumps(content, indent=1), encoding="utf-8")
+    new.replace(path)
+
+
+def read_world(path: Path) -> tuple[World, CellConfig]:
+    """Return the world of a file and the configuration of its cell.
+
+    Raises:
+        InputError: unreadable, not a world, or something in it that cannot be.
+    """
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    except ValueError as error:
+        raise InputError(f"{path}: not a world file ({error})") from None
+    if not isinstance(data, dict) or data.get("format") != FORMAT:
+        raise InputError(f'{path}: not a world file; it has "format": "{FORMAT}"')
+    if data.get("version") != VERSION:
+        raise InputError(f"{path}: version {data.get('version')!r}; this hilcal reads {VERSION}")
+    try:
+        config = CellConfig.from_json(json.dumps(data["config"]))
+        base_dir = None if data["base_dir"] is None else Path(data["base_dir"])
+        noise = data["noise"]
+        world = World(
+            cell=cell_from_config(config, base_dir),
+            physics=Truth(**{f.name: _array(data["physics"][f.name]) for f in fields(Truth)}),
+            registration=_array(data["registration"]),
+            station=_array(data["station"]),
+            noise=TrackerNoise(
+                range_std=(float(noise["range_std"][0]), float(noise["range_std"][1])),
+                transverse_std=(
+                    float(noise["transverse_std"][0]),
+                    float(noise["transverse_std"][1]),
+                ),
+                orientation_std=float(noise["orientation_std"]),
+            ),
+            joint_std=_array(data["joint_std"]),
+        )
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise InputError(f"{path}: damaged: {type(error).__name__} {error}") from None
+    return world, config
+
+
+def _listed(array: Floats) -> dict[str, Any]:
+    """Return an array as JSON; the shape apart, since one of its numbers may be 0."""
+    return {"shape": list(array.shape), "values": [float(x) for x in array.ravel()]}
+
+
+def _array(data: dict[str, Any]) -> Floats:
+    """Return the array of `_listed`."""
+    return np.array(data["values"], dtype=np.float64).reshape(data["shape"])
+
+
+def _differences(a: Cell, b: Cell) -> list[str]:
+    """Return the names of what is not the same in two cells; registrations do not count."""
+    out = [name for name in _CELL if not np.array_equal(getattr(a, name), getattr(b, name))]
+    return out + [
+        f"arm.{name}"
+        for name in _ARM
+        if not np.array_equal(getattr(a.arm, name), getattr(b.arm, name))
+    ]

@@ -1,0 +1,113 @@
+"""A person at the terminal hangs the loads: is asked, does it, and presses Enter."""
+
+import contextlib
+import math
+import sys
+import termios
+from functools import partial
+
+from rich.console import Console
+
+from hilcal.acquire.devices import Report
+from hilcal.config import CellConfig, Load
+from hilcal.errors import DeviceError, InputError
+
+_NO_TERMINAL = (
+    "operator: standard input is not a terminal, so nobody can be asked to hang a load; "
+    "run hilcal in a terminal"
+)
+
+
+class TerminalOperator:
+    """Asks on standard error and listens to standard input."""
+
+    def __init__(self, config: CellConfig) -> None:
+        """Remember where loads act and which way weights pull."""
+        self._point = config.tool.load_point_m
+        self._gravity = config.robot.gravity_m_s2
+        self._console = Console(stderr=True, highlight=False)
+
+    def report(self) -> Report:
+        """Say who is asked, and whether anybody can be."""
+        there = _is_terminal()
+        return Report(
+            "operator",
+            "the person at this terminal",
+            (("asked on", "standard error"), ("answers with", "Enter, or q to give up")),
+            () if there else (_NO_TERMINAL,),
+        )
+
+    def hang(self, load: Load | None, why: str) -> None:
+        """Ask for a load and wait for Enter; what was typed before the question is dropped.
+
+        Raises:
+            DeviceError: the person gives up with q, or nobody is there to be asked.
+        """
+        if not _is_terminal():
+            raise DeviceError(_NO_TERMINAL)
+        say = partial(self._console.print, markup=False, soft_wrap=True)
+        say()
+        if why:
+            say(why, style="bold red")
+        for line in self._request(load):
+            say(line, style="bold")
+        with contextlib.suppress(termios.error, OSError, ValueError):
+            termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)
+        while True:
+            say("Enter = done, q = give up: ", end="")
+            try:
+                answer = sys.stdin.readline()
+            except (OSError, ValueError) as error:
+                raise DeviceError(f"operator: the terminal is gone ({error})") from None
+            if not answer:
+                raise DeviceError("operator: the terminal was closed before the load was hung")
+            answer = answer.strip().lower()
+            if answer == "":
+                return
+            if answer in ("q", "quit"):
+                raise DeviceError("stopped by the operator")
+            say(f"{answer!r} is no answer.")
+
+    def close(self) -> None:
+        """Nothing to give back."""
+
+    def _request(self, load: Load | None) -> list[str]:
+        """Return what is asked for, line by line."""
+        if load is None:
+            return ["Take every load off the tool, and do not touch the arm."]
+        out = [f"Hang the load {load.name} at the load point {_numbers(self._point)} m (flange)."]
+        weight = math.hypot(*self._gravity) * load.mass_kg
+        if load.mass_kg:
+            out.append(f"  weight: {load.mass_kg:g} kg, {weight:.1f} N; let it hang freely, still")
+        if any(load.force_N):
+            out.append(f"  force:  {_numbers(load.force_N)} N, base axes")
+        if any(load.moment_Nm):
+            out.append(f"  moment: {_numbers(load.moment_Nm)} N·m, base axes")
+        return out
+
+
+def open_operator(config: CellConfig) -> TerminalOperator:
+    """Return the person at the terminal.
+
+    Raises:
+        InputError: [operator] options that this driver does not have.
+    """
+    if config.operator.options:
+        raise InputError(
+            f"[operator] options has {', '.join(config.operator.options)}; "
+            'the driver "terminal" has no options'
+        )
+    return TerminalOperator(config)
+
+
+def _is_terminal() -> bool:
+    """Whether a person can answer on standard input."""
+    try:
+        return sys.stdin.isatty()
+    except (AttributeError, ValueError):  # no standard input, or a closed one
+        return False
+
+
+def _numbers(values: tuple[float, float, float]) -> str:
+    """Return a vector for people."""
+    return "[" + ", ".join(f"{x:g}" for x in values) + "]"

@@ -1,0 +1,303 @@
+"""UR arm on ur_rtde: driver `ur` of the group `hilcal.arms`.
+
+Every call into ur_rtde is made in a child process with a deadline, since it can hang, crash,
+or go on with old values: the receive interface in one, the control interface, which exists
+only after `take_control`, in another. The arm can be stopped in three independent ways: by the
+control interface, by the dashboard server, by a program on the script port; and the
+controller's watchdog stops it 0.1 s after the control process has ended.
+"""
+
+import contextlib
+import time
+from typing import NoReturn
+
+import numpy as np
+
+from drivers.ur_link import cause, dashboard, probe, states
+from drivers.ur_link.brakes import Brakes
+from drivers.ur_link.control import Control, take
+from drivers.ur_link.failure import CHECK_LINK, CONTROL, HOLD_ON, failure
+from drivers.ur_link.lines import LinkError
+from drivers.ur_link.motion import Motion, deceleration, stands
+from drivers.ur_link.options import UrOptions
+from drivers.ur_link.reading import OPTIONAL, OUTPUTS, N, Reading
+from drivers.ur_link.receiver import Receiver
+from drivers.ur_link.survey import survey
+from drivers.ur_link.worker import WorkerError
+from hilcal.acquire.devices import ArmSample, Report
+from hilcal.config import CellConfig
+from hilcal.errors import InputError
+from hilcal.toml import check_section
+from hilcal.types import Floats
+
+_PROBE_S, _DASHBOARD_S, _RECEIVE_S = 2.5, 1.5, 4.0  # 8 s together
+_PAYLOAD_S = 1.5
+POLYSCOPE_X = 10
+"""Major version of the controllers without a dashboard server."""
+_MASS_KG, _COM_M = 1e-3, 1e-4  # how well a payload has to be read back
+_MAX_Q, _MAX_SPEED, _MAX_ACCELERATION = 6.34, 3.2, 40.0
+
+
+class UrArm:
+    """An arm of Universal Robots; see `hilcal.acquire.devices.Arm`."""
+
+    def __init__(
+        self,
+        config: CellConfig,
+        host: str,
+        hz: float,
+        controller: probe.Controller,
+        no_dashboard: str,
+        receiver: Receiver,
+    ) -> None:
+        """Use an open link; `open_arm` makes one."""
+        self._host, self._hz, self._model = host, hz, config.robot.model
+        self._arrival, self._clock = config.motion.arrival_rad, config.simulation.clock
+        self._controller, self._no_dashboard = controller, no_dashboard
+        self._receiver = receiver
+        self._has_dashboard = controller.version[0] < POLYSCOPE_X
+        self._brakes = Brakes(host, receiver, self._has_dashboard)
+        self._control: Control | None = None
+        self._motion: Motion | None = None
+        self._brake = deceleration(config.motion.speed_rad_s)
+        self._fault = ""
+
+    @property
+    def workers(self) -> tuple[int, ...]:
+        """Numbers of the processes that receive and, under control, command."""
+        return (self._receiver.pid, *(() if self._control is None else (self._control.pid,)))
+
+    def report(self) -> Report:
+        """Say who answered, versions, state, and every problem at once; moves nothing."""
+        report = survey(
+            self._host,
+            self._model,
+            self._hz,
+            self._controller,
+            self._receiver,
+            self._no_dashboard,
+        )
+        if self._control is None:
+            return report
+        ours = tuple(p for p in report.problems if not p.startswith("a program runs"))
+        return Report(report.device, report.name, report.facts, ours)
+
+    def sample(self) -> ArmSample:
+        """Return a sample that is newer than the call; see `Arm.sample`."""
+        return self._read().sample
+
+    def take_control(self, mass: float, com: Floats) -> None:
+        """Become the one who commands the arm, and set its payload; see `Arm.take_control`."""
+        if self._motion is not None:
+            raise failure(self._host, "the motion before has not ended")
+        self._give_back()
+        try:
+            self._receiver.read()
+        except LinkError:
+            try:
+                self._receiver.renew(_RECEIVE_S)
+            except LinkError as error:
+                raise failure(self._host, str(error), CHECK_LINK) from None
+        self._no_dashboard = _why_no_dashboard(self._host, self._controller.version)
+        if self._no_dashboard:
+            raise failure(self._host, f"cannot take control: {self._no_dashboard}")
+        self._control = take(self._host, self._receiver)
+        self._fault = ""
+        try:
+            self.set_payload(mass, com)
+        except BaseException:
+            self._give_back()
+            raise
+
+    def set_payload(self, mass: float, com: Floats) -> None:
+        """Tell the controller what hangs at the flange, kg and m; read back and compared."""
+        com = np.asarray(com, dtype=np.float64)
+        if com.shape != (3,) or not np.isfinite([mass, *com]).all() or mass < 0:
+            raise InputError(
+                f"payload {mass} kg at {com.tolist()} m is not valid: a mass of 0 or more and "
+                "three finite numbers"
+            )
+        control = self._in_control()
+        if self._motion is not None:
+            raise failure(self._host, "the payload cannot be changed during a motion")
+        try:
+            control.set_payload(mass, com)
+        except WorkerError as error:
+            self._fail(f"the process that commands it ended ({error})")
+        end = time.monotonic() + _PAYLOAD_S
+        while True:
+            sample = self._read().sample
+            told = sample.payload_com
+            if told is None:
+                raise failure(
+                    self._host, "it does not tell its payload; that needs PolyScope 5.5.1 or newer"
+                )
+            if abs(sample.payload - mass) <= _MASS_KG and np.abs(told - com).max() <= _COM_M:
+                return
+            if time.monotonic() > end:
+                raise failure(
+                    self._host,
+                    f"it says {sample.payload:g} kg at {np.round(told, 4).tolist()} m after it was "
+                    f"told a payload of {mass:g} kg at {np.round(com, 4).tolist()} m",
+                    "look at the payload on the pendant",
+                )
+
+    def start_move(self, q: Floats, speed: float, acceleration: float) -> None:
+        """Start a motion along a straight line in joint space; see `Arm.start_move`."""
+        q = np.asarray(q, dtype=np.float64)
+        if q.shape != (N,) or not np.isfinite(q).all() or np.abs(q).max() > _MAX_Q:
+            raise InputError(
+                f"goal {q.tolist()} is not valid: {N} finite angles within ±{_MAX_Q} rad"
+            )
+        for name, value, top in (
+            ("speed", speed, _MAX_SPEED),
+            ("acceleration", acceleration, _MAX_ACCELERATION),
+        ):
+            if not 0.0 < value <= top:
+                raise InputError(f"{name} {value} is not valid: over 0 and up to {top}")
+        control = self._in_control()
+        if self._motion is not None:
+            raise failure(self._host, "the motion before has not ended")
+        reading = self._read()
+        self._check_state(reading, 0.0)
+        motion = Motion(reading.sample.q, q, speed, acceleration, self._arrival, self._clock)
+        self._motion, self._brake = motion, motion.brake
+        try:
+            taken = control.move(q, speed, acceleration, motion.brake)
+        except WorkerError as error:
+            self._fail(f"the process that commands it ended ({error})")
+        if not taken:
+            self._fail("it did not take the motion")
+
+    def moving(self) -> bool:
+        """Whether the motion is still going on; see `Arm.moving`."""
+        motion = self._motion
+        if motion is None:
+            if self._fault:
+                self._in_control()
+            return False
+        control = self._in_control()
+        try:
+            pulse = control.alive()
+        except WorkerError as error:
+            self._fail(f"the process that commands it ended ({error})")
+        if pulse.expired:
+            self._fail("nobody watched its motion for 0.5 s, so it was stopped")
+        reading = self._read()
+        self._check_state(reading, pulse.late)
+        if motion.arrived(reading):
+            self._motion = None
+            with contextlib.suppress(WorkerError):  # at rest; the next command tells
+                control.rest()
+            return False
+        late = motion.overdue(reading)
+        if late is not None:
+            self._fail(late)
+        return True
+
+    def stop(self) -> None:
+        """Stop the arm by every way there is; returns when it stands."""
+        if self._control is None and self._stands_already():
+            return
+        if self._control is not None and self._brakes.ease(self._control, self._brake):
+            self._motion = None
+            return
+        halt = self._brakes.halt(self._control, self._brake)
+        self._control = self._motion = None
+        if not halt.stands:
+            why = f" ({halt.lost})" if halt.lost else ""
+            raise failure(self._host, f"it was told to stop{why}", HOLD_ON)
+
+    def close(self) -> None:
+        """Stop, give control back, end all child processes. Never raises."""
+        with contextlib.suppress(Exception):
+            if self._motion is not None:
+                self.stop()
+        with contextlib.suppress(Exception):
+            self._give_back()
+        with contextlib.suppress(Exception):
+            self._receiver.close()
+
+    def _in_control(self) -> Control:
+        if self._control is None:
+            why = f" ({self._fault})" if self._fault else ""
+            raise failure(self._host, f"it is not under control{why}", CONTROL)
+        return self._control
+
+    def _give_back(self) -> None:
+        control, self._control, self._motion = self._control, None, None
+        if control is not None:
+            control.give_back()
+
+    def _stands_already(self) -> bool:
+        """Whether an arm that is not under control stands."""
+        with contextlib.suppress(LinkError):
+            first, second = self._receiver.read(), self._receiver.read()
+            return stands(first) and stands(second)
+        return False
+
+    def _read(self) -> Reading:
+        """Return a new reading; a dead link is a failure of the motion, if there is one."""
+        try:
+            return self._receiver.read()
+        except LinkError as error:
+            if self._motion is not None:
+                self._fail("", lost=str(error))
+            raise failure(self._host, f"the link is lost: {error}", CHECK_LINK) from None
+
+    def _check_state(self, reading: Reading, late: float) -> None:
+        """Fail unless the robot is in a state to move."""
+        if reading.sample.safety != states.NORMAL or reading.mode != states.RUNNING:
+            self._fail("it is not ready to move")
+        if reading.runtime != states.PLAYING:
+            self._fail(cause.program_ended(reading, late))
+
+    def _fail(self, noticed: str, lost: str = "") -> NoReturn:
+        """Stop the arm first, then find out the cause and raise it."""
+        halt = self._brakes.halt(self._control, self._brake, lost)
+        self._control = self._motion = None
+        self._fault, advice = cause.find(self._host, halt, noticed, self._has_dashboard)
+        if not halt.stands:
+            advice = f"{HOLD_ON}; {advice}"
+        raise failure(self._host, self._fault, advice)
+
+
+def open_arm(config: CellConfig) -> UrArm:
+    """Connect to the controller of [robot] host; moves nothing and uploads nothing.
+
+    Raises:
+        InputError: [robot] host is missing, or [robot.options] is wrong.
+        DeviceError: no controller answers there.
+    """
+    host = config.robot.host
+    if host is None:
+        raise InputError(
+            '[robot] host is missing: the driver "ur" needs the controller\'s address, '
+            'e.g. host = "192.168.56.101"'
+        )
+    options = check_section(dict(config.robot.options), UrOptions, "[robot.options]")
+    receiver = None
+    try:
+        controller = probe.controller(host, OUTPUTS, _PROBE_S)
+        missing = set(OUTPUTS) - OPTIONAL - set(controller.outputs)
+        if missing:
+            version = states.version_word(controller.version)
+            raise failure(host, f"its version {version} lacks {', '.join(sorted(missing))}")
+        no_dashboard = _why_no_dashboard(host, controller.version)
+        receiver = Receiver(host, options.receive_hz, controller.outputs, _RECEIVE_S)
+    except LinkError as error:
+        raise failure(
+            host, str(error), "check that the controller is on and [robot] host"
+        ) from None
+    return UrArm(config, host, options.receive_hz, controller, no_dashboard, receiver)
+
+
+def _why_no_dashboard(host: str, version: tuple[int, ...]) -> str:
+    """Return why there is no dashboard server, which control needs; empty where there is one."""
+    if version[0] >= POLYSCOPE_X:
+        return "PolyScope X has no dashboard server, and ur_rtde cannot start its program there"
+    try:
+        dashboard.ask(host, ("robotmode",), _DASHBOARD_S)
+    except LinkError as error:
+        return str(error)
+    return ""

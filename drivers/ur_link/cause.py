@@ -1,0 +1,56 @@
+"""Why a motion ended, in the order in which one cause hides another."""
+
+import contextlib
+
+from drivers.ur_link import dashboard, states
+from drivers.ur_link.brakes import ASK_S, Halt
+from drivers.ur_link.failure import CHECK_LINK, RESUME
+from drivers.ur_link.lines import LinkError
+from drivers.ur_link.reading import Reading
+
+
+def find(host: str, halt: Halt, noticed: str, has_dashboard: bool) -> tuple[str, str]:
+    """Return what happened and what to do about it, after the arm has been stopped.
+
+    A safety stop ends the program, and a lost link the process that commands the arm: what was
+    noticed first is told only where nothing deeper is found.
+
+    Args:
+        host: address of the controller.
+        halt: how the stop ended.
+        noticed: what the driver noticed.
+        has_dashboard: whether there is a dashboard server to ask.
+    """
+    reading = halt.reading
+    if reading is not None and reading.sample.safety != states.NORMAL:
+        return reading.sample.safety, f"{states.safety_advice(reading.safety_bits)}, {RESUME}"
+    if reading is not None and reading.mode != states.RUNNING:
+        return _not_running(reading)
+    if has_dashboard:
+        with contextlib.suppress(LinkError):
+            if dashboard.in_remote_control(host, ASK_S) is False:
+                return "it was switched to local mode", f"switch it to remote control, {RESUME}"
+    if halt.lost:
+        return f"the link is lost: {halt.lost}", CHECK_LINK
+    return noticed, f"look at the pendant, {RESUME}"
+
+
+def program_ended(reading: Reading, late: float) -> str:
+    """Return why the robot's program does not play any more, as far as it is known.
+
+    Args:
+        reading: without a playing program.
+        late: the longest pause in the signs of life to the robot's watchdog, s; 0 for none.
+    """
+    if late > 0.0:
+        return (
+            f"its watchdog stopped it: this computer was too busy for {late:.2f} s to show that "
+            "it lives"
+        )
+    word = states.runtime_word(reading.runtime)
+    return f"its program is {word}: stopped on the pendant, by another program, or by its watchdog"
+
+
+def _not_running(reading: Reading) -> tuple[str, str]:
+    word = states.mode_word(reading.mode)
+    return f"it does not run any more ({word})", f"switch it on, {RESUME}"

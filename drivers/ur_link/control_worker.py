@@ -1,0 +1,112 @@
+"""Child process that holds the control interface of ur_rtde, and keeps the watchdog quiet.
+
+The controller stops its program, and so the arm, when it has heard nothing for 0.1 s: when
+this process ends or hangs, or when the link breaks. And this process stops the arm when its
+parent has not asked for `lease` seconds during a motion. Only asynchronous motions are used: a
+synchronous one returns from a broken link after 301 s.
+"""
+
+import os
+import time
+from typing import Any
+
+from drivers.ur_link.child import Line, start, words
+
+WATCHDOG_HZ = 10.0
+KICK_S = 0.02
+LATE_S = 0.8 / WATCHDOG_HZ
+"""A longer pause between two kicks may have set off the watchdog, s."""
+
+
+class Control:
+    """The control interface, its watchdog and the lease of a motion."""
+
+    def __init__(self, link: Any, lease: float) -> None:
+        """Arm the watchdog of an open interface."""
+        self._link, self._lease = link, lease
+        self._until: float | None = None
+        self._deceleration = 2.0
+        self._expired = False
+        self._late = 0.0
+        self._kicked = time.monotonic()
+        if not link.setWatchdog(WATCHDOG_HZ):
+            raise RuntimeError("the controller takes no watchdog")
+
+    def kick(self) -> None:
+        """Tell the robot that this process lives; stop the arm if nobody watches its motion."""
+        now = time.monotonic()
+        if now - self._kicked >= KICK_S:
+            if now - self._kicked > LATE_S:
+                self._late = max(self._late, now - self._kicked)
+            self._kicked = now
+            self._link.kickWatchdog()
+        if self._until is not None and now > self._until:
+            self._until, self._expired = None, True
+            self._link.stopJ(self._deceleration, True)
+
+    @property
+    def due(self) -> float:
+        """Time until the next kick, s."""
+        return self._kicked + KICK_S - time.monotonic()
+
+    def do(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Carry out a request."""
+        op = request["op"]
+        if op == "alive":
+            if self._until is not None:
+                self._until = time.monotonic() + self._lease
+        elif op == "move":
+            self._deceleration = request["deceleration"]
+            self._expired, self._late = False, 0.0
+            done = self._link.moveJ(request["q"], request["speed"], request["acceleration"], True)
+            self._until = time.monotonic() + self._lease if done else None
+            return {"done": bool(done)}
+        elif op == "rest":
+            self._until = None
+        elif op == "stop":
+            self._until = None
+            self._link.stopJ(request["deceleration"], True)
+        elif op == "payload":
+            return {"done": bool(self._link.setPayload(request["mass"], request["com"]))}
+        elif op == "bye":
+            self._link.stopScript()
+        return {"expired": self._expired, "late": self._late}
+
+
+def serve(line: Line, control: Control) -> None:
+    """Answer requests and kick the watchdog, until `bye` or the end of the parent."""
+    while True:
+        request = line.next(control.due)
+        if request is not None:
+            try:
+                result = control.do(request)
+            except Exception as error:
+                line.answer(request["number"], error=words(error))
+            else:
+                line.answer(request["number"], **result)
+                if request["op"] == "bye":
+                    os._exit(0)  # the library's own end takes another 0.5 s
+        control.kick()
+
+
+def main() -> None:
+    """Take control, say so, then answer requests."""
+    line, (host, hz, lease) = start()
+    try:
+        from rtde_control import RTDEControlInterface as Interface
+
+        flags = (
+            int(Interface.FLAG_UPLOAD_SCRIPT)
+            | int(Interface.FLAG_UPPER_RANGE_REGISTERS)
+            | int(Interface.FLAG_NO_EXT_FT)
+        )
+        control = Control(Interface(host, float(hz), flags), float(lease))
+    except Exception as error:  # whatever it is, the parent has to know
+        line.answer(0, error=words(error))
+        return
+    line.answer(0)
+    serve(line, control)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,132 @@
+"""A TCP connection on which nothing takes longer than one deadline."""
+
+import contextlib
+import socket
+import time
+from types import TracebackType
+from typing import Self
+
+
+class LinkError(Exception):
+    """A connection failed; the text says which and why.
+
+    Attributes:
+        refused: nobody listens on the port.
+    """
+
+    def __init__(self, text: str, *, refused: bool = False) -> None:
+        """Keep the cause."""
+        super().__init__(text)
+        self.refused = refused
+
+
+class Connection:
+    """An open connection; every call ends before the deadline given at the opening."""
+
+    def __init__(self, host: str, port: int, what: str, seconds: float) -> None:
+        """Connect.
+
+        Args:
+            host: address or name.
+            port: TCP port.
+            what: name of the service, for messages.
+            seconds: from now until everything on this connection has to be done.
+
+        Raises:
+            LinkError: nobody answers.
+        """
+        self._where = f"{what} (port {port})"
+        self._seconds = seconds
+        self._end = time.monotonic() + seconds
+        self._buffer = b""
+        try:
+            self._socket = socket.create_connection((host, port), timeout=seconds)
+        except ConnectionRefusedError:
+            raise LinkError(f"the {self._where} refuses the connection", refused=True) from None
+        except socket.gaierror:
+            raise LinkError(f'the address "{host}" is unknown') from None
+        except TimeoutError:
+            raise LinkError(f"the {self._where} does not answer within {seconds:g} s") from None
+        except OSError as error:
+            raise LinkError(f"the {self._where}: {error.strerror or error}") from None
+
+    def send(self, data: bytes) -> None:
+        """Send everything.
+
+        Raises:
+            LinkError: the connection broke or the deadline passed.
+        """
+        try:
+            self._socket.settimeout(self._left())
+            self._socket.sendall(data)
+        except TimeoutError:
+            raise self._late() from None
+        except OSError as error:
+            raise LinkError(f"the {self._where}: {error.strerror or error}") from None
+
+    def read(self, count: int) -> bytes:
+        """Return exactly so many bytes.
+
+        Raises:
+            LinkError: the connection broke or the deadline passed.
+        """
+        while len(self._buffer) < count:
+            self._more()
+        out, self._buffer = self._buffer[:count], self._buffer[count:]
+        return out
+
+    def read_line(self) -> str:
+        """Return the next line without its end.
+
+        Raises:
+            LinkError: the connection broke or the deadline passed.
+        """
+        while b"\n" not in self._buffer:
+            if len(self._buffer) > 65536:
+                raise LinkError(f"the {self._where} sends something else than lines")
+            self._more()
+        line, _, self._buffer = self._buffer.partition(b"\n")
+        return line.decode(errors="replace").strip()
+
+    def close(self) -> None:
+        """End the connection, and let the other side see it before it returns."""
+        with contextlib.suppress(OSError), self._socket:
+            self._socket.shutdown(socket.SHUT_WR)
+            self._socket.settimeout(0.1)
+            for _ in range(100):
+                if not self._socket.recv(65536):
+                    break
+
+    def __enter__(self) -> Self:
+        """Return the open connection."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """End the connection."""
+        self.close()
+
+    def _more(self) -> None:
+        try:
+            self._socket.settimeout(self._left())
+            data = self._socket.recv(65536)
+        except TimeoutError:
+            raise self._late() from None
+        except OSError as error:
+            raise LinkError(f"the {self._where}: {error.strerror or error}") from None
+        if not data:
+            raise LinkError(f"the {self._where} closed the connection")
+        self._buffer += data
+
+    def _left(self) -> float:
+        left = self._end - time.monotonic()
+        if left <= 0:
+            raise TimeoutError
+        return left
+
+    def _late(self) -> LinkError:
+        return LinkError(f"the {self._where} does not answer within {self._seconds:g} s")

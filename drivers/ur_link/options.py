@@ -1,0 +1,15 @@
+"""[robot.options] of the driver `ur`."""
+
+from typing import Annotated
+
+from pydantic import Field, Strict
+
+from hilcal.toml import Section
+
+
+class UrOptions(Section):
+    """Keys of [robot.options]; every one may be left out."""
+
+    receive_hz: Annotated[float, Strict(), Field(ge=10, le=500)] = Field(
+        125.0, description="packets of state per second, 10 to 500"
+    )

@@ -1,0 +1,99 @@
+"""Asks the controller over RTDE what it is, before the client library meets it.
+
+The library waits for ever, and with the interpreter locked, for a controller that is mute; and
+an output that the controller does not have shifts all later fields without a word. So both are
+found out here first, with a deadline. Frames: big-endian size (u16, header included), type
+(u8), body. Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide", protocol 2.
+"""
+
+import struct
+from dataclasses import dataclass
+
+from drivers.ur_link.lines import Connection, LinkError
+
+PORT = 30004
+NOT_FOUND = "NOT_FOUND"
+IN_USE = "IN_USE"
+_HEAD = struct.Struct(">HB")
+_PROBE_HZ = 10.0
+_STREAM_HZ = 125.0
+
+
+@dataclass(frozen=True, slots=True)
+class Controller:
+    """What a controller says of itself.
+
+    Attributes:
+        version: major, minor, bugfix, build.
+        outputs: those of the wanted outputs that it has.
+    """
+
+    version: tuple[int, ...]
+    outputs: tuple[str, ...]
+
+
+def controller(host: str, outputs: tuple[str, ...], seconds: float) -> Controller:
+    """Return the controller's version, and which of `outputs` it has.
+
+    Raises:
+        LinkError: nobody answers, or not as a controller does.
+    """
+    with Connection(host, PORT, "RTDE server", seconds) as line:
+        _hello(line)
+        line.send(_frame("v"))
+        version = struct.unpack(">4I", _reply(line, "v", 16))
+        line.send(_frame("O", struct.pack(">d", _PROBE_HZ) + ",".join(outputs).encode()))
+        kinds = _reply(line, "O", None)[1:].decode(errors="replace").split(",")
+        if len(kinds) != len(outputs):
+            raise LinkError("the RTDE server (port 30004) answers with a wrong number of outputs")
+        known = tuple(n for n, k in zip(outputs, kinds, strict=True) if k != NOT_FOUND)
+        return Controller(version, known)
+
+
+def check_stream(host: str, seconds: float) -> None:
+    """Ask for one packet of data.
+
+    Raises:
+        LinkError: nobody answers, or no data come.
+    """
+    with Connection(host, PORT, "RTDE server", seconds) as line:
+        _hello(line)
+        line.send(_frame("O", struct.pack(">d", _STREAM_HZ) + b"timestamp"))
+        _reply(line, "O", None)
+        line.send(_frame("S"))
+        _reply(line, "S", 1)
+        _reply(line, "U", None)
+
+
+def in_use(host: str, inputs: tuple[str, ...], seconds: float) -> bool:
+    """Whether somebody else holds one of the input registers that commands travel in.
+
+    Raises:
+        LinkError: nobody answers, or not as a controller does.
+    """
+    with Connection(host, PORT, "RTDE server", seconds) as line:
+        _hello(line)
+        line.send(_frame("I", ",".join(inputs).encode()))
+        return IN_USE in _reply(line, "I", None)[1:].decode(errors="replace").split(",")
+
+
+def _hello(line: Connection) -> None:
+    line.send(_frame("V", struct.pack(">H", 2)))
+    if _reply(line, "V", 1) != b"\x01":
+        raise LinkError("the RTDE server (port 30004) does not speak protocol 2")
+
+
+def _frame(kind: str, body: bytes = b"") -> bytes:
+    return _HEAD.pack(_HEAD.size + len(body), ord(kind)) + body
+
+
+def _reply(line: Connection, kind: str, size: int | None) -> bytes:
+    """Return the body of the next frame of a type; text messages in between are dropped."""
+    while True:
+        length, got = _HEAD.unpack(line.read(_HEAD.size))
+        body = line.read(max(0, length - _HEAD.size))
+        if got == ord("M"):
+            continue
+        if length < _HEAD.size or got != ord(kind) or (size is not None and len(body) != size):
+            raise LinkError("the RTDE server (port 30004) does not answer as a controller does")
+        return body

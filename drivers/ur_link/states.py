@@ -1,0 +1,61 @@
+"""What the controller's numbers mean, in words, and what an operator can do about them.
+
+Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide", controller output fields.
+"""
+
+ROBOT_MODES = {
+    -1: "no controller",
+    0: "disconnected",
+    1: "safety to be confirmed",
+    2: "booting",
+    3: "power off",
+    4: "power on",
+    5: "idle (brakes on)",
+    6: "backdrive",
+    7: "running",
+    8: "updating firmware",
+}
+RUNNING = 7
+
+STOPPING, STOPPED, PLAYING, PAUSING, PAUSED, RESUMING = range(6)
+RUNTIME_STATES = ("stopping", "stopped", "playing", "pausing", "paused", "resuming")
+
+NORMAL = "normal"
+# (bit of safety_status_bits, words, what to do), the gravest first
+_SAFETY = (
+    (9, "safety fault", "restart the controller"),
+    (8, "safety violation", "restart the safety system on the pendant"),
+    (6, "emergency stop of the robot", "release the emergency stop and switch the robot on"),
+    (5, "emergency stop of the system", "release the emergency stop and switch the robot on"),
+    (7, "emergency stop", "release the emergency stop and switch the robot on"),
+    (2, "protective stop", "look what the arm touched, unlock it on the pendant"),
+    (4, "safeguard stop", "leave the guarded area and reset the safeguard"),
+    (3, "recovery mode", "move the joints inside their limits on the pendant"),
+    (10, "stopped for safety", "look at the pendant"),
+    (1, "reduced mode", "leave the zone that reduces the robot's limits"),
+)
+
+
+def safety_word(bits: int) -> str:
+    """Return the safety state in words, "normal" where all is well."""
+    return next((word for bit, word, _ in _SAFETY if bits >> bit & 1), NORMAL)
+
+
+def safety_advice(bits: int) -> str:
+    """Return what the operator should do about the safety state; empty where all is well."""
+    return next((advice for bit, _, advice in _SAFETY if bits >> bit & 1), "")
+
+
+def mode_word(mode: int) -> str:
+    """Return a robot mode in words."""
+    return ROBOT_MODES.get(mode, f"robot mode {mode}")
+
+
+def runtime_word(state: int) -> str:
+    """Return the state of the robot's program in words."""
+    return RUNTIME_STATES[state] if 0 <= state < len(RUNTIME_STATES) else f"state {state}"
+
+
+def version_word(version: tuple[int, ...]) -> str:
+    """Return a controller version as people write it."""
+    return ".".join(map(str, version))

@@ -1,0 +1,112 @@
+"""What the arm says of itself, and everything that hinders a run."""
+
+import math
+
+from drivers.ur_link import dashboard, states
+from drivers.ur_link.lines import LinkError
+from drivers.ur_link.probe import Controller
+from drivers.ur_link.reading import Reading
+from drivers.ur_link.receiver import Receiver
+from hilcal.acquire.devices import Report
+
+_RATE_S = 0.4
+_ASK_S = 1.5
+
+
+def survey(
+    host: str, model: str, hz: float, controller: Controller, receiver: Receiver, no_dashboard: str
+) -> Report:
+    """Ask everything that can be asked without moving.
+
+    Args:
+        host: address of the controller.
+        model: [robot] model of the configuration.
+        hz: packets per second that were asked for.
+        controller: what it said at the opening.
+        receiver: its state.
+        no_dashboard: why there is no dashboard server; empty where there is one.
+    """
+    facts = [
+        ("address", host),
+        ("controller version", states.version_word(controller.version)),
+    ]
+    problems: list[str] = []
+    name = "Universal Robots arm"
+    if no_dashboard:
+        facts.append(("dashboard server", no_dashboard))
+        problems.append(f"{no_dashboard}; the arm cannot be controlled without it")
+    else:
+        try:
+            robot = dashboard.describe(host, _ASK_S)
+        except LinkError as error:
+            problems.append(f"{error}; the arm cannot be controlled without it")
+        else:
+            serial = f", serial number {robot.serial}" if robot.serial else ""
+            name = f"Universal Robots {robot.model or 'arm'}{serial}"
+            facts += _facts(robot)
+            problems += _problems(robot, model)
+    try:
+        reading = receiver.read()
+        rate = receiver.rate(_RATE_S)
+    except LinkError as error:
+        problems.append(str(error))
+    else:
+        facts += [*_state(reading), ("RTDE rate", f"{rate:.0f} Hz of {hz:g} Hz")]
+        problems += _hindrances(reading)
+        if rate < 0.5 * hz:
+            problems.append(f"RTDE comes at {rate:.0f} Hz instead of {hz:g} Hz; check the network")
+    return Report("arm", name, tuple(facts), tuple(problems))
+
+
+def _facts(robot: dashboard.Robot) -> list[tuple[str, str]]:
+    remote = {True: "yes", False: "no (local mode)", None: "not known to this controller"}
+    return [
+        ("model", robot.model),
+        ("serial number", robot.serial),
+        ("PolyScope", robot.version),
+        ("remote control", remote[robot.remote]),
+        ("program", robot.program),
+    ]
+
+
+def _problems(robot: dashboard.Robot, model: str) -> list[str]:
+    out = []
+    if robot.remote is False:
+        out.append("it is in local mode; switch it to remote control on the pendant")
+    # "UR10" may stand for an UR10e as well: only the size tells
+    size = "".join(c for c in robot.model if c.isdigit())
+    told = model.lower().removeprefix("ur").removesuffix("e")
+    if model.lower().startswith("ur") and told.isdigit() and size and told != size:
+        out.append(f'it is a {robot.model}; the configuration says model = "{model}"')
+    return out
+
+
+def _state(reading: Reading) -> list[tuple[str, str]]:
+    sample = reading.sample
+    com = "" if sample.payload_com is None else f" at {_list(1e3 * sample.payload_com, 1)} mm"
+    payload = "not told" if math.isnan(sample.payload) else f"{sample.payload:.3f} kg{com}"
+    return [
+        ("robot mode", states.mode_word(reading.mode)),
+        ("safety", sample.safety),
+        ("payload", payload),
+        ("joint temperatures", f"{_list(sample.joint_temperature, 1)} °C"),
+    ]
+
+
+def _hindrances(reading: Reading) -> list[str]:
+    out = []
+    sample = reading.sample
+    if sample.safety != states.NORMAL:
+        out.append(f"{sample.safety}: {states.safety_advice(reading.safety_bits)}")
+    if reading.mode != states.RUNNING:
+        word = states.mode_word(reading.mode)
+        out.append(f"it is not running ({word}); switch it on and release the brakes")
+    if reading.runtime in (states.PLAYING, states.RESUMING):
+        out.append("a program runs on the robot; stop it on the pendant")
+    if math.isnan(sample.payload) or sample.payload_com is None:
+        out.append("it does not tell its payload; that needs PolyScope 5.5.1 or newer")
+    return out
+
+
+def _list(values: object, digits: int) -> str:
+    return ", ".join(f"{v:.{digits}f}" for v in values)  # type: ignore[attr-defined]

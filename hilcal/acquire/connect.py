@@ -1,0 +1,167 @@
+"""Opening the devices that a configuration names, and everything that fails at once."""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+from typing import Any
+
+from hilcal.acquire import devices
+from hilcal.acquire.devices import Report
+from hilcal.acquire.rig import Rig
+from hilcal.config import CellConfig
+from hilcal.errors import DeviceError, HilcalError, InputError
+from hilcal.toml import suggest
+
+Factory = Callable[[CellConfig], Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What became of one device.
+
+    Attributes:
+        device: its part in the cell.
+        driver: the driver's name.
+        report: what it says of itself; None where it did not answer.
+        failure: why it did not, one line; empty where it did.
+    """
+
+    device: str
+    driver: str
+    report: Report | None
+    failure: str = ""
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """What hinders a run, one line each."""
+        if self.failure:
+            return (self.failure,)
+        return () if self.report is None else self.report.problems
+
+
+@dataclass(frozen=True, slots=True)
+class _Wanted:
+    """One device that the configuration asks for."""
+
+    device: str
+    group: str
+    driver: str | None
+    key: str
+
+
+def driver(group: str, name: str, key: str) -> Factory:
+    """Return the factory of a driver by name.
+
+    Args:
+        group: the group of entry points, see `devices`.
+        name: the driver's name.
+        key: where the configuration gives it, for messages.
+
+    Raises:
+        InputError: unknown name (lists the valid ones), or the driver cannot be loaded.
+    """
+    found = {point.name: point for point in entry_points(group=group)}
+    if name not in found:
+        valid = ", ".join(sorted(found)) or "none is installed"
+        raise InputError(
+            f'{key} = "{name}" is unknown{suggest(name, sorted(found))}; valid: {valid}'
+        )
+    try:
+        factory: Factory = found[name].load()
+    except Exception as error:  # a driver of somebody else's may fail in any way
+        words = " ".join(str(error).split())
+        raise InputError(
+            f'{key} = "{name}": the driver {found[name].value} cannot be loaded ({words})'
+        ) from error
+    return factory
+
+
+def connect(config: CellConfig) -> tuple[Rig | None, tuple[Answer, ...]]:
+    """Open every device at once; nothing moves.
+
+    Returns:
+        The rig, None where a device did not open (the others are closed again), and what
+        became of each device.
+
+    Raises:
+        InputError: the configuration names no driver for a part, or an unknown one.
+    """
+    wanted = _wanted(config)
+    factories = [_factory(one) for one in wanted]
+    with ThreadPoolExecutor(max(1, len(wanted) - 1)) as pool:
+        later = [pool.submit(_open, factory, config) for factory in factories[1:]]
+        # The arm's driver starts processes that end with the thread that started them.
+        opened = [_open(factories[0], config), *(one.result() for one in later)]
+    answers = tuple(
+        _answer(one, made, why) for one, (made, why) in zip(wanted, opened, strict=True)
+    )
+    made = {one.device: device for one, (device, _) in zip(wanted, opened, strict=True)}
+    wrong = [why for _, why in opened if isinstance(why, InputError)]
+    if wrong or any(answer.failure for answer in answers):
+        for device in made.values():
+            if device is not None:
+                device.close()
+        if wrong:
+            raise wrong[0]
+        return None, answers
+    rig = Rig(
+        arm=made["arm"],
+        tracker=made["tracker"],
+        force=made.get("force sensor"),
+        operator=made["operator"],
+    )
+    return rig, answers
+
+
+def open_rig(config: CellConfig) -> Rig:
+    """Open every device.
+
+    Raises:
+        DeviceError: names every device that failed.
+    """
+    rig, answers = connect(config)
+    if rig is None:
+        raise DeviceError("; ".join(a.failure for a in answers if a.failure))
+    return rig
+
+
+def _wanted(config: CellConfig) -> list[_Wanted]:
+    wanted = [
+        _Wanted("arm", devices.ARMS, config.robot.driver, "[robot] driver"),
+        _Wanted("tracker", devices.TRACKERS, config.tracker.driver, "[tracker] driver"),
+        _Wanted("operator", devices.OPERATORS, config.operator.driver, "[operator] driver"),
+    ]
+    if config.force_sensor is not None:
+        sensor = config.force_sensor.driver
+        wanted.append(
+            _Wanted("force sensor", devices.FORCE_SENSORS, sensor, "[force_sensor] driver")
+        )
+    return wanted
+
+
+def _factory(one: _Wanted) -> Factory:
+    if one.driver is None:
+        valid = ", ".join(sorted(point.name for point in entry_points(group=one.group)))
+        raise InputError(f"{one.key} is missing, so there is no {one.device}; valid: {valid}")
+    return driver(one.group, one.driver, one.key)
+
+
+def _open(factory: Factory, config: CellConfig) -> tuple[Any, str | HilcalError]:
+    """Open a device; what fails is told, whatever it is."""
+    try:
+        return factory(config), ""
+    except HilcalError as error:
+        return None, error
+    except Exception as error:  # a driver of somebody else's may fail in any way
+        return None, f"{type(error).__name__}: {' '.join(str(error).split())}"
+
+
+def _answer(one: _Wanted, made: Any, why: str | HilcalError) -> Answer:
+    name = one.driver or ""
+    if made is None:
+        return Answer(one.device, name, None, f"{one.device}: {why}")
+    try:
+        return Answer(one.device, name, made.report())
+    except HilcalError as error:
+        return Answer(one.device, name, None, f"{one.device}: {error}")

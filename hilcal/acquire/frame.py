@@ -1,0 +1,86 @@
+"""Where the tracker roughly stands, from the readings so far."""
+
+import numpy as np
+
+from hilcal.cell import Cell
+from hilcal.robot import chain as chains
+from hilcal.robot.chain import joint_jacobian
+from hilcal.types import Floats
+
+ENOUGH = 4
+SPREAD_M = 0.05
+"""Second extent of a cloud of positions that fixes a rotation, m."""
+PLAUSIBLE_M = 0.1
+"""A reading so far from where the nominal arm holds the target is not believed, m."""
+
+
+class RoughFrame:
+    """The registration T_sensor_base as far as it is known while a campaign is measured.
+
+    Good enough to notice that the tracker follows something else, and to judge a drift by the
+    arm's repeatability; identification does not use it.
+    """
+
+    def __init__(self, cell: Cell) -> None:
+        """Start with what the configuration knows."""
+        self._cell = cell
+        self._held: list[Floats] = []
+        self._seen: list[Floats] = []
+
+    def add(self, q: Floats, position: Floats) -> None:
+        """Take note of a reading: joint angles (n,) and position (3,), sensor axes, m."""
+        self._held.append(self._position(q))
+        self._seen.append(np.asarray(position))
+
+    def pose(self) -> tuple[Floats, Floats] | None:
+        """Return rotation (3, 3) and translation (3,) of T_sensor_base; None while unknown.
+
+        Least squares over the nominal positions p: min Σ |x − R p − t|², R from the singular
+        value decomposition of Σ (x − x̄)(p − p̄)ᵀ (Kabsch 1976).
+        """
+        known = self._cell.registration
+        if self._cell.registration_known:
+            return known[:3, :3], known[:3, 3]
+        if len(self._held) < ENOUGH:
+            return None
+        held, seen = np.array(self._held), np.array(self._seen)
+        h, s = held - held.mean(axis=0), seen - seen.mean(axis=0)
+        if np.linalg.svd(h, compute_uv=False)[1] < SPREAD_M:
+            return None
+        u, _, vt = np.linalg.svd(s.T @ h)
+        flip = np.diag([1.0, 1.0, np.linalg.det(u @ vt)])
+        rotation = u @ flip @ vt
+        return rotation, seen.mean(axis=0) - rotation @ held.mean(axis=0)
+
+    def implausible(self, q: Floats, position: Floats) -> str | None:
+        """Return in one line why a reading cannot be of the target on the arm, or None."""
+        pose = self.pose()
+        if pose is None or not self._cell.target_known:
+            return None
+        off = float(np.linalg.norm(position - pose[0] @ self._position(q) - pose[1]))
+        if off <= PLAUSIBLE_M:
+            return None
+        return (
+            f"tracker: it sees its target {off:.3g} m from where the arm holds it; does it follow "
+            "another reflector, or has it been moved?"
+        )
+
+    def repeatability(self, q: Floats, joint_std: Floats) -> Floats:
+        """Return the (3, 3) covariance that the joints' scatter adds to a position, sensor axes.
+
+        J Σ_q Jᵀ at the target; while the tracker's axes are unknown its mean over all
+        directions, tr(J Σ_q Jᵀ)/3.
+        """
+        chain = chains.evaluate(self._cell.arm, np.asarray(q)[None])
+        point = chain.point(self._cell.target[:3, 3])
+        jac = np.asarray(joint_jacobian(chain, point)[0, :3] * joint_std)
+        pose = self.pose()
+        if pose is None:
+            return np.asarray(np.sum(jac**2) / 3.0 * np.eye(3))
+        jac = pose[0] @ jac
+        return np.asarray(jac @ jac.T)
+
+    def _position(self, q: Floats) -> Floats:
+        """(3,) nominal position of the target, base axes, m."""
+        chain = chains.evaluate(self._cell.arm, np.asarray(q)[None])
+        return np.asarray(chain.point(self._cell.target[:3, 3])[0])

@@ -1,0 +1,135 @@
+"""Changing what hangs: the person is asked, the arm is told, the force sensor is asked."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from hilcal.acquire.clock import Clock
+from hilcal.acquire.devices import Arm, Operator, WrongLoadError
+from hilcal.acquire.force import ForceMeter
+from hilcal.acquire.motion import Mover
+from hilcal.acquire.progress import Phase, Remark, Watcher
+from hilcal.cell import Cell
+from hilcal.config import CellConfig, Load
+from hilcal.data.plan import UNLOADED
+from hilcal.types import Floats
+
+Wrong = Callable[[], str]
+"""Returns what is wrong, in one line; empty where nothing is."""
+TRIES = 3
+SWINGING_S = 2.0
+"""A load that seems wrong is weighed once more after so long, cell seconds."""
+
+
+def payload(cell: Cell, load: Load | None) -> tuple[float, Floats]:
+    """Return mass (kg) and centre of mass (3,) at the flange of the tool with a dead weight.
+
+    m = m_tool + m_load, c = (m_tool c_tool + m_load p_load) / m; pulls have no mass.
+    """
+    hung = 0.0 if load is None else load.mass_kg
+    mass = cell.tool_mass + hung
+    if mass == 0.0:
+        return 0.0, np.zeros(3)
+    com = (cell.tool_mass * cell.tool_com + hung * cell.load_point) / mass
+    return mass, com
+
+
+class Hook:
+    """What hangs at the arm."""
+
+    def __init__(
+        self,
+        arm: Arm,
+        operator: Operator,
+        meter: ForceMeter | None,
+        mover: Mover,
+        cell: Cell,
+        config: CellConfig,
+        clock: Clock,
+        watcher: Watcher,
+    ) -> None:
+        """Nothing is known of what hangs before `begin`."""
+        self.hanging = UNLOADED
+        self.since = clock.now()
+        self._arm, self._operator, self._meter, self._mover = arm, operator, meter, mover
+        self._cell, self._config, self._clock, self._watcher = cell, config, clock, watcher
+
+    def load(self, name: str) -> Load | None:
+        """Return a load by name, None for the unloaded state."""
+        return next((load for load in self._config.loads if load.name == name), None)
+
+    def begin(self) -> None:
+        """Have everything taken off before anything moves: nobody knows what hangs.
+
+        Where the force sensor is known from an earlier session, it is asked too.
+        """
+        self._ask(None, self._still_hangs)
+        self.hanging, self.since = UNLOADED, self._clock.now()
+
+    def change(self, name: str) -> None:
+        """Have another load hung, at the present pose.
+
+        The arm is told of a heavier payload before it is hung, of a lighter one after the
+        heavier has been taken off.
+
+        Raises:
+            DeviceError: the person gives up.
+            WrongLoadError: what hangs is wrong three times.
+        """
+        new, old = self.load(name), self.load(self.hanging)
+        heavier = payload(self._cell, new)[0] > payload(self._cell, old)[0]
+        if heavier:
+            self._arm.set_payload(*payload(self._cell, new))
+        self._ask(new, lambda: self._differs(new))
+        if not heavier:
+            self._arm.set_payload(*payload(self._cell, new))
+        self.hanging, self.since = name, self._clock.now()
+
+    def _ask(self, load: Load | None, wrong: Wrong) -> None:
+        """Ask until nothing is wrong, `TRIES` times."""
+        what = "take everything off" if load is None else f"hang {load.name}"
+        why = ""
+        for _ in range(TRIES):
+            self._watcher.tell(Phase(f"waiting for the operator to {what}"))
+            self._operator.hang(load, why)
+            self._mover.look()
+            why = wrong()
+            if not why:
+                return
+            self._watcher.tell(Remark(f"asked to {what}: {why}"))
+        raise WrongLoadError(f"operator: asked {TRIES} times to {what}; {why}")
+
+    def _differs(self, load: Load | None) -> str:
+        """What the force sensor has against a load; weighed twice, for it may swing."""
+        if self._meter is None:
+            return ""
+        text = ""
+        for pause in (self._config.acquire.settle_s, SWINGING_S):
+            self._mover.wait(pause)
+            sample = self._mover.look()
+            feeling = self._meter.feeling(self._meter.average(), sample.q)
+            good, text = self._meter.verify(load, feeling, self._config.operator)
+            if good:
+                return ""
+        return text
+
+    def _still_hangs(self) -> str:
+        """What seems to hang still: a load that fits better than nothing does.
+
+        By the zero of an earlier session; the sensor's own may have changed meanwhile.
+        """
+        if self._meter is None or not np.any(self._meter.zero):
+            return ""
+        sample = self._mover.look()
+        feeling = self._meter.feeling(self._meter.average(), sample.q)
+        force = self._meter.load_wrench(feeling)[:3]
+        felt = float(np.linalg.norm(force))
+        if felt <= self._config.operator.tolerance_N:
+            return ""
+        for load in self._config.loads:
+            if np.linalg.norm(force - load.wrench(self._cell.gravity)[:3]) < felt:
+                return (
+                    f"the force sensor feels {felt:.1f} N more than in the unloaded readings so "
+                    f"far; {load.name} seems to hang still"
+                )
+        return ""

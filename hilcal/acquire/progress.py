@@ -1,0 +1,56 @@
+"""What those who watch a campaign are told."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from hilcal.data.plan import Step
+
+
+@dataclass(frozen=True, slots=True)
+class Phase:
+    """What is being done now, in words."""
+
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Remark:
+    """Something that people should look at; the campaign goes on."""
+
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Taken:
+    """A reading has been stored.
+
+    Attributes:
+        step: its step.
+        done: readings that are stored now, in the whole campaign.
+        total: readings of the plan.
+        left_real: real seconds that the rest takes, from how long it took so far.
+        left_cell: the same in cell seconds; differs in a simulated cell only.
+        deflection: distance from the unloaded reading of the same pose and cycle, m; None for
+            an unloaded reading, and where there is none.
+        residual: distance of the reading from what a model says, m; None where none is asked.
+        residual_sigma: the same in standard deviations.
+        settling: how long the readings took to settle, cell seconds.
+    """
+
+    step: Step
+    done: int
+    total: int
+    left_real: float
+    left_cell: float
+    deflection: float | None = None
+    residual: float | None = None
+    residual_sigma: float | None = None
+    settling: float = 0.0
+
+
+class Watcher(Protocol):
+    """One who watches a campaign."""
+
+    def tell(self, event: object) -> None:
+        """Take note of a `Phase`, a `Remark` or a `Taken`; returns soon."""
+        ...

@@ -1,0 +1,132 @@
+"""Running a campaign: nothing moves without a checked plan, and whatever fails stops the arm."""
+
+import time
+import traceback
+from collections.abc import Callable
+from typing import Any
+
+from hilcal.acquire.clock import Clock
+from hilcal.acquire.devices import Arm
+from hilcal.acquire.dry_run import DryRun, dry_run
+from hilcal.acquire.progress import Phase, Remark, Watcher
+from hilcal.acquire.rig import Rig
+from hilcal.acquire.route import route
+from hilcal.acquire.session import Judge, Session
+from hilcal.acquire.store import Store
+from hilcal.cell import Cell
+from hilcal.config import CellConfig
+from hilcal.data.plan import Plan
+from hilcal.errors import DeviceError, HilcalError, InputError
+
+HOW_ON = "The campaign is safe: run again with --resume"
+_STOPS = 3
+
+
+def run(
+    rig: Rig,
+    cell: Cell,
+    config: CellConfig,
+    plan: Plan,
+    store: Store,
+    clock: Clock,
+    watcher: Watcher,
+    judge: Judge | None = None,
+    wall: Callable[[], float] = time.time,
+) -> None:
+    """Measure what is missing of a plan.
+
+    Every reading is stored before the next motion. Whatever is raised, also an interrupt from
+    the keyboard, the arm is told to stop before anything else is done. The rig stays open.
+
+    Args:
+        rig: the open devices.
+        cell: the cell.
+        config: its limits and how to measure.
+        plan: the whole plan; steps that the store has are left out.
+        store: where readings go.
+        clock: the cell's time.
+        watcher: who is told of the progress.
+        judge: says how far a reading is from what a model says; None for nothing.
+        wall: the time of day, s; it carries the campaign's time over a pause.
+
+    Raises:
+        InputError: the plan is not safe (all problems, one line each), or the store fails.
+        DeviceError: a device failed, a limit was exceeded, a person gave up.
+        KeyboardInterrupt: as it came; the arm stands.
+    """
+    whole = dry_run(cell, config, plan)
+    refuse(whole)
+    left = plan.without(store.done())
+    if not left.steps:
+        watcher.tell(Phase("nothing is missing"))
+        return
+    refuse(dry_run(cell, config, left))  # the way past what is done is another one
+    for text in whole.remarks:
+        watcher.tell(Remark(text))
+    stops = route(left, cell.arm, config.limits.joint_margin_rad)
+    session = Session(rig, cell, config, plan, store, clock, watcher, judge, wall)
+    try:
+        session.walk(stops)
+    except BaseException as error:
+        trouble = _stop(rig.arm) if session.in_control else ""
+        _note(store, error, trouble)
+        _raise(error, trouble)
+
+
+def refuse(checked: DryRun) -> None:
+    """Refuse a plan with problems.
+
+    Raises:
+        InputError: all problems, one line each.
+    """
+    if checked.problems:
+        head = "the plan is not safe to run, nothing has moved:"
+        raise InputError("\n  ".join((head, *checked.problems)))
+
+
+def _stop(arm: Arm) -> str:
+    """Stop the arm; returns why it may not stand, empty where it does."""
+    for _ in range(_STOPS):
+        try:
+            arm.stop()
+        except KeyboardInterrupt:  # impatience must not keep the arm from stopping
+            continue
+        except Exception as error:  # whatever it is, people have to know
+            return _line(error)
+        return ""
+    return "interrupted"
+
+
+def _note(store: Store, error: BaseException, trouble: str) -> None:
+    """Store why the session ended, as far as that is possible."""
+    content: dict[str, Any] = {"wall_s": time.time(), "reason": _line(error)}
+    if trouble:
+        content["arm_not_stopped"] = trouble
+    if not isinstance(error, HilcalError | KeyboardInterrupt):
+        content["trace"] = "".join(traceback.format_exception(error))
+    kind = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
+    try:
+        store.event(kind, content)
+    except Exception:  # the error that is told is the one that came first
+        return
+
+
+def _raise(error: BaseException, trouble: str) -> None:
+    """Raise the error with how to go on."""
+    if not isinstance(error, Exception) and not trouble:
+        raise error
+    text = _line(error)
+    if trouble:
+        text += f". THE ARM MAY STILL MOVE ({trouble}): press the emergency stop"
+    elif not isinstance(error, HilcalError):
+        text = f"unexpected {text} (its details are in the campaign)"
+    kind = type(error) if isinstance(error, HilcalError) and not trouble else DeviceError
+    raise kind(f"{text}. {HOW_ON}") from error
+
+
+def _line(error: BaseException) -> str:
+    """Return an error as one line."""
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted"
+    words = " ".join(str(error).split()).rstrip(".")
+    return words if isinstance(error, HilcalError) else f"{type(error).__name__}: {words}"

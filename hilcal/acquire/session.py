@@ -1,0 +1,300 @@
+"""One session of a campaign: from nothing known to the last reading that was missing."""
+
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from hilcal.acquire.clock import Clock
+from hilcal.acquire.drift import Shift
+from hilcal.acquire.dry_run import route_problems
+from hilcal.acquire.force import Feeling, ForceMeter
+from hilcal.acquire.guard import Guard
+from hilcal.acquire.loads import Hook, payload
+from hilcal.acquire.memory import Memory
+from hilcal.acquire.motion import Mover
+from hilcal.acquire.pace import Pace
+from hilcal.acquire.progress import Phase, Remark, Taken, Watcher
+from hilcal.acquire.raw import plain
+from hilcal.acquire.rig import Rig
+from hilcal.acquire.route import Stop
+from hilcal.acquire.row import detail, feeling_of, row
+from hilcal.acquire.store import Store
+from hilcal.acquire.take import Measured, Taker
+from hilcal.cell import Cell
+from hilcal.config import CellConfig
+from hilcal.data.plan import UNLOADED, Plan, Step
+from hilcal.data.readings import Readings
+from hilcal.errors import DeviceError, HilcalError
+from hilcal.types import Floats
+
+Judge = Callable[[Readings], tuple[float, float] | None]
+"""Returns how far the last of all readings is from what a model says, m and sigma."""
+
+
+class Session:
+    """Walks a route and stores a reading at every stop that asks for one."""
+
+    def __init__(
+        self,
+        rig: Rig,
+        cell: Cell,
+        config: CellConfig,
+        plan: Plan,
+        store: Store,
+        clock: Clock,
+        watcher: Watcher,
+        judge: Judge | None = None,
+        wall: Callable[[], float] = time.time,
+    ) -> None:
+        """Read what earlier sessions stored; no device is used yet."""
+        self.in_control = False
+        self._rig, self._cell, self._config, self._plan = rig, cell, config, plan
+        self._store, self._clock, self._watcher, self._judge = store, clock, watcher, judge
+        self._wall = wall
+        window = clock.real(config.acquire.force_window_s)
+        self._meter: ForceMeter | None = None
+        if rig.force is not None and config.force_sensor is not None:
+            self._meter = ForceMeter(rig.force, config.force_sensor, cell, window)
+        self._guard = Guard(cell, config)
+        self._mover = Mover(rig.arm, self._meter, self._guard, config, clock)
+        self._taker = Taker(self._mover, rig.tracker, self._meter, config, clock, watcher)
+        self._hook = Hook(
+            rig.arm, rig.operator, self._meter, self._mover, cell, config, clock, watcher
+        )
+        self._joint_std = config.repeatability.per_joint(cell.arm.n)
+        self._memory = Memory(cell, self._joint_std)
+        self._identified = 0
+        self._temperatures: bool | None = None
+        self._done = 0
+        self._begun, self._elapsed, self._epoch = clock.now(), 0.0, wall()
+        self._remember()
+
+    # what earlier sessions know
+
+    def _remember(self) -> None:
+        """Take over from the stored readings: times, tool, reference, unloaded positions."""
+        details = self._store.details()
+        stored = self._store.readings()
+        if not details or stored is None:
+            return
+        self._epoch = float(details[0]["epoch_wall_s"])
+        last = 0.0 if stored.states.time is None else float(stored.states.time[-1])
+        passed = (self._wall() - self._epoch) * self._clock.scale
+        self._elapsed = max(last, passed)
+        self._temperatures = stored.states.joint_temperature is not None
+        self._done = len(details)
+        for old, value in zip(details, stored.value, strict=True):
+            step = Step(old["pose"], old["load"], old["cycle"])
+            q, covariance = np.array(old["q_actual"]), np.array(old["tracker_covariance"])
+            self._memory.add(step, q, value, covariance, feeling_of(old))
+        felt = details[-1].get("felt")
+        if self._meter is not None and felt is not None:
+            self._meter.zero = np.array(felt["zero"])
+            self._identify()
+
+    # the way
+
+    def walk(self, stops: tuple[Stop, ...]) -> None:
+        """Go through all stops.
+
+        Raises:
+            HilcalError: something failed; the arm has to be stopped.
+        """
+        total = len(self._plan.steps)
+        self._event("start", {"missing": sum(s.step is not None for s in stops)})
+        self._begin(stops[:2])
+        pace = Pace(self._clock)
+        for k, stop in enumerate(stops[2:], start=2):
+            self._watcher.tell(Phase(f"moving to {stop.name}"))
+            self._mover.move(stop.q, stop.name)
+            if stop.change_to is not None:
+                pace.arrived()
+                self._change(stop.change_to)
+                pace.changed()
+            if stop.step is not None:
+                reading, settling = self._reading(stop, stop.step)
+                pace.read()
+                rest = stops[k + 1 :]
+                left = pace.left(
+                    sum(s.step is not None for s in rest),
+                    sum(s.change_to is not None for s in rest),
+                )
+                self._tell(stop.step, reading, total, left, settling)
+        self._finish()
+
+    def _begin(self, start: tuple[Stop, ...]) -> None:
+        """Find out where the arm stands, have the hook cleared, go to the reference, tare."""
+        sample = self._rig.arm.sample()
+        unfit = self._guard.state(sample)
+        if unfit is not None:
+            raise DeviceError(unfit)
+        if self._temperatures is None:
+            self._temperatures = bool(np.isfinite(sample.joint_temperature).all())
+        here = Stop("where the arm stands", sample.q, UNLOADED)
+        problems = route_problems(self._cell, self._config, (here, start[0]))
+        if problems:
+            raise DeviceError(
+                f"arm: it cannot go to {start[0].name} from where it stands: {problems[0]}. Drive "
+                "it by hand to a free place in the middle of its workspace"
+            )
+        self._hook.begin()
+        self.in_control = True
+        self._rig.arm.take_control(*payload(self._cell, None))
+        for stop in start:
+            self._watcher.tell(Phase(f"moving to {stop.name}"))
+            self._mover.move(stop.q, stop.name)
+        self._tare()
+
+    def _tare(self) -> None:
+        """Set the force sensor's zero at the present pose, with nothing on the hook."""
+        if self._meter is None:
+            return
+        self._watcher.tell(Phase("taring the force sensor"))
+        self._mover.wait(self._config.acquire.settle_s)
+        sample = self._meter.average()
+        q = self._mover.look().q
+        self._meter.set_zero(sample, q)
+        self._event("tare", {"force": plain(sample), "q": q.tolist()})
+
+    def _change(self, name: str) -> None:
+        if name != UNLOADED and len(self._memory.feelings) > self._identified:
+            self._identify()
+        self._hook.change(name)
+        self._event("load", {"hanging": name})
+        if name == UNLOADED:
+            self._tare()
+
+    def _identify(self) -> None:
+        """Find the tool from all unloaded readings so far."""
+        if self._meter is None:
+            return
+        self._identified = len(self._memory.feelings)
+        try:
+            tool = self._meter.identify(self._memory.feelings)
+        except HilcalError as error:
+            self._watcher.tell(Remark(f"the tool is not identified: {error}"))
+            return
+        if tool is None:
+            return
+        self._event(
+            "tool",
+            {
+                "mass_kg": float(tool.mass),
+                "com_m": self._meter.to_flange(tool.com).tolist(),
+                "bias": tool.bias.tolist(),
+                "variance_factor": tool.chi2 / max(tool.dof, 1),
+                "readings": self._identified,
+            },
+        )
+        differs = self._meter.tool_differs(self._config.operator.tolerance_N)
+        if differs is not None:
+            self._watcher.tell(Remark(differs))
+
+    # one reading
+
+    def _reading(self, stop: Stop, step: Step) -> tuple[Readings, float]:
+        """Measure and store; the arm has arrived."""
+        self._watcher.tell(Phase(f"measuring {step}"))
+        measured = self._taker.take(stop.name)
+        wrong = self._memory.frame.implausible(measured.q, measured.mean.value[:3])
+        if wrong is not None:
+            raise DeviceError(wrong)
+        feeling = None
+        if self._meter is not None and measured.force is not None:
+            feeling = self._meter.feeling(measured.force, measured.q)
+        now = self._clock.now()
+        elapsed = self._elapsed + now - self._begun
+        reading = row(
+            step,
+            stop.q,
+            measured,
+            self._wrench(step, feeling),
+            elapsed,
+            now - self._hook.since,
+            self._mover.side,
+            self._temperature(measured),
+        )
+        session: dict[str, Any] = {
+            "epoch_wall_s": self._epoch,
+            "wall_s": self._wall(),
+            "time_s": elapsed,
+            "side": self._mover.side.tolist(),
+            "losses": None if self._rig.force is None else plain(self._rig.force.losses()),
+        }
+        zero = None if self._meter is None else self._meter.zero
+        self._store.record(reading, step, detail(step, measured, feeling, zero, session))
+        self._done += 1
+        for text in measured.remarks:
+            self._watcher.tell(Remark(f"{step}: {text}"))
+        mean = measured.mean
+        shift = self._memory.add(step, measured.q, mean.value, mean.covariance, feeling)
+        if shift is not None:
+            self._tell_drift(step, shift)
+        return reading, measured.settling
+
+    def _wrench(self, step: Step, feeling: Feeling | None) -> Floats:
+        """(6,) wrench of the load at the load point, base axes: told or measured."""
+        load = self._hook.load(step.load)
+        if load is None:
+            return np.zeros(6)
+        sensor = self._config.force_sensor
+        pull = any((*load.force_N, *load.moment_Nm))
+        wanted = sensor is not None and (sensor.use == "all" or (sensor.use == "pulls" and pull))
+        if wanted and self._meter is not None and feeling is not None:
+            return self._meter.load_wrench(feeling)
+        return load.wrench(self._cell.gravity)
+
+    def _temperature(self, measured: Measured) -> Floats | None:
+        """(n,) °C, or None in a campaign without."""
+        if not self._temperatures:
+            return None
+        mean = (measured.before.joint_temperature + measured.after.joint_temperature) / 2
+        if not np.isfinite(mean).all():
+            raise DeviceError("arm: it does not tell the temperatures of its joints any more")
+        return np.asarray(mean)
+
+    def _tell_drift(self, step: Step, shift: Shift) -> None:
+        limit = self._config.acquire.drift_limit_sigma
+        content = {"shift_m": shift.metres.tolist(), "sigma": shift.sigma}
+        self._event("drift", {"cycle": step.cycle, **content, "over": shift.sigma > limit})
+        if shift.sigma > limit:
+            self._watcher.tell(Remark(shift.words(limit)))
+
+    # people
+
+    def _tell(
+        self, step: Step, reading: Readings, total: int, left: float, settling: float
+    ) -> None:
+        deflection = self._memory.deflection(step, reading.value[0, :3])
+        judged = None
+        if self._judge is not None and (readings := self._store.readings()) is not None:
+            with suppress(HilcalError):  # too early for a model; nothing depends on it
+                judged = self._judge(readings)
+        self._watcher.tell(
+            Taken(
+                step,
+                self._done,
+                total,
+                self._clock.real(left),
+                left,
+                deflection,
+                None if judged is None else judged[0],
+                None if judged is None else judged[1],
+                settling,
+            )
+        )
+
+    def _finish(self) -> None:
+        found = self._memory.repeatability()
+        if found is not None:
+            self._event("repeatability", asdict(found))
+            self._watcher.tell(Remark(found.words(self._joint_std)))
+        self._event("finished", {"readings": self._done})
+        self._watcher.tell(Phase("finished"))
+
+    def _event(self, kind: str, content: dict[str, Any]) -> None:
+        self._store.event(kind, {"wall_s": self._wall(), **content})

@@ -1,0 +1,168 @@
+"""Taking one reading: wait until everything has settled, average, refuse what cannot be."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilcal.acquire.average import Average, combine
+from hilcal.acquire.clock import Clock
+from hilcal.acquire.devices import (
+    ArmSample,
+    TargetLostError,
+    Tracker,
+    TrackerSample,
+    WrenchSample,
+)
+from hilcal.acquire.force import ForceMeter
+from hilcal.acquire.motion import POLL_S, Mover
+from hilcal.acquire.progress import Remark, Watcher
+from hilcal.acquire.settle import SettleWindow
+from hilcal.config import CellConfig
+from hilcal.errors import DeviceError
+from hilcal.types import Floats
+
+SEARCHES = 2
+"""How often a lost target is searched for in one reading."""
+AGAIN = 3
+"""How often a reading is tried that is void: the arm moved, or the samples disagree."""
+PATIENCE = 4
+"""Settling is given up after its time and at least so many windows of measurements."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measured:
+    """What was measured at one stop.
+
+    Attributes:
+        mean: of the tracker's measurements, with its covariance, sensor axes.
+        q: (n,) mean actual joint angles meanwhile, rad.
+        before: sample of the arm at the start.
+        after: the same at the end.
+        tracker: every measurement of the tracker.
+        force: mean wrench of the force sensor; None without one.
+        settling: how long it took until all was settled, cell seconds.
+        remarks: what was remarkable, one line each.
+    """
+
+    mean: Average
+    q: Floats
+    before: ArmSample
+    after: ArmSample
+    tracker: tuple[TrackerSample, ...]
+    force: WrenchSample | None
+    settling: float
+    remarks: tuple[str, ...]
+
+
+class Taker:
+    """Takes readings of an arm that stands at its goal."""
+
+    def __init__(
+        self,
+        mover: Mover,
+        tracker: Tracker,
+        meter: ForceMeter | None,
+        config: CellConfig,
+        clock: Clock,
+        watcher: Watcher,
+    ) -> None:
+        """Use open devices."""
+        self._mover, self._tracker, self._meter = mover, tracker, meter
+        self._config, self._clock, self._watcher = config, clock, watcher
+
+    def take(self, name: str) -> Measured:
+        """Measure at the present pose, called `name`.
+
+        Raises:
+            DeviceError: nothing settled in time, the target was not found again, the arm did
+                not stand still, or a device failed.
+        """
+        remarks: list[str] = []
+        searches = repeats = 0
+        while True:
+            try:
+                settling = self._settle(name)
+                measured, why = self._measure(settling, tuple(remarks))
+            except TargetLostError as error:
+                searches = self._search(error, name, searches)
+                remarks.append(f"target lost and found again: {error}")
+                continue
+            if measured is not None:
+                return measured
+            repeats += 1
+            if repeats == AGAIN:
+                raise DeviceError(f"{name}: measured {AGAIN} times in vain: {why}")
+            remarks.append(f"measured again: {why}")
+            self._watcher.tell(Remark(f"{name}: {why}; measuring again"))
+
+    def _settle(self, name: str) -> float:
+        """Wait until arm and readings have settled; returns how long it took, cell seconds."""
+        acquire, clock = self._config.acquire, self._clock
+        begun = clock.now()
+        rest: float | None = None
+        taken = 0
+        window = self._window()
+        while True:
+            if not self._mover.at_rest(self._mover.look()):
+                rest, window = None, self._window()
+                clock.sleep(POLL_S * clock.scale)
+            else:
+                rest = clock.now() if rest is None else rest
+                window.add(self._tracker.measure())
+                taken += 1
+                if clock.now() - rest >= acquire.settle_s and window.settled():
+                    return clock.now() - begun
+            late = clock.now() - begun > acquire.settle_timeout_s
+            if late and (rest is None or taken >= PATIENCE * acquire.samples):
+                what = "the arm does not rest at its goal" if rest is None else "the readings drift"
+                raise DeviceError(
+                    f"{name}: not settled within {acquire.settle_timeout_s:g} s: {what}. Look for "
+                    "a swinging load, a loose target or a warming tracker"
+                )
+
+    def _window(self) -> SettleWindow:
+        return SettleWindow(self._config.acquire.samples, self._clock.scale)
+
+    def _measure(self, settling: float, remarks: tuple[str, ...]) -> tuple[Measured | None, str]:
+        """Average over the window; None and the reason where that cannot be a reading."""
+        before = self._mover.look()
+        tracker: list[TrackerSample] = []
+        angles = [before.q]
+        for _ in range(self._config.acquire.samples):
+            tracker.append(self._tracker.measure())
+            angles.append(self._mover.look().q)
+        force = None if self._meter is None else self._meter.average()
+        after = self._mover.look()
+        why = self._mover.check_still(before, after)
+        if why is not None:
+            return None, why
+        try:
+            mean = combine(tracker, self._config.acquire.systematic_share)
+        except DeviceError as error:
+            return None, str(error)
+        if not (np.isfinite(mean.value).all() and np.isfinite(mean.covariance).all()):
+            return None, "the tracker gives what is not a number"
+        q = np.mean([*angles, after.q], axis=0)
+        said = (*remarks, *mean.warnings)
+        return Measured(mean, q, before, after, tuple(tracker), force, settling, said), ""
+
+    def _search(self, error: TargetLostError, name: str, searches: int) -> int:
+        """Search the target; returns how often that has been done.
+
+        Raises:
+            DeviceError: it was lost or not found too often.
+        """
+        while searches < SEARCHES:
+            searches += 1
+            self._watcher.tell(Remark(f"{name}: {error}; searching the target"))
+            try:
+                self._tracker.find_target()
+            except TargetLostError as again:
+                error = again
+            else:
+                self._mover.look()
+                return searches
+        raise DeviceError(
+            f"{error} (at {name}, searched {SEARCHES} times). Clear the line of sight and have "
+            "the tracker see the target"
+        )

@@ -1,0 +1,166 @@
+"""`run`: measure a campaign; `--resume` goes on after any stop."""
+
+import signal
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Annotated
+
+import typer
+
+from drivers.simulated.on_the_wire import secret_of, simulated_cell
+from drivers.simulated.rehearsal import NOTHING
+from hilcal.acquire.clock import Clock
+from hilcal.acquire.connect import connect
+from hilcal.acquire.dry_run import dry_run
+from hilcal.acquire.progress import Watcher
+from hilcal.acquire.run import run as run_plan
+from hilcal.cell import Cell
+from hilcal.cli.files import COVARIANCE, INSTRUMENT
+from hilcal.cli.live import LiveResidual
+from hilcal.cli.planning import (
+    POSES,
+    CellFile,
+    PlanFile,
+    make_plan,
+    read_cell,
+    refuse,
+    show_problems,
+)
+from hilcal.cli.terminal import Json, Terminal, terminal
+from hilcal.config import CellConfig
+from hilcal.data.campaign import Campaign
+from hilcal.data.plan import Plan, load_plan
+from hilcal.data.run_log import PLAN, RunLog
+from hilcal.errors import InputError
+from hilcal.report.live_run import watching
+from hilcal.report.progress import working
+
+SAME = ("robot", "tool", "loads")
+_ADDRESSES = {"driver", "host", "port", "baud", "options"}
+
+
+def run(
+    cell: CellFile,
+    output: Annotated[
+        Path,
+        typer.Option("-o", "--output", metavar="RUN.hilcal", help="The campaign file."),
+    ],
+    plan: PlanFile = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with what is missing in RUN.hilcal.")
+    ] = False,
+    rehearse: Annotated[
+        bool, typer.Option("--rehearse", help="On simulated devices, started for this run.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Measure a campaign: every step of the plan, each reading stored before the next motion."""
+    t = terminal(as_json)
+    config, numbers = read_cell(cell)
+    base_dir = cell.absolute().parent
+    with ExitStack() as stack:
+        if resume:
+            if plan is not None:
+                raise InputError("--plan with --resume: the plan is in the campaign; leave it out")
+            campaign = stack.enter_context(Campaign.open(output))
+            _same_cell(campaign, config)
+            made = RunLog(campaign).plan
+        else:
+            if output.exists():
+                raise InputError(
+                    f"{output}: the file exists; go on with it by --resume, or choose another name"
+                )
+            seed = config.simulation.seed
+            made = make_plan(numbers, config, POSES, seed) if plan is None else load_plan(plan)
+            refuse(dry_run(numbers, config, made), str(plan or "the plan"))
+        if rehearse:
+            with working(t.progress) as say:
+                say("starting the simulated devices")
+                choice = config.simulation.hide or NOTHING
+                secret = secret_of(config, made, choice, config.simulation.seed)
+                simulated = simulated_cell(secret, config.simulation.seed, base_dir)
+                config = stack.enter_context(simulated).config
+        if not resume:
+            campaign = stack.enter_context(create(output, config, base_dir, made))
+        measured = measure(t, config, numbers, campaign)
+    t.show(f"{measured} readings are in {output}. Go on with: hilcal refine {output}")
+    t.document({"campaign": str(output), "readings": measured, "planned": len(made.steps)})
+
+
+def create(
+    output: Path, config: CellConfig, base_dir: Path, plan: Plan, overwrite: bool = False
+) -> Campaign:
+    """Make the empty campaign of a run, its plan inside.
+
+    Raises:
+        InputError: it cannot be written, or is there already.
+    """
+    more = {PLAN: plan.to_json(), COVARIANCE: INSTRUMENT}
+    source = "measured by hilcal run"
+    return Campaign.create(
+        output, config.to_json(), str(base_dir), source, overwrite=overwrite, more=more
+    )
+
+
+def measure(t: Terminal, config: CellConfig, cell: Cell, campaign: Campaign) -> int:
+    """Measure what is missing in a campaign; returns how many readings it then holds.
+
+    Raises:
+        DeviceError: a device failed; the arm stands, and what was measured is stored.
+        InputError: the plan does not pass.
+        KeyboardInterrupt: somebody stopped it; the same holds.
+    """
+    log = RunLog(campaign)
+    with _ends_as_interrupt(), ExitStack() as stack:
+        with working(t.progress) as say:
+            say("connecting to every device")
+            rig, answers = connect(config)
+            if rig is not None:
+                stack.callback(rig.close)
+        show_problems(t, answers)
+        assert rig is not None  # noqa: S101  (show_problems has raised otherwise)
+        watcher: Watcher = stack.enter_context(watching(t.progress, len(log.plan.steps)))
+        clock = Clock(config.simulation.clock)
+        run_plan(rig, cell, config, log.plan, log, clock, watcher, judge=LiveResidual(cell, config))
+    return campaign.n_readings
+
+
+@contextmanager
+def _ends_as_interrupt() -> Iterator[None]:
+    """Let a plea to end, or a terminal that is closed, stop the arm as Ctrl-C does."""
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    kinds = (signal.SIGTERM, signal.SIGHUP)
+    before = [signal.signal(kind, stop) for kind in kinds]
+    try:
+        yield
+    finally:
+        for kind, handler in zip(kinds, before, strict=True):
+            signal.signal(kind, handler)
+
+
+def _same_cell(campaign: Campaign, config: CellConfig) -> None:
+    """Refuse to go on in another cell.
+
+    Raises:
+        InputError: names the section that differs.
+    """
+    stored = asdict_of(CellConfig.from_json(campaign.config_json))
+    given = asdict_of(config)
+    for section in SAME:
+        if stored[section] != given[section]:
+            raise InputError(
+                f"[{section}] differs from what {campaign.path} was begun with; a campaign is "
+                "measured in one cell: start another one for this"
+            )
+
+
+def asdict_of(config: CellConfig) -> dict[str, object]:
+    """Return what a campaign must not change, section by section; addresses may change."""
+    data = config.model_dump(mode="json")
+    data["robot"] = {k: v for k, v in data["robot"].items() if k not in _ADDRESSES}
+    return data

@@ -1,0 +1,68 @@
+"""`simulate`: the devices of a simulated cell, on real wires, until they are stopped."""
+
+import signal
+import threading
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from drivers.simulated.on_the_wire import secret_of, simulated_cell
+from drivers.simulated.rehearsal import NOTHING
+from hilcal.cli.planning import POSES, CellFile, PlanFile, make_plan, read_cell
+from hilcal.cli.terminal import terminal
+from hilcal.config import CellConfig
+from hilcal.config.write import to_toml
+from hilcal.data.plan import load_plan
+from hilcal.errors import InputError
+from hilcal.report.progress import working
+
+
+def simulate(
+    cell: CellFile,
+    output: Annotated[
+        Path,
+        typer.Option(
+            "-o", "--output", metavar="DIR", help="Where the devices meet; gets a cell.toml."
+        ),
+    ],
+    plan: PlanFile = None,
+    hide: Annotated[
+        str | None, typer.Option("--hide", metavar="EFFECT", help="An effect, random or nothing.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option("--seed", help="Of everything random.")] = None,
+) -> None:
+    """Run simulated devices for a cell until Ctrl-C, for `check` and `run` to talk to."""
+    t = terminal(False)
+    config, numbers = read_cell(cell)
+    number = config.simulation.seed if seed is None else seed
+    if number < 0:
+        raise InputError(f"--seed {number}; valid: a whole number, 0 or more")
+    made = make_plan(numbers, config, POSES, number) if plan is None else load_plan(plan)
+    base_dir = cell.absolute().parent
+    secret = secret_of(config, made, hide or config.simulation.hide or NOTHING, number)
+    over = threading.Event()
+    for kind in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        signal.signal(kind, lambda *_: over.set())
+    with ExitStack() as stack:
+        with working(t.progress) as say:
+            say("starting the devices")
+            there = stack.enter_context(simulated_cell(secret, number, base_dir, output))
+        target = output / "cell.toml"
+        target.write_text(to_toml(_placed(there.config, base_dir)), encoding="utf-8")
+        t.show(f"The devices run. Their cell is {target}; go on in another terminal with:")
+        t.show(f"  hilcal check {target}\n  hilcal run {target} -o run.hilcal")
+        t.show("Ctrl-C ends them.")
+        while not over.wait(1.0):
+            pass
+    t.show("The devices have ended.")
+
+
+def _placed(config: CellConfig, base_dir: Path) -> CellConfig:
+    """Return the configuration with a robot's file named by its whole path."""
+    path = base_dir / config.robot.model
+    if not path.suffix:
+        return config
+    robot = config.robot.model_copy(update={"model": str(path.absolute())})
+    return config.model_copy(update={"robot": robot})

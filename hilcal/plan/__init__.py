@@ -1,0 +1,1 @@
+"""Which states to measure, and in which order."""

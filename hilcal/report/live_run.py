@@ -1,0 +1,83 @@
+"""A campaign while it is measured: a bar on a terminal, one line per reading elsewhere."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
+
+from hilcal.acquire.progress import Phase, Remark, Taken
+from hilcal.report import numbers
+from hilcal.report.text_run import spoken
+
+
+@dataclass(slots=True)
+class _Lines:
+    """Tells everything line by line, with the seconds since the start."""
+
+    console: Console
+    begun: float = field(default_factory=time.monotonic)
+
+    def tell(self, event: object) -> None:
+        """Take note."""
+        if isinstance(event, Phase):
+            self._print(event.text)
+        elif isinstance(event, Remark):
+            self._print(f"note: {event.text}")
+        elif isinstance(event, Taken):
+            left = f", {spoken(event.left_real)} left" if event.left_real > 0 else ""
+            self._print(f"{event.done}/{event.total} {event.step}{figures(event)}{left}")
+
+    def _print(self, words: str) -> None:
+        seconds = f"[{time.monotonic() - self.begun:6.1f} s]"
+        self.console.print(f"{seconds} {words}", markup=False, highlight=False, soft_wrap=True)
+
+
+@dataclass(slots=True)
+class _Bar:
+    """Keeps one line up to date; remarks scroll by above it."""
+
+    progress: Progress
+    task: TaskID
+
+    def tell(self, event: object) -> None:
+        """Take note."""
+        if isinstance(event, Phase):
+            self.progress.update(self.task, phase=event.text)
+        elif isinstance(event, Remark):
+            self.progress.console.print(f"note: {event.text}", markup=False, highlight=False)
+        elif isinstance(event, Taken):
+            left = f"{spoken(event.left_real)} left" if event.left_real > 0 else ""
+            last = f"{event.step}{figures(event)}"
+            self.progress.update(self.task, completed=event.done, left=left, last=last)
+
+
+@contextmanager
+def watching(console: Console, total: int) -> Iterator[_Lines | _Bar]:
+    """Yield a watcher that shows a campaign of so many readings."""
+    if not console.is_terminal:
+        yield _Lines(console)
+        return
+    columns = (
+        BarColumn(bar_width=24),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[left]}", style="bold", markup=False),
+        TextColumn("{task.fields[last]}", markup=False),
+        TextColumn("{task.fields[phase]}", style="dim", markup=False),
+    )
+    with Progress(*columns, console=console, transient=True) as progress:
+        task = progress.add_task("", total=total, left="", last="", phase="")
+        yield _Bar(progress, task)
+
+
+def figures(event: Taken) -> str:
+    """Return deflection and residual of a reading for people."""
+    out = ""
+    if event.deflection is not None:
+        out += f": deflection {numbers.length(event.deflection)}"
+    if event.residual is not None:
+        sigma = "" if event.residual_sigma is None else f" ({event.residual_sigma:.1f} σ)"
+        out += f"{', ' if out else ': '}residual {numbers.length(event.residual)}{sigma}"
+    return out

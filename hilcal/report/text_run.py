@@ -1,0 +1,78 @@
+"""What `plan`, `check` and `run` say."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from rich.console import RenderableType
+from rich.padding import Padding
+from rich.table import Table
+from rich.text import Text
+
+from hilcal.acquire.connect import Answer
+from hilcal.acquire.dry_run import DryRun
+from hilcal.data.plan import UNLOADED, Plan
+from hilcal.report import text
+
+
+def spoken(seconds: float) -> str:
+    """Return a duration for people: "45 s", "12 min", "3 h 05 min"."""
+    if seconds < 99.5:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60.0)
+    return f"{minutes} min" if minutes < 100 else f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+def plan_report(plan: Plan, dry: DryRun, path: Path) -> Iterator[RenderableType]:
+    """Yield what a plan does and what it costs."""
+    yield text.heading("Plan")
+    rows = Table.grid(padding=(0, 2))
+    loads = [name for name in plan.loads if name != UNLOADED]
+    rows.add_row("poses", f"{len(plan.pose_names)}, spread over the joint space")
+    rows.add_row("loads", ", ".join(["unloaded", *loads]))
+    rows.add_row("readings", str(len(plan.steps)))
+    rows.add_row("motions", str(dry.motions))
+    rows.add_row("load changes", f"{dry.load_changes} (by hand)")
+    rows.add_row("takes about", spoken(dry.duration))
+    yield Padding(rows, (0, 0, 1, 0))
+    for remark in dry.remarks:
+        yield f"note: {remark}"
+    yield f"The plan is in {path}: a file that you may edit. Every limit was checked."
+
+
+def check_report(answers: tuple[Answer, ...], dry: DryRun | None) -> Iterator[RenderableType]:
+    """Yield who answered, in which state, and every problem."""
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
+    for head in ("device", "driver", "", "who answers, and what it says"):
+        table.add_column(head, overflow="fold")
+    for a in answers:
+        bad = bool(a.problems)
+        mark = Text("✗", style="red") if bad else Text("✓", style="green")
+        name = "no answer" if a.report is None else a.report.name
+        table.add_row(a.device, a.driver, mark, Text(name))
+        if a.report is not None:
+            for what, value in a.report.facts:
+                table.add_row("", "", "", Text(f"  {what}: {value}"))
+        for problem in a.problems:
+            table.add_row("", "", Text("!", style="red"), Text(f"  {problem}"))
+    yield Padding(table, (1, 0))
+    count = sum(len(a.problems) for a in answers)
+    if count:
+        yield f"{count} problem{'s' if count > 1 else ''}. Nothing was moved."
+    else:
+        yield "All devices are ready. Nothing was moved."
+    if dry is not None:
+        yield from _dry_report(dry)
+
+
+def _dry_report(dry: DryRun) -> Iterator[RenderableType]:
+    if dry.problems:
+        yield f"The plan cannot be run ({len(dry.problems)}):"
+        for problem in dry.problems:
+            yield f"  {problem}"
+    else:
+        yield (
+            f"The plan keeps every limit: {dry.motions} motions, {dry.load_changes} load changes, "
+            f"about {spoken(dry.duration)}."
+        )
+    for remark in dry.remarks:
+        yield f"note: {remark}"

@@ -1,0 +1,200 @@
+"""Frames of force sensors out of damaged streams, and the count of what was lost."""
+
+import binascii
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers import bota, ft300, onrobot_hex
+from drivers.frame_losses import ByArrival, ByDeviceClock
+from drivers.frames import Deframer, crc_modbus, crc_x25
+
+FORMATS = {
+    "ft300": ft300.SENSOR.frame,
+    "bota": bota.SENSOR.frame,
+    "hex": onrobot_hex._sensor(50.0, 2000.0, 1000.0).frame,
+}
+ALL = pytest.mark.parametrize("kind", FORMATS)
+
+
+def frames_of(kind, number, rng):
+    """Bodies that tell their number, and whole frames."""
+    spec = FORMATS[kind]
+    room = spec.size - len(spec.header) - 2
+    bodies = [struct.pack("<I", k) + rng.bytes(room - 4) for k in range(number)]
+    whole = [spec.header + body for body in bodies]
+    return bodies, [frame + spec.checksum(frame) for frame in whole]
+
+
+def damaged(frames, rng, most_bits, flips=0.02, cuts=0.02):
+    """Frames after flips (1 to `most_bits` bits) and truncations; which of them are whole."""
+    out, whole = [], []
+    for frame in frames:
+        data = bytearray(frame)
+        if rng.random() < flips:
+            for _ in range(rng.integers(1, most_bits + 1)):
+                data[rng.integers(len(data))] ^= 1 << int(rng.integers(8))
+        if rng.random() < cuts:
+            del data[int(rng.integers(1, len(data))) :]
+        out.append(bytes(data))
+        whole.append(bytes(data) == frame)
+    return out, np.array(whole)
+
+
+def test_checksums_are_the_published_ones():
+    assert crc_modbus(b"123456789") == 0x4B37
+    assert crc_x25(b"123456789") == 0x906E
+
+
+@given(data=st.binary(max_size=60))
+def test_x25_is_the_mirror_image_of_the_standard_library_s_ccitt(data):
+    def mirror(value, bits):
+        return int(f"{value:0{bits}b}"[::-1], 2)
+
+    mirrored = bytes(mirror(byte, 8) for byte in data)
+    assert crc_x25(data) == mirror(binascii.crc_hqx(mirrored, 0xFFFF), 16) ^ 0xFFFF
+
+
+@ALL
+@given(data=st.data())
+def test_frames_come_whole_however_the_stream_is_cut_into_pieces(kind, data):
+    bodies, frames = frames_of(kind, 12, np.random.default_rng(3))
+    stream = b"".join(frames)
+    cuts = sorted(data.draw(st.lists(st.integers(0, len(stream)), max_size=20)))
+    deframer = Deframer(FORMATS[kind])
+    found = []
+    for start, end in zip([0, *cuts], [*cuts, len(stream)], strict=True):
+        found += deframer.push(stream[start:end])
+    kept = bodies if not FORMATS[kind].weak else bodies[:-1]  # a sum waits for the next header
+    assert found == kept
+    assert (deframer.frames, deframer.corrupt, deframer.skipped) == (len(kept), 0, 0)
+
+
+@ALL
+def test_a_stream_entered_in_the_middle_of_a_frame_has_lost_nothing(kind):
+    bodies, frames = frames_of(kind, 20, np.random.default_rng(4))
+    deframer = Deframer(FORMATS[kind])
+    found = deframer.push(b"".join(frames)[5:])
+    assert found[0] == bodies[1]
+    assert (deframer.corrupt, deframer.skipped) == (0, 0)
+
+
+@ALL
+@pytest.mark.parametrize("seed", range(3))
+def test_no_wrong_frame_is_accepted_from_a_damaged_stream(kind, seed):
+    rng = np.random.default_rng(seed)
+    bodies, frames = frames_of(kind, 5_000, rng)
+    weak = FORMATS[kind].weak  # two flips may cancel in a mere sum
+    stream, whole = damaged(frames, rng, most_bits=1 if weak else 3)
+    deframer = Deframer(FORMATS[kind])
+    found = []
+    for frame in stream:
+        found += deframer.push(frame)
+    numbers = [struct.unpack_from("<I", body)[0] for body in found]
+    assert all(
+        0 <= k < len(bodies) and body == bodies[k] for k, body in zip(numbers, found, strict=True)
+    )
+    assert numbers == sorted(set(numbers))
+    # a damaged frame costs itself, and a whole one only between two damaged ones or, for the
+    # mere sum, before one
+    bad = int(np.sum(~whole))
+    assert len(found) >= len(frames) - (2.2 if weak else 1.2) * bad
+    assert 0.8 * bad <= deframer.corrupt <= 1.3 * bad
+
+
+@ALL
+def test_noise_alone_gives_no_frame(kind):
+    deframer = Deframer(FORMATS[kind])
+    rng = np.random.default_rng(8)
+    spec = FORMATS[kind]
+    for _ in range(2000):  # headers among noise
+        assert deframer.push(spec.header + rng.bytes(int(rng.integers(0, 60)))) == []
+
+
+def test_a_frame_inside_a_frame_is_not_taken():
+    """Out of step, a right checksum alone is not enough: a body may hold a whole frame."""
+    spec = FORMATS["ft300"]
+    _, (inner,) = frames_of("ft300", 1, np.random.default_rng(1))
+    bodies, outer = frames_of("ft300", 3, np.random.default_rng(2))
+    deframer = Deframer(spec)
+    assert deframer.push(b"noise" + inner + b"noise" + b"".join(outer)) == bodies
+
+
+def ticks_at(numbers, period=1000, start=0):
+    return [(start + int(k) * period) % 2**32 for k in numbers]
+
+
+@pytest.mark.parametrize("start", [0, 2**32 - 50_000])
+def test_the_device_s_clock_counts_exactly_what_is_missing(start):
+    rng = np.random.default_rng(5)
+    numbers = np.flatnonzero(rng.random(2000) > 0.05)
+    counter = ByDeviceClock(1e-6, 32)
+    ticks = ticks_at(numbers, start=start)
+    kept = [counter.follow(1, [tick], 0.0)[0] for tick in ticks]
+    assert all(kept)
+    assert counter.lost == numbers[-1] - numbers[0] + 1 - len(numbers)
+    assert counter.rate == pytest.approx(1000.0)
+
+
+def test_a_long_gap_is_counted_by_the_device_s_clock():
+    counter = ByDeviceClock(1e-6, 32)
+    counter.follow(100, ticks_at(range(100)), 0.0)
+    counter.follow(100, ticks_at(range(10_100, 10_200)), 10.0)
+    assert counter.lost == 10_000
+
+
+def test_a_frame_with_an_impossible_time_is_left_out():
+    counter = ByDeviceClock(1e-6, 32)
+    ticks = ticks_at(range(100))
+    ticks[50] = 3_123_456_789
+    assert counter.follow(100, ticks, 0.0) == [k != 50 for k in range(100)]
+    assert counter.lost == 1
+
+
+def test_a_sensor_that_begins_to_count_anew_is_followed():
+    counter = ByDeviceClock(1e-6, 32)
+    counter.follow(100, ticks_at(range(100), start=3_000_000_000), 0.0)
+    assert counter.follow(100, ticks_at(range(100)), 1.0) == [False] + [True] * 99
+
+
+def arrivals(counter, times, read_every=0.005):
+    """Give frames that arrived at times (s) as a reader that looks now and then finds them."""
+    at = 0
+    for now in np.arange(0.0, times[-1] + read_every, read_every):
+        count = int(np.searchsorted(times, now, side="right")) - at
+        if count:
+            counter.follow(count, [], float(now))
+            at += count
+
+
+@pytest.mark.parametrize("rate", [99.5, 100.0, 100.5])
+def test_by_arrival_a_whole_stream_loses_nothing_whatever_its_clock(rate):
+    rng = np.random.default_rng(6)
+    counter = ByArrival(100.0)
+    times = np.arange(10_000) / rate + rng.uniform(0.0, 0.002, 10_000)
+    arrivals(counter, times)
+    assert counter.lost == 0
+
+
+def test_by_arrival_missing_frames_are_counted():
+    rng = np.random.default_rng(7)
+    times = np.arange(20_000) / 100.0 + rng.uniform(0.0, 0.002, 20_000)
+    missing = rng.random(len(times)) < 0.02
+    missing[5000:5100] = True
+    missing[[0, -1]] = False
+    counter = ByArrival(100.0)
+    arrivals(counter, times[~missing])
+    assert counter.lost == pytest.approx(missing.sum(), abs=5)
+
+
+def test_by_arrival_frames_that_were_held_up_are_not_lost():
+    times = np.arange(3000) / 100.0
+    times[1000:1030] = times[1030]  # the reader or the adapter slept for 0.3 s
+    trickle = times.copy()
+    trickle[2000:2030] = times[2030] + np.arange(30) * 0.006  # and then came one by one
+    counter = ByArrival(100.0)
+    arrivals(counter, np.maximum.accumulate(trickle))
+    assert counter.lost == 0

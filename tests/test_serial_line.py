@@ -1,0 +1,188 @@
+"""A serial port: one clear line for whatever goes wrong, and nobody else's bytes."""
+
+import os
+import subprocess
+import sys
+import threading
+import time
+import tty
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from drivers.serial_line import close_port, drain, line_failures, open_port, plugged_in
+from hilcal.errors import DeviceError, InputError
+
+HOLD = """
+import sys
+from drivers.serial_line import open_port
+port = open_port("tracker", sys.argv[1], 19200)
+print("held", flush=True)
+sys.stdin.read()
+"""
+
+
+@dataclass(eq=False)
+class Line:
+    """A pseudo-terminal under a stable name, whose other end the test holds."""
+
+    path: Path
+    master: int
+    slave: int
+
+    def unplug(self) -> None:
+        self.path.unlink(missing_ok=True)
+        for end in (self.master, self.slave):
+            os.close(end)
+        self.master = self.slave = -1
+
+
+@pytest.fixture
+def line(tmp_path: Path) -> Iterator[Line]:
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    path = tmp_path / "adapter"
+    path.symlink_to(os.ttyname(slave))
+    line = Line(path, master, slave)
+    yield line
+    if line.master >= 0:
+        line.unplug()
+
+
+def test_bytes_go_both_ways(line):
+    port = open_port("tracker", str(line.path), 19200)
+    try:
+        port.write(b"\x00\x03\x11\x13\r\n\xff")
+        assert os.read(line.master, 100) == b"\x00\x03\x11\x13\r\n\xff"
+        os.write(line.master, b"\x00\x03\x11\x13\r\n\xff")
+        assert port.read(7) == b"\x00\x03\x11\x13\r\n\xff"
+    finally:
+        close_port(port)
+
+
+def test_a_port_that_another_program_uses_is_refused_and_named(line):
+    other = subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(line.path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    with other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == b"held\n"
+        with pytest.raises(DeviceError, match="in use by another program") as caught:
+            open_port("force sensor", str(line.path), 19200)
+        assert str(line.path) in str(caught.value)
+        assert str(caught.value).startswith("force sensor: ")
+        other.kill()  # as its death may be; the lock dies with it
+    close_port(open_port("force sensor", str(line.path), 19200))
+
+
+def test_a_port_is_free_again_after_close_and_may_be_closed_twice(line):
+    port = open_port("tracker", str(line.path), 19200)
+    close_port(port)
+    close_port(port)
+    close_port(open_port("tracker", str(line.path), 19200))
+
+
+def test_a_port_that_does_not_exist(tmp_path):
+    with pytest.raises(DeviceError, match=r"^tracker: there is no port .*nothing; is its adapter"):
+        open_port("tracker", str(tmp_path / "nothing"), 19200)
+
+
+def test_a_file_is_no_port(tmp_path):
+    path = tmp_path / "file"
+    path.write_bytes(b"hello")
+    with pytest.raises(DeviceError, match="is not a serial port"):
+        open_port("tracker", str(path), 19200)
+    with pytest.raises(DeviceError, match="is not a serial port"):
+        open_port("tracker", str(tmp_path), 19200)
+    assert path.read_bytes() == b"hello"
+
+
+@pytest.mark.parametrize("baud", [-1, 10**12])
+def test_a_rate_that_no_port_has(line, baud):
+    with pytest.raises(InputError, match=f"{baud} is no rate"):
+        open_port("tracker", str(line.path), baud)
+    close_port(open_port("tracker", str(line.path), 19200))  # nothing is left locked
+
+
+@pytest.mark.parametrize("action", ["read", "write", "waiting", "reset", "drain"])
+def test_an_unplugged_adapter_is_one_line_whatever_was_tried(line, action):
+    port = open_port("tracker", str(line.path), 19200, timeout=0.2)
+    try:
+        assert plugged_in(port)
+        line.unplug()
+        assert port.is_open
+        assert not plugged_in(port)
+        actions = {
+            "read": lambda: port.read(1),
+            "write": lambda: port.write(b"x"),
+            "waiting": lambda: port.in_waiting,
+            "reset": port.reset_input_buffer,
+            "drain": lambda: drain(port, 0.05, 1.0),
+        }
+        with (
+            pytest.raises(DeviceError, match=r"^tracker: port .* is gone; was its adapter unp"),
+            line_failures("tracker", str(line.path)),
+        ):
+            actions[action]()
+    finally:
+        close_port(port)
+
+
+def test_an_adapter_replugged_under_the_same_name_is_not_the_one_that_was_opened(line):
+    port = open_port("tracker", str(line.path), 19200)
+    master, slave = os.openpty()
+    try:
+        line.path.unlink()
+        line.path.symlink_to(os.ttyname(slave))
+        assert not plugged_in(port)
+    finally:
+        close_port(port)
+        for end in (master, slave):
+            os.close(end)
+
+
+def test_other_errors_pass_through():
+    with pytest.raises(ValueError, match="mine"), line_failures("tracker", "port"):
+        raise ValueError("mine")
+
+
+def test_a_line_is_drained_until_quiet(line):
+    port = open_port("tracker", str(line.path), 19200)
+    sent = threading.Event()
+
+    def talk() -> None:
+        for _ in range(10):
+            os.write(line.master, b"late answer\r\n")
+            time.sleep(0.01)
+        sent.set()
+
+    thread = threading.Thread(target=talk)
+    try:
+        thread.start()
+        assert drain(port, quiet=0.3, limit=20.0)
+        assert sent.is_set()
+        assert port.in_waiting == 0
+    finally:
+        thread.join()
+        close_port(port)
+
+
+def test_a_line_that_never_is_quiet_is_told_of(line):
+    port = open_port("tracker", str(line.path), 19200)
+    stop = threading.Event()
+
+    def talk() -> None:
+        while not stop.is_set():
+            os.write(line.master, b"x")
+            time.sleep(0.002)
+
+    thread = threading.Thread(target=talk)
+    try:
+        thread.start()
+        assert not drain(port, quiet=0.5, limit=1.0)
+    finally:
+        stop.set()
+        thread.join()
+        close_port(port)

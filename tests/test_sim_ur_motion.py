@@ -1,0 +1,165 @@
+"""The simulated controller's trajectory, kinematics and script port, without a process."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as some
+from scipy.spatial.transform import Rotation
+
+from drivers.simulated.ur.kinematics import GRAVITY, Kinematics, pose, rotation, transform
+from drivers.simulated.ur.motion import Trajectory, line
+from drivers.simulated.ur.script import ScriptStream
+from hilcal.robot.catalogue import load_arm
+
+GOAL = np.array([1.0, -0.5, 0.0, 0.2, 0.0, -1.5])
+vectors = some.lists(some.floats(-3.0, 3.0), min_size=6, max_size=6).map(np.array)
+
+
+def trajectory():
+    return Trajectory(np.zeros(6), np.ones(6), 5, 100.0)
+
+
+@given(vectors, some.floats(0.01, 2.0), some.floats(0.01, 10.0))
+def test_speed_is_the_derivative_and_limits_hold(goal, speed, acceleration):
+    segment = line(np.zeros(6), goal, speed, acceleration)
+    if segment is None:
+        assert np.max(np.abs(goal)) < 1e-9
+        return
+    assert segment.length == pytest.approx(np.max(np.abs(goal)), rel=1e-9)
+    times = np.linspace(0.0, segment.duration, 2001)
+    way, rate = np.array([segment.at(t) for t in times]).T
+    assert rate.max() <= speed * (1 + 1e-9)
+    assert rate[0] == 0.0
+    assert rate[-1] == pytest.approx(0.0, abs=1e-9 * (1 + rate.max()))
+    step = times[1] - times[0]
+    corner = 0.25 * acceleration * step**2 + 1e-12  # what a trapezium misses where ramps end
+    np.testing.assert_allclose(
+        np.diff(way), 0.5 * step * (rate[1:] + rate[:-1]), rtol=0.0, atol=corner
+    )
+    assert np.max(np.abs(np.diff(rate))) <= acceleration * step * (1 + 1e-6) + 1e-12
+
+
+def test_line_in_joint_space_and_end():
+    path = trajectory()
+    path.start(GOAL, 0.5, 1.0, 100.0)
+    for now in np.arange(100.0, 103.6, 0.01):
+        path.advance(now)
+        if path.moving:
+            np.testing.assert_allclose(path.q * GOAL[5], path.q[5] * GOAL, atol=1e-12)
+    assert not path.moving
+    np.testing.assert_allclose(path.q, GOAL, atol=1e-15)
+    assert path.rest_time == pytest.approx(100.0 + 1.5 / 0.5 + 0.5 / 1.0)
+    assert path.arrivals == 6
+    np.testing.assert_array_equal(path.side, [1, -1, 1, 1, 1, -1])
+
+
+@pytest.mark.parametrize("when", [0.2, 1.5, 3.1, 3.45])
+def test_stop_is_smooth_and_stays_on_the_line(when):
+    path = trajectory()
+    path.start(GOAL, 0.5, 1.0, 100.0)
+    path.advance(100.0 + when)
+    speed, q = np.max(np.abs(path.qd)), path.q.copy()
+    path.stop(2.0, 100.0 + when)
+    assert path.moving
+    path.advance(100.0 + when + 1e-6)
+    assert np.max(np.abs(path.qd)) == pytest.approx(speed, rel=1e-3)
+    path.advance(104.0)
+    assert not path.moving
+    assert path.arrivals == 6
+    rest = path.rest_time - 100.0 - when
+    assert rest <= speed / 2.0 + 1e-9
+    np.testing.assert_allclose(path.q - q, GOAL / 1.5 * 0.5 * speed * rest, atol=1e-9)
+    assert np.all(np.abs(path.q) <= np.abs(GOAL) + 1e-12)
+
+
+def test_a_new_move_under_way_stops_first():
+    path = trajectory()
+    path.start(GOAL, 0.5, 1.0, 100.0)
+    path.advance(101.0)
+    path.start(np.zeros(6), 0.5, 1.0, 101.0)
+    assert path.moving
+    path.advance(101.001)
+    assert np.max(np.abs(path.qd)) > 0.4
+    path.advance(110.0)
+    assert not path.moving
+    np.testing.assert_allclose(path.q, 0.0, atol=1e-12)
+    assert path.arrivals == 7
+    np.testing.assert_array_equal(path.side, [-1, 1, 1, -1, 1, 1])
+
+
+def test_slider_slows_and_holds():
+    path = trajectory()
+    path.start(GOAL, 0.5, 1.0, 100.0)
+    path.advance(101.0)
+    path.rate = 0.5
+    path.advance(101.1)
+    assert np.max(np.abs(path.qd)) == pytest.approx(0.25)
+    path.rate = 0.0
+    path.advance(150.0)
+    held = path.q.copy()
+    assert path.moving
+    assert path.left == float("inf")
+    assert np.all(path.qd == 0.0)
+    path.stop(1.0, 151.0)
+    assert not path.moving
+    np.testing.assert_array_equal(path.q, held)
+
+
+def test_a_move_to_the_same_place_is_none():
+    path = trajectory()
+    path.start(np.zeros(6), 0.5, 1.0, 100.0)
+    assert not path.moving
+    assert path.arrivals == 5
+
+
+@given(vectors)
+def test_poses_go_there_and_back(given):
+    # rotation vectors up to half a turn
+    given[3:] *= np.pi / max(np.pi, np.linalg.norm(given[3:]))
+    place = transform(given)
+    np.testing.assert_allclose(
+        place[:3, :3], Rotation.from_rotvec(given[3:]).as_matrix(), atol=1e-12
+    )
+    np.testing.assert_allclose(transform(pose(place)), place, atol=1e-6)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 3.0, np.pi - 1e-7, np.pi])
+def test_rotation_vectors_near_their_limits(angle):
+    vector = angle * np.array([0.36, -0.48, 0.8])
+    back = pose(transform(np.concatenate([np.zeros(3), vector])))[3:]
+    np.testing.assert_allclose(rotation(back), rotation(vector), atol=1e-6)
+    assert np.linalg.norm(back) == pytest.approx(angle, abs=1e-6)
+
+
+def test_jacobian_and_weight_are_derivatives():
+    kinematics = Kinematics(load_arm("ur10e"))
+    arm = kinematics.arm
+    rng = np.random.default_rng(2)
+    q, com, mass, h = rng.uniform(-2, 2, 6), np.array([0.05, -0.1, 0.2]), 4.0, 1e-6
+
+    def tip(q):
+        place = kinematics.flange(q)
+        return place[:3, 3] + place[:3, :3] @ com
+
+    def energy(q):
+        """Work of gravity, J."""
+        frames = kinematics.frames(q)
+        heights = [f[:3, :3] @ c + f[:3, 3] for f, c in zip(frames[:-1], arm.coms, strict=True)]
+        return sum(m * GRAVITY @ p for m, p in zip(arm.masses, heights, strict=True)) + (
+            mass * GRAVITY @ tip(q)
+        )
+
+    steps = h * np.eye(6)
+    numeric = np.array([(tip(q + s) - tip(q - s)) / (2 * h) for s in steps]).T
+    np.testing.assert_allclose(kinematics.jacobian(q, tip(q))[:3], numeric, atol=1e-8)
+    work = [(energy(q + s) - energy(q - s)) / (2 * h) for s in steps]
+    np.testing.assert_allclose(kinematics.weight_torque(q, mass, com), work, atol=1e-6)
+
+
+def test_script_port_cuts_programs_and_lines():
+    text = "stopj(2.0)\ndef a():\n  def b():\n    x = 1\n  end\nend\n\nsec c():\n  y = 2\nend\nd()"
+    stream = ScriptStream()
+    programs = [p for k in range(0, len(text), 3) for p in stream.feed(text[k : k + 3].encode())]
+    assert [p.split("\n")[0] for p in programs] == ["stopj(2.0)", "def a():", "sec c():"]
+    assert programs[1].endswith("  end\nend")
+    assert list(stream.feed(b"\r\n")) == ["d()"]
