@@ -5,13 +5,14 @@ from collections.abc import Callable
 import serial
 
 from drivers.force_stream import DEVICE, ForceStream, Sensor
-from drivers.serial_line import close_port, open_port
+from drivers.serial_line import close_port, drain, line_failures, open_port
 from hilcal.acquire.devices import Losses, Report, WrenchSample
 from hilcal.config import CellConfig
 from hilcal.config.rig import ForceSensor as Section
 from hilcal.errors import InputError
 
 FIRST_FRAME_S = 1.0
+OLD_S = 0.05
 
 
 class StreamingSensor:
@@ -85,11 +86,15 @@ def open_streaming(section: Section, baud: int, sensor: Sensor) -> StreamingSens
         DeviceError: no such port, in use, nothing or nothing sensible comes.
     """
     port = open_port(DEVICE, section.port, section.baud or baud)
-    stream = ForceStream(port, sensor)
+    stream: ForceStream | None = None
     try:
+        with line_failures(DEVICE, section.port):
+            drain(port, quiet=OLD_S, limit=OLD_S)  # adapters keep some of what came before
+        stream = ForceStream(port, sensor)
         stream.wait_for_first(FIRST_FRAME_S)
     except BaseException:
-        stream.stop()
+        if stream is not None:
+            stream.stop()
         close_port(port)
         raise
     return StreamingSensor(port, stream, sensor.name)

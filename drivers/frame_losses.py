@@ -93,12 +93,12 @@ class ByArrival:
     frames that come early at once and late ones slowly (sender and host have different
     clocks). One that is late by almost a period or more shows how many are missing. Frames that
     were only held up come early by this schedule, and are taken off the count again; for that
-    the schedule stays for a second.
+    the schedule stays for ten times as long as they were late.
     """
 
     LATE = 0.9
     FOLLOW = 0.05
-    DOUBT_S = 1.0
+    DOUBT = 10.0
 
     def __init__(self, rate: float) -> None:
         """Expect so many frames per second."""
@@ -115,11 +115,13 @@ class ByArrival:
         missing = 0
         if late >= self.LATE:
             missing = math.floor(late + 1.0 - self.LATE)
-            self._doubt_until = now + self.DOUBT_S
+            self._doubt_until = now + self.DOUBT * late * period
         elif now < self._doubt_until and late < 0.0:
             missing = -min(self.lost, math.floor(-late + 1.0 - self.LATE))
         self.lost += missing
         late -= missing
-        follow = self.FOLLOW if late > 0.0 else float(now >= self._doubt_until)
+        follow = self.FOLLOW if late > 0.0 else 1.0
+        if now < self._doubt_until:
+            follow = 0.0
         self._due += (missing + follow * late) * period
         return [True] * count

@@ -88,26 +88,27 @@ def open_force_sensor(config: CellConfig) -> ForceSensor:
 
 def _begin(port: serial.Serial) -> tuple[str, str]:
     """Return firmware and serial number, with the stream started."""
+    heard = False
     for _ in range(2):
         port.write(STOP)  # it may be streaming still, for a program that was killed
-        if drain(port, quiet=0.06, limit=0.4):
-            break
-    try:
-        firmware = _words(port, *FIRMWARE)
-        number = _words(port, *SERIAL_NUMBER)
-        write_register(port, SLAVE, STREAM_REGISTER, STREAM)
-    except NoAnswerError as error:
-        said = (
-            "what comes is no answer; the rate is wrong, the line is disturbed, or it is no FT 300"
-            if error.heard
-            else "nobody answers; check the sensor's power, its cable and the rate"
-        )
-        raise DeviceError(f"{DEVICE}: port {port.port} at {port.baudrate} Bd: {said}") from None
-    except RefusedError as error:
-        raise DeviceError(
-            f"{DEVICE}: port {port.port}: it does not stream, {error}; is it an FT 300?"
-        ) from None
-    return firmware, number
+        drain(port, quiet=0.06, limit=0.25)
+        try:
+            firmware = _words(port, *FIRMWARE)
+            number = _words(port, *SERIAL_NUMBER)
+            write_register(port, SLAVE, STREAM_REGISTER, STREAM)
+            return firmware, number
+        except NoAnswerError as error:
+            heard = heard or error.heard
+        except RefusedError as error:
+            raise DeviceError(
+                f"{DEVICE}: port {port.port}: it does not stream, {error}; is it an FT 300?"
+            ) from None
+    said = (
+        "what comes is no answer; the rate is wrong, the line is disturbed, or it is no FT 300"
+        if heard
+        else "nobody answers; check the sensor's power, its cable and the rate"
+    )
+    raise DeviceError(f"{DEVICE}: port {port.port} at {port.baudrate} Bd: {said}")
 
 
 def _words(port: serial.Serial, address: int, count: int) -> str:

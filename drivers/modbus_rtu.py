@@ -14,7 +14,7 @@ from hilcal.errors import DeviceError
 
 ANSWER_S = 0.25
 QUIET_S = 0.03
-TRIES = 3
+TRIES = 2
 READ, WRITE = 3, 16
 REFUSED = 0x80
 
@@ -36,7 +36,7 @@ def read_registers(port: serial.Serial, slave: int, address: int, count: int) ->
     """Return `count` holding registers (16 bits each) from an address on.
 
     Raises:
-        NoAnswerError: no sound answer, three times.
+        NoAnswerError: no sound answer, twice.
         RefusedError: the device has no such registers.
         OSError: the port failed; termios.error likewise.
     """
@@ -50,35 +50,34 @@ def write_register(port: serial.Serial, slave: int, address: int, value: int) ->
 
 
 def _ask(port: serial.Serial, request: bytes, size: int) -> bytes:
-    """Return a sound answer of `size` bytes (without checksum)."""
+    """Return a sound answer of `size` bytes (without checksum), whatever comes around it."""
     heard = False
     for _ in range(TRIES):
         drain(port, QUIET_S, 4 * QUIET_S)  # also the silence that a request begins with
         port.write(request + _crc(request))
-        answer = _answer(port, request, size)
-        heard = heard or bool(answer)
-        sound = len(answer) >= 5 and _crc(answer[:-2]) == answer[-2:]
-        if not sound or answer[0] != request[0]:
-            continue
-        if answer[1] == request[1] | REFUSED:
-            address = int.from_bytes(request[2:4], "big")
-            raise RefusedError(f"register {address} refused (Modbus exception {answer[2]})")
-        if answer[1] == request[1] and len(answer) == size + 2:
-            return answer[:-2]
+        end, got = time.monotonic() + ANSWER_S, b""
+        while time.monotonic() < end:
+            got += port.read(port.in_waiting)
+            if answer := _sound(got, request[:2], size):
+                return answer
+            refusal = _sound(got, bytes([request[0], request[1] | REFUSED]), 3)
+            if refusal:
+                address = int.from_bytes(request[2:4], "big")
+                raise RefusedError(f"register {address} refused (Modbus exception {refusal[2]})")
+            time.sleep(0.002)
+        heard = heard or bool(got)
     raise NoAnswerError(heard)
 
 
-def _answer(port: serial.Serial, request: bytes, size: int) -> bytes:
-    """Read until the answer is complete, or its time is up."""
-    end = time.monotonic() + ANSWER_S
-    answer = b""
-    while time.monotonic() < end:
-        refused = len(answer) > 1 and answer[1] == request[1] | REFUSED
-        if len(answer) >= (5 if refused else size + 2):
-            break
-        answer += port.read(port.in_waiting)
-        time.sleep(0.002)
-    return answer
+def _sound(data: bytes, begin: bytes, size: int) -> bytes:
+    """The first message of `size` bytes with this beginning and a right checksum, else b""."""
+    at = data.find(begin)
+    while 0 <= at <= len(data) - size - 2:
+        message, crc = data[at : at + size], data[at + size : at + size + 2]
+        if _crc(message) == crc:
+            return message
+        at = data.find(begin, at + 1)
+    return b""
 
 
 def _crc(data: bytes) -> bytes:

@@ -21,7 +21,7 @@ from drivers.ur_link.lines import LinkError
 from drivers.ur_link.motion import Motion, deceleration, stands
 from drivers.ur_link.options import UrOptions
 from drivers.ur_link.reading import OPTIONAL, OUTPUTS, N, Reading
-from drivers.ur_link.receiver import Receiver
+from drivers.ur_link.receiver import PATIENCE_S, STALE_S, Receiver
 from drivers.ur_link.survey import survey
 from drivers.ur_link.worker import WorkerError
 from hilcal.acquire.devices import ArmSample, Report
@@ -123,7 +123,7 @@ class UrArm:
         try:
             control.set_payload(mass, com)
         except WorkerError as error:
-            self._fail(f"the process that commands it ended ({error})")
+            self._fail(cause.not_commanded(error))
         end = time.monotonic() + _PAYLOAD_S
         while True:
             sample = self._read().sample
@@ -165,7 +165,7 @@ class UrArm:
         try:
             taken = control.move(q, speed, acceleration, motion.brake)
         except WorkerError as error:
-            self._fail(f"the process that commands it ended ({error})")
+            self._fail(cause.not_commanded(error))
         if not taken:
             self._fail("it did not take the motion")
 
@@ -180,7 +180,7 @@ class UrArm:
         try:
             pulse = control.alive()
         except WorkerError as error:
-            self._fail(f"the process that commands it ended ({error})")
+            self._fail(cause.not_commanded(error))
         if pulse.expired:
             self._fail("nobody watched its motion for 0.5 s, so it was stopped")
         reading = self._read()
@@ -239,7 +239,7 @@ class UrArm:
     def _read(self) -> Reading:
         """Return a new reading; a dead link is a failure of the motion, if there is one."""
         try:
-            return self._receiver.read()
+            return self._receiver.read(PATIENCE_S if self._motion is None else STALE_S)
         except LinkError as error:
             if self._motion is not None:
                 self._fail("", lost=str(error))

@@ -2,6 +2,7 @@
 
 import os
 import re
+import resource
 import signal
 import socket
 import subprocess
@@ -48,9 +49,29 @@ class Site:
     toml: Path
     plan_file: Path
     directory: Path
+    runs: list["Run"]
+
+    def end_runs(self) -> None:
+        """End what a test that failed has left running."""
+        for run in self.runs:
+            if run.process.poll() is None:
+                run.kill()
+                run.process.wait()
+        self.runs.clear()
 
     def ask(self, device: str, op: str, **arguments: Any) -> Any:
         return self.simulated.ask(device, op, **arguments)
+
+    def now(self) -> float:
+        """Time as the simulated devices stamp it, s."""
+        return time.monotonic()
+
+    def shorter(self, directory: Path, poses: int) -> "Site":
+        """The same cell with a plan of fewer poses."""
+        plan = spread_plan(self.cell, self.config, poses, np.random.default_rng(7), repeats=0)
+        plan_file = directory / "plan.json"
+        plan_file.write_text(plan.to_json(), encoding="utf-8")
+        return replace(self, plan=plan, plan_file=plan_file, directory=directory)
 
     def dashboard(self, *commands: str) -> list[str]:
         """Say something to the controller's dashboard, as the pendant's buttons do."""
@@ -91,15 +112,18 @@ def site(directory: Path, *, clock: float = 20.0, poses: int = 3, seed: int = 5)
         toml.write_text(to_toml(running.config), encoding="utf-8")
         plan_file.write_text(plan.to_json(), encoding="utf-8")
         yield Site(
-            running, secret.world, secret.cell, running.config, plan, toml, plan_file, directory
+            running, secret.world, secret.cell, running.config, plan, toml, plan_file, directory, []
         )
 
 
 class Run:
     """One `hilcal run`, in a session of its own."""
 
-    def __init__(self, site: Site, path: Path, *more: str) -> None:
-        """Start it; `--resume` where the campaign is there already."""
+    def __init__(self, site: Site, path: Path, *more: str, limit: int | None = None) -> None:
+        """Start it; `--resume` where the campaign is there already.
+
+        With `limit`, no file of the program can grow beyond so many blocks of 64 KiB.
+        """
         self.site, self.path = site, path
         self.log = path.with_suffix(f".{time.monotonic_ns()}.log")
         how = ("--resume",) if path.exists() else ("--plan", str(site.plan_file))
@@ -113,8 +137,10 @@ class Run:
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
                 env=environment,
+                preexec_fn=None if limit is None else lambda: _limited(limit << 16),
             )
         self._family: set[int] = {self.process.pid}
+        site.runs.append(self)
 
     @property
     def words(self) -> str:
@@ -155,6 +181,11 @@ class Run:
             lambda: "measuring" in "".join(self.words.splitlines()[count:]), "measurement"
         )
 
+    def next_reading(self, words: str) -> None:
+        """Wait until one more reading is stored."""
+        count = len(TAKEN.findall(self.words))
+        self.wait_until(lambda: len(TAKEN.findall(self.words)) > count, f"a reading with {words}")
+
     def family(self) -> set[int]:
         """Process numbers of it and of all that it has started."""
         try:
@@ -192,6 +223,10 @@ class Run:
             if not names or time.monotonic() > end:
                 return names
             time.sleep(0.02)
+
+
+def _limited(size: int) -> None:
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
 
 
 def _alive(pid: int) -> str:

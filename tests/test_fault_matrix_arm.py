@@ -85,6 +85,12 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
         yield made
 
 
+@pytest.fixture(autouse=True)
+def nothing_goes_on(cell: Site) -> Iterator[None]:
+    yield
+    cell.end_runs()
+
+
 @pytest.fixture(scope="module")
 def path(cell: Site) -> Path:
     return cell.directory / "run.hilcal"

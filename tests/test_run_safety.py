@@ -13,6 +13,7 @@ from tests.fake_devices import (
     POSES,
     STD,
     Bench,
+    FakeClock,
     plan_of,
     usual_plan,
 )
@@ -266,3 +267,30 @@ def test_at_least_twenty_frames_whatever_the_clock() -> None:
     measure(b, plan_of(("p1", "none", 0), ("p2", "none", 0)))
     assert all(json.loads(text)["force"]["frames"] >= 20 for _, _, text in b.store.rows)
     assert b.world.calls.count("force.average") == 1 + 3  # once too short, for the tare
+
+
+@pytest.mark.parametrize("scale", [1.0, 20.0])
+def test_everything_is_looked_at_twenty_times_a_second_in_motion(scale: float) -> None:
+    """Real seconds: a fast world's motions are short, and looked at as often as others."""
+    b = Bench()
+    b.world.hurry = 1.0
+    b.clock = FakeClock(scale=scale, world=b.world)
+    call, gaps = b.world.call, {"arm.moving": 0.0, "arm.sample": 0.0, "force.latest": 0.0}
+    last: dict[str, float] = {}
+    looks = 0
+
+    def noted(name: str) -> None:
+        nonlocal looks
+        if name in gaps and b.world.is_moving:
+            looks += 1
+            since = last.get(name, b.world.begun)
+            gaps[name] = max(gaps[name], (b.world.time - since) / scale)
+            last[name] = b.world.time
+        elif name == "arm.start_move":
+            last.clear()
+        call(name)
+
+    b.world.call = noted  # type: ignore[method-assign]
+    measure(b, plan_of(("p1", "none", 0), ("p1", "3kg", 0)))
+    assert looks > 30
+    assert max(gaps.values()) <= 0.05, gaps

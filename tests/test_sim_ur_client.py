@@ -204,7 +204,7 @@ def test_ways_to_stop(sim, how):
 
 
 def test_protective_stop_has_to_be_unlocked_and_the_script_uploaded_again(sim):
-    sim.admin("set", unlock_s=1.0)
+    sim.admin("set", unlock_s=1000.0)
     with client(sim.host, "control", "receive", "dashboard") as run:
         goal = under_way(run, sim)
         fault = sim.admin("protective_stop")["fault_ns"]
@@ -218,7 +218,7 @@ def test_protective_stop_has_to_be_unlocked_and_the_script_uploaded_again(sim):
         assert run("control", "moveJ", goal, SPEED, ACCELERATION) is False
         with pytest.raises(ClientError, match="unlock"):
             run("dashboard", "unlockProtectiveStop")
-        time.sleep(1.0)
+        sim.admin("set", unlock_s=0.0)
         run("dashboard", "unlockProtectiveStop")
         state = sim.admin()
         assert state["safety"] == 1
@@ -227,7 +227,6 @@ def test_protective_stop_has_to_be_unlocked_and_the_script_uploaded_again(sim):
         assert run("control", "reuploadScript")
         assert sim.wait("runtime", 2)["q"] == state["q"]
         assert run("control", "moveJ", goal_of(sim, 0.05), SPEED, ACCELERATION)
-    sim.admin("set", unlock_s=0.3)
 
 
 def test_resumed_program_goes_on_to_its_goal(sim):
@@ -238,7 +237,7 @@ def test_resumed_program_goes_on_to_its_goal(sim):
         sim.admin("protective_stop")
         sim.wait("runtime", 4)
         assert dashboard.ask("play") == "Failed to execute: play"
-        time.sleep(0.35)
+        sim.admin("set", unlock_s=0.0)
         assert dashboard.ask("unlock protective stop") == "Protective stop releasing"
         assert abs(sim.admin()["q"][0] - goal[0]) > 0.1
         assert dashboard.ask("play") == "Starting program"

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from drivers.simulated.ur.motion import line
 from drivers.ur_link import states
 from drivers.ur_link.motion import MARGIN_S, Motion, deceleration, duration
-from drivers.ur_link.reading import N, OUTPUTS, ReadingError, read
+from drivers.ur_link.reading import OUTPUTS, N, ReadingError, read
 from drivers.ur_link.worker import Worker, WorkerError
 
 FIELDS = {

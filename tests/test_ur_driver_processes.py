@@ -134,7 +134,7 @@ def _runs(pid):
 _HANGING = """
 import sys, threading
 from drivers.ur_link.worker import Worker
-arguments = (sys.argv[1], "125.0", "timestamp", "0.2")
+arguments = (sys.argv[1], "125.0", "timestamp")
 start = lambda: Worker("drivers.ur_link.receive_worker", arguments, 60.0)
 thread = threading.Thread(target=start)
 thread.start()

@@ -126,3 +126,22 @@ class Blackboard:
     def scale(self) -> float:
         """World seconds per real second."""
         return float(self._content["world"]["scale"][0])
+
+
+_LATE_S = 0.2
+"""How long an instrument waits for the world to catch up with an arm that has arrived."""
+
+
+def settled_truth(board: Blackboard) -> Any:
+    """Return the truth; where the arm has just arrived, that of its arrival.
+
+    The world looks at the arm some hundred times a second of real time. Where its clock goes
+    faster than that, an instrument would see the arm still on its way.
+    """
+    end = time.monotonic() + _LATE_S
+    while True:
+        arm, truth = board.read("arm"), board.read("truth")
+        late = not arm["moving"] and truth["arrivals"] != arm["arrivals"]
+        if not late or time.monotonic() > end:
+            return truth
+        time.sleep(0.001)

@@ -1,7 +1,7 @@
 """A simulated force sensor on a pseudo-terminal: `DIR/force`, admin `force.sock`.
 
     python -m drivers.simulated.force_server --directory DIR --kind ft300|bota|hex --seed N
-        [--rate HZ]
+        [--rate HZ] [--on S]
 
 Admin operations besides those of the line (`pty_port.FAULTS`): `overload {force}` adds a wrench
 (6 numbers, N and N·m), `stall {on}` stops sending while the sensor's clock goes on, `state`;
@@ -123,13 +123,14 @@ def main() -> None:
     parser.add_argument("--kind", choices=sorted(KINDS), required=True)
     parser.add_argument("--seed", type=int, required=True)
     parser.add_argument("--rate", type=float, help="frames per second")
+    parser.add_argument("--on", type=float, default=1200.0, help="s that it has been on")
     options = parser.parse_args()
     end_with_parent()
     kind = KINDS[options.kind]
     sensor = kind() if options.rate is None else kind(options.rate)
     measuring, faults = np.random.default_rng(options.seed).spawn(2)
     board = Blackboard.attach(options.directory / "world.bin")
-    gauge = Gauge.draw(board, sensor.noise, measuring)
+    gauge = Gauge.draw(board, sensor.noise, measuring, options.on)
     port = PtyPort(options.directory / "force", sensor.baud, faults)
     stream = Stream(sensor, gauge, port, due=time.monotonic())
     admin.serve(options.directory / "force.sock", stream.operate)

@@ -9,7 +9,7 @@ from drivers.ur_link.control import Control
 from drivers.ur_link.lines import LinkError
 from drivers.ur_link.motion import stands
 from drivers.ur_link.reading import Reading
-from drivers.ur_link.receiver import Receiver
+from drivers.ur_link.receiver import STALE_S, Receiver
 from drivers.ur_link.worker import WorkerError
 
 ASK_S = 0.25
@@ -54,7 +54,9 @@ class Brakes:
         with contextlib.suppress(WorkerError, LinkError):
             control.stop(brake, 0.3)
             reading = self._until_still(_GENTLE_S, program=False)
-            return reading is not None and reading.runtime == states.PLAYING
+            if reading is not None and reading.runtime == states.PLAYING:
+                control.rest()
+                return True
         return False
 
     def halt(self, control: Control | None, brake: float, lost: str = "") -> Halt:
@@ -92,7 +94,7 @@ class Brakes:
         if reading is None:
             self._by_script(brake)
             reading = self._until_still(_SURE_S - _AGAIN_S, program=True)
-        return Halt(reading or self.receiver.read(), reading is not None, "")
+        return Halt(reading or self.receiver.read(STALE_S), reading is not None, "")
 
     def _by_dashboard(self) -> bool:
         if self.has_dashboard:
@@ -112,7 +114,7 @@ class Brakes:
         """
         end, still = time.monotonic() + seconds, 0
         while time.monotonic() < end:
-            reading = self.receiver.read()
+            reading = self.receiver.read(STALE_S)
             ended = reading.runtime not in (states.PLAYING, states.RESUMING)
             safe = not program or ended or reading.sample.safety != states.NORMAL
             still = still + 1 if stands(reading) and safe else 0

@@ -7,6 +7,7 @@ from drivers.ur_link.brakes import ASK_S, Halt
 from drivers.ur_link.failure import CHECK_LINK, RESUME
 from drivers.ur_link.lines import LinkError
 from drivers.ur_link.reading import Reading
+from drivers.ur_link.worker import WorkerError
 
 
 def find(host: str, halt: Halt, noticed: str, has_dashboard: bool) -> tuple[str, str]:
@@ -49,6 +50,13 @@ def program_ended(reading: Reading, late: float) -> str:
         )
     word = states.runtime_word(reading.runtime)
     return f"its program is {word}: stopped on the pendant, by another program, or by its watchdog"
+
+
+def not_commanded(error: WorkerError) -> str:
+    """Return why a command did not get through."""
+    if error.lost:
+        return f"the process that commands it ended ({error})"
+    return f"it did not take a command ({error})"
 
 
 def _not_running(reading: Reading) -> tuple[str, str]:

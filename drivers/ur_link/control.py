@@ -17,6 +17,7 @@ COMMAND_S = 0.5
 """Deadline of a command, real s."""
 CONNECT_S = 8.0
 """Deadline for taking control, real s."""
+_ORPHAN_S = 1.6
 _HZ = 125.0
 _REGISTERS = ("input_int_register_24", "input_double_register_24")
 """Two of the registers that ur_rtde sends its commands through."""
@@ -156,8 +157,8 @@ def _ready(host: str, receiver: Receiver) -> None:
 
 def _no_program(host: str, receiver: Receiver) -> None:
     """Refuse a robot that runs somebody's program; end a paused one, which a stop left behind."""
-    with contextlib.suppress(LinkError):  # ours may take a moment to end
-        _wait_for(receiver, (states.STOPPED, states.PAUSED), 0.6)
+    with contextlib.suppress(LinkError):  # an orphan of ours ends by its watchdog
+        _wait_for(receiver, (states.STOPPED, states.PAUSED), _ORPHAN_S)
     runtime = receiver.read().runtime
     if runtime == states.PAUSED:
         dashboard.stop(host, 1.0)

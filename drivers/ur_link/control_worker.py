@@ -1,8 +1,9 @@
 """Child process that holds the control interface of ur_rtde, and keeps the watchdog quiet.
 
-The controller stops its program, and so the arm, when it has heard nothing for 0.1 s: when
-this process ends or hangs, or when the link breaks. And this process stops the arm when its
-parent has not asked for `lease` seconds during a motion. Only asynchronous motions are used: a
+During a motion the controller stops its program, and so the arm, when it has heard nothing for
+0.1 s: when this process ends or hangs, or when the link breaks. (At rest it waits for 1 s, so
+that a busy computer does not lose control for nothing.) And this process stops the arm when
+its parent has not asked for `lease` seconds during a motion. Only asynchronous motions are used: a
 synchronous one returns from a broken link after 301 s.
 """
 
@@ -13,6 +14,7 @@ from typing import Any
 from drivers.ur_link.child import Line, start, words
 
 WATCHDOG_HZ = 10.0
+REST_HZ = 1.0
 KICK_S = 0.02
 LATE_S = 0.8 / WATCHDOG_HZ
 """A longer pause between two kicks may have set off the watchdog, s."""
@@ -29,8 +31,7 @@ class Control:
         self._expired = False
         self._late = 0.0
         self._kicked = time.monotonic()
-        if not link.setWatchdog(WATCHDOG_HZ):
-            raise RuntimeError("the controller takes no watchdog")
+        self._guard(REST_HZ)
 
     def kick(self) -> None:
         """Tell the robot that this process lives; stop the arm if nobody watches its motion."""
@@ -58,11 +59,13 @@ class Control:
         elif op == "move":
             self._deceleration = request["deceleration"]
             self._expired, self._late = False, 0.0
+            self._guard(WATCHDOG_HZ)
             done = self._link.moveJ(request["q"], request["speed"], request["acceleration"], True)
             self._until = time.monotonic() + self._lease if done else None
             return {"done": bool(done)}
         elif op == "rest":
             self._until = None
+            self._guard(REST_HZ)
         elif op == "stop":
             self._until = None
             self._link.stopJ(request["deceleration"], True)
@@ -71,6 +74,11 @@ class Control:
         elif op == "bye":
             self._link.stopScript()
         return {"expired": self._expired, "late": self._late}
+
+    def _guard(self, hz: float) -> None:
+        """Set the least rate of signs of life, below which the controller stops its program."""
+        if not self._link.setWatchdog(hz):
+            raise RuntimeError("the controller takes no watchdog")
 
 
 def serve(line: Line, control: Control) -> None:

@@ -1,8 +1,8 @@
 """Child process that holds the receive interface of ur_rtde: `sample` and `rate`.
 
-A reading is given only when it is new: the controller's timestamp has to change within
-`stale` seconds. Whether the library calls itself connected proves nothing, since its getters
-go on with the last values for ever; that it calls itself disconnected is believed.
+A reading is given only when it is new: the controller's timestamp has to change within the
+`stale` seconds of the request. Whether the library calls itself connected proves nothing, since
+its getters go on with the last values for ever; that it calls itself disconnected is believed.
 """
 
 import time
@@ -79,8 +79,8 @@ def _rate(link: Any, seconds: float, stale: float) -> dict[str, Any]:
 
 def main() -> None:
     """Connect, say so, then answer requests until the parent closes the line."""
-    line, (host, hz, names_text, stale_text) = start()
-    names, stale = names_text.split(","), float(stale_text)
+    line, (host, hz, names_text) = start()
+    names = names_text.split(",")
     try:
         import rtde_receive
 
@@ -98,9 +98,9 @@ def main() -> None:
             continue
         try:
             if request["op"] == "sample":
-                result = _sample(link, names, stale)
+                result = _sample(link, names, request["stale"])
             else:
-                result = _rate(link, request["window"], stale)
+                result = _rate(link, request["window"], request["stale"])
         except Exception as error:
             line.answer(request["number"], error=words(error))
         else:

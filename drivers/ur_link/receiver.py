@@ -8,8 +8,10 @@ from drivers.ur_link.reading import Reading, ReadingError, read
 from drivers.ur_link.worker import Worker, WorkerError
 
 STALE_S = 0.2
-"""Data are stale when the controller's timestamp has not changed for so long, real s."""
-_ANSWER_S = STALE_S + 0.3
+"""In a motion, the link is lost when the controller's timestamp stands for so long, real s."""
+PATIENCE_S = 0.8
+"""At rest, new data are waited for so long, real s."""
+_ANSWER_S = 0.3
 
 
 class Receiver:
@@ -22,7 +24,7 @@ class Receiver:
             LinkError: the controller does not answer or sends no data.
         """
         self._host = host
-        self._arguments = (host, repr(hz), ",".join(outputs), repr(STALE_S))
+        self._arguments = (host, repr(hz), ",".join(outputs))
         self._worker = self._start(seconds)
 
     @property
@@ -30,14 +32,17 @@ class Receiver:
         """Number of the worker's process."""
         return self._worker.pid
 
-    def read(self) -> Reading:
-        """Return the next packet.
+    def read(self, stale: float = PATIENCE_S) -> Reading:
+        """Return the next packet, which is newer than the call.
+
+        Args:
+            stale: within so long, real s.
 
         Raises:
             LinkError: no new data.
         """
         try:
-            return read(self._worker.call("sample", _ANSWER_S))
+            return read(self._worker.call("sample", stale + _ANSWER_S, stale=stale))
         except WorkerError as error:
             how = "the process that receives over RTDE: " if error.lost else ""
             raise LinkError(f"{how}{error}") from None
@@ -51,7 +56,9 @@ class Receiver:
             LinkError: no new data.
         """
         try:
-            return float(self._worker.call("rate", seconds + _ANSWER_S, window=seconds)["rate"])
+            deadline = seconds + PATIENCE_S + _ANSWER_S
+            answer = self._worker.call("rate", deadline, window=seconds, stale=PATIENCE_S)
+            return float(answer["rate"])
         except WorkerError as error:
             raise LinkError(str(error)) from None
 

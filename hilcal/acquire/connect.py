@@ -34,10 +34,13 @@ class Answer:
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """What hinders a run, one line each."""
-        if self.failure:
+        """What hinders a run, one line each, with the device."""
+        if self.failure or self.report is None:
             return (self.failure,)
-        return () if self.report is None else self.report.problems
+        return tuple(
+            text if text.startswith(self.device) else f"{self.device}: {text}"
+            for text in self.report.problems
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,10 +92,8 @@ def connect(config: CellConfig) -> tuple[Rig | None, tuple[Answer, ...]]:
     """
     wanted = _wanted(config)
     factories = [_factory(one) for one in wanted]
-    with ThreadPoolExecutor(max(1, len(wanted) - 1)) as pool:
-        later = [pool.submit(_open, factory, config) for factory in factories[1:]]
-        # The arm's driver starts processes that end with the thread that started them.
-        opened = [_open(factories[0], config), *(one.result() for one in later)]
+    with ThreadPoolExecutor(len(wanted)) as pool:
+        opened = list(pool.map(lambda factory: _open(factory, config), factories))
     answers = tuple(
         _answer(one, made, why) for one, (made, why) in zip(wanted, opened, strict=True)
     )
@@ -159,9 +160,11 @@ def _open(factory: Factory, config: CellConfig) -> tuple[Any, str | HilcalError]
 
 def _answer(one: _Wanted, made: Any, why: str | HilcalError) -> Answer:
     name = one.driver or ""
-    if made is None:
-        return Answer(one.device, name, None, f"{one.device}: {why}")
     try:
-        return Answer(one.device, name, made.report())
+        if made is not None:
+            return Answer(one.device, name, made.report())
     except HilcalError as error:
-        return Answer(one.device, name, None, f"{one.device}: {error}")
+        why = error
+    words = str(why)
+    told = words if words.startswith(one.device) else f"{one.device}: {words}"
+    return Answer(one.device, name, None, told)

@@ -57,16 +57,18 @@ class Mover:
             self._clock.sleep(min(left, 0.5 * self._clock.scale))
             self.look()
 
+    def is_at(self, q: Floats) -> bool:
+        """Whether the last motion went to just these joint angles (n,)."""
+        return self.goal is not None and np.array_equal(q, self.goal)
+
     def move(self, q: Floats, name: str) -> None:
-        """Move to joint angles (n,) in a straight line in joint space; no motion if there.
+        """Move to joint angles (n,) in a straight line in joint space.
 
         Raises:
             DeviceError: the arm failed, a limit was exceeded, or it did not arrive.
         """
         sample = self.look()
         start = sample.q if self.goal is None else self.goal
-        if self.goal is not None and np.array_equal(q, start):
-            return
         moved = np.sign(q - start)
         motion = self._motion
         self._arm.start_move(q, motion.speed_rad_s, motion.acceleration_rad_s2)

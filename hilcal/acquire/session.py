@@ -109,8 +109,7 @@ class Session:
         self._begin(stops[:2])
         pace = Pace(self._clock)
         for k, stop in enumerate(stops[2:], start=2):
-            self._watcher.tell(Phase(f"moving to {stop.name}"))
-            self._mover.move(stop.q, stop.name)
+            self._move(stop)
             if stop.change_to is not None:
                 pace.arrived()
                 self._change(stop.change_to)
@@ -145,9 +144,13 @@ class Session:
         self.in_control = True
         self._rig.arm.take_control(*payload(self._cell, None))
         for stop in start:
+            self._move(stop)
+        self._tare()
+
+    def _move(self, stop: Stop) -> None:
+        if not self._mover.is_at(stop.q):
             self._watcher.tell(Phase(f"moving to {stop.name}"))
             self._mover.move(stop.q, stop.name)
-        self._tare()
 
     def _tare(self) -> None:
         """Set the force sensor's zero at the present pose, with nothing on the hook."""

@@ -10,7 +10,7 @@ import typer
 from hilcal.acquire.connect import Answer, connect
 from hilcal.acquire.dry_run import DryRun, dry_run
 from hilcal.cell import Cell, cell_from_config
-from hilcal.cli.terminal import Json, Terminal, terminal
+from hilcal.cli.terminal import Json, terminal
 from hilcal.config import CellConfig, load_config
 from hilcal.data.plan import Plan, load_plan
 from hilcal.errors import DeviceError, InputError
@@ -135,14 +135,11 @@ def _answer_json(answer: Answer) -> dict[str, object]:
     }
 
 
-def show_problems(t: Terminal, answers: tuple[Answer, ...]) -> None:
-    """Say what hinders a run.
+def refuse_unready(answers: tuple[Answer, ...]) -> None:
+    """Refuse to run with devices that are not ready.
 
     Raises:
-        DeviceError: where something does.
+        DeviceError: says everything that hinders.
     """
-    lines = [problem for answer in answers for problem in answer.problems]
-    if lines:
-        for line in lines[1:]:
-            t.notice(f"also: {line}")
-        raise DeviceError(lines[0])
+    if lines := [problem for answer in answers for problem in answer.problems]:
+        raise DeviceError("; ".join(lines))

@@ -2,7 +2,8 @@
 
 import signal
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import Annotated
@@ -12,9 +13,10 @@ import typer
 from drivers.simulated.on_the_wire import secret_of, simulated_cell
 from drivers.simulated.rehearsal import NOTHING
 from hilcal.acquire.clock import Clock
-from hilcal.acquire.connect import connect
+from hilcal.acquire.connect import Answer, connect
 from hilcal.acquire.dry_run import dry_run
 from hilcal.acquire.progress import Watcher
+from hilcal.acquire.rig import Rig
 from hilcal.acquire.run import run as run_plan
 from hilcal.cell import Cell
 from hilcal.cli.files import COVARIANCE, INSTRUMENT
@@ -26,16 +28,16 @@ from hilcal.cli.planning import (
     make_plan,
     read_cell,
     refuse,
-    show_problems,
+    refuse_unready,
 )
 from hilcal.cli.terminal import Json, Terminal, terminal
 from hilcal.config import CellConfig
 from hilcal.data.campaign import Campaign
 from hilcal.data.plan import Plan, load_plan
 from hilcal.data.run_log import PLAN, RunLog
-from hilcal.errors import InputError
+from hilcal.errors import DeviceError, InputError
 from hilcal.report.live_run import watching
-from hilcal.report.progress import working
+from hilcal.report.progress import Say, working
 
 SAME = ("robot", "tool", "loads")
 _ADDRESSES = {"driver", "host", "port", "baud", "options"}
@@ -113,28 +115,47 @@ def measure(t: Terminal, config: CellConfig, cell: Cell, campaign: Campaign) -> 
         KeyboardInterrupt: somebody stopped it; the same holds.
     """
     log = RunLog(campaign)
-    with _ends_as_interrupt(), ExitStack() as stack:
+    with _ends_as_interrupt(t), ExitStack() as stack:
         with working(t.progress) as say:
             say("connecting to every device")
             rig, answers = connect(config)
             if rig is not None:
                 stack.callback(rig.close)
-        show_problems(t, answers)
-        assert rig is not None  # noqa: S101  (show_problems has raised otherwise)
+                answers = tuple(_sighted(rig, answer, say) for answer in answers)
+        refuse_unready(answers)
+        assert rig is not None  # noqa: S101  (refuse_unready has raised otherwise)
         watcher: Watcher = stack.enter_context(watching(t.progress, len(log.plan.steps)))
         clock = Clock(config.simulation.clock)
         run_plan(rig, cell, config, log.plan, log, clock, watcher, judge=LiveResidual(cell, config))
     return campaign.n_readings
 
 
+def _sighted(rig: Rig, answer: Answer, say: Say) -> Answer:
+    """Let a tracker that has lost its target search for it; only its telescope turns."""
+    if answer.device != "tracker" or not answer.problems:
+        return answer
+    say(f"tracker: {answer.problems[0]}; searching")
+    with suppress(DeviceError):  # what it then says of itself is what counts
+        rig.tracker.find_target()
+        return replace(answer, report=rig.tracker.report())
+    return answer
+
+
 @contextmanager
-def _ends_as_interrupt() -> Iterator[None]:
-    """Let a plea to end, or a terminal that is closed, stop the arm as Ctrl-C does."""
+def _ends_as_interrupt(t: Terminal) -> Iterator[None]:
+    """Let Ctrl-C, a plea to end, or a closed terminal stop the arm; once is enough.
+
+    Stopping has deadlines of its own, so whoever asks again meanwhile is told to wait.
+    """
+    asked: list[int] = []
 
     def stop(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
+        asked.append(number)
+        if len(asked) == 1:
+            raise KeyboardInterrupt
+        t.notice("stopping the arm; wait a moment")
 
-    kinds = (signal.SIGTERM, signal.SIGHUP)
+    kinds = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     before = [signal.signal(kind, stop) for kind in kinds]
     try:
         yield

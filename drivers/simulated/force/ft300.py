@@ -28,7 +28,7 @@ _SERIAL = "F3004242"
 _YEAR = 2024
 
 
-def crc16_modbus(data: bytes) -> int:
+def crc16_modbus(data: bytes | bytearray) -> int:
     """Return the CRC-16/MODBUS: polynomial x¹⁶ + x¹⁵ + x² + 1, reflected, start FFFF."""
     crc = 0xFFFF
     for byte in data:

@@ -26,10 +26,11 @@ class Gauge:
     Attributes:
         board: the one physical world.
         rng: generator of the noise.
-        bias: (6,) at the temperature of switching on, N and N·m.
+        bias: (6,) when the world begins, N and N·m.
         drift: (6,) per K.
         noise: (6,) standard deviation of one frame.
         overload: (6,) wrench added by a fault.
+        on: how long the sensor has been on when the world begins, s.
     """
 
     board: Blackboard
@@ -38,9 +39,12 @@ class Gauge:
     drift: Floats
     noise: Floats
     overload: Floats
+    on: float
 
     @staticmethod
-    def draw(board: Blackboard, noise: tuple[float, float], rng: np.random.Generator) -> "Gauge":
+    def draw(
+        board: Blackboard, noise: tuple[float, float], rng: np.random.Generator, on: float
+    ) -> "Gauge":
         """Return a sensor with a drawn zero; `noise` is of a force (N) and a moment (N·m)."""
         return Gauge(
             board,
@@ -49,17 +53,21 @@ class Gauge:
             DRIFT_STD * rng.standard_normal(6),
             np.repeat(noise, 3),
             np.zeros(6),
+            on,
         )
 
     def temperature(self) -> float:
         """Return the sensor's temperature, °C: it warms up above the air."""
         air = float(self.board.read("truth")["air_temperature"])
-        warm = WARM_K * (1.0 - np.exp(-self.board.time / WARM_S))
-        return float((air if air != 0.0 else ROOM) + warm)
+        return float((air if air != 0.0 else ROOM) + self._own_heat(self.board.time))
 
     def read(self, count: int) -> Floats:
         """Return (count, 6) wrenches of the frames that are due now, N and N·m."""
         truth = self.board.read("truth")["sensor_wrench"]
-        warm = WARM_K * (1.0 - np.exp(-self.board.time / WARM_S))
-        mean = truth + self.bias + self.drift * warm + self.overload
+        since = self._own_heat(self.board.time) - self._own_heat(0.0)
+        mean = truth + self.bias + self.drift * since + self.overload
         return np.asarray(mean + self.noise * self.rng.standard_normal((count, 6)))
+
+    def _own_heat(self, time: float) -> float:
+        """Return by how much it is warmer than the air at a world time (s), K."""
+        return float(WARM_K * (1.0 - np.exp(-(time + self.on) / WARM_S)))

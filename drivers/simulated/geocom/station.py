@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from drivers.simulated.blackboard import Blackboard
+from drivers.simulated.blackboard import Blackboard, settled_truth
 from drivers.simulated.geocom.optics import Beam, Polar
 
 AIM_S = 0.3
@@ -79,7 +79,7 @@ class Station:
         """Return where the target truly is at this moment; None where none can be seen."""
         if self.broken:
             return None
-        point = self.board.read("truth")["target"]
+        point = settled_truth(self.board)["target"]
         if not np.all(np.isfinite(point)) or not np.any(point):
             return None  # the world has not begun
         return Polar.of(point)

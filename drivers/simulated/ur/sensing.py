@@ -110,7 +110,7 @@ class Sensors:
                 (arm.robot_mode is not RobotMode.POWER_OFF) | (arm.runtime is Runtime.PLAYING) << 1,
             ),
             "runtime_state": lambda: (arm.runtime,),
-            "speed_scaling": lambda: (arm.scaling * arm.slider,),
+            "speed_scaling": lambda: (arm.scaling,),
             "target_speed_fraction": lambda: (arm.slider,),
         }
 
