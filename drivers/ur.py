@@ -61,6 +61,7 @@ class UrArm:
         self._motion: Motion | None = None
         self._brake = deceleration(config.motion.speed_rad_s)
         self._fault = ""
+        self._was_ours = False
 
     @property
     def workers(self) -> tuple[int, ...]:
@@ -101,7 +102,9 @@ class UrArm:
         self._no_dashboard = _why_no_dashboard(self._host, self._controller.version)
         if self._no_dashboard:
             raise failure(self._host, f"cannot take control: {self._no_dashboard}")
+        self._end_program()
         self._control = take(self._host, self._receiver)
+        self._was_ours = True
         self._fault = ""
         try:
             self.set_payload(mass, com)
@@ -216,6 +219,8 @@ class UrArm:
         with contextlib.suppress(Exception):
             self._give_back()
         with contextlib.suppress(Exception):
+            self._end_program()
+        with contextlib.suppress(Exception):
             self._receiver.close()
 
     def _in_control(self) -> Control:
@@ -228,6 +233,16 @@ class UrArm:
         control, self._control, self._motion = self._control, None, None
         if control is not None:
             control.give_back()
+
+    def _end_program(self) -> None:
+        """End a program of ours that has outlived its process.
+
+        After a lost link ur_rtde may have uploaded it again, with no watchdog.
+        """
+        if self._was_ours and not self._no_dashboard:
+            with contextlib.suppress(LinkError):
+                dashboard.stop(self._host, _DASHBOARD_S)
+                self._was_ours = False
 
     def _stands_already(self) -> bool:
         """Whether an arm that is not under control stands."""

@@ -160,7 +160,7 @@ def test_the_operator_hangs_the_wrong_load_and_is_told(cell: Site, tmp_path: Pat
     run = Run(short, path)
     code, words = run.end()
     assert code == 0, words
-    assert "asked for" in words
+    assert "asked to take everything off: the force sensor feels" in words
     right(short, path)
 
 

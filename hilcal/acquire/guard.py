@@ -10,6 +10,8 @@ from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.types import Floats
 
+NORMAL = "normal"
+"""The safety state of an arm where all is well."""
 SLACK_M = 0.005
 """An arm that sags at the edge of its workspace is not stopped for it, m."""
 
@@ -37,8 +39,8 @@ class Guard:
 
     def state(self, sample: ArmSample) -> str | None:
         """Return in one line why a sample is not one of this arm, ready to move; or None."""
-        if sample.safety != "normal":
-            return f"arm: its safety state is {sample.safety}"
+        if sample.safety != NORMAL:
+            return f"arm: its safety state is {sample.safety}; put that right on the pendant"
         n = self.cell.arm.n
         if sample.q.shape != (n,) or sample.qd.shape != (n,):
             return f"arm: it reports {len(sample.q)} joints; {self.cell.arm.name} has {n}"

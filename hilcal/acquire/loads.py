@@ -50,6 +50,7 @@ class Hook:
     ) -> None:
         """Nothing is known of what hangs before `begin`."""
         self.hanging = UNLOADED
+        self._doubted = False
         self.since = clock.now()
         self._arm, self._operator, self._meter, self._mover = arm, operator, meter, mover
         self._cell, self._config, self._clock, self._watcher = cell, config, clock, watcher
@@ -116,10 +117,13 @@ class Hook:
     def _still_hangs(self) -> str:
         """What seems to hang still: a load that fits better than nothing does.
 
-        By the zero of an earlier session; the sensor's own may have changed meanwhile.
+        By the zero of an earlier session; the sensor's own may have changed meanwhile. Without
+        one it is the sensor's own, which may be far off: then it is asked once, and what the
+        person says to that is taken.
         """
-        if self._meter is None or not np.any(self._meter.zero):
+        if self._meter is None or (self._doubted and not np.any(self._meter.zero)):
             return ""
+        self._doubted = True
         sample = self._mover.look()
         feeling = self._meter.feeling(self._meter.average(), sample.q)
         force = self._meter.load_wrench(feeling)[:3]
@@ -128,8 +132,10 @@ class Hook:
             return ""
         for load in self._config.loads:
             if np.linalg.norm(force - load.wrench(self._cell.gravity)[:3]) < felt:
+                known = np.any(self._meter.zero)
+                since = "in the unloaded readings so far" if known else "the tool weighs"
                 return (
-                    f"the force sensor feels {felt:.1f} N more than in the unloaded readings so "
-                    f"far; {load.name} seems to hang still"
+                    f"the force sensor feels {felt:.1f} N more than {since}; {load.name} seems to "
+                    "hang still"
                 )
         return ""

@@ -5,7 +5,7 @@ import numpy as np
 from hilcal.acquire.clock import Clock
 from hilcal.acquire.devices import Arm, ArmSample
 from hilcal.acquire.force import ForceMeter
-from hilcal.acquire.guard import Guard
+from hilcal.acquire.guard import NORMAL, Guard
 from hilcal.acquire.route import duration
 from hilcal.config import CellConfig
 from hilcal.errors import DeviceError
@@ -47,6 +47,8 @@ class Mover:
         felt = None if self._meter is None else self._meter.felt()
         reason = self._guard.check(sample, felt)
         if reason is not None:
+            if sample.safety != NORMAL:
+                self._arm.moving()  # in motion the driver tells the cause and what to do
             raise DeviceError(reason)
         return sample
 

@@ -57,12 +57,13 @@ def demo(
     if number < 0:
         raise InputError(f"--seed {number}; valid: a whole number, 0 or more")
     check_choice(choice)
-    if output.exists():
-        t.notice(f"{output} exists and is replaced")
+    there = output.exists()
     if without_devices:
         r = in_process(t, config, choice, number, output, path.parent)
     else:
         r = on_devices(t, config, choice, number, output, path.parent, poses)
+    if there:
+        t.notice(f"{output} existed and is replaced")
     hashed = content_hash(r.readings)
     _introduce(t, r, choice, number)
     with working(t.progress) as say:
