@@ -32,6 +32,7 @@ from hilcal.types import Floats
 
 _PROBE_S, _DASHBOARD_S, _RECEIVE_S = 2.5, 1.5, 4.0  # 8 s together
 _PAYLOAD_S = 1.5
+_ORPHAN_S = 1.6
 POLYSCOPE_X = 10
 """Major version of the controllers without a dashboard server."""
 _MASS_KG, _COM_M = 1e-3, 1e-4  # how well a payload has to be read back
@@ -70,7 +71,18 @@ class UrArm:
 
     def report(self) -> Report:
         """Say who answered, versions, state, and every problem at once; moves nothing."""
-        report = survey(
+        report = self._survey()
+        if self._control is None:
+            end = time.monotonic() + _ORPHAN_S
+            while any(map(_is_foreign, report.problems)) and time.monotonic() < end:
+                time.sleep(0.2)  # the program of a killed hilcal ends by its watchdog
+                report = self._survey()
+            return report
+        ours = tuple(p for p in report.problems if not _is_foreign(p))
+        return Report(report.device, report.name, report.facts, ours)
+
+    def _survey(self) -> Report:
+        return survey(
             self._host,
             self._model,
             self._hz,
@@ -78,10 +90,6 @@ class UrArm:
             self._receiver,
             self._no_dashboard,
         )
-        if self._control is None:
-            return report
-        ours = tuple(p for p in report.problems if not p.startswith("a program runs"))
-        return Report(report.device, report.name, report.facts, ours)
 
     def sample(self) -> ArmSample:
         """Return a sample that is newer than the call; see `Arm.sample`."""
@@ -275,6 +283,10 @@ class UrArm:
         if not halt.stands:
             advice = f"{HOLD_ON}; {advice}"
         raise failure(self._host, self._fault, advice)
+
+
+def _is_foreign(problem: str) -> bool:
+    return problem.startswith("a program runs")
 
 
 def open_arm(config: CellConfig) -> UrArm:

@@ -33,7 +33,7 @@ from hilcal.robot.catalogue import configs_dir
 
 ROOT = Path(__file__).resolve().parents[1]
 TAKEN = re.compile(r"\d+/\d+ ")
-DEADLINE = 120.0
+DEADLINE = 60.0
 """Nothing here may take longer, s; far above what it takes."""
 
 
@@ -122,7 +122,7 @@ class Run:
     def __init__(self, site: Site, path: Path, *more: str, limit: int | None = None) -> None:
         """Start it; `--resume` where the campaign is there already.
 
-        With `limit`, no file of the program can grow beyond so many blocks of 64 KiB.
+        With `limit`, no file of the program can grow beyond so many bytes.
         """
         self.site, self.path = site, path
         self.log = path.with_suffix(f".{time.monotonic_ns()}.log")
@@ -137,7 +137,7 @@ class Run:
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
                 env=environment,
-                preexec_fn=None if limit is None else lambda: _limited(limit << 16),
+                preexec_fn=None if limit is None else lambda: _limited(limit),
             )
         self._family: set[int] = {self.process.pid}
         site.runs.append(self)
@@ -205,9 +205,9 @@ class Run:
         self.family()
         self.process.kill()
 
-    def end(self) -> tuple[int, str]:
+    def end(self, longest: float = DEADLINE) -> tuple[int, str]:
         """Wait for its end; returns the exit code and what it said."""
-        end = time.monotonic() + DEADLINE
+        end = time.monotonic() + longest
         while self.process.poll() is None:
             self.family()
             assert time.monotonic() < end, f"it hangs:\n{self.words}"
@@ -239,6 +239,10 @@ def _alive(pid: int) -> str:
         return ""
 
 
+LONG = 900.0
+"""A whole campaign may take so long, s."""
+
+
 def failed(run: Run, code: int = 3) -> str:
     """Check that a run ended as it should when something fails; returns the line that says why."""
     got, words = run.end()
@@ -254,7 +258,7 @@ def finish(site: Site, path: Path, tries: int = 1) -> None:
     """Resume until it is done, and check the campaign."""
     for attempt in range(tries):
         run = Run(site, path)
-        code, words = run.end()
+        code, words = run.end(LONG)
         assert run.left_behind() == []
         if code == 0:
             break

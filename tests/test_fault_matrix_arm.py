@@ -81,7 +81,7 @@ FAULTS = (
 
 @pytest.fixture(scope="module")
 def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
-    with site(tmp_path_factory.mktemp("arm"), poses=8) as made:
+    with site(tmp_path_factory.mktemp("arm"), poses=6) as made:
         yield made
 
 

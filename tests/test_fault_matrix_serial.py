@@ -105,7 +105,7 @@ OVERCOME = {
 
 @pytest.fixture(scope="module")
 def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
-    with site(tmp_path_factory.mktemp("serial"), poses=12) as made:
+    with site(tmp_path_factory.mktemp("serial"), poses=8) as made:
         yield made
 
 

@@ -19,7 +19,7 @@ from hilcal.data.run_log import RunLog
 
 pytestmark = pytest.mark.xdist_group("stops")
 
-KILLS = 4
+KILLS = 3
 KILLS_SLOW = 100
 LONGEST = 9.0
 """The moment of a kill is drawn up to here, s after the start; a run takes longer."""
@@ -27,7 +27,7 @@ LONGEST = 9.0
 
 @pytest.fixture(scope="module")
 def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
-    with site(tmp_path_factory.mktemp("stops"), poses=8) as made:
+    with site(tmp_path_factory.mktemp("stops"), poses=4) as made:
         yield made
 
 
@@ -100,7 +100,7 @@ def _sound(path: Path) -> None:
 
 
 def test_kill_minus_nine_at_random_moments(cell: Site, tmp_path: Path) -> None:
-    short = cell.shorter(tmp_path, poses=3)
+    short = cell.shorter(tmp_path, poses=2)
     path = tmp_path / "killed.hilcal"
     _kill_at_random(short, path, KILLS, 1)
     finish(short, path)
@@ -108,15 +108,16 @@ def test_kill_minus_nine_at_random_moments(cell: Site, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_kill_minus_nine_at_a_hundred_random_moments(cell: Site, tmp_path: Path) -> None:
+    long = cell.shorter(tmp_path, poses=60)
     path = tmp_path / "killed.hilcal"
-    _kill_at_random(cell, path, KILLS_SLOW, 2)
-    finish(cell, path)
+    _kill_at_random(long, path, KILLS_SLOW, 2)
+    finish(long, path)
 
 
 def test_a_full_disk_stops_the_arm_and_loses_nothing(cell: Site, tmp_path: Path) -> None:
-    short = cell.shorter(tmp_path, poses=2)
+    short = cell.shorter(tmp_path, poses=1)
     path = tmp_path / "full.hilcal"
-    run = Run(short, path, limit=1)
+    run = Run(short, path, limit=56 << 10)
     line = failed(run)
     assert "make room on the disk" in line
     assert not cell.ask("arm", "state")["moving"]
