@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from campaign_cases import Run, Site, failed, finish, right, site, stopped_within
 
-pytestmark = pytest.mark.xdist_group("arm faults")
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("arm faults")]
 
 Act = Callable[[Site], object]
 

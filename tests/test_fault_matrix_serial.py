@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from campaign_cases import Run, Site, failed, finish, right, site, stopped_within
 
-pytestmark = pytest.mark.xdist_group("serial faults")
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("serial faults")]
 
 Act = Callable[[Site], object]
 

@@ -17,7 +17,7 @@ from campaign_cases import Run, Site, failed, finish, right, site, stopped_withi
 from hilcal.data.campaign import Campaign
 from hilcal.data.run_log import RunLog
 
-pytestmark = pytest.mark.xdist_group("stops")
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("stops")]
 
 KILLS = 3
 KILLS_SLOW = 100
