@@ -152,10 +152,15 @@ def _open(factory: Factory, config: CellConfig) -> tuple[Any, str | HilcalError]
     """Open a device; what fails is told, whatever it is."""
     try:
         return factory(config), ""
-    except HilcalError as error:
-        return None, error
     except Exception as error:  # a driver of somebody else's may fail in any way
-        return None, f"{type(error).__name__}: {' '.join(str(error).split())}"
+        return None, _why(error)
+
+
+def _why(error: Exception) -> str | HilcalError:
+    """Return what an error says; it keeps its kind where it is one of ours."""
+    if isinstance(error, HilcalError):
+        return error
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
 def _answer(one: _Wanted, made: Any, why: str | HilcalError) -> Answer:
@@ -163,8 +168,8 @@ def _answer(one: _Wanted, made: Any, why: str | HilcalError) -> Answer:
     try:
         if made is not None:
             return Answer(one.device, name, made.report())
-    except HilcalError as error:
-        why = error
+    except Exception as error:  # as above
+        why = _why(error)
     words = str(why)
     told = words if words.startswith(one.device) else f"{one.device}: {words}"
     return Answer(one.device, name, None, told)

@@ -50,7 +50,7 @@ def run(
         wall: the time of day, s; it carries the campaign's time over a pause.
 
     Raises:
-        InputError: the plan is not safe (all problems, one line each), or the store fails.
+        InputError: the plan is not safe (says the first problem), or the store fails.
         DeviceError: a device failed, a limit was exceeded, a person gave up.
         KeyboardInterrupt: as it came; the arm stands.
     """
@@ -77,11 +77,14 @@ def refuse(checked: DryRun) -> None:
     """Refuse a plan with problems.
 
     Raises:
-        InputError: all problems, one line each.
+        InputError: says the first problem, and how many more there are.
     """
     if checked.problems:
-        head = "the plan is not safe to run, nothing has moved:"
-        raise InputError("\n  ".join((head, *checked.problems)))
+        more = len(checked.problems) - 1
+        others = f" (and {more} more: hilcal check --plan shows all)" if more else ""
+        raise InputError(
+            f"the plan is not safe to run, nothing has moved: {checked.problems[0]}{others}"
+        )
 
 
 def _stop(arm: Arm) -> str:

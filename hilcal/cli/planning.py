@@ -68,7 +68,7 @@ def check(cell: CellFile, plan: PlanFile = None, as_json: Json = False) -> None:
     t.document(
         {
             "ok": not any(a.problems for a in answers) and not (dry and dry.problems),
-            "devices": [_answer_json(a) for a in answers],
+            "devices": [answer_json(a) for a in answers],
             "plan": None if dry is None else asdict(dry),
         }
     )
@@ -123,7 +123,8 @@ def plan_json(made: Plan, dry: DryRun) -> dict[str, object]:
     }
 
 
-def _answer_json(answer: Answer) -> dict[str, object]:
+def answer_json(answer: Answer) -> dict[str, object]:
+    """Return what became of a device as a JSON document says it."""
     report = answer.report
     return {
         "device": answer.device,

@@ -25,6 +25,7 @@ from hilcal.cli.planning import (
     POSES,
     CellFile,
     PlanFile,
+    answer_json,
     make_plan,
     read_cell,
     refuse,
@@ -125,6 +126,7 @@ def measure(t: Terminal, config: CellConfig, cell: Cell, campaign: Campaign) -> 
         refuse_unready(answers)
         assert rig is not None  # noqa: S101  (refuse_unready has raised otherwise)
         watcher: Watcher = stack.enter_context(watching(t.progress, len(log.plan.steps)))
+        log.event("devices", {"answers": [answer_json(answer) for answer in answers]})
         clock = Clock(config.simulation.clock)
         run_plan(rig, cell, config, log.plan, log, clock, watcher, judge=LiveResidual(cell, config))
     return campaign.n_readings

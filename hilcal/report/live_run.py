@@ -5,8 +5,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
+from rich.text import Text
 
 from hilcal.acquire.progress import Phase, Remark, Taken
 from hilcal.report import numbers
@@ -37,7 +38,7 @@ class _Lines:
 
 @dataclass(slots=True)
 class _Bar:
-    """Keeps one line up to date; remarks scroll by above it."""
+    """Keeps two lines up to date; remarks scroll by above them."""
 
     progress: Progress
     task: TaskID
@@ -54,6 +55,16 @@ class _Bar:
             self.progress.update(self.task, completed=event.done, left=left, last=last)
 
 
+class _TwoLines(Progress):
+    """The bar with what goes on, and below it the last reading: both fit 80 columns."""
+
+    def get_renderables(self) -> Iterator[RenderableType]:
+        """Yield the lines."""
+        yield self.make_tasks_table(self.tasks)
+        for task in self.tasks:
+            yield Text(task.fields["last"], no_wrap=True, overflow="ellipsis")
+
+
 @contextmanager
 def watching(console: Console, total: int) -> Iterator[_Lines | _Bar]:
     """Yield a watcher that shows a campaign of so many readings."""
@@ -61,13 +72,12 @@ def watching(console: Console, total: int) -> Iterator[_Lines | _Bar]:
         yield _Lines(console)
         return
     columns = (
-        BarColumn(bar_width=24),
+        BarColumn(bar_width=20),
         MofNCompleteColumn(),
         TextColumn("{task.fields[left]}", style="bold", markup=False),
-        TextColumn("{task.fields[last]}", markup=False),
         TextColumn("{task.fields[phase]}", style="dim", markup=False),
     )
-    with Progress(*columns, console=console, transient=True) as progress:
+    with _TwoLines(*columns, console=console, transient=True) as progress:
         task = progress.add_task("", total=total, left="", last="", phase="")
         yield _Bar(progress, task)
 
