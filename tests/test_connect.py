@@ -22,7 +22,7 @@ class Device:
 
     def report(self):
         if "mute" in self.name:
-            raise ValueError("nothing\nsaid")
+            raise ValueError("nothing\\nsaid")
         return Report(self.device, self.name)
 
     def close(self):
