@@ -281,6 +281,7 @@ def _devices(
 def _filled_in(config: CellConfig, directory: Path, host: str) -> CellConfig:
     """Return the configuration that leads to the simulated devices; what it gives stays."""
     robot = {"host": host, "driver": config.robot.driver or "ur"}
+    directory = directory.absolute()
     tracker = {"port": str(directory / "tracker"), "driver": config.tracker.driver or "geocom"}
     options = {**config.operator.options, "socket": str(directory / "world.sock")}
     changes: dict[str, Any] = {
