@@ -14,7 +14,7 @@ from hilcal.acquire.workspace import points
 from hilcal.config import ForceSensor, Limits, Load, Motion, Tool
 from hilcal.data.plan import Plan, Step
 from hilcal.robot.catalogue import load_arm
-from tests.fake_devices import POSES, Bench, plan_of, usual_plan
+from tests.fake_bench import POSES, Bench, plan_of, usual_plan
 
 WIDE = Limits(workspace_min_m=(-3, -3, -3), workspace_max_m=(3, 3, 3))
 

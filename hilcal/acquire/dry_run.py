@@ -6,12 +6,15 @@ from itertools import pairwise
 import numpy as np
 
 from hilcal.acquire import workspace
+from hilcal.acquire.clearance import Clearance, clearance_of
 from hilcal.acquire.route import Stop, duration, home, route
+from hilcal.acquire.sight import UNKNOWN, Sight, sight_of, tracker_place
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.data.plan import REFERENCE, UNLOADED, Plan, Step
 from hilcal.robot import chain as chains
 from hilcal.robot import se3
+from hilcal.robot.body import is_known
 from hilcal.robot.statics import Load, slot_wrenches
 from hilcal.toml import suggest
 from hilcal.types import Floats
@@ -20,8 +23,6 @@ PATH_STEP_RAD = 0.02
 """Distance of the points at which a path is checked, rad of the leading joint."""
 MEASURING_S = 1.0
 """How long one tracker measurement is taken to last, s; only for the estimate of time."""
-LOADING_S = 60.0
-"""How long a person is taken to need for a change of the load, s; only for the estimate."""
 _ROUNDING = 1e-9
 
 
@@ -48,7 +49,9 @@ def dry_run(cell: Cell, config: CellConfig, plan: Plan) -> DryRun:
     """Check a plan against every limit of the cell; all problems at once.
 
     Checked are joints, poses, the straight path in joint space between all stops of the route,
-    torques and the force sensor under each load, payload, speed, and the names of the loads.
+    torques and the force sensor under each load, payload, speed, collisions of arm, obstacles
+    and what hangs from the load point, the tracker's sight of the target at each reading, and
+    the names of the loads.
 
     Args:
         cell: the cell.
@@ -66,7 +69,7 @@ def dry_run(cell: Cell, config: CellConfig, plan: Plan) -> DryRun:
     changes = sum(stop.change_to is not None for stop in stops)
     return DryRun(
         tuple(dict.fromkeys(problems)),
-        _remarks(plan),
+        (*_remarks(plan), *_unchecked(cell, config)),
         _duration(config, stops, changes, len(plan.steps)),
         len(moves),
         changes,
@@ -121,12 +124,14 @@ def _load_problems(cell: Cell, config: CellConfig, plan: Plan) -> list[str]:
 def route_problems(cell: Cell, config: CellConfig, stops: tuple[Stop, ...]) -> list[str]:
     """Return what is wrong with stops and with the paths between them, one line each."""
     out = {}
-    here = [_at_stop(cell, config, stop) for stop in stops]
+    shapes = clearance_of(cell, config)
+    sight = sight_of(shapes)
+    here = [_at_stop(shapes, sight, stop) for stop in stops]
     for found in here:
         out.update(found)
     for (a, b), (at_a, at_b) in zip(pairwise(stops), pairwise(here), strict=True):
         known = {kind for kind, *_ in (*at_a, *at_b)}
-        for (kind, *rest), line in _on_path(cell, config, a, b).items():
+        for (kind, *rest), line in _on_path(shapes, a, b).items():
             if kind not in known:
                 out[kind, *rest] = line
     return list(dict.fromkeys(out.values()))
@@ -136,8 +141,8 @@ _Problems = dict[tuple[str, ...], str]
 """By (kind, where): a path's problem is not told again where one of its ends has it."""
 
 
-def _at_stop(cell: Cell, config: CellConfig, stop: Stop) -> _Problems:
-    arm, margin = cell.arm, config.limits.joint_margin_rad
+def _at_stop(shapes: Clearance, sight: Sight | None, stop: Stop) -> _Problems:
+    arm, margin = shapes.cell.arm, shapes.config.limits.joint_margin_rad
     where = f"pose {stop.name}"
     out: _Problems = {}
     for k, name in enumerate(arm.joint_names):
@@ -147,25 +152,29 @@ def _at_stop(cell: Cell, config: CellConfig, stop: Stop) -> _Problems:
                 f"{where}: {name} is at {stop.q[k]:.4g} rad; usable are {low:.4g} to {high:.4g} "
                 f"(joint_margin_rad {margin:g})"
             )
-    out.update(_along(cell, config, stop.q[None], stop.hanging, where))
+    out.update(_along(shapes, stop.q[None], stop.hanging, where))
     if stop.change_to is not None:
-        out.update(_along(cell, config, stop.q[None], stop.change_to, where))
+        out.update(_along(shapes, stop.q[None], stop.change_to, where))
+    if stop.step is not None and sight is not None:
+        out.update(sight.problems(stop.q[None], stop.step.load, where))
     return out
 
 
-def _on_path(cell: Cell, config: CellConfig, a: Stop, b: Stop) -> _Problems:
+def _on_path(shapes: Clearance, a: Stop, b: Stop) -> _Problems:
     """Problems between two stops, their joint limits aside: a straight line keeps those."""
     count = int(np.ceil(np.abs(b.q - a.q).max(initial=0.0) / PATH_STEP_RAD))
     if count < 2:
         return {}
     share = np.arange(1, count)[:, None] / count
     where = f"between {a.name} and {b.name}"
-    return _along(cell, config, a.q + share * (b.q - a.q), b.hanging, where)
+    return _along(shapes, a.q + share * (b.q - a.q), b.hanging, where)
 
 
-def _along(cell: Cell, config: CellConfig, q: Floats, load: str, where: str) -> _Problems:
-    """Workspace and torques at N points, the worst of each kind."""
+def _along(shapes: Clearance, q: Floats, load: str, where: str) -> _Problems:
+    """Workspace, collisions and torques at N points, the worst of each kind."""
+    cell, config = shapes.cell, shapes.config
     out: _Problems = {}
+    out.update(shapes.problems(q, load, where, itself=is_known(cell.arm)))
     for name, axis, over, limit in workspace.outside(cell, config, q):
         worst = float(over.max())
         if not worst <= _ROUNDING:
@@ -221,6 +230,18 @@ def _pull(cell: Cell, config: CellConfig, load: str) -> Floats | None:
     return next((x.wrench(cell.gravity) for x in config.loads if x.name == load), None)
 
 
+def _unchecked(cell: Cell, config: CellConfig) -> tuple[str, ...]:
+    """What is not checked since it is not known; told where the cell says more of it."""
+    out = []
+    if tracker_place(cell, config) is None and config.sight.target_normal is not None:
+        out.append(UNKNOWN)
+    if not is_known(cell.arm):
+        out.append(
+            f"the shape of {cell.arm.name} is not known: whether it touches itself is not checked"
+        )
+    return tuple(out)
+
+
 def _remarks(plan: Plan) -> tuple[str, ...]:
     out = []
     unloaded = {(s.pose, s.cycle) for s in plan.steps if s.load == UNLOADED}
@@ -246,7 +267,9 @@ def _duration(config: CellConfig, stops: tuple[Stop, ...], changes: int, reading
         duration(a.q, b.q, motion.speed_rad_s, motion.acceleration_rad_s2)
         for a, b in pairwise(stops)
     )
-    each = acquire.settle_s + acquire.samples * MEASURING_S
-    if config.force_sensor is not None:
-        each += acquire.force_window_s
-    return moving + changes * LOADING_S + readings * each
+    each = config.planning.reading_s
+    if each is None:
+        each = acquire.settle_s + acquire.samples * MEASURING_S
+        if config.force_sensor is not None:
+            each += acquire.force_window_s
+    return moving + changes * config.planning.load_change_s + readings * each

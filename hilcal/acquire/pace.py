@@ -3,7 +3,9 @@
 import numpy as np
 
 from hilcal.acquire.clock import Clock
-from hilcal.acquire.dry_run import LOADING_S
+
+LOADING_S = 60.0
+"""How long a person is taken to need for a change of the load until one was seen, s."""
 
 
 class Pace:

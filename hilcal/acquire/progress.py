@@ -35,6 +35,8 @@ class Taken:
         residual: distance of the reading from what a model says, m; None where none is asked.
         residual_sigma: the same in standard deviations.
         settling: how long the readings took to settle, cell seconds.
+        goal: how far the campaign's goal is, in words; empty without one, and while that is
+            not known.
     """
 
     step: Step
@@ -46,6 +48,7 @@ class Taken:
     residual: float | None = None
     residual_sigma: float | None = None
     settling: float = 0.0
+    goal: str = ""
 
 
 class Watcher(Protocol):

@@ -13,6 +13,7 @@ from hilcal.acquire.rig import Rig
 from hilcal.acquire.route import route
 from hilcal.acquire.session import Judge, Session
 from hilcal.acquire.store import Store
+from hilcal.acquire.until import Rule
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.data.plan import Plan
@@ -32,8 +33,9 @@ def run(
     watcher: Watcher,
     judge: Judge | None = None,
     wall: Callable[[], float] = time.time,
+    goal: Rule | None = None,
 ) -> None:
-    """Measure what is missing of a plan.
+    """Measure what is missing of a plan, or as much of it as a goal needs.
 
     Every reading is stored before the next motion. Whatever is raised, also an interrupt from
     the keyboard, the arm is told to stop before anything else is done. The rig stays open.
@@ -48,6 +50,8 @@ def run(
         watcher: who is told of the progress.
         judge: says how far a reading is from what a model says; None for nothing.
         wall: the time of day, s; it carries the campaign's time over a pause.
+        goal: says when the readings are enough; then the arm goes home and the load is taken
+            off, and the rest is not measured.
 
     Raises:
         InputError: the plan is not safe (says the first problem), or the store fails.
@@ -64,7 +68,7 @@ def run(
     for text in whole.remarks:
         watcher.tell(Remark(text))
     stops = route(left, cell.arm, config.limits.joint_margin_rad)
-    session = Session(rig, cell, config, plan, store, clock, watcher, judge, wall)
+    session = Session(rig, cell, config, plan, store, clock, watcher, judge, wall, goal)
     try:
         session.walk(stops)
     except BaseException as error:

@@ -24,6 +24,7 @@ from hilcal.acquire.route import Stop
 from hilcal.acquire.row import detail, feeling_of, row
 from hilcal.acquire.store import Store
 from hilcal.acquire.take import Measured, Taker
+from hilcal.acquire.until import Aim, Rule, ending
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.data.plan import UNLOADED, Plan, Step
@@ -49,12 +50,14 @@ class Session:
         watcher: Watcher,
         judge: Judge | None = None,
         wall: Callable[[], float] = time.time,
+        goal: Rule | None = None,
     ) -> None:
         """Read what earlier sessions stored; no device is used yet."""
         self.in_control = False
         self._rig, self._cell, self._config, self._plan = rig, cell, config, plan
         self._store, self._clock, self._watcher, self._judge = store, clock, watcher, judge
         self._wall = wall
+        self._aim = Aim(goal, plan, store, watcher, self._event)
         window = clock.real(config.acquire.force_window_s)
         self._meter: ForceMeter | None = None
         if rig.force is not None and config.force_sensor is not None:
@@ -99,7 +102,7 @@ class Session:
     # the way
 
     def walk(self, stops: tuple[Stop, ...]) -> None:
-        """Go through all stops.
+        """Go through all stops, or home as soon as the goal is met.
 
         Raises:
             HilcalError: something failed; the arm has to be stopped.
@@ -108,7 +111,13 @@ class Session:
         self._event("start", {"missing": sum(s.step is not None for s in stops)})
         self._begin(stops[:2])
         pace = Pace(self._clock)
-        for k, stop in enumerate(stops[2:], start=2):
+        behind, ahead = list(stops[:2]), stops[2:]
+        if self._aim.come_to_be_met(last=False):  # an earlier session was stopped on its way home
+            ahead = ending(self._cell, self._config, self._plan, behind, self._store.done())
+        while ahead:
+            stop, *rest = ahead
+            ahead = tuple(rest)
+            behind.append(stop)
             self._move(stop)
             if stop.change_to is not None:
                 pace.arrived()
@@ -117,10 +126,12 @@ class Session:
             if stop.step is not None:
                 reading, settling = self._reading(stop, stop.step)
                 pace.read()
-                rest = stops[k + 1 :]
+                if self._aim.come_to_be_met(last=all(s.step is None for s in ahead)):
+                    done = self._store.done()
+                    ahead = ending(self._cell, self._config, self._plan, behind, done)
                 left = pace.left(
-                    sum(s.step is not None for s in rest),
-                    sum(s.change_to is not None for s in rest),
+                    sum(s.step is not None for s in ahead),
+                    sum(s.change_to is not None for s in ahead),
                 )
                 self._tell(stop.step, reading, total, left, settling)
         self._finish()
@@ -288,6 +299,7 @@ class Session:
                 None if judged is None else judged[0],
                 None if judged is None else judged[1],
                 settling,
+                self._aim.standing.words,
             )
         )
 

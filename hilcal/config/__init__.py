@@ -3,8 +3,6 @@
 from hilcal.config.cell import (
     STANDARD_GRAVITY_M_S2,
     CellConfig,
-    Limits,
-    Load,
     Repeatability,
     Robot,
     Simulation,
@@ -12,6 +10,8 @@ from hilcal.config.cell import (
     Tracker,
     load_config,
 )
+from hilcal.config.loads import Limits, Load
+from hilcal.config.planning import Obstacle, Planning, Sight
 from hilcal.config.rig import Acquire, ForceSensor, Motion, Operator
 
 __all__ = [
@@ -22,9 +22,12 @@ __all__ = [
     "Limits",
     "Load",
     "Motion",
+    "Obstacle",
     "Operator",
+    "Planning",
     "Repeatability",
     "Robot",
+    "Sight",
     "Simulation",
     "Tool",
     "Tracker",

@@ -6,6 +6,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, Strict, model_validator
 
+from hilcal.config.loads import Limits, Load
+from hilcal.config.planning import Obstacle, Planning, Sight
 from hilcal.config.rig import (
     OPTIONS,
     PORT,
@@ -25,6 +27,7 @@ from hilcal.toml import (
     Vector3,
     check_json,
     load_section,
+    suggest,
 )
 from hilcal.types import Floats
 
@@ -176,71 +179,6 @@ class Repeatability(Section):
         return np.broadcast_to(values, n).copy()
 
 
-class Load(Section):
-    """[[loads]]: a load at hand: a dead weight, a pull in base axes, or both."""
-
-    name: str = Field(min_length=1, description='a name other than "none"')
-    mass_kg: NonNegative = Field(0.0, description="a mass in kg, 0 or more")
-    force_N: Vector3 = Field(
-        (0.0, 0.0, 0.0), description="three finite numbers in N, base axes, e.g. [50.0, 0.0, 0.0]"
-    )
-    moment_Nm: Vector3 = Field(
-        (0.0, 0.0, 0.0), description="three finite numbers in N·m, base axes"
-    )
-
-    @model_validator(mode="after")
-    def _some_load(self) -> "Load":
-        if self.name == "none":
-            raise ValueError('the name "none" is kept for the unloaded state; choose another')
-        if self.mass_kg == 0.0 and not any((*self.force_N, *self.moment_Nm)):
-            raise ValueError(
-                f'load "{self.name}" is zero; give mass_kg, force_N or moment_Nm '
-                "(the unloaded state is always there)"
-            )
-        return self
-
-    def wrench(self, gravity: Floats) -> Floats:
-        """Return (6,) force and moment at the load point, base axes, N and N·m.
-
-        force = mass * gravity + force_N; a dead weight hangs from the load point.
-        """
-        force = self.mass_kg * gravity + np.asarray(self.force_N)
-        return np.concatenate([force, np.asarray(self.moment_Nm)])
-
-
-class Limits(Section):
-    """[limits]: what a plan keeps clear of."""
-
-    joint_margin_rad: NonNegative = Field(
-        0.05, description="the distance kept from every joint limit in rad, 0 or more"
-    )
-    torque_share: Annotated[float, Strict(), Field(gt=0, le=1)] = Field(
-        0.9, description="the usable share of the joint torques, more than 0, at most 1"
-    )
-    workspace_min_m: Vector3 | None = Field(
-        None, description=VECTOR_M + ": a corner that flange, target and load point stay above"
-    )
-    workspace_max_m: Vector3 | None = Field(
-        None, description=VECTOR_M + ": a corner that flange, target and load point stay below"
-    )
-    joint_speed_rad_s: Positive = Field(
-        2.0, description="a measured joint speed in rad/s that stops the arm, over 0"
-    )
-
-    @model_validator(mode="after")
-    def _box(self) -> "Limits":
-        low, high = self.workspace_min_m, self.workspace_max_m
-        if (
-            low is not None
-            and high is not None
-            and not all(a < b for a, b in zip(low, high, strict=True))
-        ):
-            raise ValueError(
-                f"workspace_min_m = {list(low)} is not below workspace_max_m = {list(high)}"
-            )
-        return self
-
-
 class Simulation(Section):
     """[simulation]: what a simulated cell hides."""
 
@@ -273,14 +211,43 @@ class CellConfig(Section):
     motion: Motion = Field(default_factory=Motion, description="a section [motion]")
     acquire: Acquire = Field(default_factory=Acquire, description="a section [acquire]")
     limits: Limits = Field(default_factory=Limits, description="a section [limits]")
+    planning: Planning = Field(default_factory=Planning, description="a section [planning]")
+    obstacles: tuple[Obstacle, ...] = Field(
+        (), description="sections [[obstacles]], one per thing that stands in the arm's way"
+    )
+    sight: Sight = Field(default_factory=Sight, description="a section [sight]")
     simulation: Simulation = Field(default_factory=Simulation, description="a section [simulation]")
 
     @model_validator(mode="after")
-    def _distinct_loads(self) -> "CellConfig":
-        names = [load.name for load in self.loads]
-        for name in names:
-            if names.count(name) > 1:
-                raise ValueError(f'two [[loads]] have the name "{name}"; names must differ')
+    def _distinct_names(self) -> "CellConfig":
+        for section, things in (("loads", self.loads), ("obstacles", self.obstacles)):
+            names = [thing.name for thing in things]
+            for name in names:
+                if names.count(name) > 1:
+                    raise ValueError(f'two [[{section}]] have the name "{name}"; names must differ')
+        return self
+
+    @model_validator(mode="after")
+    def _known_work_load(self) -> "CellConfig":
+        names = ["none", *(load.name for load in self.loads)]
+        load = self.planning.work_load
+        if load not in names:
+            raise ValueError(
+                f'[planning] work_load = "{load}" is not in [[loads]]{suggest(load, names)}; '
+                f"valid: {', '.join(names)}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _one_place_of_the_tracker(self) -> "CellConfig":
+        if self.sight.tracker_m is None:
+            return self
+        for key in ("station_m", "base_xyz_m"):
+            if getattr(self.tracker, key) is not None:
+                raise ValueError(
+                    f"[sight] tracker_m together with [tracker] {key}, which tells the tracker's "
+                    "place already; leave tracker_m out"
+                )
         return self
 
     def to_json(self) -> str:

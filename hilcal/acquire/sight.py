@@ -1,0 +1,121 @@
+"""Whether the tracker sees the target: beam and incidence."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilcal.acquire.clearance import TOOL_RADIUS, Clearance
+from hilcal.cell import Cell
+from hilcal.config import CellConfig, Obstacle
+from hilcal.robot import chain as chains
+from hilcal.robot import se3
+from hilcal.robot.scene import FLOOR, Segment
+from hilcal.robot.segments import segment_distance
+from hilcal.types import Bools, Floats
+
+UNKNOWN = (
+    "the tracker's place is not known: whether it sees the target is not checked; give [sight] "
+    "tracker_m"
+)
+_SHY = 1.5  # the beam ends so many radii of tool and beam before the target
+
+
+def tracker_place(cell: Cell, config: CellConfig) -> Floats | None:
+    """Return (3,) where the tracker stands, base axes, m; None where it is not known.
+
+    A known registration T_sensor_base tells it, −Rᵀ p; with positions in base axes
+    [tracker] station_m; else [sight] tracker_m.
+    """
+    if config.tracker.frame == "tracker" and cell.registration_known:
+        return np.asarray(-cell.registration[:3, :3].T @ cell.registration[:3, 3])
+    told = config.tracker.station_m or config.sight.tracker_m
+    return None if told is None else np.array(told)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sight:
+    """The tracker's view of the target.
+
+    Attributes:
+        clearance: the cell's shapes.
+        tracker: (3,) where the tracker stands, base axes, m.
+    """
+
+    clearance: Clearance
+    tracker: Floats
+
+    def free(self, q: Floats, load: str) -> Bools:
+        """Return (N,) in which states nothing is closer to the beam than [sight] clearance_m.
+
+        The beam ends shortly before the target. Not in its way are the way from the flange to
+        the target and what else of the tool is next to it, whose shape is not known; obstacles
+        that the tracker stands in or on; and the floor of a plan, which nothing is built on.
+        """
+        beam = self.beam(q)
+        out = ~self.clearance.scene.touching(q, beam, 0.0)
+        for other in self.clearance.segments(q, load):
+            gap = segment_distance(beam.start, beam.end, other.start, other.end)
+            out &= gap > beam.radius + other.radius
+        return np.asarray(out)
+
+    def incidence(self, q: Floats) -> Floats | None:
+        """Return (N,) angles between the reflector's normal and the beam, rad.
+
+        None where [sight] target_normal is not given.
+        """
+        normal = self.clearance.config.sight.target_normal
+        if normal is None:
+            return None
+        chain = chains.evaluate(self.clearance.cell.arm, q)
+        looks = se3.apply(chain.rotation[-1], np.array(normal) / np.linalg.norm(normal))
+        way = self.tracker - chain.point(self.clearance.cell.target[:3, 3])
+        along = np.sum(looks * way, axis=1)
+        return np.asarray(np.arctan2(np.linalg.norm(se3.cross(looks, way), axis=1), along))
+
+    def problems(self, q: Floats, load: str, where: str) -> dict[tuple[str, ...], str]:
+        """Return why the tracker would not see the target in one state (1, n)."""
+        out: dict[tuple[str, ...], str] = {}
+        most = self.clearance.config.sight.incidence_max_rad
+        angle = self.incidence(q)
+        if angle is not None and float(angle.max()) > most:
+            out["incidence", where] = (
+                f"{where}: the beam meets the reflector at {float(angle.max()):.3g} rad; [sight] "
+                f"incidence_max_rad is {most:g}"
+            )
+        if not self.free(q, load).all():
+            names = self.clearance.scene.blocking(q, self.beam(q))
+            names += tuple(x.name for x in self.clearance.segments(q, load) if not names)
+            out["sight", where] = f"{where}: {' and '.join(names)} between tracker and target"
+        return out
+
+    def beam(self, q: Floats) -> Segment:
+        """Return the beam in N states (N, n)."""
+        config, cell = self.clearance.config, self.clearance.cell
+        radius = config.sight.clearance_m
+        target = chains.evaluate(cell.arm, q).point(cell.target[:3, 3])
+        way = target - self.tracker
+        length = np.linalg.norm(way, axis=1, keepdims=True)
+        gap = np.minimum(_SHY * (TOOL_RADIUS + radius), 0.5 * length)
+        end = target - gap * way / np.where(length > 0.0, length, 1.0)
+        start = np.broadcast_to(self.tracker, end.shape)
+        stands = [x.name for x in config.obstacles if _holds(x, self.tracker, radius)]
+        near = self.clearance.near(cell.target[:3, 3], radius)
+        return Segment("beam", start, end, max(radius, 1e-4), near.union(stands, {FLOOR}))
+
+
+def sight_of(clearance: Clearance) -> Sight | None:
+    """Return the tracker's view; None where its place is not known."""
+    place = tracker_place(clearance.cell, clearance.config)
+    return None if place is None else Sight(clearance, place)
+
+
+def _holds(thing: Obstacle, point: Floats, margin: float) -> bool:
+    """Whether a point is in an obstacle, or closer to it than `margin` along each axis."""
+    if thing.center_m is not None and thing.size_m is not None:
+        off = np.abs(point - np.array(thing.center_m)) - 0.5 * np.array(thing.size_m)
+        return bool(np.all(off <= margin))
+    if thing.bottom_m is None or thing.radius_m is None or thing.height_m is None:
+        return False
+    off = point - np.array(thing.bottom_m)
+    upright = -margin <= off[2] <= thing.height_m + margin
+    return bool(upright and np.hypot(off[0], off[1]) <= thing.radius_m + margin)

@@ -1,0 +1,172 @@
+"""The room that an arm takes: capsules on its bodies.
+
+Universal Robots' arms have figures of their own; any other arm gets a capsule per link whose
+radius is a share of its reach. A capsule is all points within `radius` of a segment.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilcal.robot.arm import Arm
+from hilcal.types import Floats
+
+BASE = "base"
+_JOINTS = 6
+_RIM = 0.5  # of the radius: a housing's rounded end; so much shorter is the capsule's segment
+_THICK, _THIN = 0.047, 0.03  # radii of an unknown arm at base and flange, shares of its reach
+_SHORT = 1e-6  # m
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Capsule:
+    """A capsule that moves with a body.
+
+    Attributes:
+        name: what it is, for people.
+        body: 0 the base, i what joint i moves.
+        start: (3,) one end of the segment in the body's frame, m.
+        end: (3,) the other end, m.
+        radius: m.
+    """
+
+    name: str
+    body: int
+    start: Floats
+    end: Floats
+    radius: float
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """Sizes of an arm of Universal Robots' build, m.
+
+    Attributes:
+        shoulder: offset of the upper arm's tube along the shoulder's axis.
+        elbow: offset of the forearm's tube along the same direction.
+        housings: radii of the housings on joints 1, 2, 3 and on the wrists.
+        tubes: radii of the tubes of upper arm and forearm.
+    """
+
+    shoulder: float
+    elbow: float
+    housings: tuple[float, float, float, float]
+    tubes: tuple[float, float]
+
+
+# Offsets: the manufacturer's ROS 2 description package, config/*/physical_parameters.yaml,
+# `offsets`. Radii of UR5e and UR10e: the collision capsules of the MuJoCo Menagerie
+# (universal_robots_ur5e, universal_robots_ur10e); those of their CB3 predecessors and of the
+# UR16e, which share the joints, are taken equal. Radii of UR3(e), UR20 and UR30: a housing of
+# the joint torque T has 78 mm (T / 330 N·m)^0.27, which gives 60 mm for the 150 N·m joint and
+# 40 mm for the 28 N·m joint of those two arms within 3 mm. All radii are below half of the data
+# sheets' footprints of 128 (UR3e), 149 (UR5e), 190 (UR10e) and 245 mm (UR20), as they must be.
+_UR5 = ((0.060, 0.060, 0.055, 0.040), (0.050, 0.038))
+_UR10 = ((0.078, 0.078, 0.058, 0.050), (0.060, 0.043))
+_UR3 = ((0.049, 0.049, 0.041, 0.033), (0.040, 0.030))
+_UR20 = ((0.099, 0.099, 0.084, 0.060), (0.078, 0.062))
+_FIGURES = {
+    "ur3": Figures(0.1198, 0.0275, *_UR3),
+    "ur3e": Figures(0.120, 0.027, *_UR3),
+    "ur5": Figures(0.13585, 0.0165, *_UR5),
+    "ur5e": Figures(0.138, 0.007, *_UR5),
+    "ur10": Figures(0.220941, 0.049042, *_UR10),
+    "ur10e": Figures(0.1762, 0.0393, *_UR10),
+    "ur16e": Figures(0.1762, 0.0393, *_UR10),
+    "ur20": Figures(0.260, 0.043, *_UR20),
+    "ur30": Figures(0.260, 0.043, *_UR20),
+}
+
+
+def is_known(arm: Arm) -> bool:
+    """Whether the arm's sizes are known; else they are guessed from its reach."""
+    parallel = arm.n == _JOINTS and min(abs(arm.links[k][2, 2]) for k in (2, 3)) > 0.99
+    return arm.name in _FIGURES and bool(parallel)  # a file of the same name may be another arm
+
+
+def capsules(arm: Arm) -> tuple[Capsule, ...]:
+    """Return the capsules of base and bodies, those of one body side by side.
+
+    Real housings are cylinders with rounded ends; the capsules hold them but for a rim of at
+    most an eighth of the radius, which the margins of collision checks cover.
+    """
+    return _of_ur(arm, _FIGURES[arm.name]) if is_known(arm) else _of_any(arm)
+
+
+def flange_capsule(arm: Arm, name: str, start: Floats, end: Floats, radius: float) -> Capsule:
+    """Return a capsule that the flange carries.
+
+    Args:
+        arm: the arm.
+        name: what it is.
+        start: (3,) one end, flange axes, m.
+        end: (3,) the other end, flange axes, m.
+        radius: m.
+    """
+    axes, origin = arm.links[arm.n][:3, :3], arm.links[arm.n][:3, 3]
+    return Capsule(name, arm.n, origin + axes @ start, origin + axes @ end, radius)
+
+
+def _of_ur(arm: Arm, figures: Figures) -> tuple[Capsule, ...]:
+    """Housings about the joint axes and tubes between them."""
+    r1, r2, r3, r4 = figures.housings
+    upper, fore = figures.tubes
+    d1, d4 = (float(arm.links[k][2, 3]) for k in (1, 4))
+    at = _Along
+    x2, x3 = arm.links[2][:3, 3], arm.links[3][:3, 3]
+    inner, outer = figures.elbow, figures.shoulder
+    between = 0.5 * (inner + outer)
+    lift = arm.links[1][:3, 2]  # the shoulder's axis, in the frame of body 1
+    top = np.array([0.0, 0.0, d1])
+    spin = arm.links[4][:3, 2]  # the second wrist's axis, in the frame of body 4
+    d5 = float(arm.links[5][2, 3])
+    out = [
+        at(BASE, 0, np.zeros(3), 0.0, 0.6 * d1, r1).capsule(),
+        Capsule("shoulder", 1, 0.6 * top, top, r1),
+        Capsule("shoulder", 1, top, top + 0.5 * outer * lift, r2),
+        at("upper arm", 2, np.zeros(3), 0.5 * outer, outer + r2, r2).capsule(),
+        Capsule("upper arm", 2, outer * _Z, x2 + outer * _Z, upper),
+        at("upper arm", 2, x2, between, outer + r3, r3).capsule(),
+        at("forearm", 3, np.zeros(3), inner - r3, between, r3).capsule(),
+        Capsule("forearm", 3, inner * _Z, x3 + inner * _Z, fore),
+        at("forearm", 3, x3, inner - r4, inner + r4, r4).capsule(),
+        at("wrist 1", 4, np.zeros(3), inner + r4, d4 + r4, r4).capsule(),
+        Capsule("wrist 1", 4, d4 * _Z, d4 * _Z + 0.4 * d5 * spin, r4),
+        at("wrist 2", 5, np.zeros(3), 0.4 * d5, d5 + r4, r4).capsule(),
+        Capsule("wrist 3", 6, np.zeros(3), arm.links[6][:3, 3] - _RIM * r4 * _Z, r4),
+    ]
+    return tuple(out)
+
+
+_Z = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Along:
+    """A housing about an axis along z through `origin`, from `low` to `high`."""
+
+    name: str
+    body: int
+    origin: Floats
+    low: float
+    high: float
+    radius: float
+
+    def capsule(self) -> Capsule:
+        """Capsule in the housing: its segment ends half a radius within, or in its middle."""
+        rim = min(_RIM * self.radius, 0.5 * (self.high - self.low))
+        ends = self.origin + np.array([[self.low + rim], [self.high - rim]]) * _Z
+        return Capsule(self.name, self.body, ends[0], ends[1], self.radius)
+
+
+def _of_any(arm: Arm) -> tuple[Capsule, ...]:
+    """One capsule per link, from its joint's frame to the next one's."""
+    reach = max(arm.reach, 0.1)
+    radii = np.linspace(_THICK, _THIN, arm.n + 1) * reach
+    names = (BASE, *arm.joint_names)
+    out = []
+    for k, link in enumerate(arm.links):
+        end = link[:3, 3]
+        if float(np.linalg.norm(end)) > _SHORT:
+            out.append(Capsule(names[k], k, np.zeros(3), end, float(radii[k])))
+    return tuple(out)
