@@ -48,8 +48,7 @@ def spread_plan(
             f"{n_poses} poses with {repeats} repeats, reference every {reference_every}; valid: "
             "at least one pose, at most as many repeats, every one reading or more"
         )
-    pulls = np.array([load.wrench(cell.gravity) for load in config.loads]).reshape(-1, 6)
-    space = Space(cell, config, pulls)
+    space = Space(cell, config)
     home, poses = _poses(space, n_poses, rng)
     names = tuple(f"p{k + 1}" for k in range(n_poses))
     order = _tour(space, home, poses)

@@ -1,0 +1,237 @@
+"""What a plan takes for granted: the model that will be fitted, and its parameters."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hilcal.cell import Cell
+from hilcal.config import CellConfig
+from hilcal.data.readings import States
+from hilcal.effects.catalogue import catalogue, effect_class, make
+from hilcal.effects.options import Options, reading_options
+from hilcal.effects.protocol import Effect
+from hilcal.errors import InputError
+from hilcal.identify.fit import Fit
+from hilcal.identify.gauss_newton import prior_of
+from hilcal.model import Model
+from hilcal.types import Floats, Ints
+
+DISTANCE = 2.0
+"""Reaches from the base to a tracker whose place is not given."""
+HARMONICS = 4
+"""Harmonics of a transmission error that is planned for: the coarse ones, as a fit to few poses
+tries them."""
+FRAME_PRIOR = {"prior_m": 3e-3, "prior_rad": 6e-3}
+"""In deflections the frames act only by turning them; they are known from the positions, about
+as well as the arm's elastic sag lets them be."""
+DURATION_S = 3600.0
+_SEED = 20240607
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Assumed:
+    """The model that is planned for.
+
+    Attributes:
+        model: frames where unknown, and effects; its cell has a tracker in its place.
+        theta: (P,) parameters, SI.
+        live: (L,) indices of the parameters that are not held at zero.
+        prior_std: (P,) prior standard deviations, infinite where nothing is known, SI.
+        station: (3,) where the beam starts, sensor axes, m.
+        m: elements of a reading: 3 or 6.
+        fit: of what has been measured already; None at first.
+        notes: what was assumed, one line each.
+    """
+
+    model: Model
+    theta: Floats
+    live: Ints
+    prior_std: Floats
+    station: Floats
+    m: int
+    fit: Fit | None
+    notes: tuple[str, ...]
+
+    @property
+    def cell(self) -> Cell:
+        """The cell, registered."""
+        return self.model.cell
+
+
+def assumed(cell: Cell, config: CellConfig, m: int = 3) -> Assumed:
+    """Return the model of `[planning]` with ordinary parameters.
+
+    What is planned hardly depends on the parameters: deflections are linear in them to about
+    1e-3. Compliances are ordinary, all else is zero.
+
+    Args:
+        cell: the cell as configured.
+        config: its configuration.
+        m: 3 for positions, 6 for poses.
+
+    Raises:
+        InputError: an unknown effect (lists the valid ones).
+    """
+    place, given = tracker_place(cell, config)
+    notes = []
+    if not given:
+        notes.append(
+            f"the tracker's place is not configured: taken to be {_metres(place)} in base axes "
+            "([sight] tracker_m tells it)"
+        )
+    registered, station = _registered(cell, config, place)
+    frames = [
+        name
+        for name, known in (
+            ("base_frame", cell.registration_known),
+            ("target_offset", cell.target_known),
+        )
+        if not known
+    ]
+    names = tuple(dict.fromkeys((*frames, *checked(config.planning.model, "model"))))
+    prior = FRAME_PRIOR if config.planning.readings == "deflection" else {}
+    effects = tuple(build(name, registered, m, prior if name in frames else {}) for name in names)
+    model = Model(registered, effects)
+    parts = [
+        np.array([p.scale for p in e.parameters])
+        if e.name == "joint_compliance"
+        else np.zeros(len(e.parameters))
+        for e in effects
+    ]
+    notes += random_columns(effects)
+    theta = np.concatenate(parts)
+    prior_std = _prior_std(model)
+    return Assumed(model, theta, np.arange(model.size), prior_std, station, m, None, tuple(notes))
+
+
+def after(fit: Fit, config: CellConfig) -> Assumed:
+    """Return the model and the parameters of what has been measured already.
+
+    Args:
+        fit: the newest revision of the campaign.
+        config: the configuration of the cell that is planned for.
+
+    Raises:
+        InputError: a fit whose residual is not whitened, or an effect that needs what no plan
+            tells, as a temperature.
+    """
+    if fit.scaling != "gc":
+        raise InputError(f"planning on needs a fit with scaling gc, this one has {fit.scaling}")
+    cell, prior = replace(fit.model.cell, registration_known=True), fit.solution.prior
+    _, station = _registered(cell, config, tracker_place(cell, config)[0])
+    # The fit weighs its priors against the noise factor β.
+    std = np.where(np.isinf(prior), np.inf, prior / np.sqrt(fit.solution.beta))
+    names = " + ".join(fit.model.names)
+    count = len(fit.readings) - int(fit.outlier.sum())
+    notes = (
+        f"planned on from {count} readings, fitted with {names}",
+        *random_columns(fit.model.effects),
+    )
+    live = np.flatnonzero(prior > 0)
+    return Assumed(fit.model, fit.theta, live, std, station, fit.readings.m, fit, notes)
+
+
+def build(name: str, cell: Cell, m: int, options: Options | None = None) -> Effect:
+    """Make an effect for a plan; a transmission error has its coarse harmonics."""
+    own: dict[str, object] = {"harmonics": HARMONICS} if name == "transmission_error" else {}
+    own |= {"reference_s": 0.0, "span_s": DURATION_S} if name == "tracker_drift" else {}
+    states = nominal_states(np.zeros((1, cell.arm.n)), np.zeros((1, 6)))
+    return make(name, cell, states, {**own, **reading_options(name, m), **(options or {})})
+
+
+def random_columns(effects: tuple[Effect, ...]) -> tuple[str, ...]:
+    """Say of which effects a plan has to guess what they need, one line each.
+
+    Raises:
+        InputError: an effect that needs what no plan tells, as a temperature.
+    """
+    known = nominal_states(np.zeros((1, 1)), np.zeros((1, 6)))
+    for e in effects:
+        if not type(e).computable(known):
+            raise InputError(
+                f"effect {e.name} needs {', '.join(e.needs)}, which no plan tells; leave it out"
+            )
+    return tuple(
+        f"{e.name}: {', '.join(e.needs)} of the readings taken at random, as a shuffled order "
+        "would give them"
+        for e in effects
+        if e.needs
+    )
+
+
+def checked(names: tuple[str, ...], key: str) -> tuple[str, ...]:
+    """Return the names of effects, each once.
+
+    Raises:
+        InputError: an unknown effect (lists the valid ones).
+    """
+    for name in names:
+        try:
+            effect_class(name)
+        except InputError as error:
+            raise InputError(f"[planning] {key}: {error}") from None
+    return tuple(dict.fromkeys(names))
+
+
+def potential_names(config: CellConfig, model: Model) -> tuple[str, ...]:
+    """Names of the effects that `[planning] against` asks for, without those of the model.
+
+    Of the whole catalogue those are left out that need what only the order of a plan tells, as
+    the time or the side of approach.
+
+    Raises:
+        InputError: an unknown effect (lists the valid ones).
+    """
+    asked = config.planning.against
+    if asked == "catalogue":
+        names = tuple(name for name, kind in catalogue().items() if not kind.needs)
+    else:
+        names = checked(asked, "against")
+    return tuple(name for name in names if name not in model.names)
+
+
+def tracker_place(cell: Cell, config: CellConfig) -> tuple[Floats, bool]:
+    """Return where the tracker stands, (3,) base axes in m, and whether anything tells it."""
+    tracker, sight = config.tracker, config.sight
+    if tracker.frame == "tracker" and cell.registration_known:
+        rotation, origin = cell.registration[:3, :3], cell.registration[:3, 3]
+        return np.asarray(-rotation.T @ origin), True
+    for given in (tracker.station_m, sight.tracker_m):
+        if given is not None:
+            return np.array(given), True
+    reach = cell.arm.reach
+    return np.array([DISTANCE * reach, 0.0, 0.5 * reach]), False
+
+
+def nominal_states(q: Floats, wrench: Floats) -> States:
+    """Return states (N) with a time and sides of approach, as a shuffled order would have them.
+
+    Args:
+        q: (N, n) joint angles, rad.
+        wrench: (N, 6) at the load point, base axes, N and N·m.
+    """
+    rng = np.random.default_rng(_SEED)
+    time = rng.uniform(0.0, DURATION_S, len(q))
+    return States(q=q, wrench=wrench, time=time, approach=rng.choice([-1.0, 1.0], q.shape))
+
+
+def _registered(cell: Cell, config: CellConfig, place: Floats) -> tuple[Cell, Floats]:
+    """Cell with a registration, and the beam's start (3,) in sensor axes."""
+    if config.tracker.frame == "base":
+        return cell, place
+    if cell.registration_known:
+        return cell, np.zeros(3)
+    registration = np.eye(4)
+    registration[:3, 3] = -place
+    return replace(cell, registration=registration), np.zeros(3)
+
+
+def _prior_std(model: Model) -> Floats:
+    """(P,) what effects know of their parameters; a shrunk family is ordinary."""
+    prior, groups = prior_of(model)
+    scale = np.array([p.scale for e in model.effects for p in e.parameters])
+    return np.asarray(np.where(groups >= 0, scale, prior))
+
+
+def _metres(x: Floats) -> str:
+    return "[" + ", ".join(f"{v:.2g}" for v in x) + "] m"

@@ -1,0 +1,193 @@
+"""Choosing units by a criterion, and the loads that are worth hanging."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.plan.criteria import A, D, Linear
+from hilcal.plan.criterion import Criterion
+from hilcal.plan.extremes import E, K
+from hilcal.plan.information import Problem
+from hilcal.plan.optimum import Curve, Design, best, curve
+from hilcal.plan.relaxation import relax
+from hilcal.plan.rivals import rivals
+from hilcal.plan.separation import Separate
+from hilcal.plan.units import Units
+from hilcal.plan.work import WorkPoses
+from hilcal.types import Bools, Floats, Ints
+
+CRITERIA = ("D", "A", "E", "K", "test", "separate")
+LOOSE = 3e-3
+"""Relative gap at which sets of loads are compared."""
+EFFORT = 200
+"""Of the search for whole numbers: 98 % of the best in a second; more gains a part per thousand."""
+SAMPLE = 150
+"""Poses by which sets of loads are compared."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Question:
+    """What a plan is to be best at.
+
+    D, A, test: all parameters, the potential terms with their priors among them; of A and test
+    only the model's count, the others are in its way. E and K are of the model's parameters
+    alone, as the observability indices of the literature are, without those that have a prior.
+
+    Attributes:
+        criterion: φ.
+        units: the units by the parameters that φ is of.
+        prior: (P, P) what is known before of these.
+        names: of the parameters.
+    """
+
+    criterion: Criterion
+    units: Units
+    prior: Floats
+    names: tuple[str, ...]
+
+
+def question(problem: Problem, name: str, work: WorkPoses | None) -> Question:
+    """Return what a criterion asks of a problem.
+
+    Args:
+        problem: the design problem.
+        name: "D", "A", "E", "K", "test" or "separate".
+        work: the test poses, for "test".
+
+    Raises:
+        InputError: an unknown name, or "test" without test poses.
+    """
+    names = tuple(t.name for t in problem.terms)
+    size = problem.model_size
+    whole = Question(D(), problem.units, problem.prior, names)
+    if name == "D":
+        return whole
+    if name == "A":
+        return replace(whole, criterion=A(np.arange(size)))
+    if name == "test":
+        if work is None:
+            raise InputError('criterion "test" needs test poses; see [planning] work_q_rad')
+        return replace(whole, criterion=Linear(work.matrix(len(names))))
+    if name == "separate":
+        apart = rivals(problem)
+        return replace(whole, criterion=Separate(apart.pairs), prior=apart.prior)
+    if name in ("E", "K"):
+        free = unknown(problem)
+        own = Units(np.ascontiguousarray(problem.units.rows[:, :, free]), problem.units.cost)
+        known = problem.measured[np.ix_(free, free)]
+        return Question(E() if name == "E" else K(), own, known, tuple(names[k] for k in free))
+    raise InputError(f"criterion {name!r}; valid: {', '.join(CRITERIA)}")
+
+
+def unknown(problem: Problem) -> Ints:
+    """Return the indices of the model's parameters that have no prior."""
+    live = problem.assumed.live
+    return np.flatnonzero(np.isinf(problem.assumed.prior_std[live]))
+
+
+def choose(
+    asked: Question, budget: float, rng: np.random.Generator, effort: int = EFFORT
+) -> Design:
+    """Return the units to take; see `optimum.best`."""
+    return best(
+        asked.units, asked.criterion, budget, asked.prior, rng, names=asked.names, effort=effort
+    )
+
+
+def promising(asked: Question, budget: float) -> Ints:
+    """Return the units that a plan is likely to be made of: those of the best prices."""
+    found = relax(
+        asked.units, asked.criterion, budget, asked.prior, names=asked.names, tolerance=LOOSE
+    )
+    count = min(2 * len(found.index), len(asked.units))
+    best_first = np.argsort(-found.price / asked.units.cost, kind="stable")
+    return np.union1d(found.index, best_first[:count])
+
+
+def enough(asked: Question, budgets: Sequence[float]) -> Curve:
+    """Return what smaller and larger budgets buy."""
+    return curve(
+        asked.units, asked.criterion, np.asarray(budgets, dtype=float), asked.prior,
+        names=asked.names,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Loads:
+    """Loads that are worth hanging.
+
+    Attributes:
+        names: those that are kept.
+        budget: readings for them within the time.
+        left_out: those that are not, with the gain of leaving each out as a share of φ.
+    """
+
+    names: tuple[str, ...]
+    budget: float
+    left_out: tuple[tuple[str, float], ...]
+
+
+def worthwhile(
+    asked: Question, problem: Problem, budget: float, change: float, rng: np.random.Generator
+) -> Loads:
+    """Leave out loads, one after the other, while the same time buys more without them.
+
+    Hanging a load costs as much time as so many readings; a plan without it takes these
+    instead. Compared are the continuous optima over some of the poses.
+
+    Args:
+        asked: the question.
+        problem: the design problem.
+        budget: readings of the plan with all loads.
+        change: readings that fit into the time of one load change.
+        rng: generator.
+    """
+    poses = np.array([pose for pose, _ in problem.what])
+    few = rng.permutation(len(problem.candidates))[:SAMPLE]
+    sample = np.isin(poses, few)
+    keep = tuple(name for name in problem.candidates.loads[1:] if _uses(problem, name).any())
+    left: list[tuple[str, float]] = []
+    now = _value(asked, problem, sample, keep, budget)
+    while len(keep) > 1 and change > 0 and now > 0:
+        tried = [
+            (_value(asked, problem, sample, tuple(k for k in keep if k != name), budget + change),
+             name)
+            for name in keep
+        ]  # fmt: skip
+        value, name = max(tried)
+        if not value > now * (1.0 + LOOSE):
+            break
+        left.append((name, value / now - 1.0))
+        keep, now, budget = tuple(k for k in keep if k != name), value, budget + change
+    return Loads(keep, float(np.floor(budget + 1e-9)), tuple(left))
+
+
+def only(asked: Question, wanted: Bools) -> Question:
+    """Return the question with some of the units."""
+    return replace(asked, units=Units(asked.units.rows[wanted], asked.units.cost[wanted]))
+
+
+def within(problem: Problem, loads: Sequence[str]) -> Bools:
+    """(K,) which units take no other loads than these."""
+    allowed = {*loads, problem.candidates.loads[0]}
+    return np.array([set(names) <= allowed for _, names in problem.what])
+
+
+def _uses(problem: Problem, load: str) -> Bools:
+    return np.array([load in names for _, names in problem.what])
+
+
+def _value(
+    asked: Question, problem: Problem, sample: Bools, loads: tuple[str, ...], budget: float
+) -> float:
+    """φ of the continuous optimum; 0 where these loads do not determine everything."""
+    some = only(asked, sample & within(problem, loads))
+    try:
+        found = relax(
+            some.units, some.criterion, budget, some.prior, names=some.names, tolerance=LOOSE
+        )
+    except (CannotAnswerError, InputError):
+        return 0.0
+    return float(found.value)

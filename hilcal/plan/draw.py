@@ -1,0 +1,156 @@
+"""Candidate poses: drawn evenly over the joint space, those that the cell allows."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import qmc
+
+from hilcal.data.plan import UNLOADED
+from hilcal.errors import CannotAnswerError
+from hilcal.plan.feasible import REASONS, Space
+from hilcal.types import Bools, Floats
+
+_CHUNK = 1 << 12
+_VAIN = 1 << 15  # drawn states after which nothing will come
+_MOST = 1 << 19, 64  # drawn at most: so many states, or so many per candidate
+_FUNNEL = (  # cheap ones and those that leave little first
+    "joint limits",
+    "payload",
+    "workspace",
+    "incidence",
+    "torque",
+    "force sensor",
+    "singularity",
+    "self-collision",
+    "obstacle",
+    "sight",
+    "hanging",
+)
+_OF_LOADS = ("payload", "torque", "force sensor", "hanging", "sight")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drawn:
+    """K poses that are allowed unloaded, and the loads that each may bear.
+
+    Attributes:
+        q: (K, n) joint angles, rad.
+        loads: 1 + L names, "none" first.
+        allowed: (K, 1 + L) which loads each pose bears.
+        drawn: how many states were looked at.
+        left: by reason, how many of them were left after it, in the order of checking.
+        remarks: what people should know.
+    """
+
+    q: Floats
+    loads: tuple[str, ...]
+    allowed: Bools
+    drawn: int
+    left: dict[str, int]
+    remarks: tuple[str, ...]
+
+
+def draw(
+    space: Space,
+    count: int,
+    rng: np.random.Generator,
+    *,
+    least: int = 1,
+    also: Floats | None = None,
+    most: int | None = None,
+) -> Drawn:
+    """Return poses from a Sobol sequence over the joint space, turned by a random shift.
+
+    Args:
+        space: what the cell allows.
+        count: poses wanted; fewer where the cell leaves fewer.
+        rng: shift of the sequence.
+        least: so many have to be found.
+        also: (M, n) states that are looked at first, rad.
+        most: so many states are drawn at most; by default many times `count`.
+
+    Raises:
+        CannotAnswerError: too few poses, or no load that any of them bears; names the
+            constraint that leaves nothing.
+    """
+    low, high = space.low, space.high
+    if np.any(low >= high):
+        j = int(np.argmax(low - high)) + 1
+        raise CannotAnswerError(f"joint_margin_rad leaves joint {j} no range; lower it")
+    sequence = qmc.Sobol(len(low), scramble=False)
+    shift = rng.random(len(low))
+    left = dict.fromkeys(_FUNNEL, 0)
+    found = [np.empty((0, len(low)))]
+    drawn = have = 0
+    most = max(_MOST[0], _MOST[1] * count) if most is None else most
+    if also is not None:
+        found.append(_kept(space, also, left))
+        drawn, have = len(also), len(found[-1])
+    while have < count and drawn < (most if have else _VAIN):
+        u = (sequence.random(_CHUNK) + shift) % 1.0
+        found.append(_kept(space, low + u * (high - low), left))
+        drawn += _CHUNK
+        have += len(found[-1])
+    if have < least:
+        raise CannotAnswerError(_too_few(drawn, left, least))
+    q = np.vstack(found)[:count]
+    allowed = np.ones((len(q), len(space.loads)), dtype=np.bool_)
+    remarks = [*space.remarks]
+    if len(q) < count:
+        remarks.append(f"{drawn:,} drawn states gave {len(q):,} of {count:,} candidates")
+    for k, load in enumerate(space.loads[1:], start=1):
+        allowed[:, k] = space.allowed(q, load, _OF_LOADS)
+        if not allowed[:, k].any():
+            remarks.append(_unusable(space, q, load))
+    if len(space.loads) > 1 and not allowed[:, 1:].any():
+        raise CannotAnswerError("; ".join(remarks[-(len(space.loads) - 1) :]))
+    return Drawn(q, space.loads, allowed, drawn, left, tuple(remarks))
+
+
+def _kept(space: Space, q: Floats, left: dict[str, int]) -> Floats:
+    """Those of the states that are allowed unloaded; counts what each reason leaves."""
+    for reason in _FUNNEL:
+        if len(q):
+            q = q[space.keeps(reason, q, UNLOADED)]
+        left[reason] += len(q)
+    return q
+
+
+def _too_few(drawn: int, left: dict[str, int], least: int) -> str:
+    """What leaves too few: the first reason that leaves none, else the one that takes most."""
+    counts = list(left.values())
+    names = list(left)
+    before = [drawn, *counts[:-1]]
+    share = np.array(counts) / np.maximum(before, 1)
+    worst = counts.index(0) if 0 in counts else int(np.argmin(share))
+    told = [
+        f"{n:,} {REASONS[reason][0]}"
+        for reason, n, b in zip(names[: worst + 1], counts, before, strict=False)
+        if n < b
+    ]
+    head = "no pose" if counts[-1] == 0 else f"only {counts[-1]:,} poses, {least:,} are needed"
+    return f"{head}: of {drawn:,} drawn states {', '.join(told)} ({REASONS[names[worst]][1]})"
+
+
+def _unusable(space: Space, q: Floats, load: str) -> str:
+    """Why no pose bears a load."""
+    hung = space.shapes.load(load)
+    mass = space.cell.tool_mass + (0.0 if hung is None else hung.mass_kg)
+    if mass > space.cell.arm.payload:
+        return (
+            f'load "{load}": tool and load are {mass:.4g} kg; the payload of '
+            f"{space.cell.arm.name} is {space.cell.arm.payload:g} kg"
+        )
+    told = []
+    before = len(q)
+    for reason in _OF_LOADS:
+        q = q[space.keeps(reason, q, load)]
+        if len(q) < before:
+            told.append(f"{len(q):,} {REASONS[reason][0]}")
+        if not len(q):
+            return (
+                f'load "{load}": no pose: of {before:,} feasible poses {", ".join(told)} '
+                f"({REASONS[reason][1]})"
+            )
+        before = len(q)
+    return f'load "{load}": no pose'

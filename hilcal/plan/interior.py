@@ -1,0 +1,221 @@
+"""The continuous optimum over some units: a primal-dual interior-point method."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg as sl
+
+from hilcal.plan.bound import prices, upper_bound
+from hilcal.plan.criterion import Criterion, Smooth
+from hilcal.types import Floats
+
+_STEPS = 80
+_BACK = 0.995  # share of the way to the boundary
+_CENTRAL = 1.0  # square of Newton's decrement at which μ may fall
+_CLAMP = 1e4  # how far a dual may be from μ / w
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Program:
+    """Maximise φ(M0 + Σ w_k A_kᵀA_k) over w with Σ w_k c_k ≤ B, 0 ≤ w_k ≤ most.
+
+    Attributes:
+        criterion: φ.
+        rows: (n, R, P) A.
+        cost: (n,) c.
+        budget: B.
+        most: bound of each weight; infinity for none.
+        prior: (P, P) M0.
+    """
+
+    criterion: Criterion
+    rows: Floats
+    cost: Floats
+    budget: float
+    most: float
+    prior: Floats
+
+    def information(self, weight: Floats) -> Floats:
+        """Return (P, P) M."""
+        root = (self.rows * np.sqrt(weight)[:, None, None]).reshape(-1, self.rows.shape[2])
+        return np.asarray(self.prior + root.T @ root)
+
+    def bound(self, smooth: Smooth) -> float:
+        """Return the bound of φ over these units."""
+        above = prices(self.rows, smooth.above)
+        below = None if smooth.below is None else prices(self.rows, smooth.below)
+        return upper_bound(smooth, self.prior, above, self.cost, self.budget, self.most, below)
+
+    def curvature(self, smooth: Smooth) -> Floats:
+        """Return (n, n) −∂²f/∂w_k∂w_l, positive semidefinite."""
+        n, size, p = self.rows.shape
+        flat = self.rows.reshape(-1, p)
+        out = np.zeros((n, n))
+        if size * size <= p:  # by the rows
+            for c, x, y in smooth.products:
+                left = flat @ x @ flat.T
+                left *= left if y is x else flat @ y @ flat.T
+                out -= c * left.reshape(n, size, n, size).sum(axis=3).sum(axis=1)
+        else:  # by the matrices
+            h = np.matmul(self.rows.transpose(0, 2, 1), self.rows)
+            for c, x, y in smooth.products:
+                out -= c * (h.reshape(n, -1) @ (x @ h @ y).reshape(n, -1).T)
+        for c, v in smooth.squares:
+            price = prices(self.rows, v)
+            out -= c * np.outer(price, price)
+        return np.asarray(0.5 * (out + out.T))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Optimum:
+    """A continuous optimum.
+
+    Attributes:
+        weight: (n,) w.
+        smooth: f there, with the matrices of the bound.
+        value: φ.
+        bound: of φ over these units.
+        order: of the surrogate.
+    """
+
+    weight: Floats
+    smooth: Smooth
+    value: float
+    bound: float
+    order: float
+
+    @property
+    def gap(self) -> float:
+        """How far φ may be below the optimum, relative."""
+        return self.bound / self.value - 1.0 if self.value > 0.0 else np.inf
+
+
+def solve(program: Program, start: Floats, tolerance: float, order: float = 1.0) -> Optimum:
+    """Return the optimum to a relative gap.
+
+    Newton's method on the barrier problem f(w) + μ Σ log w_k + μ Σ log(most − w_k), with the
+    duals z of the bounds as variables of their own (Wright 1997, Primal-Dual Interior-Point
+    Methods), μ falling to 0. Criteria with a kink have a surrogate of order μ.
+
+    Args:
+        program: the units.
+        start: (n,) weights over 0, under `most`, that spend the budget.
+        tolerance: relative gap at which to stop.
+        order: μ n at the start, about the relative gap of the start.
+    """
+    w, n = start, len(start)
+    capped = np.isfinite(program.most)
+    m = program.information(w)
+    mu = max(min(order, 1.0), tolerance) / n
+    z = mu / w
+    y = mu / (program.most - w) if capped else np.zeros(n)
+    best: Optimum | None = None
+    central = False
+    for step in range(_STEPS):
+        surrogate = program.criterion.surrogate(m, mu)
+        smooth = surrogate(m)
+        if smooth is None:
+            break
+        value = float(program.criterion.value(m))
+        found = Optimum(w, smooth, value, program.bound(smooth), mu)
+        if best is None or found.gap < best.gap:
+            best = found
+        if found.gap <= tolerance or step == _STEPS - 1:
+            break
+        if central:
+            mu = max(0.2 * mu, 0.1 * tolerance / n)
+            central, z, y = False, 0.2 * z, 0.2 * y
+            surrogate = program.criterion.surrogate(m, mu)
+            smooth = surrogate(m) or smooth
+        slope = prices(program.rows, smooth.gradient)
+        top = program.most - w if capped else np.ones(n)
+        lean = slope + mu / w - (mu / top if capped else 0.0)
+        move = _newton(program, program.curvature(smooth) + np.diag(z / w + y / top), lean, w)
+        if move is None:
+            break
+        length = min(1.0, _BACK * _room(w, move))
+        if capped:
+            length = min(length, _BACK * _room(top, -move))
+        push = float(lean @ move)
+        length = _search(program, surrogate, smooth, w, move, length, mu, push)
+        if length == 0.0 and (program.criterion.kinked or mu <= tolerance / (10 * n)):
+            break
+        z = _dual(z, mu / w - z - z / w * move)
+        if capped:
+            y = _dual(y, mu / top - y + y / top * move)
+        w = w + length * move
+        m = program.information(w)
+        z = np.clip(z, mu / (_CLAMP * w), _CLAMP * mu / w)
+        complement = float(z @ w) / n
+        if capped:
+            top = program.most - w
+            y = np.clip(y, mu / (_CLAMP * top), _CLAMP * mu / top)
+            complement = 0.5 * (complement + float(y @ top) / n)
+        if program.criterion.kinked:  # μ is also the width of the kink: it falls only where central
+            central = push <= _CENTRAL * mu
+        else:
+            fall = 0.1 if length > 0.9 else 0.3 if length > 0.5 else 0.8
+            mu = max(min(fall * complement, mu), 0.05 * tolerance / n)
+    if best is None:
+        smooth_none = Smooth(0.0, m * 0.0, (), (), m * 0.0)
+        return Optimum(w, smooth_none, 0.0, np.inf, mu)
+    return best
+
+
+def _newton(program: Program, matrix: Floats, lean: Floats, w: Floats) -> Floats | None:
+    """Return the step that spends the budget: K dw + λ c = lean, c·dw = B − c·w."""
+    diagonal = np.diag(matrix).copy()
+    for ridge in (1e-14, 1e-10, 1e-6):
+        matrix[np.diag_indices_from(matrix)] = diagonal * (1.0 + ridge)
+        try:
+            factor = sl.cho_factor(matrix, lower=True, check_finite=False)
+        except (np.linalg.LinAlgError, ValueError):
+            continue
+        both = sl.cho_solve(factor, np.column_stack([lean, program.cost]), check_finite=False)
+        if np.isfinite(both).all():
+            short = program.budget - float(program.cost @ w)
+            price = (float(program.cost @ both[:, 0]) - short) / float(program.cost @ both[:, 1])
+            return np.asarray(both[:, 0] - price * both[:, 1])
+    return None
+
+
+def _room(x: Floats, move: Floats) -> float:
+    """Return how long a step may be until x reaches 0."""
+    with np.errstate(divide="ignore"):
+        return float(np.min(np.where(move < 0.0, -x / move, np.inf), initial=np.inf))
+
+
+def _dual(z: Floats, move: Floats) -> Floats:
+    """Return duals after a step that keeps them over 0."""
+    return np.asarray(z + min(1.0, _BACK * _room(z, move)) * move)
+
+
+def _search(
+    program: Program,
+    surrogate: Callable[[Floats], Smooth | None],
+    here: Smooth,
+    w: Floats,
+    move: Floats,
+    length: float,
+    mu: float,
+    slope: float,
+) -> float:
+    """Return the length of the step: halved until the barrier problem improves; 0 if never."""
+    capped = np.isfinite(program.most)
+
+    def barrier(x: Floats) -> float:
+        out = float(np.log(x).sum())
+        return out + (float(np.log(program.most - x).sum()) if capped else 0.0)
+
+    start = barrier(w)
+    noise = 1e-13 * (1.0 + abs(here.value))
+    for _ in range(30):
+        x = w + length * move
+        there = surrogate(program.information(x))
+        if there is not None:
+            gain = there.value - here.value + mu * (barrier(x) - start)
+            if gain >= 1e-4 * length * slope - noise:
+                return length
+        length *= 0.5
+    return 0.0

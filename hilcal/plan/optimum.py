@@ -1,0 +1,160 @@
+"""The plan of whole numbers that is nearly the best, with the proof that it is."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilcal.errors import CannotAnswerError
+from hilcal.plan.criterion import Criterion
+from hilcal.plan.exchange import exact, rounded
+from hilcal.plan.relaxation import Relaxed, checked, relax
+from hilcal.plan.units import Units
+from hilcal.types import Floats, Ints
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Design:
+    """What is taken, and how good it is.
+
+    Attributes:
+        counts: (K,) how often each unit is taken.
+        value: φ of it.
+        bound: φ of no plan within the budget exceeds it.
+        information: (P, P) of it, with what was known before.
+        cost: Σ n_k c_k.
+        relaxed: the continuous optimum.
+    """
+
+    counts: Ints
+    value: float
+    bound: float
+    information: Floats
+    cost: float
+    relaxed: Relaxed
+
+    @property
+    def efficiency(self) -> float:
+        """Share of the best possible that is certainly reached, at most 1."""
+        return min(1.0, self.value / self.bound)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Curve:
+    """What a budget buys.
+
+    Attributes:
+        budget: (N,) budgets.
+        value: (N,) φ of a plan of whole numbers, quickly found; 0 where none determines all.
+        bound: (N,) φ that no plan exceeds.
+    """
+
+    budget: Floats
+    value: Floats
+    bound: Floats
+
+    @property
+    def efficiency(self) -> Floats:
+        """(N,) value / bound: low where whole numbers cost much."""
+        return np.minimum(1.0, self.value / self.bound)
+
+
+def best(
+    units: Units,
+    criterion: Criterion,
+    budget: float,
+    prior: Floats | None = None,
+    rng: np.random.Generator | None = None,
+    *,
+    most: int | None = None,
+    names: Sequence[str] | None = None,
+    tolerance: float | None = None,
+    effort: int | None = None,
+) -> Design:
+    """Return a plan with Σ n_k c_k ≤ B whose φ(M0 + Σ n_k A_kᵀA_k) is nearly the largest.
+
+    Args:
+        units: what can be taken.
+        criterion: φ.
+        budget: B, in the units of the cost.
+        prior: (P, P) M0: what is known before, and units that are in the plan in any case.
+        rng: generator; the plan depends on nothing else that is random.
+        most: how often a unit may be taken; any number of times by default.
+        names: of the parameters, for messages.
+        tolerance: relative gap of the continuous optimum; see `relax`.
+        effort: of the search for whole numbers; see `exact`.
+
+    Raises:
+        InputError: a budget that takes no unit, or arrays that do not fit.
+        CannotAnswerError: parameters that no candidate determines, or not within the budget.
+    """
+    rng = np.random.default_rng(0) if rng is None else rng
+    relaxed = relax(units, criterion, budget, prior, most=most, names=names, tolerance=tolerance)
+    counts = exact(units, criterion, budget, prior, relaxed, rng, most=most, effort=effort)
+    known = checked(units, budget, prior, most)
+    used = np.flatnonzero(counts)
+    information = known + units.information(counts[used].astype(float), used)
+    value = float(criterion.value(information))
+    cost = float(counts @ units.cost)
+    try:
+        criterion.sure(information, names)
+        enough = value > 0.0
+    except CannotAnswerError:
+        enough = False
+    if not enough:
+        raise CannotAnswerError(
+            f"a budget of {budget:g} takes {int(counts.sum())} units, too few to determine "
+            f"{units.size} parameters by criterion {criterion.name}; raise the budget"
+        )
+    return Design(counts, value, max(relaxed.bound, value), information, cost, relaxed)
+
+
+def curve(
+    units: Units,
+    criterion: Criterion,
+    budgets: Floats,
+    prior: Floats | None = None,
+    *,
+    most: int | None = None,
+    names: Sequence[str] | None = None,
+    tolerance: float = 1e-3,
+) -> Curve:
+    """Return what budgets buy: how many readings are enough.
+
+    Without a prior the bound grows in proportion to the budget; what falls short of it at small
+    budgets is the price of whole numbers.
+
+    Args:
+        units: what can be taken.
+        criterion: φ.
+        budgets: (N,) budgets.
+        prior: (P, P) what is known before.
+        most: how often a unit may be taken.
+        names: of the parameters, for messages.
+        tolerance: relative gap of the continuous optima.
+
+    Raises:
+        InputError: as `best`.
+        CannotAnswerError: as `best`.
+    """
+    budgets = np.asarray(budgets, dtype=float)
+    values, bounds = np.zeros(len(budgets)), np.zeros(len(budgets))
+    start: Relaxed | None = None
+    for k in np.argsort(budgets, kind="stable"):
+        budget = float(budgets[k])
+        start = relax(
+            units,
+            criterion,
+            budget,
+            prior,
+            most=most,
+            names=names,
+            tolerance=tolerance,
+            start=start,
+        )
+        counts = rounded(units, criterion, budget, prior, start, most=most)
+        used = np.flatnonzero(counts)
+        known = checked(units, budget, prior, most)
+        information = known + units.information(counts[used].astype(float), used)
+        values[k], bounds[k] = float(criterion.value(information)), start.bound
+    return Curve(budgets, values, np.maximum(values, bounds))

@@ -1,0 +1,241 @@
+"""From a cell to a plan: candidates, loads, the optimum with its certificate, and the order."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from hilcal.cell import Cell
+from hilcal.config import CellConfig
+from hilcal.data.plan import UNLOADED
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.identify.fit import Fit
+from hilcal.plan.assumed import after, assumed
+from hilcal.plan.choice import (
+    EFFORT,
+    Loads,
+    Question,
+    choose,
+    only,
+    promising,
+    question,
+    within,
+    worthwhile,
+)
+from hilcal.plan.draw import Drawn, draw
+from hilcal.plan.feasible import Space
+from hilcal.plan.information import Problem, problem, readings_of
+from hilcal.plan.noise_model import reading_covariance
+from hilcal.plan.optimum import Design
+from hilcal.plan.order import Chosen, Ordered, Ordering, order_plan
+from hilcal.plan.timing import pace
+from hilcal.plan.work import WorkPoses, work_poses
+from hilcal.types import Bools, Floats, Ints
+
+HOMES = 4
+"""Central poses of which one becomes the reference."""
+PROBES = 60
+"""Poses by which the reference is judged."""
+SAMPLE = 50
+"""Poses by which the noise of a reading is judged."""
+ROUNDS = 6
+"""How often poses that are not reached from the reference may be replaced."""
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What somebody wants of a plan.
+
+    Attributes:
+        poses: as many readings as so many poses take unloaded and under each load.
+        readings: or this many readings, those at the reference and repeats not counted.
+        criterion: of `[planning]` where None.
+        effort: of the search for whole numbers.
+        unloaded: "around" or "first", see `Ordering`.
+    """
+
+    poses: int = 20
+    readings: int | None = None
+    criterion: str | None = None
+    effort: int = EFFORT
+    unloaded: Literal["around", "first"] = "around"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Planned:
+    """A plan with everything that it was chosen by.
+
+    Attributes:
+        ordered: the plan in order, with what the order costs.
+        design: the units that were chosen, with the certificate.
+        loads: which loads are worth hanging.
+        problem: the design problem.
+        asked: the question that the design answers.
+        usable: (K,) which units were to choose from.
+        work: the test poses.
+        drawn: the candidates.
+        budget: readings of the design.
+        criterion: name of the criterion.
+    """
+
+    ordered: Ordered
+    design: Design
+    loads: Loads
+    problem: Problem
+    asked: Question
+    usable: Bools
+    work: WorkPoses
+    drawn: Drawn
+    budget: float
+    criterion: str
+
+    @property
+    def counts(self) -> Floats:
+        """(K,) how often each unit of the problem is taken."""
+        out = np.zeros(len(self.problem.units))
+        out[np.flatnonzero(self.usable)] = self.design.counts
+        return out
+
+
+def make(
+    cell: Cell,
+    config: CellConfig,
+    request: Request,
+    rng: np.random.Generator,
+    known: Fit | None = None,
+    say: Say = lambda words: None,
+) -> Planned:
+    """Return the plan.
+
+    Args:
+        cell: the cell.
+        config: limits, loads, noise, and `[planning]`: what it is for.
+        request: how many readings, and the criterion.
+        rng: generator.
+        known: fit of what has been measured already.
+        say: told what is being done.
+
+    Raises:
+        InputError: numbers or names that cannot be.
+        CannotAnswerError: the cell leaves too few states, or the readings are too few; says
+            which constraint or parameter it is.
+    """
+    criterion = request.criterion or config.planning.criterion
+    say("drawing poses that the cell allows")
+    space = Space(cell, config)
+    drawn = draw(space, config.planning.candidates, rng, least=2)
+    home, poses = _reference(space, drawn, rng)
+    drawn = replace(drawn, q=drawn.q[poses], allowed=drawn.allowed[poses])
+    say("working out what each of them tells")
+    model = assumed(cell, config) if known is None else after(known, config)
+    of = problem(model, config, drawn.q, drawn.allowed)
+    work = work_poses(model, config, drawn.q, space.clear)
+    asked = question(of, criterion, work)
+    budget = _budget(request, of)
+    say("choosing loads")
+    seconds = pace(config)
+    # so many readings and no more: then there is nothing to be had for a load's time
+    change = 0.0 if request.readings is not None else seconds.change_s / seconds.reading_s
+    loads = worthwhile(asked, of, budget, change, rng)
+    usable = within(of, loads.names)
+    say(f"choosing poses by criterion {criterion}")
+    pose_of = np.array([pose for pose, _ in of.what])
+    first = np.flatnonzero(usable)[promising(only(asked, usable), loads.budget)]
+    usable &= ~np.isin(pose_of, _unreachable(space, of, home, first))
+    for _ in range(ROUNDS):
+        design = choose(only(asked, usable), loads.budget, rng, request.effort)
+        units = np.flatnonzero(usable)[np.flatnonzero(design.counts)]
+        lost = _unreachable(space, of, home, units)
+        if not len(lost):
+            break
+        usable &= ~np.isin(pose_of, lost)
+    else:
+        raise CannotAnswerError(
+            f"after {ROUNDS} rounds there are still poses that no clear straight motion from the "
+            "reference pose reaches; widen the workspace"
+        )
+    say("putting them in order")
+    counts = np.zeros(len(usable), dtype=np.int64)
+    counts[np.flatnonzero(usable)] = design.counts
+    ordered = _ordered(space, of, home, counts, rng, request.unloaded)
+    return Planned(ordered, design, loads, of, asked, usable, work, drawn, loads.budget, criterion)
+
+
+def _budget(request: Request, of: Problem) -> float:
+    """Readings that are to be taken."""
+    if request.readings is not None:
+        if request.readings < 1:
+            raise InputError(f"{request.readings} readings; valid: a whole number from 1")
+        return float(request.readings)
+    if request.poses < 1:
+        raise InputError(f"{request.poses} poses; valid: a whole number from 1")
+    return float(request.poses * len(of.candidates.loads))
+
+
+def _reference(space: Space, drawn: Drawn, rng: np.random.Generator) -> tuple[Floats, Ints]:
+    """Return the reference (n,), where every load can hang, and which other poses are left.
+
+    It is central, and of some such poses the one from which most others are reached.
+    """
+    every = drawn.allowed.any(axis=0)  # loads that are of use at all
+    bears = np.flatnonzero(drawn.allowed[:, every].all(axis=1))
+    if not len(bears):
+        raise CannotAnswerError(
+            "no pose bears every load, so there is none to change them at; leave out a load "
+            "or widen [limits]"
+        )
+    q = drawn.q[bears]
+    central = bears[np.argsort(np.linalg.norm(q - np.median(drawn.q, axis=0), axis=1))[:HOMES]]
+    probes = drawn.q[rng.permutation(len(drawn.q))[:PROBES]]
+    reached = [int(space.passable(drawn.q[k], probes, UNLOADED).sum()) for k in central]
+    home = int(central[int(np.argmax(reached))])
+    return drawn.q[home], np.delete(np.arange(len(drawn.q)), home)
+
+
+def _unreachable(space: Space, of: Problem, home: Floats, units: Ints) -> Ints:
+    """Return the poses among the chosen units that the arm cannot go to straight from home."""
+    wanted: dict[str, set[int]] = {}
+    for k in units:
+        pose, loads = of.what[k]
+        for load in readings_of((pose, loads), of.mode):
+            wanted.setdefault(load, set()).add(pose)
+    lost: set[int] = set()
+    for load, poses in wanted.items():
+        which = np.array(sorted(poses))
+        good = space.passable(home, of.candidates.q[which], load)
+        lost |= set(which[~good].tolist())
+    return np.array(sorted(lost), dtype=np.int64)
+
+
+def _ordered(
+    space: Space,
+    of: Problem,
+    home: Floats,
+    counts: Ints,
+    rng: np.random.Generator,
+    unloaded: Literal["around", "first"],
+) -> Ordered:
+    """Name the chosen poses, and put their readings in order."""
+    taken = np.flatnonzero(counts)
+    poses = sorted({of.what[k][0] for k in taken})
+    name = {pose: f"p{k}" for k, pose in enumerate(poses, start=1)}
+    chosen = [
+        Chosen(name[of.what[k][0]], readings_of(of.what[k], of.mode), int(counts[k])) for k in taken
+    ]
+    repeats = max(2, len(poses) // 10)
+    how = Ordering(unloaded=unloaded, repeats=repeats, reading_std=_reading_std(space, of))
+    q = of.candidates.q[poses]
+    return order_plan(
+        space.cell, space.config, list(name.values()), q, home, chosen, space.passable, rng, how
+    )
+
+
+def _reading_std(space: Space, of: Problem) -> float:
+    """Typical standard uncertainty of a reading in one coordinate, m."""
+    model, theta = of.assumed.model, of.assumed.theta
+    some = of.candidates[slice(0, SAMPLE)].states()
+    covariance = reading_covariance(of.assumed, space.config, model.predict(some, theta))
+    return float(np.sqrt(np.mean(np.diagonal(covariance[:, :3, :3], axis1=1, axis2=2))))

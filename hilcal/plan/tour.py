@@ -1,0 +1,236 @@
+"""Tours from the reference pose through stops and back: short ones, random ones, and their loops.
+
+All work on a matrix of seconds, (m + 1, m + 1), whose row i and column j hold the way from
+stop i to stop j; 0 is the reference. A way that does not exist costs `NEVER`.
+"""
+
+from collections.abc import Sequence
+from itertools import pairwise, permutations
+
+import numpy as np
+
+from hilcal.types import Floats, Ints
+
+NEVER = 1e7
+"""Seconds of a way that does not exist: more than any campaign, so that sums stay exact."""
+_EXACT = 7  # stops up to which every order is tried
+_LONGEST = 3  # stops of a segment that is moved as one
+_GAIN = 1e-9  # s, below which a change is rounding
+
+
+def length(seconds: Floats, order: Sequence[int]) -> float:
+    """Return the seconds of the tour 0, order, 0."""
+    way = [0, *order, 0]
+    return float(seconds[way[:-1], way[1:]].sum())
+
+
+def shortest(seconds: Floats, rng: np.random.Generator, kicks: int = 20) -> list[int]:
+    """Return an order of stops 1 to m whose tour is short; the shortest up to 7 stops.
+
+    Nearest insertion, then 2-opt and Or-opt exchanges until none helps, then the same again
+    after each of some double bridges (Martin, Otto & Felten 1991), of which the best is kept.
+
+    Args:
+        seconds: (m + 1, m + 1), also asymmetric.
+        rng: generator of the double bridges.
+        kicks: number of double bridges.
+    """
+    count = len(seconds) - 1
+    if count <= _EXACT:
+        return _by_trial(seconds)
+    best = improved(seconds, _inserted(seconds))
+    least = length(seconds, best)
+    for _ in range(kicks):
+        a, b, c = sorted(int(k) for k in rng.choice(np.arange(1, count), 3, replace=False))
+        order = improved(seconds, best[:a] + best[b:c] + best[a:b] + best[c:])
+        if (here := length(seconds, order)) < least - _GAIN:
+            best, least = order, here
+    return best
+
+
+def _by_trial(seconds: Floats) -> list[int]:
+    """Return the best of all orders."""
+    count = len(seconds) - 1
+    if count == 0:
+        return []
+    orders = np.array(list(permutations(range(1, count + 1))))
+    ways = np.pad(orders, ((0, 0), (1, 1)))
+    best = int(np.argmin(seconds[ways[:, :-1], ways[:, 1:]].sum(axis=1)))
+    return [int(k) for k in orders[best]]
+
+
+def _inserted(seconds: Floats) -> list[int]:
+    """Insert the stop that is nearest to the tour where it costs least, until all are in."""
+    count = len(seconds) - 1
+    near = np.minimum(seconds, seconds.T)
+    gap, left = near[0].copy(), np.ones(count + 1, dtype=np.bool_)
+    left[0] = False
+    way = [0, 0]
+    for _ in range(count):
+        k = int(np.argmin(np.where(left, gap, np.inf)))
+        a, b = way[:-1], way[1:]
+        place = int(np.argmin(seconds[a, k] + seconds[k, b] - seconds[a, b]))
+        way.insert(place + 1, k)
+        left[k] = False
+        gap = np.minimum(gap, near[k])
+    return way[1:-1]
+
+
+def improved(seconds: Floats, order: Sequence[int]) -> list[int]:
+    """Return an order that no 2-opt or Or-opt exchange makes shorter; the best one first."""
+    way = np.array([0, *order, 0])
+    while len(way) > 3:
+        found = min(_turned(seconds[np.ix_(way, way)]), _moved(seconds[np.ix_(way, way)]))
+        if found[0] > -_GAIN:
+            break
+        _, i, j, after, turn = found
+        part = way[i : j + 1][::-1] if turn else way[i : j + 1]
+        rest = np.concatenate([way[:i], way[j + 1 :]])
+        at = after + 1 if after < i else after - (j - i)
+        way = np.concatenate([rest[:at], part, rest[at:]])
+    return [int(k) for k in way[1:-1]]
+
+
+_Change = tuple[float, int, int, int, bool]
+"""Seconds gained (negative), first and last place of a part, after which place it is put (one
+outside of the part), and whether it is turned round."""
+
+
+def _turn_cost(p: Floats) -> Floats:
+    """Return (k, k): what turning the inside of the part from place i to j costs, s."""
+    there = np.concatenate([[0.0], np.cumsum(np.diagonal(p, 1))])
+    back = np.concatenate([[0.0], np.cumsum(np.diagonal(p, -1))])
+    extra = back - there
+    return np.asarray(extra[None, :] - extra[:, None])
+
+
+def _turned(p: Floats) -> _Change:
+    """Return the best turn of a part (2-opt); `p` holds the ways between places of the tour."""
+    k = len(p)
+    i, j = np.triu_indices(k - 2, 1)
+    i, j = i + 1, j + 1
+    gain = p[i - 1, j] + p[i, j + 1] - p[i - 1, i] - p[j, j + 1] + _turn_cost(p)[i, j]
+    best = int(np.argmin(gain))
+    return float(gain[best]), int(i[best]), int(j[best]), int(i[best]) - 1, True
+
+
+def _moved(p: Floats) -> _Change:
+    """Return the best move of a part of up to three stops to another place (Or-opt)."""
+    k, turn_cost = len(p), _turn_cost(p)
+    after = np.arange(k - 1)
+    best: _Change = (np.inf, 0, 0, 0, False)
+    for size in range(1, min(_LONGEST, k - 3) + 1):
+        i = np.arange(1, k - size)[:, None]
+        j = i + size - 1
+        out = p[i - 1, j + 1] - p[i - 1, i] - p[j, j + 1] - p[after, after + 1]
+        inside = (after >= i - 1) & (after <= j)
+        for turn in (False, True) if size > 1 else (False,):
+            a, b = (j, i) if turn else (i, j)
+            gain = out + p[after, a] + p[b, after + 1] + (turn_cost[i, j] if turn else 0.0)
+            gain = np.where(inside, np.inf, gain)
+            at = int(np.argmin(gain))
+            row, place = divmod(at, k - 1)
+            found = (float(gain[row, place]), row + 1, row + size, place, turn)
+            best = min(best, found)
+    return best
+
+
+def shaken(
+    seconds: Floats, order: Sequence[int], budget: float, rng: np.random.Generator, moves: int
+) -> list[int]:
+    """Return a random order whose tour takes at most `budget`, or no longer than `order`'s.
+
+    A random walk by turns and moves of parts; a step that would exceed the budget is not taken.
+    Turns and moves are as probable as their inverses, so that a long walk comes to every order
+    within the budget that it can reach with the same probability.
+
+    Args:
+        seconds: (m + 1, m + 1).
+        order: where the walk begins.
+        budget: s.
+        rng: generator.
+        moves: steps of the walk.
+    """
+    way = [0, *order, 0]
+    here, count = length(seconds, order), len(order)
+    if count < 2:
+        return list(order)
+    symmetric = bool(np.array_equal(seconds, seconds.T))
+    w = seconds.tolist()
+    draws = rng.integers(1, count + 1, (moves, 2)).tolist()
+    turns = (rng.random(moves) < 0.5).tolist()
+    for (a, b), turn in zip(draws, turns, strict=True):
+        if a == b:
+            continue
+        i, j = min(a, b), max(a, b)
+        if turn:
+            part = way[i : j + 1]
+            new = part[::-1]
+        elif a < b:  # the stop at a goes to b
+            part = way[i : j + 1]
+            new = [*part[1:], part[0]]
+        else:
+            part = way[i : j + 1]
+            new = [part[-1], *part[:-1]]
+        old_ends, new_ends = (way[i - 1], *part, way[j + 1]), (way[i - 1], *new, way[j + 1])
+        if turn and symmetric:
+            gain = w[way[i - 1]][new[0]] + w[new[-1]][way[j + 1]]
+            gain -= w[way[i - 1]][part[0]] + w[part[-1]][way[j + 1]]
+        else:
+            gain = sum(w[x][y] for x, y in pairwise(new_ends))
+            gain -= sum(w[x][y] for x, y in pairwise(old_ends))
+        if here + gain <= max(budget, here):
+            way[i : j + 1] = new
+            here += gain
+    return way[1:-1]
+
+
+def loops(
+    direct: Floats, order: Sequence[int], reading_s: float, limit_s: float
+) -> list[list[int]] | None:
+    """Return a tour cut into loops from the reference, each within the limit, in least time.
+
+    Dynamic programming over the places where the tour may be cut (Beasley 1983, route first and
+    cluster second): T(j) = min over i of T(i) + loop(i + 1 … j). A loop of one stop is always
+    allowed.
+
+    Args:
+        direct: (m + 1, m + 1) s, `NEVER` where no straight motion is clear.
+        order: stops.
+        reading_s: s at each stop and at the reference.
+        limit_s: s from leaving the reference to coming back.
+
+    Returns:
+        The loops in order; None where there is no such tour.
+    """
+    count = len(order)
+    best, cut = np.full(count + 1, np.inf), np.zeros(count + 1, dtype=np.int64)
+    best[0] = 0.0
+    for i in range(count):
+        if not np.isfinite(best[i]):
+            continue
+        out = direct[0, order[i]]
+        for j in range(i, count):
+            if j > i:
+                out += direct[order[j - 1], order[j]]
+            out += reading_s
+            if out >= NEVER or (j > i and out > limit_s):
+                break
+            whole = out + direct[order[j], 0]
+            if whole >= NEVER or (j > i and whole > limit_s):
+                continue
+            if best[i] + whole + reading_s < best[j + 1]:
+                best[j + 1], cut[j + 1] = best[i] + whole + reading_s, i
+    if not np.isfinite(best[count]):
+        return None
+    return _parts(order, cut)
+
+
+def _parts(order: Sequence[int], cut: Ints) -> list[list[int]]:
+    """Follow the cuts from the end."""
+    out, j = [], len(order)
+    while j > 0:
+        i = int(cut[j])
+        out.append(list(order[i:j]))
+        j = i
+    return out[::-1]
