@@ -1,0 +1,103 @@
+"""The recording of a plan: a file that shows it before anything is measured."""
+
+import contextlib
+import hashlib
+import os
+import uuid
+from pathlib import Path
+
+import rerun as rr
+
+from hilcal.cell import Cell
+from hilcal.config import CellConfig
+from hilcal.data.plan import Plan
+from hilcal.errors import HilcalError, InputError
+from hilcal.plan.story import PlanStory
+from hilcal.report.viewer import (
+    plan_cell,
+    plan_charts,
+    plan_layout,
+    plan_promises,
+    plan_scene,
+    plan_words,
+    style,
+)
+from hilcal.report.viewer.plan_digest import PlanDigest, plan_digest
+from hilcal.report.viewer.stream import APPLICATION, flush
+
+
+def record_plan(cell: Cell, config: CellConfig, plan: Plan, story: PlanStory, path: Path) -> None:
+    """Write a plan as a recording file, whole or not at all; an existing file is replaced.
+
+    The timeline `step` goes through the readings in order, from 1: the arm in its pose, what
+    hangs, and the beam of the tracker, coloured by whether it sees the target. Equal plans give
+    equal recordings.
+
+    Args:
+        cell: the cell.
+        config: its loads, obstacles, limits and sight.
+        plan: poses and steps.
+        story: what the plan promises.
+        path: of the recording, ".rrd".
+
+    Raises:
+        InputError: the folder is missing, or the plan's poses do not fit the arm.
+        HilcalError: the file cannot be written.
+    """
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise InputError(f"recording {path}: no folder {path.parent}; make it first")
+    d = plan_digest(cell, config, plan, story)
+    rec = rr.RecordingStream(
+        APPLICATION,
+        recording_id=_recording_id(config, plan, story),
+        send_properties=False,
+        # Chunks end where the plan is flushed, not when a clock ticks: equal files.
+        batcher_config=rr.ChunkBatcherConfig.NEVER(),
+    )
+    rec.set_log_time_enabled(False)
+    rec.set_log_tick_enabled(False)
+    memory = rec.memory_recording()
+    rec.send_blueprint(plan_layout.blueprint(d), make_active=False, make_default=True)
+    _tell(rec, d)
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        part.write_bytes(memory.drain_as_bytes())
+        part.replace(path)
+    except OSError as error:
+        raise HilcalError(f"recording {path}: cannot be written: {error.strerror}") from error
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+        rec.disconnect()
+
+
+def _tell(rec: rr.RecordingStream, d: PlanDigest) -> None:
+    rec.send_recording_name(f"hilcal plan: {style.safe(d.cell.arm.name)}, {len(d)} readings")
+    plan_cell.static_scene(rec, d)
+    plan_charts.schedule(rec, d)
+    plan_promises.promises(rec, d.story)
+    for name, text in (
+        ("plan", plan_words.summary(d)),
+        ("guide", plan_words.GUIDE),
+        ("parameters", plan_words.parameters(d.story)),
+        ("bought", plan_words.bought(d.story)),
+    ):
+        document = rr.TextDocument(text, media_type="text/markdown")
+        rec.log(f"words/{name}", document, static=True)
+    flush(rec)
+    plan_scene.step_scene(rec, d)
+    plan_charts.step_charts(rec, d)
+    cards = [plan_words.step_card(d, k) for k in range(len(d))]
+    rec.send_columns(
+        "words/step",
+        indexes=[rr.TimeColumn("step", sequence=d.numbers)],
+        columns=rr.TextDocument.columns(text=cards, media_type=["text/markdown"] * len(cards)),
+    )
+    flush(rec)
+
+
+def _recording_id(config: CellConfig, plan: Plan, story: PlanStory) -> str:
+    """Return an identifier that depends on what is told, and on nothing else."""
+    told = "\n".join((config.to_json(), plan.to_json(), repr(story)))
+    return str(uuid.UUID(bytes=hashlib.sha256(told.encode()).digest()[:16]))
