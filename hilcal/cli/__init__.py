@@ -19,6 +19,7 @@ from hilcal.cli.planning import check, plan
 from hilcal.cli.refining import add, diagnose, refine, view
 from hilcal.cli.running import run
 from hilcal.cli.simulating import simulate
+from hilcal.cli.study_plans import plans
 from hilcal.cli.tables import export, import_
 from hilcal.errors import HilcalError
 
@@ -63,6 +64,7 @@ def _application() -> typer.Typer:
     study = make("Studies of the program's own mathematics.")
     study.command("scaling")(scaling)
     study.command("hidden")(hidden)
+    study.command("plans")(plans)
     study.callback()(_group)
     app.add_typer(study, name="study")
     app.callback()(_top)

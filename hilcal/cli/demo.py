@@ -39,7 +39,7 @@ def demo(
         Path,
         typer.Option("-o", "--output", metavar="RUN.hilcal", help="The campaign file to make."),
     ] = Path("demo.hilcal"),
-    poses: Annotated[int, typer.Option("--poses", help="Poses beside the reference.")] = POSES,
+    poses: Annotated[int, typer.Option("--poses", help="See hilcal plan.")] = POSES,
     without_devices: Annotated[
         bool,
         typer.Option("--without-devices", help="Draw the readings at once, through no wire."),
@@ -59,7 +59,7 @@ def demo(
     check_choice(choice)
     there = output.exists()
     if without_devices:
-        r = in_process(t, config, choice, number, output, path.parent)
+        r = in_process(t, config, choice, number, output, path.parent, poses)
     else:
         r = on_devices(t, config, choice, number, output, path.parent, poses)
     if there:
@@ -112,7 +112,8 @@ def demo(
 
 
 def _introduce(t: Terminal, r: Rehearsal, choice: str, seed: int) -> None:
-    loads = [name for name in r.readings.load_names if name != "none"]
+    used = np.unique(r.readings.load)
+    loads = [name for k, name in enumerate(r.readings.load_names) if k in used and name != "none"]
     poses = len(np.unique(r.readings.pose))
     what = {
         NOTHING: "Nothing is hidden in it; the program does not know that.",

@@ -1,8 +1,8 @@
-"""`plan`: choose poses and loads; `check`: who answers, and may this plan be run."""
+"""`plan`: choose poses, loads and order; `check`: who answers, and may this plan be run."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import typer
@@ -10,13 +10,20 @@ import typer
 from hilcal.acquire.connect import Answer, connect
 from hilcal.acquire.dry_run import DryRun, dry_run
 from hilcal.cell import Cell, cell_from_config
-from hilcal.cli.terminal import Json, terminal
+from hilcal.cli.files import check_record, open_run
+from hilcal.cli.terminal import Json, Record, Terminal, terminal
 from hilcal.config import CellConfig, load_config
 from hilcal.data.plan import Plan, load_plan
+from hilcal.data.plan_csv import plan_csv
 from hilcal.errors import DeviceError, InputError
-from hilcal.plan.spread import spread_plan
+from hilcal.identify.fit import Fit
+from hilcal.plan.choice import CRITERIA
+from hilcal.plan.planner import Request, make
+from hilcal.plan.story import PlanStory
+from hilcal.plan.tell import about, remarks, story
 from hilcal.report import text_run
-from hilcal.report.progress import working
+from hilcal.report.progress import Say, working
+from hilcal.report.text_plan import story_report
 
 POSES = 20
 
@@ -31,25 +38,91 @@ def plan(
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="PLAN", help="The plan file to make.")
     ],
-    poses: Annotated[int, typer.Option("--poses", help="Poses beside the reference.")] = POSES,
+    poses: Annotated[
+        int,
+        typer.Option("--poses", help="As many readings as so many poses take under every load."),
+    ] = POSES,
+    readings: Annotated[
+        int | None, typer.Option("--readings", help="Or so many readings, repeats not counted.")
+    ] = None,
+    criterion: Annotated[
+        str | None,
+        typer.Option("--criterion", metavar="|".join(CRITERIA), help="What it is to be best at."),
+    ] = None,
+    after: Annotated[
+        Path | None,
+        typer.Option("--after", metavar="RUN.hilcal", help="Plan on from what it knows already."),
+    ] = None,
     seed: Annotated[int, typer.Option("--seed", help="Of the random candidates.")] = 0,
+    unloaded_first: Annotated[
+        bool,
+        typer.Option(
+            "--unloaded-first",
+            help="All unloaded readings before the loads: for run --until; a drift costs more.",
+        ),
+    ] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Without comparing criteria and numbers of poses.")
+    ] = False,
+    csv: Annotated[
+        Path | None, typer.Option("--csv", metavar="F.csv", help="The plan as a table, too.")
+    ] = None,
+    record: Record = None,
     as_json: Json = False,
 ) -> None:
-    """Choose poses for every load of the cell, and check that they can be run."""
+    """Choose poses, loads and their order, with a proof of how near to the best they are."""
     t = terminal(as_json)
+    check_record(record)
     config, numbers = read_cell(cell)
+    unloaded: Literal["around", "first"] = "first" if unloaded_first else "around"
+    wanted = Request(poses, readings, _criterion(criterion), unloaded=unloaded)
     with working(t.progress) as say:
-        say("choosing poses")
-        made = make_plan(numbers, config, poses, seed)
+        known = None if after is None else _known(t, after, say)
+        rng = _generator(seed)
+        chosen = make(numbers, config, wanted, rng, known, say)
+        made = replace(chosen.ordered.plan, about=about(chosen))
+        told = story(chosen, config, rng, say, compare=not quick)
         say("going through it in thought")
         dry = dry_run(numbers, config, made)
     refuse(dry, "the plan")
+    told = replace(told, remarks=tuple(dict.fromkeys((*dry.remarks, *told.remarks))))
+    _write(output, made.to_json() + "\n")
+    if csv is not None:
+        pulls = {load.name: load.wrench(numbers.gravity) for load in config.loads}
+        _write(csv, plan_csv(made, pulls))
+    if record is not None:
+        from hilcal.report.viewer.plan_stream import record_plan  # loads the viewer, which lasts
+
+        with working(t.progress) as say:
+            say(f"recording {record}")
+            record_plan(numbers, config, made, told, record)
+    t.show(story_report(told))
+    t.show(f"The plan is in {output}: a file that you may edit. Every limit was checked.")
+    t.document({**plan_json(made, dry, told), "plan": str(output)})
+
+
+def _criterion(name: str | None) -> str | None:
+    """Check a criterion.
+
+    Raises:
+        InputError: lists the valid ones.
+    """
+    if name is not None and name not in CRITERIA:
+        raise InputError(f"--criterion {name!r} is unknown; valid: {', '.join(CRITERIA)}")
+    return name
+
+
+def _known(t: Terminal, path: Path, say: Say) -> Fit:
+    """Return the newest fit of a campaign."""
+    with open_run(path) as run:
+        return run.latest_fit(t, say)[1]
+
+
+def _write(path: Path, text: str) -> None:
     try:
-        output.write_text(made.to_json() + "\n", encoding="utf-8")
+        path.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise InputError(f"{output}: cannot be written ({error.strerror})") from None
-    t.show(text_run.plan_report(made, dry, output))
-    t.document({**plan_json(made, dry), "plan": str(output)})
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
 
 
 def check(cell: CellFile, plan: PlanFile = None, as_json: Json = False) -> None:
@@ -85,14 +158,18 @@ def read_cell(path: Path) -> tuple[CellConfig, Cell]:
     return config, cell_from_config(config, path.absolute().parent)
 
 
-def make_plan(cell: Cell, config: CellConfig, poses: int, seed: int) -> Plan:
-    """Return a plan of so many poses under every load of the cell."""
-    if poses < 1:
-        raise InputError(f"--poses {poses}; valid: a whole number from 1")
+def make_plan(
+    cell: Cell, config: CellConfig, poses: int, seed: int, say: Say = lambda words: None
+) -> Plan:
+    """Return a plan of as many readings as so many poses take under every load of the cell."""
+    chosen = make(cell, config, Request(poses), _generator(seed), None, say)
+    return replace(chosen.ordered.plan, about={**about(chosen), "remarks": list(remarks(chosen))})
+
+
+def _generator(seed: int) -> np.random.Generator:
     if seed < 0:
         raise InputError(f"--seed {seed}; valid: a whole number, 0 or more")
-    repeats = min(poses, max(2, poses // 10))
-    return spread_plan(cell, config, poses, np.random.default_rng(seed), repeats=repeats)
+    return np.random.default_rng(seed)
 
 
 def refuse(dry: DryRun, what: str) -> None:
@@ -107,19 +184,27 @@ def refuse(dry: DryRun, what: str) -> None:
         raise InputError(f"{what} cannot be run: {dry.problems[0]}{others}")
 
 
-def plan_json(made: Plan, dry: DryRun) -> dict[str, object]:
+def plan_json(made: Plan, dry: DryRun, told: PlanStory) -> dict[str, object]:
     """Return what the JSON document says of a plan."""
+    known = asdict(told)
     return {
-        "poses": len(made.pose_names),
-        "readings": len(made.steps),
-        "criterion": "spread",
-        "efficiency": None,
-        "predicted_std": {},
+        "poses": told.poses,
+        "readings": told.readings,
+        "criterion": told.criterion,
+        "efficiency": told.efficiency,
+        "predicted_std": {p.name: p.std for p in told.predicted},
+        "position_std_m": told.position_std_m,
         "loads": list(made.loads),
+        "readings_by_load": told.loads,
         "load_changes": dry.load_changes,
         "motions": dry.motions,
         "duration_s": dry.duration,
-        "remarks": list(dry.remarks),
+        "parameters": known["predicted"],
+        "criteria": known["bought"],
+        "curve": known["curve"],
+        "detectable": known["seen"],
+        "order": known["order"],
+        "remarks": list(told.remarks),
     }
 
 

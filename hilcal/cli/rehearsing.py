@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from drivers.simulated.on_the_wire import secret_of, simulated_cell
-from drivers.simulated.rehearsal import Rehearsal, rehearse
+from drivers.simulated.on_the_wire import rehearse_plan, secret_of, simulated_cell
+from drivers.simulated.rehearsal import Rehearsal, as_told
 from hilcal.acquire.dry_run import dry_run
 from hilcal.cell import cell_from_config
 from hilcal.cli.planning import make_plan, refuse
@@ -14,8 +14,9 @@ from hilcal.cli.running import create, measure
 from hilcal.cli.terminal import Terminal
 from hilcal.config import CellConfig
 from hilcal.data.campaign import Campaign
+from hilcal.data.plan import Plan
 from hilcal.identify.repeatability import with_repeatability
-from hilcal.report.progress import counting, working
+from hilcal.report.progress import Say, counting, working
 
 
 def on_devices(
@@ -45,14 +46,11 @@ def on_devices(
         InputError: an unknown choice, or a cell without loads.
         DeviceError: a device failed.
     """
-    planned = cell_from_config(config, base_dir)
     with ExitStack() as stack:
         with working(t.progress) as say:
-            say("choosing poses")
-            plan = make_plan(planned, config, poses, seed)
+            plan = _plan(config, choice, seed, base_dir, poses, say)
             secret = secret_of(config, plan, choice, seed)
             cell = secret.cell
-            refuse(dry_run(cell, secret.config, plan), "the plan")
             say("starting the simulated devices")
             there = stack.enter_context(simulated_cell(secret, seed, base_dir))
         campaign = stack.enter_context(create(output, there.config, base_dir, plan, True))
@@ -70,15 +68,31 @@ def on_devices(
     )
 
 
+def _plan(config: CellConfig, choice: str, seed: int, base_dir: Path, poses: int, say: Say) -> Plan:
+    """Plan a campaign, as the program that is not told what is hidden would."""
+    told = as_told(config, choice)
+    plan = make_plan(cell_from_config(told, base_dir), told, poses, seed, say)
+    refuse(dry_run(cell_from_config(told, base_dir), told, plan), "the plan")
+    return plan
+
+
 def in_process(
-    t: Terminal, config: CellConfig, choice: str, seed: int, output: Path, base_dir: Path
+    t: Terminal,
+    config: CellConfig,
+    choice: str,
+    seed: int,
+    output: Path,
+    base_dir: Path,
+    poses: int,
 ) -> Rehearsal:
-    """Draw a campaign from the simulated world without any device, in a second or two.
+    """Plan a campaign and draw its readings from the simulated world without any device.
 
     It is written pose by pose, as a real one grows. Arguments as in `on_devices`.
     """
-    r = rehearse(config, choice, seed)
-    poses = list(dict.fromkeys(r.readings.pose.tolist()))
+    with working(t.progress) as say:
+        plan = _plan(config, choice, seed, base_dir, poses, say)
+        r = rehearse_plan(config, plan, choice, seed)
+    visited = list(dict.fromkeys(r.readings.pose.tolist()))
     with (
         Campaign.create(
             output,
@@ -87,9 +101,9 @@ def in_process(
             "rehearsal in a simulated cell, without devices",
             overwrite=True,
         ) as campaign,
-        counting(t.progress, "measuring poses", len(poses)) as advance,
+        counting(t.progress, "measuring poses", len(visited)) as advance,
     ):
-        for pose in poses:
+        for pose in visited:
             campaign.append_readings(r.readings[np.equal(r.readings.pose, pose)])
             advance(1)
     return r

@@ -32,11 +32,12 @@ from hilcal.cli.planning import (
     refuse_unready,
 )
 from hilcal.cli.terminal import Json, Terminal, terminal
+from hilcal.cli.until import Until
 from hilcal.config import CellConfig
 from hilcal.data.campaign import Campaign
 from hilcal.data.plan import Plan, load_plan
 from hilcal.data.run_log import PLAN, RunLog
-from hilcal.errors import DeviceError, InputError
+from hilcal.errors import CannotAnswerError, DeviceError, InputError
 from hilcal.report.live_run import watching
 from hilcal.report.progress import Say, working
 
@@ -57,11 +58,22 @@ def run(
     rehearse: Annotated[
         bool, typer.Option("--rehearse", help="On simulated devices, started for this run.")
     ] = False,
+    until: Annotated[
+        str | None,
+        typer.Option(
+            "--until",
+            metavar="GOAL",
+            help='End as soon as a goal is met, e.g. "joint std < 2 %" or "position std < 20 um": '
+            "the arm goes home, and the load is taken off. Exit 4 where all readings do not do; "
+            "they are kept.",
+        ),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Measure a campaign: every step of the plan, each reading stored before the next motion."""
     t = terminal(as_json)
     config, numbers = read_cell(cell)
+    goal = None if until is None else Until(until, numbers, config)
     base_dir = cell.absolute().parent
     with ExitStack() as stack:
         if resume:
@@ -87,9 +99,20 @@ def run(
                 config = stack.enter_context(simulated).config
         if not resume:
             campaign = stack.enter_context(create(output, config, base_dir, made))
-        measured = measure(t, config, numbers, campaign)
-    t.show(f"{measured} readings are in {output}. Go on with: hilcal refine {output}")
-    t.document({"campaign": str(output), "readings": measured, "planned": len(made.steps)})
+        measured = measure(t, config, numbers, campaign, goal)
+    planned = len(made.steps)
+    document: dict[str, object] = {"campaign": str(output), "readings": measured}
+    document["planned"] = planned
+    if goal is not None:
+        document["goal"] = goal.standing.figures
+        if goal.standing.met:
+            t.show(f'The goal "{goal.goal.text}" is met: {goal.standing.words}.')
+    of = "" if measured == planned else f" of {planned}"
+    t.show(f"{measured}{of} readings are in {output}. Go on with: hilcal refine {output}")
+    t.document(document)
+    if goal is not None and not goal.standing.met:
+        on = f"hilcal plan {cell} --after {output}"
+        raise CannotAnswerError(f"{goal.missed(measured)}; plan on with: {on}")
 
 
 def create(
@@ -107,8 +130,12 @@ def create(
     )
 
 
-def measure(t: Terminal, config: CellConfig, cell: Cell, campaign: Campaign) -> int:
+def measure(
+    t: Terminal, config: CellConfig, cell: Cell, campaign: Campaign, goal: Until | None = None
+) -> int:
     """Measure what is missing in a campaign; returns how many readings it then holds.
+
+    With a goal it is only as much as that needs; nothing where it is met already.
 
     Raises:
         DeviceError: a device failed; the arm stands, and what was measured is stored.
@@ -116,6 +143,9 @@ def measure(t: Terminal, config: CellConfig, cell: Cell, campaign: Campaign) -> 
         KeyboardInterrupt: somebody stopped it; the same holds.
     """
     log = RunLog(campaign)
+    stored = log.readings()
+    if goal is not None and stored is not None and goal(stored, last=True).met and _is_home(log):
+        return campaign.n_readings
     with _ends_as_interrupt(t), ExitStack() as stack:
         with working(t.progress) as say:
             say("connecting to every device")
@@ -128,8 +158,15 @@ def measure(t: Terminal, config: CellConfig, cell: Cell, campaign: Campaign) -> 
         watcher: Watcher = stack.enter_context(watching(t.progress, len(log.plan.steps)))
         log.event("devices", {"answers": [answer_json(answer) for answer in answers]})
         clock = Clock(config.simulation.clock)
-        run_plan(rig, cell, config, log.plan, log, clock, watcher, judge=LiveResidual(cell, config))
+        judge = LiveResidual(cell, config)
+        run_plan(rig, cell, config, log.plan, log, clock, watcher, judge=judge, goal=goal)
     return campaign.n_readings
+
+
+def _is_home(log: RunLog) -> bool:
+    """Whether the last session came to its end: the arm is home and nothing hangs."""
+    events = log.events()
+    return bool(events) and events[-1]["kind"] == "finished"
 
 
 def _sighted(rig: Rig, answer: Answer, say: Say) -> Answer:

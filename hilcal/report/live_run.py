@@ -90,4 +90,6 @@ def figures(event: Taken) -> str:
     if event.residual is not None:
         sigma = "" if event.residual_sigma is None else f" ({event.residual_sigma:.1f} σ)"
         out += f"{', ' if out else ': '}residual {numbers.length(event.residual)}{sigma}"
+    if event.goal:
+        out += f"{', ' if out else ': '}{event.goal}"
     return out
