@@ -1,246 +1,140 @@
-"""Campaigns on a simulated cell as an operator runs them: `hilcal run` as its own process."""
+"""Campaigns on a simulated cell: fixtures, faults in the middle of a run, and what must hold."""
 
-import os
 import re
-import resource
-import signal
-import socket
-import subprocess
-import sys
-import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
-import psutil
+import pytest
+from campaign_run import EndedError, Run
+from campaign_site import Site, site
 
-from drivers.simulated.cell_processes import SimulatedCell
-from drivers.simulated.on_the_wire import secret_of, simulated_cell
-from drivers.simulated.world import World
-from hilcal.acquire.dry_run import dry_run
-from hilcal.cell import Cell, cell_from_config
-from hilcal.config import CellConfig, load_config
-from hilcal.config.write import to_toml
+from hilcal.cell import Cell
 from hilcal.data.campaign import Campaign
-from hilcal.data.plan import Plan, Step
+from hilcal.data.plan import Step
 from hilcal.data.run_log import RunLog
 from hilcal.identify.repeatability import with_repeatability
-from hilcal.plan.spread import spread_plan
-from hilcal.robot.catalogue import configs_dir
-
-ROOT = Path(__file__).resolve().parents[1]
-TAKEN = re.compile(r"\d+/\d+ ")
-DEADLINE = 60.0
-"""Nothing here may take longer, s; far above what it takes."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Site:
-    """A running simulated cell with its files, and a short plan for it."""
-
-    simulated: SimulatedCell
-    world: World
-    cell: Cell
-    config: CellConfig
-    plan: Plan
-    toml: Path
-    plan_file: Path
-    directory: Path
-    runs: list["Run"]
-
-    def end_runs(self) -> None:
-        """End what a test that failed has left running."""
-        for run in self.runs:
-            if run.process.poll() is None:
-                run.kill()
-                run.process.wait()
-        self.runs.clear()
-
-    def ask(self, device: str, op: str, **arguments: Any) -> Any:
-        return self.simulated.ask(device, op, **arguments)
-
-    def now(self) -> float:
-        """Time as the simulated devices stamp it, s."""
-        return time.monotonic()
-
-    def shorter(self, directory: Path, poses: int) -> "Site":
-        """The same cell with a plan of fewer poses."""
-        plan = spread_plan(self.cell, self.config, poses, np.random.default_rng(7), repeats=0)
-        plan_file = directory / "plan.json"
-        plan_file.write_text(plan.to_json(), encoding="utf-8")
-        return replace(self, plan=plan, plan_file=plan_file, directory=directory)
-
-    def dashboard(self, *commands: str) -> list[str]:
-        """Say something to the controller's dashboard, as the pendant's buttons do."""
-        assert self.config.robot.host is not None
-        with (
-            socket.create_connection((self.config.robot.host, 29999), timeout=5.0) as line,
-            line.makefile("rw") as stream,
-        ):
-            stream.readline()
-            answers = []
-            for command in commands:
-                stream.write(command + "\n")
-                stream.flush()
-                answers.append(stream.readline().strip())
-        return answers
-
-    def until(self, what: Callable[[], bool]) -> None:
-        """Wait until something holds."""
-        end = time.monotonic() + DEADLINE
-        while not what():
-            assert time.monotonic() < end
-            time.sleep(0.02)
-
-
-@contextmanager
-def site(directory: Path, *, clock: float = 20.0, poses: int = 3, seed: int = 5) -> Iterator[Site]:
-    """Run a simulated cell with two loads and a plan of few poses."""
-    base_dir = configs_dir() / "cells"
-    config = load_config(base_dir / "demo_ur10e.toml")
-    simulation = config.simulation.model_copy(update={"clock": clock})
-    config = config.model_copy(update={"simulation": simulation, "loads": config.loads[:2]})
-    cell = cell_from_config(config)
-    plan = spread_plan(cell, config, poses, np.random.default_rng(seed), repeats=1)
-    assert dry_run(cell, config, plan).problems == ()
-    secret = secret_of(config, plan, "nothing", seed)
-    with simulated_cell(secret, seed, base_dir, directory / "cell") as running:
-        toml, plan_file = directory / "cell.toml", directory / "plan.json"
-        toml.write_text(to_toml(running.config), encoding="utf-8")
-        plan_file.write_text(plan.to_json(), encoding="utf-8")
-        yield Site(
-            running, secret.world, secret.cell, running.config, plan, toml, plan_file, directory, []
-        )
-
-
-class Run:
-    """One `hilcal run`, in a session of its own."""
-
-    def __init__(self, site: Site, path: Path, *more: str, limit: int | None = None) -> None:
-        """Start it; `--resume` where the campaign is there already.
-
-        With `limit`, no file of the program can grow beyond so many bytes.
-        """
-        self.site, self.path = site, path
-        self.log = path.with_suffix(f".{time.monotonic_ns()}.log")
-        how = ("--resume",) if path.exists() else ("--plan", str(site.plan_file))
-        command = [sys.executable, "-m", "hilcal", "run", str(site.toml), "-o", str(path)]
-        environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-        with self.log.open("wb") as log:
-            self.process = subprocess.Popen(
-                [*command, *how, *more],
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-                env=environment,
-                preexec_fn=None if limit is None else lambda: _limited(limit),
-            )
-        self._family: set[int] = {self.process.pid}
-        site.runs.append(self)
-
-    @property
-    def words(self) -> str:
-        """What it has said so far."""
-        return self.log.read_text(encoding="utf-8", errors="replace")
-
-    def wait_for(self, readings: int) -> None:
-        """Wait until so many readings of this campaign are stored."""
-        self.wait_until(lambda: f" {readings}/" in self.words, f"{readings} readings")
-
-    def wait_until(self, what: Callable[[], bool], words: str) -> None:
-        """Wait until something holds."""
-        end = time.monotonic() + DEADLINE
-        while not what():
-            self.family()
-            assert self.process.poll() is None, f"it ended before {words}:\n{self.words}"
-            assert time.monotonic() < end, f"no {words} in {DEADLINE} s:\n{self.words}"
-            time.sleep(0.02)
-
-    def some_readings(self) -> None:
-        """Wait until this run has stored a reading."""
-        self.wait_until(lambda: bool(TAKEN.search(self.words)), "a reading")
-
-    def moving(self) -> None:
-        """Wait until the arm has just begun to move."""
-        count = len(self.words.splitlines())
-
-        def begun() -> bool:
-            new = self.words.splitlines()[count:]
-            return any("moving to" in w for w in new) and self.site.ask("arm", "state")["moving"]
-
-        self.wait_until(begun, "motion")
-
-    def measuring(self) -> None:
-        """Wait until a reading has just begun."""
-        count = len(self.words.splitlines())
-        self.wait_until(
-            lambda: "measuring" in "".join(self.words.splitlines()[count:]), "measurement"
-        )
-
-    def next_reading(self, words: str) -> None:
-        """Wait until one more reading is stored."""
-        count = len(TAKEN.findall(self.words))
-        self.wait_until(lambda: len(TAKEN.findall(self.words)) > count, f"a reading with {words}")
-
-    def family(self) -> set[int]:
-        """Process numbers of it and of all that it has started."""
-        try:
-            children = psutil.Process(self.process.pid).children(recursive=True)
-            self._family |= {child.pid for child in children}
-        except psutil.Error:
-            pass
-        return self._family
-
-    def interrupt(self) -> None:
-        """Ctrl-C at the terminal: the whole group gets it."""
-        self.family()
-        os.killpg(self.process.pid, signal.SIGINT)
-
-    def kill(self) -> None:
-        """Kill -9, only the program itself."""
-        self.family()
-        self.process.kill()
-
-    def end(self, longest: float = DEADLINE) -> tuple[int, str]:
-        """Wait for its end; returns the exit code and what it said."""
-        end = time.monotonic() + longest
-        while self.process.poll() is None:
-            self.family()
-            assert time.monotonic() < end, f"it hangs:\n{self.words}"
-            time.sleep(0.02)
-        return self.process.wait(), self.words
-
-    def left_behind(self) -> list[str]:
-        """Processes that it has left behind, after a moment."""
-        end = time.monotonic() + 3.0
-        while True:
-            there = [_alive(pid) for pid in self._family]
-            names = [name for name in there if name]
-            if not names or time.monotonic() > end:
-                return names
-            time.sleep(0.02)
-
-
-def _limited(size: int) -> None:
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
-
-
-def _alive(pid: int) -> str:
-    try:
-        process = psutil.Process(pid)
-        if process.status() == psutil.STATUS_ZOMBIE:
-            return ""
-        return " ".join(process.cmdline())
-    except psutil.Error:
-        return ""
-
+from hilcal.types import Floats
 
 LONG = 900.0
 """A whole campaign may take so long, s."""
+STARVED = re.compile(
+    r"no new data over RTDE|no answer within|by its watchdog|too busy|nothing came for"
+)
+"""What a run says, too, where this computer has given one of the processes no turn for long."""
+TRIES = 3
+
+Then = TypeVar("Then")
+Act = Callable[[Site], object]
+
+
+@pytest.fixture(scope="module")
+def cell(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Site]:
+    """One simulated cell for a file, with a plan that is long enough for all of its runs.
+
+    Each of them stores a reading or two before it meets its fault; how many more some of them
+    store, a file says in MORE_READINGS.
+    """
+    runs = sum(
+        item.path == request.path and "path" in getattr(item, "fixturenames", ())
+        for item in request.session.items
+    )
+    readings = 3 * runs // 2 + 5 + getattr(request.module, "MORE_READINGS", 0)
+    poses = -(-(readings - 4) // 3)  # with two loads, P poses are 3 P + 4 readings and some
+    with site(tmp_path_factory.mktemp("cell"), poses=poses) as made:
+        yield made
+
+
+@pytest.fixture(autouse=True)
+def nothing_goes_on(cell: Site) -> Iterator[None]:
+    """End what a test that failed has left running, and let the arm move at its full speed."""
+    yield
+    cell.end_runs()
+    cell.slider(1.0)
+
+
+@pytest.fixture(scope="module")
+def path(cell: Site) -> Path:
+    """The campaign that the tests of a file measure, one after the other."""
+    return cell.directory / "run.hilcal"
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """What happens in the middle of a run, what is said, and how it is put right.
+
+    Attributes:
+        name: of the test.
+        do: makes it happen.
+        undo: puts it right, as the operator would.
+        says: patterns that the one line has to contain.
+        stops: whether the arm has to be stopped for it (else it stands already).
+        fast: whether it is one of the few that are tested every time.
+    """
+
+    name: str
+    do: Act
+    undo: Act
+    says: tuple[str, ...]
+    stops: bool = True
+    fast: bool = False
+
+
+def act(device: str, op: str, **arguments: object) -> Act:
+    """Return what switches something at a simulated device."""
+    return lambda cell: cell.ask(device, op, **arguments)
+
+
+def nothing(cell: Site) -> None:
+    """Nothing has to be put right."""
+
+
+def each(faults: tuple[Fault, ...]) -> pytest.MarkDecorator:
+    """Run a test with every fault, under its name."""
+    rows = [
+        pytest.param(one, id=one.name, marks=() if one.fast else pytest.mark.slow) for one in faults
+    ]
+    return pytest.mark.parametrize("fault", rows)
+
+
+def begin(cell: Site, path: Path, then: Callable[[Run], Then]) -> tuple[Run, Then]:
+    """Start a run, wait for its first reading and for what comes then; returns both.
+
+    The devices' deadlines are real time: on a computer that is too busy a run may be stopped
+    before it has met its fault. Then it is begun again, as an operator does.
+    """
+    for left in reversed(range(TRIES)):
+        run = Run(cell, path)
+        try:
+            run.some_readings()
+            return run, then(run)
+        except EndedError as error:
+            if not left or not STARVED.search(str(error)):
+                raise
+        cell.slider(1.0)
+    raise AssertionError("unreachable")
+
+
+def meets(fault: Fault, cell: Site, path: Path, *, moving: bool) -> None:
+    """Let a run meet a fault after its first reading, and check what the operator sees."""
+    run, goal = begin(cell, path, Run.moving if moving else Run.measuring)
+    since = cell.now()
+    try:
+        fault.do(cell)
+        line = failed(run)
+        if goal is not None and fault.stops:
+            stopped_on_its_way(cell, since, goal)
+        assert not cell.ask("arm", "state")["moving"]
+    finally:
+        fault.undo(cell)
+    for words in fault.says:
+        assert re.search(words, line), line
+    assert "--resume" in line, line
+    right(cell, path)
 
 
 def failed(run: Run, code: int = 3) -> str:
@@ -254,15 +148,16 @@ def failed(run: Run, code: int = 3) -> str:
     return lines[0]
 
 
-def finish(site: Site, path: Path, tries: int = 1) -> None:
-    """Resume until it is done, and check the campaign."""
-    for attempt in range(tries):
+def finish(site: Site, path: Path) -> None:
+    """Resume until it is done, and check the campaign; see `begin` for more than one try."""
+    for left in reversed(range(TRIES)):
         run = Run(site, path)
         code, words = run.end(LONG)
         assert run.left_behind() == []
         if code == 0:
             break
-        assert attempt + 1 < tries, words
+        assert left, words
+        assert STARVED.search(words), words
     whole(site, path)
 
 
@@ -300,12 +195,13 @@ def _registered(site: Site) -> Cell:
     )
 
 
-def stopped_within(site: Site, since: float | None = None, seconds: float = 0.5) -> None:
-    """Check that the arm stands since at most so long after `since` (monotonic, s).
+def stopped_within(cell: Site, since: float, seconds: float = 0.5) -> None:
+    """Check that the arm stands since at most so long after `since` (monotonic, s)."""
+    cell.until(lambda: not cell.ask("arm", "state")["moving"])
+    assert cell.ask("arm", "state")["rest_ns"] * 1e-9 - since <= seconds
 
-    Without it, after the last fault that the simulated controller was asked for.
-    """
-    site.until(lambda: not site.ask("arm", "state")["moving"])
-    state = site.ask("arm", "state")
-    begun = state["fault_ns"] * 1e-9 if since is None else since
-    assert state["rest_ns"] * 1e-9 - begun <= seconds
+
+def stopped_on_its_way(cell: Site, since: float, goal: Floats) -> None:
+    """Check that the arm came to rest in time after `since`, far from where it was to go (6,)."""
+    stopped_within(cell, since)
+    assert np.abs(goal - cell.ask("arm", "state")["q"]).max() > 0.1

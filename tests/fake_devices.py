@@ -1,12 +1,6 @@
-"""Devices in memory that share one small world; every call can be made to fail.
+"""Devices in memory that share one small world."""
 
-Time stands still but for what the devices and the waiting take, so that everything is the same
-on every run.
-"""
-
-import json
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -19,125 +13,11 @@ from hilcal.acquire.devices import (
     TrackerSample,
     WrenchSample,
 )
-from hilcal.acquire.rig import Rig
-from hilcal.cell import Cell, cell_from_config
-from hilcal.config import (
-    Acquire,
-    CellConfig,
-    ForceSensor,
-    Limits,
-    Load,
-    Motion,
-    Repeatability,
-    Robot,
-    Tool,
-    Tracker,
-)
-from hilcal.data.plan import Plan, Step
-from hilcal.data.readings import Readings
-from hilcal.errors import DeviceError
-from hilcal.robot import chain as chains
-from hilcal.robot import se3
+from hilcal.config import Load
 from hilcal.types import Floats
+from tests.fake_world import World
 
-REGISTRATION = se3.matrix(se3.rotation(np.array([0.02, -0.03, 2.1])), np.array([2.4, -1.6, -0.5]))
-SAG = 2e-5  # m/N, how far the target gives way along the force
 STD = 1e-5  # m, of one measurement
-
-
-class Killed(BaseException):
-    """The process is killed: nothing that it does from now on reaches anybody."""
-
-
-@dataclass
-class World:
-    """Arm, load and time, and the calls that reached any device."""
-
-    config: CellConfig
-    cell: Cell
-    q: Floats
-    time: float = 100.0
-    start: Floats = field(default_factory=lambda: np.zeros(6))
-    goal: Floats = field(default_factory=lambda: np.zeros(6))
-    begun: float = 0.0
-    lasts: float = 0.0
-    is_moving: bool = False
-    load: str = "none"
-    payload: tuple[float, Floats] | None = None
-    control: bool = False
-    offset: Floats = field(default_factory=lambda: np.array([3.0, -2.0, 5.0, 0.1, 0.2, -0.1]))
-    tool_mass: float = 0.8
-    calls: list[str] = field(default_factory=list)
-    fail: dict[int, BaseException] = field(default_factory=dict)
-    kill_at: int | None = None
-    kill_after: tuple[str, int] | None = None  # a call, and how many of it
-    killed: bool = False
-    safety: str = "normal"
-    extra: Floats = field(default_factory=lambda: np.zeros(6))  # further force, sensor axes
-    extra_speed: float = 0.0
-    shift: Floats = field(default_factory=lambda: np.zeros(3))  # of the target
-    creep: float = 0.0  # m/s, of the target while at rest
-    hurry: float = 10.0  # how much faster than commanded the arm moves
-    jitter: float = 0.0  # rad, of the joints from sample to sample at rest
-    lost: int = 0  # the next so many measurements see no target
-    not_found: int = 0  # the next so many searches find none
-    wrong: list[str] = field(default_factory=list)  # loads that are hung instead, in order
-    at_start: list[tuple[Floats, str]] = field(default_factory=list)  # load at each motion
-    rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(5))
-
-    def call(self, name: str) -> None:
-        """Count a call; fail where that is wanted."""
-        if self.killed:
-            raise Killed
-        self.calls.append(name)
-        k = len(self.calls)
-        last = self.kill_after is not None and self.kill_after[0] == name
-        if last and self.calls.count(name) == self.kill_after[1]:  # type: ignore[index]
-            self.kill_at = k
-        if self.kill_at == k:
-            self.killed = True
-            raise Killed
-        if k in self.fail:
-            raise self.fail[k]
-
-    def again(self) -> None:
-        """Start the program anew: the arm has stopped where it was, the load still hangs."""
-        self.joints()
-        self.is_moving = self.control = self.killed = False
-        self.kill_at = self.kill_after = None
-        self.fail = {}
-        self.calls.clear()
-
-    def joints(self) -> Floats:
-        """Where the joints are now, rad."""
-        if self.is_moving:
-            share = min(1.0, (self.time - self.begun) / self.lasts)
-            self.q = self.start + share * (self.goal - self.start)
-            self.is_moving = share < 1.0
-        return self.q
-
-    def pull(self) -> Floats:
-        """(6,) wrench of the load at the load point, base axes."""
-        for load in self.config.loads:
-            if load.name == self.load:
-                return load.wrench(self.cell.gravity)
-        return np.zeros(6)
-
-    def position(self) -> Floats:
-        """(3,) target in sensor axes."""
-        chain = chains.evaluate(self.cell.arm, self.joints()[None])
-        at = chain.point(self.cell.target[:3, 3])[0] + SAG * self.pull()[:3] + self.shift
-        return REGISTRATION[:3, :3] @ at + REGISTRATION[:3, 3] + self.creep * self.time
-
-    def wrench(self) -> Floats:
-        """(6,) what the sensor reads, sensor axes (those of the flange)."""
-        rotation = chains.evaluate(self.cell.arm, self.joints()[None]).rotation[-1][0]
-        force = rotation.T @ (self.tool_mass * self.cell.gravity)
-        out = np.concatenate([force, np.cross(self.cell.tool_com, force)])
-        pull = self.pull()
-        f, m = rotation.T @ pull[:3], rotation.T @ pull[3:]
-        out += np.concatenate([f, m + np.cross(self.cell.load_point, f)])
-        return out + self.offset + self.extra
 
 
 @dataclass
@@ -293,66 +173,6 @@ class FakeOperator:
         return
 
 
-class MemoryStore:
-    """Keeps what it is given, as JSON where a file would; may be full."""
-
-    def __init__(self, world: World) -> None:
-        self.world = world
-        self.full_at: int | None = None
-        self.rows: list[tuple[Step, Readings, str]] = []
-        self.events: list[tuple[str, dict[str, Any]]] = []
-
-    def record(self, reading: Readings, step: Step, detail: dict[str, Any]) -> None:
-        self.world.call("store.record")
-        if self.full_at == len(self.rows):
-            raise DeviceError("run.hilcal: the disk is full")
-        assert len(reading) == 1
-        assert not self.world.is_moving, "stored in motion"
-        self.rows.append((step, reading, json.dumps(detail, allow_nan=False)))
-        self.world.call("store.recorded")
-
-    def event(self, kind: str, content: dict[str, Any]) -> None:
-        self.world.call("store.event")
-        json.dumps(content, allow_nan=False)
-        self.events.append((kind, content))
-
-    def done(self) -> frozenset[Step]:
-        return frozenset(step for step, _, _ in self.rows)
-
-    def details(self) -> list[dict[str, Any]]:
-        return [json.loads(text) for _, _, text in self.rows]
-
-    def readings(self) -> Readings | None:
-        if not self.rows:
-            return None
-        rows = [reading for _, reading, _ in self.rows]
-        poses = tuple(dict.fromkeys(r.pose_names[0] for r in rows))
-        loads = tuple(dict.fromkeys(r.load_names[0] for r in rows))
-        states = {
-            name: np.concatenate([getattr(r.states, name) for r in rows])
-            for name in rows[0].states.__dataclass_fields__
-            if getattr(rows[0].states, name) is not None
-        }
-        return Readings(
-            states=type(rows[0].states)(**states),
-            pose=np.array([poses.index(r.pose_names[0]) for r in rows]),
-            load=np.array([loads.index(r.load_names[0]) for r in rows]),
-            cycle=np.concatenate([r.cycle for r in rows]),
-            value=np.concatenate([r.value for r in rows]),
-            covariance=np.concatenate([r.covariance for r in rows]),
-            load_names=loads,
-            pose_names=poses,
-        )
-
-    def kinds(self) -> list[str]:
-        """Kinds of the events, in order."""
-        return [kind for kind, _ in self.events]
-
-    def last(self, kind: str) -> dict[str, Any]:
-        """The newest event of a kind."""
-        return next(content for k, content in reversed(self.events) if k == kind)
-
-
 @dataclass(frozen=True)
 class FakeClock(Clock):
     """The world's time."""
@@ -366,83 +186,3 @@ class FakeClock(Clock):
     def sleep(self, seconds: float) -> None:
         assert self.world is not None
         self.world.time += max(0.0, seconds)
-
-
-@dataclass
-class Notes:
-    """A watcher that remembers."""
-
-    told: list[object] = field(default_factory=list)
-
-    def tell(self, event: object) -> None:
-        self.told.append(event)
-
-    def of(self, kind: type) -> list[Any]:
-        """What was told of one kind."""
-        return [event for event in self.told if isinstance(event, kind)]
-
-
-def configuration(**changes: Any) -> CellConfig:
-    """A UR10e with a force sensor, two weights and a pull."""
-    sections: dict[str, Any] = {
-        "robot": Robot(model="ur10e"),
-        "tool": Tool(
-            target_m=(0.06, 0.02, 0.12),
-            load_point_m=(0.05, 0.0, 0.15),
-            mass_kg=0.8,
-            com_m=(0.01, 0.0, 0.06),
-        ),
-        "tracker": Tracker(frame="tracker"),
-        "repeatability": Repeatability(joint_std_rad=1e-5),
-        "loads": (
-            Load(name="3kg", mass_kg=3.0),
-            Load(name="6kg", mass_kg=6.0),
-            Load(name="pull", force_N=(40.0, 0.0, 0.0)),
-        ),
-        "force_sensor": ForceSensor(driver="fake", port="nowhere"),
-        "motion": Motion(speed_rad_s=0.5, acceleration_rad_s2=5.0),
-        "acquire": Acquire(samples=3, settle_s=0.2, force_window_s=0.3),
-        "limits": Limits(workspace_min_m=(-1.2, -1.2, 0.05), workspace_max_m=(1.2, 1.2, 1.5)),
-    }
-    return CellConfig(**(sections | changes))
-
-
-POSES = {
-    "reference": (0.0, -1.2, 1.5, -1.5, -1.5, 0.0),
-    "p1": (0.5, -1.0, 1.4, -1.2, -1.2, 0.3),
-    "p2": (-0.6, -1.4, 1.7, -1.7, -1.9, -0.8),
-    "p3": (0.9, -0.9, 1.2, -0.8, -1.6, 1.0),
-    "p4": (-0.2, -1.5, 1.9, -2.2, -0.9, 2.0),
-}
-
-
-def plan_of(*steps: tuple[str, str, int], poses: dict[str, Any] | None = None) -> Plan:
-    """A plan with steps over `POSES`."""
-    poses = POSES if poses is None else poses
-    return Plan(tuple(poses), np.array(list(poses.values())), tuple(Step(*step) for step in steps))
-
-
-def usual_plan() -> Plan:
-    """Four poses unloaded and under each load, with returns to the reference pose."""
-    names = ("p1", "p2", "p3", "p4")
-    steps = [("reference", "none", 0), *((p, "none", 0) for p in names)]
-    for cycle, load in enumerate(("3kg", "pull"), start=1):
-        steps += [(p, load, 0) for p in names]
-        steps += [("reference", "none", cycle)]
-    return plan_of(*steps)
-
-
-class Bench:
-    """Everything that a run needs, in memory."""
-
-    def __init__(self, **changes: Any) -> None:
-        self.config = configuration(**changes)
-        self.cell = cell_from_config(self.config)
-        start = np.array([0.1, -1.3, 1.6, -1.4, -1.4, 0.1])
-        self.world = World(self.config, self.cell, start)
-        self.store = MemoryStore(self.world)
-        self.notes = Notes()
-        self.operator = FakeOperator(self.world)
-        force = None if self.config.force_sensor is None else FakeForce(self.world)
-        self.rig = Rig(FakeArm(self.world), FakeTracker(self.world), force, self.operator)
-        self.clock = FakeClock(world=self.world)

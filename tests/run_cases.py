@@ -6,7 +6,7 @@ from hilcal.acquire.run import run
 from hilcal.data.plan import Plan
 from hilcal.data.readings import Readings
 from hilcal.types import Bools
-from tests.fake_devices import Bench, usual_plan
+from tests.fake_bench import Bench, usual_plan
 
 
 def measure(b: Bench, plan: Plan | None = None, **more: Any) -> Readings:

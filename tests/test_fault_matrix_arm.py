@@ -5,137 +5,199 @@ meets a fault. Whatever it is, the arm stands within half a second, the program 
 with one line, and leaves no process; the resumed campaign has every reading exactly once.
 """
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from campaign_cases import Run, Site, failed, finish, right, site, stopped_within
+from campaign_cases import (
+    Act,
+    Fault,
+    act,
+    begin,
+    cell,
+    each,
+    failed,
+    finish,
+    meets,
+    nothing,
+    nothing_goes_on,
+    path,
+    right,
+    stopped_on_its_way,
+)
+from campaign_run import Run
+from campaign_site import Site
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("arm faults")]
+from hilcal.types import Floats
 
-Act = Callable[[Site], object]
+__all__ = ["cell", "nothing_goes_on", "path"]  # fixtures
 
-
-@dataclass(frozen=True, slots=True)
-class Fault:
-    """One row: what happens, when, what is said, and how it is put right.
-
-    Attributes:
-        name: of the test.
-        do: makes it happen.
-        undo: puts it right, as the operator would.
-        says: what the one line has to contain.
-        moving: whether it happens in motion (else in a reading).
-        stops: whether it moves on unless it is stopped.
-    """
-
-    name: str
-    do: Act
-    undo: Act
-    says: tuple[str, ...]
-    moving: bool = True
-    stops: bool = True
+pytestmark = pytest.mark.xdist_group("arm faults")
 
 
-def _arm(op: str, **arguments: object) -> Act:
-    return lambda s: s.ask("arm", op, **arguments)
+def arm(op: str, **arguments: object) -> Act:
+    return act("arm", op, **arguments)
 
 
-def _nothing(s: Site) -> None:
-    pass
+def off(*ops: str) -> Act:
+    """Switch faults off."""
+
+    def undo(s: Site) -> None:
+        for op in ops:
+            s.ask("arm", op, on=False)
+
+    return undo
 
 
-def _unlock(s: Site) -> None:
+def unlock(s: Site) -> None:
     """As on the pendant: acknowledge, and stop the paused program."""
     s.ask("arm", "set", unlock_s=0.0)
     s.dashboard("unlock protective stop", "stop")
 
 
-def _release(s: Site) -> None:
+def release(s: Site) -> None:
     s.ask("arm", "release_emergency_stop")
     s.dashboard("power on", "brake release")
     s.until(lambda: s.ask("arm", "state")["robot_mode"] == 7)
 
 
-FAULTS = (
-    Fault("protective stop", _arm("protective_stop"), _unlock, ("protective stop", "unlock")),
-    Fault("emergency stop", _arm("emergency_stop"), _release, ("emergency stop",)),
-    Fault("local mode", _arm("local_mode"), _arm("remote_mode"), ("local",)),
-    Fault("program stopped", _arm("kill_script"), _nothing, ("program",)),
-    Fault("link dropped in motion", _arm("rtde_drop"), _nothing, ("link",)),
-    Fault("link dropped at rest", _arm("rtde_drop"), _nothing, ("link",), moving=False),
+def alone(op: str, **arguments: object) -> Act:
+    """The same while the dashboard, the second way to stop, does not answer."""
+
+    def do(s: Site) -> None:
+        s.ask("arm", "dashboard_mute", on=True)
+        s.ask("arm", op, **arguments)
+
+    return do
+
+
+MOTION = (
     Fault(
-        "link stalled", _arm("rtde_stall", on=True), _arm("rtde_stall", on=False), ("link", "0.2 s")
+        "protective stop",
+        arm("protective_stop"),
+        unlock,
+        ("protective stop", "unlock"),
+        fast=True,
     ),
-    Fault("half a frame", _arm("rtde_half_frame"), _nothing, ("link",)),
+    Fault("emergency stop", arm("emergency_stop"), release, ("emergency stop",)),
+    Fault("local mode", arm("local_mode"), arm("remote_mode"), ("local",)),
+    Fault("program stopped", arm("kill_script"), nothing, ("program",)),
+    Fault("link dropped", arm("rtde_drop"), nothing, ("link",)),
+    Fault("link stalled", arm("rtde_stall"), off("rtde_stall"), ("link", "0.2 s")),
+    Fault("half a frame", arm("rtde_half_frame"), nothing, ("link",)),
+    Fault("controller mute", arm("rtde_mute"), off("rtde_mute"), ("arm",)),
+    Fault(
+        "link dropped, dashboard mute",
+        alone("rtde_drop"),
+        off("dashboard_mute"),
+        ("link",),
+        fast=True,
+    ),
+    Fault(
+        "link stalled, dashboard mute",
+        alone("rtde_stall"),
+        off("rtde_stall", "dashboard_mute"),
+        ("link",),
+    ),
     Fault(
         "paused by the speed slider",
-        _arm("set", slider=0.0),
-        _arm("set", slider=1.0),
+        arm("set", slider=0.0),
+        arm("set", slider=1.0),
         ("speed",),
         stops=False,  # it stands already
     ),
 )
 
+REST = (
+    Fault("protective stop", arm("protective_stop"), unlock, ("protective stop",)),
+    Fault("emergency stop", arm("emergency_stop"), release, ("emergency stop",)),
+    Fault("local mode", arm("local_mode"), arm("remote_mode"), ("local",)),
+    Fault("program stopped", arm("kill_script"), nothing, ("program",)),
+    Fault("link dropped", arm("rtde_drop"), nothing, ("link",), fast=True),
+    Fault("link stalled", arm("rtde_stall"), off("rtde_stall"), ("link",)),
+    Fault("half a frame", arm("rtde_half_frame"), nothing, ("link",)),
+    Fault("controller mute", arm("rtde_mute"), off("rtde_mute"), ("arm",)),
+    Fault(
+        "motion refused",
+        arm("refuse_motion"),
+        off("refuse_motion"),
+        ("did not take the motion",),
+        fast=True,
+    ),
+)
 
-@pytest.fixture(scope="module")
-def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
-    with site(tmp_path_factory.mktemp("arm"), poses=6) as made:
-        yield made
-
-
-@pytest.fixture(autouse=True)
-def nothing_goes_on(cell: Site) -> Iterator[None]:
-    yield
-    cell.end_runs()
-
-
-@pytest.fixture(scope="module")
-def path(cell: Site) -> Path:
-    return cell.directory / "run.hilcal"
-
-
-@pytest.mark.parametrize("fault", FAULTS, ids=lambda f: f.name)
-def test_a_fault_of_the_arm(fault: Fault, cell: Site, path: Path) -> None:
-    run = Run(cell, path)
-    run.some_readings()
-    run.moving() if fault.moving else run.measuring()
-    fault.do(cell)
-    line = failed(run)
-    if fault.stops:
-        stopped_within(cell)
-    for words in fault.says:
-        assert words in line
-    assert "--resume" in line
-    right(cell, path)
-    fault.undo(cell)
+START = {
+    "mute": (arm("rtde_mute"), off("rtde_mute"), ("RTDE", "does not answer")),
+    "negotiated, then no data": (arm("rtde_stall"), off("rtde_stall"), ("data",)),
+    "refused": (arm("refuse"), off("refuse"), ("refuses the connection",)),
+    "dashboard mute": (arm("dashboard_mute"), off("dashboard_mute"), ("dashboard",)),
+    "local mode": (arm("local_mode"), arm("remote_mode"), ("local mode", "remote control")),
+    "protective stop": (arm("protective_stop"), unlock, ("protective stop", "unlock")),
+    "emergency stop": (arm("emergency_stop"), release, ("emergency stop",)),
+}
 
 
+@each(MOTION)
+def test_a_fault_in_motion(fault: Fault, cell: Site, path: Path) -> None:
+    meets(fault, cell, path, moving=True)
+
+
+@each(REST)
+def test_a_fault_at_rest(fault: Fault, cell: Site, path: Path) -> None:
+    meets(fault, cell, path, moving=False)
+
+
+@pytest.mark.slow
 def test_the_controller_loses_power_in_motion(cell: Site, path: Path) -> None:
-    run = Run(cell, path)
-    run.some_readings()
-    run.moving()
+    run, _ = begin(cell, path, Run.moving)
     cell.simulated.kill("arm")
-    assert "link" in failed(run)
-    right(cell, path)
-    run = Run(cell, path)
-    line = failed(run)  # nobody answers
+    try:
+        assert "link" in failed(run)
+        right(cell, path)
+        line = failed(Run(cell, path))  # nobody answers
+    finally:
+        cell.simulated.restart("arm")
     assert cell.config.robot.host is not None
     assert cell.config.robot.host in line
-    cell.simulated.restart("arm")
 
 
-@pytest.mark.parametrize("fault", ["rtde_mute", "dashboard_mute", "refuse"])
-def test_a_controller_that_accepts_and_stays_mute_is_not_waited_for(
-    fault: str, cell: Site, path: Path
+@pytest.mark.slow
+def test_a_dashboard_that_is_dropped_or_mute_costs_nothing_and_the_arm_is_stopped_without_it(
+    cell: Site, path: Path
 ) -> None:
-    cell.ask("arm", fault, on=True)
+    def without(run: Run) -> Floats:
+        cell.ask("arm", "dashboard_drop")
+        run.next_reading("a dropped dashboard")
+        cell.ask("arm", "dashboard_mute", on=True)
+        run.next_reading("a mute dashboard")
+        return run.moving()
+
+    try:
+        run, goal = begin(cell, path, without)
+        since = cell.now()
+        run.interrupt()
+        assert "interrupted" in failed(run, 130)
+        stopped_on_its_way(cell, since, goal)
+    finally:
+        cell.ask("arm", "dashboard_mute", on=False)
+    right(cell, path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", START)
+def test_an_arm_that_is_not_ready_is_named_and_not_waited_for(
+    name: str, cell: Site, path: Path
+) -> None:
+    do, undo, says = START[name]
+    arrivals = cell.ask("arm", "state")["arrivals"]
+    do(cell)
     try:
         line = failed(Run(cell, path))
-        assert "arm" in line
+        assert cell.ask("arm", "state")["arrivals"] == arrivals
     finally:
-        cell.ask("arm", fault, on=False)
+        undo(cell)
+    assert "arm" in line
+    for words in says:
+        assert words in line
 
 
 def test_the_campaign_has_every_reading_exactly_once(cell: Site, path: Path) -> None:

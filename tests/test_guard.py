@@ -9,7 +9,7 @@ from hilcal.acquire.devices import ArmSample
 from hilcal.acquire.guard import SLACK_M, Guard
 from hilcal.acquire.workspace import points
 from hilcal.config import ForceSensor, Limits
-from tests.fake_devices import POSES, Bench
+from tests.fake_bench import POSES, Bench
 
 
 @pytest.fixture

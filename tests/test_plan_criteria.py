@@ -244,7 +244,7 @@ def test_says_which_parameters_nothing_determines() -> None:
         require_determined(blind.T @ blind, names)
     same = a.copy()
     same[:, 2] = 1e-4 * same[:, 0]
-    with pytest.raises(CannotAnswerError, match="separates (j1, offset|offset, j1);"):
+    with pytest.raises(CannotAnswerError, match=r"separates (j1, offset|offset, j1);"):
         require_determined(same.T @ same, names)
     with pytest.raises(CannotAnswerError, match="parameter 2"):
         require_determined(blind.T @ blind)

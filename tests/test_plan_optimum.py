@@ -5,7 +5,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hilcal.errors import CannotAnswerError, InputError
@@ -141,6 +141,7 @@ def test_small_problems_against_all_shares(name: str) -> None:
 
 
 @every
+@settings(max_examples=15)
 @given(
     seed=st.integers(0, 10**6),
     costs=st.booleans(),
@@ -155,7 +156,7 @@ def test_no_plan_exceeds_the_bound(
     units = random_units(seed, 15, costs=costs)
     prior = prior_of(seed) if known else None
     base = np.zeros((3, 3)) if prior is None else prior
-    design = best(units, criterion, 9.0, prior, np.random.default_rng(0), most=most, effort=60)
+    design = best(units, criterion, 9.0, prior, np.random.default_rng(0), most=most, effort=40)
     rng = np.random.default_rng(seed)
     for _ in range(20):
         counts = np.zeros(len(units))
@@ -192,7 +193,9 @@ def test_tiny_plans_against_all_plans(name: str) -> None:
         plans = np.array(list(product(range(2 if most else 6), repeat=7)), dtype=float)
         plans = plans[plans @ units.cost <= budget]
         top = largest(criterion, units, plans, np.zeros((3, 3)) if prior is None else prior)
-        design = best(units, criterion, budget, prior, np.random.default_rng(0), most=most)
+        design = best(
+            units, criterion, budget, prior, np.random.default_rng(0), most=most, effort=400
+        )
         assert design.bound >= top * (1 - 1e-9)
         assert design.value <= top * (1 + 1e-9)
         shares.append(design.value / top)

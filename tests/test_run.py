@@ -14,15 +14,9 @@ from hilcal.data.plan import Step
 from hilcal.data.readings import Readings
 from hilcal.errors import CannotAnswerError
 from hilcal.robot import chain as chains
-from tests.fake_devices import (
-    POSES,
-    REGISTRATION,
-    SAG,
-    STD,
-    Bench,
-    plan_of,
-    usual_plan,
-)
+from tests.fake_bench import POSES, Bench, plan_of, usual_plan
+from tests.fake_devices import STD
+from tests.fake_world import REGISTRATION, SAG
 from tests.run_cases import measure, rows
 
 # what is stored

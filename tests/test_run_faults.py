@@ -9,7 +9,8 @@ from hilcal.acquire.run import HOW_ON, run
 from hilcal.config import Limits
 from hilcal.data.plan import Plan
 from hilcal.errors import DeviceError, InputError
-from tests.fake_devices import Bench, Killed, plan_of
+from tests.fake_bench import Bench, plan_of
+from tests.fake_world import Killed
 
 FAULTS = (
     DeviceError("arm: the line is dead"),

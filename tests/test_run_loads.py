@@ -8,13 +8,8 @@ import pytest
 
 from hilcal.acquire.progress import Phase, Remark
 from hilcal.errors import DeviceError
-from tests.fake_devices import (
-    POSES,
-    Bench,
-    Killed,
-    plan_of,
-    usual_plan,
-)
+from tests.fake_bench import POSES, Bench, plan_of, usual_plan
+from tests.fake_world import Killed
 from tests.run_cases import measure, rows
 
 # loads

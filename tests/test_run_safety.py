@@ -9,14 +9,8 @@ import pytest
 from hilcal.acquire.progress import Taken
 from hilcal.config import Acquire, ForceSensor, Limits, Load
 from hilcal.errors import DeviceError, InputError
-from tests.fake_devices import (
-    POSES,
-    STD,
-    Bench,
-    FakeClock,
-    plan_of,
-    usual_plan,
-)
+from tests.fake_bench import POSES, Bench, plan_of, usual_plan
+from tests.fake_devices import STD, FakeClock
 from tests.run_cases import measure
 
 LIMIT = ForceSensor(driver="fake", port="nowhere", max_force_N=120.0)

@@ -7,25 +7,12 @@ import time
 import numpy as np
 import pytest
 import ur_driver_cases as cases
+from ur_driver_cases import arm, sim
 
 from drivers.ur_link import dashboard
 from hilcal.errors import DeviceError
 
-
-@pytest.fixture(scope="module")
-def sim(tmp_path_factory):
-    running = cases.start(tmp_path_factory.mktemp("ur"))
-    yield running
-    running.close()
-
-
-@pytest.fixture
-def arm(sim):
-    opened = cases.controlled(sim)
-    yield opened
-    cases.put_right(sim)
-    opened.close()
-    assert cases.children() == []
+__all__ = ["arm", "sim"]  # fixtures
 
 
 FAULTS = {
@@ -51,6 +38,14 @@ def test_fault_in_motion_stops_the_arm_and_names_its_cause(arm, sim, fault):
     arm.take_control(cases.MASS, cases.COM)  # what the next run does
     arm.start_move(cases.away(arm, by=0.1), cases.SPEED, cases.ACCELERATION)
     cases.finish(arm)
+
+
+def test_motion_that_is_refused_is_told(arm, sim):
+    sim.admin("refuse_motion", on=True)
+    goal = cases.away(arm)
+    text = cases.error_of(lambda: arm.start_move(goal, cases.SPEED, cases.ACCELERATION))
+    assert "did not take the motion" in text
+    assert not sim.admin()["moving"]
 
 
 def error_again(arm):

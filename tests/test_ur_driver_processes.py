@@ -12,22 +12,11 @@ import psutil
 import pytest
 import sim_ur_cases
 import ur_driver_cases as cases
+from ur_driver_cases import arm, sim
 
+from drivers.ur_link import dashboard
 
-@pytest.fixture(scope="module")
-def sim(tmp_path_factory):
-    running = cases.start(tmp_path_factory.mktemp("ur"))
-    yield running
-    running.close()
-
-
-@pytest.fixture
-def arm(sim):
-    opened = cases.controlled(sim)
-    yield opened
-    cases.put_right(sim)
-    opened.close()
-    assert cases.children() == []
+__all__ = ["arm", "sim"]  # fixtures
 
 
 @pytest.mark.parametrize(
@@ -122,6 +111,37 @@ def test_kill_9_of_the_program_stops_the_arm_and_leaves_no_process(sim):
         parent.stdout.close()
     arm = cases.controlled(sim)  # and the next program takes over
     arm.close()
+
+
+_TAKING = """
+import sys
+sys.path.insert(0, "tests")
+import ur_driver_cases as cases
+from drivers.ur import open_arm
+open_arm(cases.config(sys.argv[1])).take_control(cases.MASS, cases.COM)
+"""
+
+
+def test_kill_9_while_control_is_taken_leaves_no_program_behind(sim):
+    scripts = sim.admin()["scripts"]
+    parent = subprocess.Popen(
+        [sys.executable, "-c", _TAKING, sim.host],
+        cwd=sim_ur_cases.ROOT,
+        env=sim_ur_cases.environment(),
+    )
+    try:
+        while sim.admin()["scripts"] == scripts:
+            assert parent.poll() is None
+            time.sleep(0.001)
+        parent.kill()  # the robot's program is uploaded and has no watchdog yet
+        sim.wait("script_running", False)
+        sim.wait("rtde_clients", 0)
+        arm = cases.controlled(sim)  # and the next program takes over
+        arm.close()
+    finally:
+        parent.kill()
+        parent.wait()
+        dashboard.ask(sim.host, ("stop",), 2.0)
 
 
 def _runs(pid):

@@ -1,12 +1,13 @@
 """The UR driver on a simulated controller: how tests open it, move it, and put faults right."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import psutil
+import pytest
 import sim_ur_cases
 
 from drivers.ur import UrArm, open_arm
@@ -96,7 +97,7 @@ def _words(process: psutil.Process) -> list[str]:
 
 def put_right(sim: Sim) -> None:
     """Switch off every fault and bring the robot back to running (not a protective stop)."""
-    for op in ("rtde_stall", "rtde_mute", "dashboard_mute", "refuse"):
+    for op in ("rtde_stall", "rtde_mute", "dashboard_mute", "refuse", "refuse_motion"):
         sim.admin(op, on=False)
     sim.admin("set", slider=1.0, speed_scaling=1.0)
     sim.admin("remote_mode")
@@ -113,3 +114,21 @@ def check_resting(sim: Sim, since: int) -> None:
     assert state["rest_ns"] - since < STOP_NS
     time.sleep(0.05)
     assert sim.admin()["q"] == state["q"]
+
+
+@pytest.fixture(scope="module")
+def sim(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Sim]:
+    """One controller for a file."""
+    running = start(tmp_path_factory.mktemp("ur"))
+    yield running
+    running.close()
+
+
+@pytest.fixture
+def arm(sim: Sim) -> Iterator[UrArm]:
+    """An arm under control; after the test there is no fault and no process."""
+    opened = controlled(sim)
+    yield opened
+    put_right(sim)
+    opened.close()
+    assert children() == []

@@ -57,7 +57,8 @@ def upper_bound(
     φ(M0 + Σ n_k H_k) ≤ tr(Z M0) + max of Σ n_k tr(Z H_k) over n ≥ 0, Σ n_k c_k ≤ B: the budget
     goes to the best prices per cost, each at most `most` times. Kiefer & Wolfowitz (1960),
     Canadian J. Math. 12; Pukelsheim (1993), Optimal Design of Experiments, ch. 7. Of a ratio
-    tr(Z N)/tr(Y N), the largest value over the same plans (Dinkelbach 1967).
+    tr(Z N)/tr(Y N) of eigenvalues, the largest value over the same plans (Dinkelbach 1967), at
+    most 1.
 
     Args:
         smooth: with Z and Y.
@@ -73,7 +74,7 @@ def upper_bound(
         return known + float(gains @ spend(gains, cost, budget, most))
     known_below = float(np.sum(smooth.below * prior))
     if known_below <= 0.0:  # the best unit alone
-        return float(np.max(gains / np.maximum(below, np.finfo(float).tiny)))
+        return min(1.0, float(np.max(gains / np.maximum(below, np.finfo(float).tiny))))
     ratio = known / known_below
     for _ in range(100):
         weight = spend(gains - ratio * below, cost, budget, most)
@@ -81,7 +82,7 @@ def upper_bound(
         if new <= ratio * (1.0 + 1e-13):
             break
         ratio = new
-    return ratio
+    return min(1.0, ratio)
 
 
 def spend(gains: Floats, cost: Floats, budget: float, most: float) -> Floats:

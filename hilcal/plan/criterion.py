@@ -143,7 +143,8 @@ def factors(m: Floats) -> tuple[Floats, Bools]:
         return np.concatenate([f for f, _ in parts]), np.concatenate([good for _, good in parts])
     pivots = np.diagonal(factor, axis1=1, axis2=2) ** 2
     left = 0.1 * DETERMINED * np.diagonal(m, axis1=1, axis2=2)
-    return factor, np.asarray(np.all(pivots > left, axis=1) & np.isfinite(factor).all(axis=(1, 2)))
+    good = np.all(pivots > left, axis=1) & np.isfinite(factor).all(axis=(1, 2))
+    return np.asarray(factor, dtype=np.float64), np.asarray(good, dtype=np.bool_)
 
 
 def soft_least(values: Floats, width: float) -> tuple[float, Floats]:

@@ -12,19 +12,19 @@ from hilcal.plan.relaxation import Relaxed, checked
 from hilcal.plan.units import Units
 from hilcal.types import Floats, Ints
 
-EFFORT = 4000
-"""Units that are put into a plan before the search ends, at most; 100 for each that it has."""
+EFFORT = 6000
+"""Units that are put into a plan before the search ends, at most; fewer of small plans."""
 KINKED_EFFORT = 1500
 """The same for criteria with kinks, whose values cost more."""
 
 _POOL = 4000  # units of the best prices, among which a plan is sought
 _TABLE = 10_000_000  # numbers in the pool's table
-_TRIED = 16  # units whose value is worked out, of those of the best price
+_TRIED = 8  # units whose value is worked out, of those of the best price
 _SLACK = 1e-9
 _ORDER = 0.02  # of the surrogate whose prices lead the search
 _BETTER = 1e-9  # relative improvement that counts
-_EACH = 100
-_PASSED = 0.3  # chance that a unit is passed over, so that plans vary
+_EACH = 150  # of the effort, for each unit of a plan
+_VARIED = 0.1  # share of the plans that vary at random; more of small ones
 _WORSE = 0.12  # of the distance to the bound, by which a plan may be worse and be gone on from
 
 
@@ -188,7 +188,7 @@ class _Search:
             ends = m + np.matmul(self.rows[tried].transpose(0, 2, 1), self.rows[tried])
             values = self.criterion.value(ends + rest[tried, None, None] * self.ideal)
             if rng is not None:
-                values = np.where(rng.random(len(values)) < _PASSED, -1.0, values)
+                values = np.where(rng.random(len(values)) < rng.random(), -1.0, values)
             k = int(np.argmax(values))
             if not self.criterion.monotone and values[k] <= float(self.criterion.value(m)) > 0.0:
                 break
@@ -234,7 +234,8 @@ class _Search:
             out = rng.choice(every, min(int(rng.integers(1, 4)), len(every)), replace=False)
             counts = plan.counts.copy()
             np.subtract.at(counts, out, 1)
-            new = self.refilled(counts, int(out[0]), rng)
+            varied = rng.random() < max(_VARIED, 2.0 / len(every))
+            new = self.refilled(counts, int(out[0]), rng if varied else None)
             left -= max(1, int(new.counts.sum() - counts.sum()))
             if new.value > best.value * (1.0 - worse):
                 plan = new
@@ -261,7 +262,7 @@ def _search(
     weight[relaxed.index] = relaxed.weight
     spent = float(units.cost[relaxed.index] @ relaxed.weight)
     root = _root(relaxed.information)
-    ideal = (relaxed.information - prior) / spent
+    ideal = (relaxed.information - prior) / max(spent, _SLACK * budget)
     return _Search(
         criterion,
         index,

@@ -13,7 +13,7 @@ from hilcal.plan.interior import Optimum, Program
 from hilcal.plan.units import Units
 from hilcal.types import Floats, Ints
 
-TOLERANCE = 1e-6
+TOLERANCE = 1e-7
 """Relative gap between the continuous optimum and its bound."""
 KINKED_TOLERANCE = 1e-3
 """The same for criteria with kinks."""
@@ -74,7 +74,7 @@ def relax(
         prior: (P, P) M0, what is known before; zero by default.
         most: how often a unit may be taken; any number of times by default.
         names: of the parameters, for messages.
-        tolerance: relative gap at which to stop; 1e-6, or 1e-3 of criteria with kinks.
+        tolerance: relative gap at which to stop; 1e-7, or 1e-3 of criteria with kinks.
         start: optimum of a similar problem over the same units.
 
     Raises:
@@ -100,7 +100,7 @@ def relax(
         order = 0.3
     else:
         active, weight, order = start.index, start.weight, 0.03
-    best, found = np.inf, None
+    best, top = np.inf, None
     gaps: list[float] = []
     for _ in range(_ROUNDS):
         last = len(active) == len(units)
@@ -108,15 +108,17 @@ def relax(
         found = scan.solve(active, weight, goal, order)
         rate, bound = scan.all(found.smooth)
         best = min(best, bound)
-        gap = best / found.value - 1.0 if found.value > 0.0 else np.inf
+        if top is None or found.value > top[0].value:
+            top = found, active
+        gap = best / top[0].value - 1.0 if top[0].value > 0.0 else np.inf
         gaps.append(gap)
         if gap <= tolerance or last or (len(gaps) > _STALE and gap > 0.8 * min(gaps[:-_STALE])):
             break
         active, weight = _exchanged(scan, active, found.weight, rate)
         order = max(min(0.5 * gap, order), tolerance)
-    if found is None or not found.value > 0.0:
+    if top is None or not top[0].value > 0.0:
         raise CannotAnswerError("the candidates tell next to nothing: the criterion stays 0")
-    return _pruned(scan, active, found.weight, best)
+    return _pruned(scan, top[1], top[0].weight, best)
 
 
 def checked(units: Units, budget: float, prior: Floats | None, most: int | None) -> Floats:
@@ -169,7 +171,8 @@ class _Scan:
         if not self.criterion.monotone:  # one more unit that tells nothing
             rows = np.concatenate([rows, np.zeros((1, *rows.shape[1:]))])
             cost = np.append(cost, self.budget)
-            start = np.append(0.99 * start, 0.01)
+            left = min(max(1.0 - float(weight @ cost[:-1]) / self.budget, 0.01), 0.99)
+            start = np.append((1.0 - left) * start, left)
         program = Program(self.criterion, rows, cost, self.budget, self.cap, self.prior)
         found = interior.solve(program, start, goal, order)
         return replace(found, weight=found.weight[: len(active)])

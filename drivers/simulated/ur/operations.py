@@ -12,7 +12,7 @@ from hilcal.errors import InputError
 OPERATIONS = (
     "state, protective_stop, emergency_stop, release_emergency_stop, local_mode, remote_mode, "
     "kill_script, rtde_drop, rtde_stall {on}, rtde_mute {on}, rtde_half_frame, "
-    "dashboard_mute {on}, dashboard_drop, refuse {on}, "
+    "dashboard_mute {on}, dashboard_drop, refuse {on}, refuse_motion {on}, "
     "set {version, slider, speed_scaling, unlock_s}, die, log"
 )
 
@@ -73,6 +73,8 @@ class AdminOperations:
                 server.dashboard.drop()
             case "refuse":
                 await server.accept(not arguments.get("on", True))
+            case "refuse_motion":
+                server.arm.refuses_motion = bool(arguments.get("on", True))
             case _:
                 raise InputError(f"no operation {op!r}; valid: {OPERATIONS}")
 

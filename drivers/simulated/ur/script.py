@@ -128,6 +128,8 @@ class ControlScript:
         arm, motion, now = self._arm, self._arm.trajectory, self._arm.clock.now
         match number:
             case Command.MOVE_J | Command.MOVE_L_FK | Command.MOVE_PATH:
+                if arm.refuses_motion:
+                    raise ValueError("the motion is refused")
                 given = self._doubles(0, 8)
                 goals = [(given[:6], float(given[6]), float(given[7]))]
                 if number == Command.MOVE_PATH:

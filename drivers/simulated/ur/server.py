@@ -79,8 +79,13 @@ class Server:
         if on and self._listening is None:
             self._listening = await self._listen(self._run_rtde, RTDE)
         elif not on and self._listening is not None:
-            self._listening.close()
-            self._listening = None
+            closing, self._listening = self._listening, None
+            loop = asyncio.get_running_loop()
+            for door in closing.sockets:
+                loop.remove_reader(door)
+            # Who has just been let in gets a link first: asyncio forgets him with the server.
+            await asyncio.sleep(0)
+            closing.close()
 
     async def run(self) -> None:
         """Keep the controller going, for ever."""
