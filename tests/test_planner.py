@@ -246,4 +246,6 @@ def test_loads_that_are_all_too_heavy_are_named(tmp_path: Path, capsys: Capsys) 
 def test_too_few_readings_say_so(tmp_path: Path, capsys: Capsys) -> None:
     cell = cell_file(tmp_path, small(against=()))
     line = refused(capsys, 4, "plan", cell, "-o", tmp_path / "p.json", "--readings", "2")
-    assert "raise the budget" in line or "readings" in line
+    assert "raise the budget" in line
+    line = refused(capsys, 4, "plan", cell, "-o", tmp_path / "p.json", "--readings", "6")
+    assert "an unknown registration needs at least 4: raise the readings" in line

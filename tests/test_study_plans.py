@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from cli_cases import CELL, run
 from rich.console import Console
+from study_plans_cases import configured
 
-from hilcal.cell import Cell, cell_from_config
+from hilcal.cell import cell_from_config
 from hilcal.cli.study_plans import SimulatedArm, arms, with_robot
 from hilcal.config import CellConfig, load_config
 from hilcal.data.readings import Readings, States
@@ -24,19 +25,6 @@ from hilcal.study.plans_table import as_predicted, halved, report
 from hilcal.types import Floats
 
 SEED = 5
-KNOWN = {"base_xyz_m": (-3.0, 0.5, -0.6), "base_rotvec_rad": (0.0, 0.0, 0.4)}
-
-
-def configured(
-    mode: str = "deflection", *, known: bool = False, robust: bool = False
-) -> CellConfig:
-    """The demo's cell."""
-    config = load_config(CELL)
-    planning = {"readings": mode, **({} if robust else {"against": ()})}
-    update: dict[str, object] = {"planning": config.planning.model_copy(update=planning)}
-    if known:
-        update["tracker"] = config.tracker.model_copy(update=KNOWN)
-    return config.model_copy(update=update)
 
 
 def scene_of(config: CellConfig, candidates: int = 120) -> Scene:
@@ -311,47 +299,3 @@ def test_wrong_input_is_one_line(
     assert done.code == 2
     assert words in done.err
     assert len(done.err.strip().splitlines()) == 1
-
-
-def studied(config: CellConfig, campaigns: int) -> PlansStudy:
-    cell: Cell = cell_from_config(config)
-    return plans_study(cell, config, arms(0), campaigns=campaigns, candidates=400)
-
-
-def needs_at_most_half(study: PlansStudy, kind: str) -> bool:
-    """As predicted, and not truly worse than random plans of twice the readings."""
-    (s,) = (s for s in study.shrinkage() if s.kind == kind)
-    assert s.twice.std < 0.1
-    return halved(study, s) != "no"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("robot", ["ur10e", "ur5e"])
-def test_errors_are_those_predicted_and_shrink_as_predicted(robot: str) -> None:
-    """Within 10 %, with a registered tracker: what is predicted then is all that there is."""
-    study = studied(with_robot(configured(known=True), robot), 150)
-    for line in study.lines:
-        r = line.result
-        assert max(r.spread.std, r.position_ratio.std) < 0.05
-        assert abs(r.spread.value - 1.0) <= 0.1, line.kind
-        assert abs(r.position_ratio.value - 1.0) <= 0.1, line.kind
-    for s in study.shrinkage():
-        for ratio in (s.agreement, s.position_agreement):
-            assert ratio.std < 0.06
-            assert as_predicted(ratio) != "no", s.kind
-    assert needs_at_most_half(study, TEST)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("robot", ["ur10e", "ur5e"])
-def test_half_of_the_readings_of_random_plans_do(robot: str) -> None:
-    """50 campaigns each, registration unknown; each plan in the measure that it was made for."""
-    study = studied(with_robot(configured(robust=True), robot), 50)
-    for line in study.lines:
-        assert as_predicted(line.result.spread) != "no", line.kind
-        # The registration is better than a plan takes for granted: errors are hardly larger.
-        assert line.result.position_ratio.value <= 1.1, line.kind
-    assert all(as_predicted(s.agreement) != "no" for s in study.shrinkage())
-    assert needs_at_most_half(study, TEST)
-    needs = study.of("test, robust").random_readings_open
-    assert needs is None or needs >= 2 * study.readings

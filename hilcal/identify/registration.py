@@ -19,6 +19,7 @@ from hilcal.robot import se3
 from hilcal.types import Floats
 
 ALTERNATIONS = 200
+MIN_POSES = 4
 NARROW = 1e-3
 """Positions whose rms spread across a line is less than this, m, are on the line."""
 
@@ -37,10 +38,10 @@ def register(cell: Cell, readings: Readings) -> Cell:
     chain = chains.evaluate(cell.arm, angle)
     r, p = chain.rotation[-1], chain.position[-1]
     distinct = len(np.unique(np.round(angle, 9), axis=0))
-    if distinct < 4:
+    if distinct < MIN_POSES:
         raise CannotAnswerError(
-            f"registration: {distinct} distinct poses; measure at least 4, better 10, that turn "
-            "the flange and do not lie on a line"
+            f"registration: {distinct} distinct poses; measure at least {MIN_POSES}, better 10, "
+            "that turn the flange and do not lie on a line"
         )
     y = readings.value[:, :3]
     target, registration = cell.target.copy(), cell.registration.copy()

@@ -11,6 +11,7 @@ from hilcal.config import CellConfig
 from hilcal.data.plan import UNLOADED
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.fit import Fit
+from hilcal.identify.registration import MIN_POSES
 from hilcal.plan.assumed import after, assumed
 from hilcal.plan.choice import (
     EFFORT,
@@ -156,6 +157,12 @@ def make(
         raise CannotAnswerError(
             f"after {ROUNDS} rounds there are still poses that no clear straight motion from the "
             "reference pose reaches; widen the workspace"
+        )
+    visited = len({of.what[k][0] for k in units}) + 1
+    if not cell.registration_known and known is None and visited < MIN_POSES:
+        raise CannotAnswerError(
+            f"{loads.budget:g} readings are best taken at {visited} poses, the reference among "
+            f"them; an unknown registration needs at least {MIN_POSES}: raise the readings"
         )
     say("putting them in order")
     counts = np.zeros(len(usable), dtype=np.int64)
