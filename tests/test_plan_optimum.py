@@ -251,6 +251,8 @@ def test_a_cap_tightens_the_bound() -> None:
     once = relax(units, D(), 20.0, most=1)
     assert free.weight.max() > 1.5
     assert once.bound < 0.99 * free.bound
+    for most in (1, 2, 3):
+        assert relax(units, D(), 20.0, most=most).gap <= 1e-6
     assert relax(units, D(), 30.0, most=1).value == pytest.approx(
         float(D().value(units.information(np.ones(30))))
     )

@@ -34,7 +34,7 @@ __all__ = ["cell", "nothing_goes_on", "path"]  # fixtures
 
 pytestmark = pytest.mark.xdist_group("stops")
 
-LONGEST = 6.0
+LONGEST = 5.0
 """The moment of a kill is drawn up to here, s; a run takes longer."""
 SLOW = 0.3
 """Position of the speed slider meanwhile: the arm moves for about half of the time."""

@@ -15,6 +15,7 @@ import select
 import signal
 import socket
 import sys
+from collections.abc import Iterator
 from typing import Any
 
 _NICE = -10
@@ -34,6 +35,23 @@ def end_with_parent(life: int, parent: int) -> None:
     fcntl.fcntl(life, fcntl.F_SETFL, fcntl.fcntl(life, fcntl.F_GETFL) | os.O_ASYNC)
     if select.select([life], [], [], 0)[0] or os.getppid() != parent:
         os._exit(0)  # it ended meanwhile
+
+
+@contextlib.contextmanager
+def outliving(seconds: float) -> Iterator[None]:
+    """Finish what must not be left half done, also when the parent ends meanwhile.
+
+    The end is put off for at most so many seconds; then SIGALRM, which no lock holds up either,
+    ends the process whether it is done or not.
+    """
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGIO})
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGIO})
 
 
 class Line:

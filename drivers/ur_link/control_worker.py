@@ -11,11 +11,13 @@ import os
 import time
 from typing import Any
 
-from drivers.ur_link.child import Line, start, words
+from drivers.ur_link.child import Line, outliving, start, words
 
 WATCHDOG_HZ = 10.0
 REST_HZ = 1.0
 KICK_S = 0.02
+TAKING_S = 8.0
+"""How long taking control may last when the parent has ended meanwhile, s."""
 LATE_S = 0.8 / WATCHDOG_HZ
 """A longer pause between two kicks may have set off the watchdog, s."""
 
@@ -108,7 +110,9 @@ def main() -> None:
             | int(Interface.FLAG_UPPER_RANGE_REGISTERS)
             | int(Interface.FLAG_NO_EXT_FT)
         )
-        control = Control(Interface(host, float(hz), flags), float(lease))
+        # From the upload of its program to the watchdog nothing would end it but this process.
+        with outliving(TAKING_S):
+            control = Control(Interface(host, float(hz), flags), float(lease))
     except Exception as error:  # whatever it is, the parent has to know
         line.answer(0, error=words(error))
         return
