@@ -30,8 +30,6 @@ SMALL = 0.05  # rad
 SLOW = 0.2  # rad/s
 PATIENCE = 60.0  # s
 
-pytestmark = pytest.mark.xdist_group("devices")
-
 
 @pytest.fixture(scope="module")
 def there(

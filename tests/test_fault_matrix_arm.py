@@ -31,8 +31,6 @@ from hilcal.types import Floats
 
 __all__ = ["cell", "nothing_goes_on", "path"]  # fixtures
 
-pytestmark = pytest.mark.xdist_group("arm faults")
-
 
 def arm(op: str, **arguments: object) -> Act:
     return act("arm", op, **arguments)

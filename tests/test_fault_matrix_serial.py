@@ -29,8 +29,6 @@ from campaign_site import Site
 
 __all__ = ["cell", "nothing_goes_on", "path"]  # fixtures
 
-pytestmark = pytest.mark.xdist_group("serial faults")
-
 NO_FORCE = [0.0] * 6
 HIT = [0.0, 0.0, -280.0, 0.0, 0.0, 0.0]
 TOO_MUCH = "max_force_N|over its range"  # with a load on the hook it may be beyond the range

@@ -32,8 +32,6 @@ from hilcal.data.run_log import RunLog
 
 __all__ = ["cell", "nothing_goes_on", "path"]  # fixtures
 
-pytestmark = pytest.mark.xdist_group("stops")
-
 LONGEST = 5.0
 """The moment of a kill is drawn up to here, s; a run takes longer."""
 SLOW = 0.3

@@ -1,8 +1,6 @@
 """The recording of a plan: a file that shows it before anything is measured."""
 
-import contextlib
 import hashlib
-import os
 import uuid
 from pathlib import Path
 
@@ -11,7 +9,6 @@ import rerun as rr
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.data.plan import Plan
-from hilcal.errors import HilcalError, InputError
 from hilcal.plan.story import PlanStory
 from hilcal.report.viewer import (
     plan_cell,
@@ -23,7 +20,7 @@ from hilcal.report.viewer import (
     style,
 )
 from hilcal.report.viewer.plan_digest import PlanDigest, plan_digest
-from hilcal.report.viewer.stream import APPLICATION, flush
+from hilcal.report.viewer.stream import flush, opened, require_folder, write
 
 
 def record_plan(cell: Cell, config: CellConfig, plan: Plan, story: PlanStory, path: Path) -> None:
@@ -45,31 +42,10 @@ def record_plan(cell: Cell, config: CellConfig, plan: Plan, story: PlanStory, pa
         HilcalError: the file cannot be written.
     """
     path = Path(path)
-    if not path.parent.is_dir():
-        raise InputError(f"recording {path}: no folder {path.parent}; make it first")
+    require_folder(path)
     d = plan_digest(cell, config, plan, story)
-    rec = rr.RecordingStream(
-        APPLICATION,
-        recording_id=_recording_id(config, plan, story),
-        send_properties=False,
-        # Chunks end where the plan is flushed, not when a clock ticks: equal files.
-        batcher_config=rr.ChunkBatcherConfig.NEVER(),
-    )
-    rec.set_log_time_enabled(False)
-    rec.set_log_tick_enabled(False)
-    memory = rec.memory_recording()
-    rec.send_blueprint(plan_layout.blueprint(d), make_active=False, make_default=True)
-    _tell(rec, d)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        part.write_bytes(memory.drain_as_bytes())
-        part.replace(path)
-    except OSError as error:
-        raise HilcalError(f"recording {path}: cannot be written: {error.strerror}") from error
-    finally:
-        with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
-        rec.disconnect()
+    rec = opened(_recording_id(config, plan, story))
+    write(rec, plan_layout.blueprint(d), lambda: _tell(rec, d), path)
 
 
 def _tell(rec: rr.RecordingStream, d: PlanDigest) -> None:

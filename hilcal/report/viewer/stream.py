@@ -7,12 +7,13 @@ import os
 import socket
 import subprocess
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
 
 from hilcal.errors import HilcalError, InputError
 from hilcal.report import picture
@@ -57,29 +58,14 @@ def record(story: Story, *sinks: Sink, limits: Limits | None = None) -> rr.Recor
 def save(story: Story, path: Path, limits: Limits | None = None) -> None:
     """Write a story as a recording file, whole or not at all; an existing file is replaced.
 
-    The recording is encoded in memory: rerun's own file sink can wait forever on a full disk.
-
     Raises:
         InputError: the folder is missing, or the story's arrays do not fit together.
         HilcalError: the file cannot be written.
     """
     path = Path(path)
-    if not path.parent.is_dir():
-        raise InputError(f"recording {path}: no folder {path.parent}; make it first")
+    require_folder(path)
     d, rec = _open(story, limits)
-    memory = rec.memory_recording()
-    rec.send_blueprint(layout.blueprint(d), make_active=False, make_default=True)
-    _tell(rec, d)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        part.write_bytes(memory.drain_as_bytes())
-        part.replace(path)
-    except OSError as error:
-        raise HilcalError(f"recording {path}: cannot be written: {error.strerror}") from error
-    finally:
-        with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
-        rec.disconnect()
+    write(rec, layout.blueprint(d), lambda: _tell(rec, d), path)
 
 
 @contextlib.contextmanager
@@ -124,6 +110,55 @@ def recording_id(story: Story) -> str:
     return str(uuid.UUID(bytes=sha.digest()[:16]))
 
 
+def opened(identifier: str) -> rr.RecordingStream:
+    """Return a stream that is equal for equal data: no clock, no run number goes into it."""
+    rec = rr.RecordingStream(
+        APPLICATION,
+        recording_id=identifier,
+        send_properties=False,
+        # Chunks end where the stream is flushed, not when a clock ticks: equal files.
+        batcher_config=rr.ChunkBatcherConfig.NEVER(),
+    )
+    rec.set_log_time_enabled(False)
+    rec.set_log_tick_enabled(False)
+    return rec
+
+
+def require_folder(path: Path) -> None:
+    """Refuse a file in a folder that is not there.
+
+    Raises:
+        InputError: names the folder.
+    """
+    if not path.parent.is_dir():
+        raise InputError(f"recording {path}: no folder {path.parent}; make it first")
+
+
+def write(
+    rec: rr.RecordingStream, blueprint: rrb.Blueprint, tell: Callable[[], None], path: Path
+) -> None:
+    """Write what is told to a stream as a file, whole or not at all, and close the stream.
+
+    The recording is encoded in memory: rerun's own file sink can wait forever on a full disk.
+
+    Raises:
+        HilcalError: the file cannot be written.
+    """
+    memory = rec.memory_recording()
+    rec.send_blueprint(blueprint, make_active=False, make_default=True)
+    tell()
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        part.write_bytes(memory.drain_as_bytes())
+        part.replace(path)
+    except OSError as error:
+        raise HilcalError(f"recording {path}: cannot be written: {error.strerror}") from error
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+        rec.disconnect()
+
+
 def flush(rec: rr.RecordingStream) -> None:
     """Hand everything logged so far to the sinks; a slow viewer only costs the time-out.
 
@@ -152,16 +187,7 @@ def disable_analytics() -> None:
 
 def _open(story: Story, limits: Limits | None) -> tuple[Digest, rr.RecordingStream]:
     check(story)
-    rec = rr.RecordingStream(
-        APPLICATION,
-        recording_id=recording_id(story),
-        send_properties=False,
-        # Chunks end where the story is flushed, not when a clock ticks: equal files.
-        batcher_config=rr.ChunkBatcherConfig.NEVER(),
-    )
-    rec.set_log_time_enabled(False)
-    rec.set_log_tick_enabled(False)
-    return digest(story, limits or Limits()), rec
+    return digest(story, limits or Limits()), opened(recording_id(story))
 
 
 def _tell(rec: rr.RecordingStream, d: Digest) -> None:
