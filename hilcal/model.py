@@ -8,11 +8,12 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.data.readings import States
+from hilcal.effects.options import typical_compliances
 from hilcal.effects.protocol import Effect, Situation
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.observe import Observation, motion, observe
 from hilcal.robot import chain as chains
-from hilcal.robot.batch import along_states, chunks, join, take, zeros
+from hilcal.robot.batch import along_states, by_field, chunks, join, take, zeros
 from hilcal.robot.chain import Chain
 from hilcal.robot.deviation import Deviation
 from hilcal.robot.statics import Load, slot_wrenches
@@ -46,6 +47,7 @@ class Prediction:
             angle=s.angle[rows],
             chain=take(s.chain, rows, axis=1),
             wrench=s.wrench[rows],
+            load=replace(s.load, wrench=s.load.wrench[rows]),
         )
         return Prediction(chosen, take(self.deviation, rows), take(self.observation, rows))
 
@@ -101,15 +103,18 @@ class Model:
         cell = self.cell
         angle = states.q if states.q_actual is None else states.q_actual
         angle = along_states(angle)
-        parts = [(e, theta[s]) for e, s in zip(self.effects, self.slices(), strict=True)]
+        parts = self._parts(theta)
         chain = chains.evaluate(cell.arm, angle)
-        s = Situation(cell, states, angle, chain, zeros(len(states), cell.arm.n + 1, 6))
+        nothing = zeros(len(states), cell.arm.n + 1, 6)
+        recorded = self._load(states, theta)
+        s = Situation(cell, states, angle, chain, nothing, recorded, self._compliance(theta))
         rigid = sum((e.deviation(t, s) for e, t in parts if not e.elastic), Deviation())
         elastic = [(e, t) for e, t in parts if e.elastic]
-        load = self._load(states, theta)
         before: float | None = None
         for _ in range(MAX_EQUILIBRIUM_STEPS):
-            s = replace(s, chain=chain, wrench=slot_wrenches(cell.arm, chain, load))
+            load = self._corrected(recorded, replace(s, chain=chain), theta)
+            wrench = slot_wrenches(cell.arm, chain, load)
+            s = replace(s, chain=chain, wrench=wrench, load=load)
             deviation = sum((e.deviation(t, s) for e, t in elastic), rigid)
             chain = chains.evaluate(cell.arm, angle, deviation)
             moved = _flange_motion(s.chain, chain, cell.arm.reach)
@@ -173,32 +178,67 @@ class Model:
         s = prediction.situation
         m = out.shape[1]
         moves = motion(self.cell, prediction.observation, s.chain, prediction.deviation, m)
+        mine = self._parts(theta)
         for e, place in zip(effects, places, strict=True):
             wanted = np.flatnonzero(place >= 0)
             if not len(wanted):
                 continue
             within = np.full(len(place), -1)
             within[wanted] = np.arange(len(wanted))
+            at = next((t for other, t in mine if other is e), np.zeros(len(place)))
+            columns = e.columns(s)
+            if e in self.effects and e.compliance(at) is not None:
+                for other, part in mine:
+                    columns += other.compliance_columns(part, s)
             block = zeros(len(s.states), m, len(wanted))
-            for columns in e.columns(s):
-                c = columns.only(within[columns.parameter] >= 0)
-                block[:, :, within[c.parameter]] += moves.by_columns(c)
-            change = e.wrench_columns(s)
+            for c in columns:
+                c = c.only(within[c.parameter] >= 0)
+                _add_columns(block, within[c.parameter], moves.by_columns(c))
+            change = e.wrench_columns(at, s)
             if change is not None:
-                for other, part in zip(self.effects, self.slices(), strict=True):
-                    if other.elastic:
-                        response = other.response(theta[part], s, change[:, wanted])
-                        block += moves.by_response(response)
+                change = change[:, wanted]
+                gives = [other.response(part, s, change) for other, part in mine if other.elastic]
+                if gives:
+                    whole = by_field(gives, lambda given: np.asarray(sum(given[1:], given[0])))
+                    block += moves.by_response(whole)
             out[:, :, place[wanted]] = block
 
+    def _parts(self, theta: Floats) -> list[tuple[Effect, Floats]]:
+        """Each effect with its parameters."""
+        return [(e, theta[s]) for e, s in zip(self.effects, self.slices(), strict=True)]
+
+    def _compliance(self, theta: Floats) -> Floats:
+        """(n,) joint compliances in force."""
+        told = [c for e, t in self._parts(theta) if (c := e.compliance(t)) is not None]
+        return told[0] if told else typical_compliances(self.cell)
+
     def _load(self, states: States, theta: Floats) -> Load:
+        """Load as recorded, where it acts, and the weights."""
         cell, point = self.cell, self.cell.load_point
-        for e, s in zip(self.effects, self.slices(), strict=True):
-            change = e.load_change(theta[s])
-            if change is not None:
+        moments: Floats | None = None
+        for e, t in self._parts(theta):
+            change = e.load_change(t)
+            if change is not None and change.point is not None:
                 point = point + change.point
+            if change is not None and change.first_moment is not None:
+                moments = change.first_moment + (0.0 if moments is None else moments)
         wrench = along_states(states.wrench)
-        return Load(wrench, point, cell.tool_mass, cell.tool_com, cell.gravity)
+        return Load(wrench, point, cell.tool_mass, cell.tool_com, cell.gravity, moments)
+
+    def _corrected(self, recorded: Load, s: Situation, theta: Floats) -> Load:
+        """Load with the wrench that acts, at the orientation of the flange."""
+        changes = [e.wrench_change(t, s) for e, t in self._parts(theta)]
+        given = [c for c in changes if c is not None]
+        return replace(recorded, wrench=sum(given, recorded.wrench)) if given else recorded
+
+
+def _add_columns(block: Floats, at: Ints, moved: Floats) -> None:
+    """Add columns (N, m, P) where they belong, also where one parameter moves several elements."""
+    if len(np.unique(at)) == len(at):
+        block[:, :, at] += moved
+    else:
+        for column, place in enumerate(at):
+            block[:, :, place] += moved[:, :, column]
 
 
 def _flange_motion(a: Chain, b: Chain, reach: float) -> float:
@@ -219,6 +259,9 @@ def _joined(states: States, parts: Sequence[Prediction]) -> Prediction:
         angle=np.concatenate([s.angle for s in situations]),
         chain=join([s.chain for s in situations], axis=1),
         wrench=np.concatenate([s.wrench for s in situations]),
+        load=replace(
+            situations[0].load, wrench=np.concatenate([s.load.wrench for s in situations])
+        ),
     )
     return Prediction(
         situation,

@@ -255,6 +255,7 @@ def test_effects_lists_the_catalogue(capsys: Capsys) -> None:
     d = ok(capsys, "effects", "--json").document
     assert [e["name"] for e in d["effects"]] == list(catalogue())
     assert all(e["law"] and e["parameters"] for e in d["effects"])
+    assert {e["source"] for e in d["effects"]} == {"built in"}
     words = ok(capsys, "effects").out
     assert all(name in words for name in catalogue())
 

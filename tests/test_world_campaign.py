@@ -8,6 +8,7 @@ from example_cell import ur10e_cell
 
 from drivers.simulated.campaign import dead_weights, rehearsal_states, simulate
 from drivers.simulated.hidden import hide, nothing_hidden
+from drivers.simulated.temperatures import air, joints
 from hilcal.errors import InputError
 
 CELL = ur10e_cell()
@@ -29,7 +30,71 @@ def test_every_pose_is_seen_unloaded_first_and_then_under_each_load():
         assert np.ptp(states.q[pose == p], axis=0).max() == 0.0
         assert set(cycle[pose == p]) == {0, 1}
     assert np.diff(states.time).min() >= 20.0
-    assert np.all(states.load_time > 0.0)
+
+
+def test_loads_hang_for_seconds_or_minutes_and_never_since_before_the_last_reading():
+    states, _, load, _ = rehearse(n=60)
+    hung = states.load_time
+    assert hung.min() >= 4.999
+    assert hung.max() <= 300.001
+    assert np.all(hung[1:] < np.diff(states.time))
+    decades = np.log(hung / 5.0) / np.log(60.0)  # uniform from 0 to 1, whatever hangs
+    for which in range(3):
+        mine = decades[load == which]
+        assert mine.mean() == pytest.approx(0.5, abs=4.0 * np.sqrt(1 / 12 / len(mine)))
+        assert mine.std() == pytest.approx(np.sqrt(1 / 12), rel=0.25)
+
+
+def test_where_nothing_is_ever_hung_the_time_under_load_goes_on():
+    states, _, load, _ = rehearsal_states(CELL, 5, [], np.random.default_rng(0))
+    assert not load.any()
+    np.testing.assert_allclose(np.diff(states.load_time), np.diff(states.time))
+
+
+def test_joints_warm_up_each_by_its_own_and_the_air_drifts():
+    states, _, _, _ = rehearse(n=40)
+    warm, hall = states.joint_temperature, states.air_temperature
+    assert warm.shape == states.q.shape
+    assert np.abs(warm[0] - 22.0).max() < 1.5
+    risen = warm[-5:].mean(axis=0) - 22.0
+    assert risen.min() > 4.0
+    assert risen.max() < 20.5
+    assert np.ptp(risen) > 1.0
+    assert np.corrcoef(warm.T).min() > 0.5
+    lasted = np.diff(states.time)
+    # at most 20 °C with a time constant of 1500 s, and six of the sensor's sigmas
+    assert np.all(np.abs(np.diff(warm, axis=0)) < lasted[:, None] * 20 / 1500 + 6 * 0.07)
+    assert len(np.unique(hall)) == len(hall)
+    assert 0.3 < np.ptp(hall) < 6.0
+    assert np.abs(hall - 22.0).max() < 6.0
+    # the quickest is the air conditioning, 0.25 °C in a period of 1200 s
+    assert np.all(np.abs(np.diff(hall)) < lasted * 0.0022 + 6 * 0.03)
+
+
+def test_every_campaign_has_its_own_weather():
+    time = np.linspace(0.0, 8000.0, 30)
+    rng = np.random.default_rng(0)
+    rises = [np.ptp(joints(time, 6, rng), axis=0) for _ in range(50)]
+    drifts = [seen[-1] - seen[0] for seen in (air(time, rng) for _ in range(50))]
+    assert np.std(rises) > 2.0
+    assert np.min(rises) > 3.0
+    assert np.ptp(drifts) > 1.0
+    assert np.abs(drifts).max() < 6.0
+
+
+def test_temperatures_are_drawn_apart_from_all_else():
+    with_, without = (
+        (*rehearsal_states(CELL, 6, WEIGHTS, rng, temperatures=told), rng.random(4))
+        for told, rng in ((True, np.random.default_rng(5)), (False, np.random.default_rng(5)))
+    )
+    for name in ("q", "wrench", "time", "load_time", "approach"):
+        np.testing.assert_array_equal(getattr(with_[0], name), getattr(without[0], name))
+    np.testing.assert_array_equal(with_[-1], without[-1])
+    assert without[0].air_temperature is None
+    assert without[0].joint_temperature is None
+    again = rehearsal_states(CELL, 6, WEIGHTS, np.random.default_rng(5))[0]
+    np.testing.assert_array_equal(again.air_temperature, with_[0].air_temperature)
+    np.testing.assert_array_equal(again.joint_temperature, with_[0].joint_temperature)
 
 
 def test_poses_are_feasible_and_spread():

@@ -1,6 +1,7 @@
 """A world comes back from its file as it was."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from living_cell import (
     states,
     world_of,
 )
+from world_cases import further
 
 from drivers.simulated.world_file import read_world, write_world
 from hilcal.errors import InputError
@@ -20,7 +22,8 @@ from hilcal.errors import InputError
 
 def test_world_comes_back_from_its_file_to_the_last_bit(tmp_path):
     made = config(force_sensor={"driver": "ft300", "port": "x", "origin_m": [0, 0, 0.1]})
-    world = world_of(made, **everything(np.random.default_rng(3)))
+    world = world_of(made, **everything(np.random.default_rng(3)), **further(4))
+    world = replace(world, joint_reference=23.4)
     write_world(tmp_path / "world.json", world, made)
     back, told = read_world(tmp_path / "world.json")
     assert told == made
@@ -28,7 +31,8 @@ def test_world_comes_back_from_its_file_to_the_last_bit(tmp_path):
     assert back.noise == world.noise
     for name in ("registration", "station", "joint_std"):
         assert same(getattr(back, name), getattr(world, name))
-    state = states(Q, WEIGHT, 12.3)
+    assert back.joint_reference == 23.4
+    state = replace(states(Q, WEIGHT, 12.3), joint_temperature=np.full((1, 6), 25.0))
     assert same(back.sight(state).position, world.sight(state).position)
 
 
@@ -62,6 +66,10 @@ def test_a_damaged_world_says_so(tmp_path):
     del content["physics"]["base_frame"]
     path.write_text(json.dumps(content))
     with pytest.raises(InputError, match="damaged: KeyError 'base_frame'"):
+        read_world(path)
+    write_world(path, world_of(config()), config())
+    path.write_text(path.read_text().replace('"version": 2', '"version": 1'))
+    with pytest.raises(InputError, match="version 1; this hilcal reads 2"):
         read_world(path)
     with pytest.raises(InputError, match="cannot be read"):
         read_world(tmp_path / "none.json")

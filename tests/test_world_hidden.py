@@ -119,13 +119,39 @@ def test_load_point_adds_the_moment_of_the_load():
     )
 
 
-def test_effects_that_cancel_hardly_show_in_deflections():
-    first = np.array([np.flatnonzero((p == POSE) & (LOAD == 0))[0] for p in POSE])
-    for effect in set(EFFECTS) - set(DEFLECTION_EFFECTS):
-        world = hide(effect, CELL, STATES, 3.0, "absolute", np.random.default_rng(1))
-        change = world.sight(STATES).position - without(world, effect).sight(STATES).position
-        left = np.abs(change - change[first]).max()
-        assert left < 0.02 * np.abs(change).max()
+FIRST = np.array([np.flatnonzero((p == POSE) & (LOAD == 0))[0] for p in POSE])
+ABSOLUTE_ONLY = tuple(e for e in EFFECTS if e not in DEFLECTION_EFFECTS)
+
+
+@pytest.mark.parametrize("effect", ABSOLUTE_ONLY)
+def test_effects_that_cancel_hardly_show_in_deflections(effect):
+    """They cancel to first order: where no temperature changes with the load."""
+    still = replace(
+        STATES,
+        air_temperature=STATES.air_temperature[FIRST],
+        joint_temperature=STATES.joint_temperature[FIRST],
+    )
+    world = hide(effect, CELL, still, 3.0, "absolute", np.random.default_rng(1))
+    change = world.sight(still).position - without(world, effect).sight(still).position
+    left = np.abs(change - change[FIRST]).max()
+    assert left < 0.02 * np.abs(change).max()
+
+
+@pytest.mark.parametrize("effect", DEFLECTION_EFFECTS)
+def test_effects_that_do_not_cancel_show_in_deflections(effect):
+    """As strong in deflections as they are in absolute readings, within a few times."""
+    world = hide(effect, CELL, STATES, 3.0, "absolute", np.random.default_rng(1))
+    change = world.sight(STATES).position - without(world, effect).sight(STATES).position
+    left = np.sqrt(np.mean((change - change[FIRST])[LOAD > 0] ** 2))
+    assert left > (0.01 if effect == "tracker_drift" else 0.1) * np.sqrt(np.mean(change**2))
+
+
+@pytest.mark.parametrize("effect", ["thermal_growth", "thermal_joint_drift"])
+def test_temperatures_change_too_little_within_a_pose_to_show_in_deflections(effect):
+    world = hide(effect, CELL, STATES, 3.0, "absolute", np.random.default_rng(1))
+    change = world.sight(STATES).position - without(world, effect).sight(STATES).position
+    left = np.sqrt(np.mean((change - change[FIRST])[LOAD > 0] ** 2))
+    assert left < 0.1 * np.sqrt(np.mean(change**2))
 
 
 def test_truth_is_named_in_si():
@@ -185,12 +211,36 @@ def test_what_cannot_be_hidden_is_refused(effect, strength, mode, message):
 
 
 @pytest.mark.parametrize(
-    ("effect", "column"), [("hysteresis", "approach"), ("tracker_drift", "time")]
+    ("effect", "column"),
+    [
+        ("hysteresis", "approach"),
+        ("tracker_drift", "time"),
+        ("creep", "load_time"),
+        ("thermal_growth", "air_temperature"),
+        ("thermal_joint_drift", "joint_temperature"),
+    ],
 )
 def test_states_without_what_the_effect_needs_are_refused(effect, column):
     bare = States(q=STATES.q, wrench=STATES.wrench)
     with pytest.raises(InputError, match=f"^{column}: {effect} is hidden"):
         hide(effect, CELL, bare, 3.0, "absolute", np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("effect", ["wrench_bias", "wrench_gain", "sensor_misalignment"])
+def test_a_sensor_cannot_misread_what_is_not_there(effect):
+    unloaded = replace(STATES, wrench=np.zeros_like(STATES.wrench))
+    with pytest.raises(InputError, match="no state has a load; valid: ") as caught:
+        hide(effect, CELL, unloaded, 3.0, "absolute", np.random.default_rng(0))
+    assert "\n" not in str(caught.value)
+
+
+def test_joints_drift_from_the_first_temperature_of_the_states():
+    warm = replace(STATES, joint_temperature=STATES.joint_temperature + 6.0)
+    world = hide("thermal_joint_drift", CELL, warm, 3.0, "absolute", np.random.default_rng(0))
+    assert world.joint_reference == pytest.approx(warm.joint_temperature[0].mean())
+    later = hide("thermal_joint_drift", CELL, warm[np.arange(len(warm))[::-1]], 3.0, "absolute",
+                 np.random.default_rng(0))  # fmt: skip
+    assert later.joint_reference == world.joint_reference
 
 
 def test_a_pose_without_an_unloaded_reading_is_refused():
@@ -205,7 +255,8 @@ def test_a_pose_without_an_unloaded_reading_is_refused():
 def test_the_world_shares_no_physics_with_the_program():
     allowed = {"hilcal.robot.arm", "hilcal.cell", "hilcal.data.readings", "hilcal.errors",
                "hilcal.types"}  # fmt: skip
-    files = ("rigid", "elastic_tree", "mechanics", "tracker", "truth", "world", "draw", "hidden",
+    files = ("rigid", "elastic_tree", "elasticity", "conditions", "mechanics", "misreading",
+             "temperatures", "tracker", "truth", "world", "draw", "hidden",
              "campaign")  # fmt: skip
     folder = Path(drivers.simulated.__file__).parent
     for name in files:

@@ -1,11 +1,14 @@
 """A rehearsal: random well-spread poses, loads that hang on them, and the readings."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from drivers.simulated.elastic_tree import build
-from drivers.simulated.mechanics import elasticity, equilibrium
+from drivers.simulated.elasticity import elasticity
+from drivers.simulated.mechanics import equilibrium
+from drivers.simulated.temperatures import air, joints
 from drivers.simulated.world import World
 from hilcal.cell import Cell
 from hilcal.data.readings import Readings, States
@@ -16,7 +19,7 @@ UNLOADED = "none"
 _READING = 20.0  # s from one reading to the next
 _LOADING = 30.0  # s that it takes to change the load
 _MOVING = 15.0  # s that the arm takes to the next pose
-_SETTLING = (8.0, 16.0)  # s that the load has hung when the reading is taken
+_SETTLING = (5.0, 300.0)  # s that the load has hung when the reading is taken
 _MARGIN = 0.9  # share of the joint range and of the torque limits that is used
 _CANDIDATES = 12  # poses drawn per pose that is kept
 _ROUNDS = 60
@@ -30,6 +33,7 @@ def rehearsal_states(
     *,
     approach: bool = True,
     cycles: int = 1,
+    temperatures: bool = True,
 ) -> tuple[States, Ints, Ints, Ints]:
     """Plan a campaign without any device: each pose unloaded, then under each load.
 
@@ -37,7 +41,8 @@ def rehearsal_states(
     above the floor, away from the base's column, not stretched out) and spread over the
     joint space. A joint's approach side is the direction of its last motion: that of the
     move to the pose and, after a change of the load, for about half of the joints that of
-    the change of torque, in which the joint gives way.
+    the change of torque, in which the joint gives way. Some readings are taken as soon as the
+    load has come to rest, some after minutes: the time under load is log-uniform, 5 s to 300 s.
 
     Args:
         cell: the cell.
@@ -46,10 +51,12 @@ def rehearsal_states(
         rng: generator.
         approach: whether the states tell the approach sides.
         cycles: how often the whole campaign is measured.
+        temperatures: whether the states tell those of air and joints; they are drawn apart, so
+            that all else is the same with and without.
 
     Returns:
-        The N = cycles * n_poses * (1 + loads) states with time, load time and approach, and
-        the (N,) indices of pose, load (0 is unloaded) and cycle.
+        The N = cycles * n_poses * (1 + loads) states with time, load time, approach and
+        temperatures, and the (N,) indices of pose, load (0 is unloaded) and cycle.
 
     Raises:
         InputError: a wrong number or wrench, or no feasible poses.
@@ -64,16 +71,27 @@ def rehearsal_states(
     cycle = np.repeat(np.arange(cycles), n_poses * loads)
     changes = np.diff(load, prepend=0) != 0
     moves = load == 0
-    time = np.cumsum(_READING + _LOADING * changes + _MOVING * moves)
     torque = np.stack([_rigid(cell, poses, pull)[1] for pull in pulls], axis=1)
     sides = _sides(poses[pose], torque[pose, load], moves, rng)
+    shortest, longest = _SETTLING
+    hung = shortest * (longest / shortest) ** rng.random(len(pose))
+    taken = _READING + _LOADING * changes + _MOVING * moves
+    time = np.cumsum(np.maximum(taken, (hung + _LOADING) * changes))
+    changed = np.maximum.accumulate(np.where(changes, time - hung, time[0] - hung[0]))
     states = States(
         q=poses[pose],
         wrench=pulls[load],
         time=time,
-        load_time=rng.uniform(*_SETTLING, len(pose)),
+        load_time=time - changed,
         approach=sides if approach else None,
     )
+    if temperatures:
+        (apart,) = rng.spawn(1)
+        states = replace(
+            states,
+            air_temperature=air(time, apart),
+            joint_temperature=joints(time, cell.arm.n, apart),
+        )
     return states, pose, load, cycle
 
 

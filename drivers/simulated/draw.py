@@ -8,6 +8,15 @@ from drivers.simulated.elastic_tree import long_links
 from hilcal.robot.arm import Arm
 from hilcal.types import Floats
 
+_BY_LOAD = (
+    "tool_compliance",
+    "periodic_joint_compliance",
+    "backlash",
+    "creep",
+    "wrench_bias",
+    "wrench_gain",
+    "sensor_misalignment",
+)
 _GIVE = np.array([2.0e-3, 2.6e-3, 1.35e-3, 1.7e-3, 2.0e-3, 2.2e-3])
 
 
@@ -77,7 +86,41 @@ class Draw:
             return 5e-3 * rng.standard_normal(3)
         if name == "base_frame":
             return 1e-3 * rng.standard_normal(6)
-        return np.repeat([1e-8, 3e-9], 3) * rng.standard_normal(6)  # tracker_drift
+        if name == "tracker_drift":
+            return np.repeat([1e-8, 3e-9], 3) * rng.standard_normal(6)
+        return self._by_load(name, rng) if name in _BY_LOAD else self._by_heat(name, rng)
+
+    def _by_load(self, name: str, rng: np.random.Generator) -> Floats:
+        """Draw what depends on the load: further elasticity, and what its sensor misreads."""
+        n = self.arm.n
+        typical = typical_compliance(self.arm)
+        if name == "tool_compliance":  # a flange plate and its bolts: stiffer about its own axis
+            plate = 0.3 * float(typical[-1]) * np.array([0.5, 1.0])
+            return np.asarray(plate * rng.uniform(0.5, 1.0, 2))
+        if name == "periodic_joint_compliance":
+            return np.asarray(0.1 * typical[:, None] * rng.standard_normal((n, 2)))
+        if name == "backlash":
+            return 5e-5 * rng.uniform(0.3, 1.0, n)
+        if name == "creep":
+            return 0.03 * rng.uniform(0.5, 1.5, 1)
+        if name == "wrench_bias":
+            return np.repeat([1.0, 0.1], 3) * rng.standard_normal(6)
+        if name == "wrench_gain":
+            return 1e-2 * rng.standard_normal(6)
+        return 1e-2 * rng.standard_normal(3)  # sensor_misalignment
+
+    def _by_heat(self, name: str, rng: np.random.Generator) -> Floats:
+        """Draw what comes from temperature, from wrong masses, or from the instrument."""
+        n = self.arm.n
+        if name == "thermal_growth":  # steel to aluminium
+            return rng.uniform(11e-6, 24e-6, 1)
+        if name == "thermal_joint_drift":
+            return 5e-6 * rng.standard_normal(n)
+        if name == "link_mass":  # centres of mass some centimetres off
+            heavy = np.maximum(self.arm.masses, 0.1)
+            return np.asarray(0.03 * heavy[:, None] * rng.standard_normal((n, 3)))
+        side = rng.choice(np.array([-1.0, 1.0]), 1)
+        return np.asarray(5e-6 * side * rng.uniform(0.5, 1.5, 1))  # tracker_scale
 
     def _beams(self, rng: np.random.Generator) -> Floats:
         """Draw 1/EI and 1/GJ (b, 2): a tube that gives as much as half a drive over its length."""

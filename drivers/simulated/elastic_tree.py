@@ -8,6 +8,8 @@ import pinocchio as pin
 from hilcal.robot.arm import Arm
 from hilcal.types import Floats, Ints
 
+_MASSLESS = 1e-9  # kg; what carries the first moment of a body without a mass
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ElasticTree:
@@ -16,7 +18,8 @@ class ElasticTree:
     The tree from base to flange is
 
         RX RY RZ (base origin), then for each joint j: RX RY (bearing) RZ (drive),
-        and behind the drive of a long link: PY PZ RX RY RZ (its tip, x along the beam).
+        and behind the drive of a long link: PY PZ RX RY RZ (its tip, x along the beam);
+        last RX RY RZ (flange).
 
     Attributes:
         model: the Pinocchio model, v degrees of freedom.
@@ -26,6 +29,7 @@ class ElasticTree:
         beam: (b, 5) indices of the tips: two displacements, twist, two rotations.
         beam_length: (b,) lengths, m.
         beam_link: (b,) number k of each long link, the constant transform L_k.
+        tool: (3,) indices of the flange's tilts about its x, y, z; (0,) where it has none.
         last: number of the last Pinocchio joint, which carries the flange.
         flange: (4, 4) flange in the last joint's frame.
     """
@@ -37,6 +41,7 @@ class ElasticTree:
     beam: Ints
     beam_length: Floats
     beam_link: Ints
+    tool: Ints
     last: int
     flange: Floats
 
@@ -59,6 +64,8 @@ def build(
     gravity: Floats,
     *,
     beams: bool = False,
+    tool: bool = False,
+    moments: Floats | None = None,
 ) -> ElasticTree:
     """Build the tree from the true links (n + 1, 4, 4); lengths in m, masses in kg.
 
@@ -69,6 +76,9 @@ def build(
         tool_com: (3,) its centre of mass, flange axes, m.
         gravity: (3,) base axes, m/s².
         beams: whether long links get elastic tips.
+        tool: whether the flange can tilt; only then no constant transform is left behind the
+            last degree of freedom.
+        moments: (n, 3) first moments of the bodies beyond their own, body axes, kg·m.
     """
     model = pin.Model()
     model.gravity.linear = np.asarray(gravity, dtype=float)
@@ -94,7 +104,7 @@ def build(
             [add(pin.JointModelRX(), f"tilt_x{j + 1}"), add(pin.JointModelRY(), f"tilt_y{j + 1}")]
         )
         drive.append(add(pin.JointModelRZ(), f"drive{j + 1}"))
-        body = pin.Inertia(float(arm.masses[j]), arm.coms[j], np.zeros((3, 3)))
+        body = _body(float(arm.masses[j]), arm.coms[j], None if moments is None else moments[j])
         model.appendBodyToJoint(last, body, pin.SE3.Identity())
         here = pin.SE3(links[j + 1])
         if j + 1 in bent:
@@ -109,8 +119,15 @@ def build(
             )
             beam.append([add(kind, f"beam{j + 1}_{i}") for i, kind in enumerate(kinds)])
             here = tip.inverse() * pin.SE3(links[j + 1])
-    tool = pin.Inertia(float(tool_mass), np.asarray(tool_com, dtype=float), np.zeros((3, 3)))
-    model.appendBodyToJoint(last, tool, here)
+    hand = []
+    if tool:
+        hand = [
+            add(pin.JointModelRX(), "tool_x"),
+            add(pin.JointModelRY(), "tool_y"),
+            add(pin.JointModelRZ(), "tool_z"),
+        ]
+    carried = pin.Inertia(float(tool_mass), np.asarray(tool_com, dtype=float), np.zeros((3, 3)))
+    model.appendBodyToJoint(last, carried, here)
     return ElasticTree(
         model=model,
         base=np.array(base),
@@ -119,9 +136,18 @@ def build(
         beam=np.array(beam, dtype=np.int64).reshape(-1, 5),
         beam_length=np.linalg.norm(links[bent, :3, 3], axis=1),
         beam_link=bent,
+        tool=np.array(hand, dtype=np.int64),
         last=last,
         flange=np.asarray(here.homogeneous),
     )
+
+
+def _body(mass: float, com: Floats, moment: Floats | None) -> pin.Inertia:
+    """Return a body of the given mass whose first moment is mass com + moment, kg·m."""
+    if moment is not None and np.any(moment):
+        held = max(mass, _MASSLESS)
+        com, mass = (mass * com + moment) / held, held
+    return pin.Inertia(mass, np.asarray(com, dtype=float), np.zeros((3, 3)))
 
 
 def _beam_axes(along: Floats) -> Floats:

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from drivers.simulated.conditions import joint_temperature
 from drivers.simulated.draw import Draw, joint_compliance, typical_torque
 from drivers.simulated.rigid import rotation_vector
 from drivers.simulated.tracker import TrackerNoise
@@ -24,8 +25,19 @@ DEFLECTION_EFFECTS = (
     "hysteresis",
     "load_point",
     "tracker_drift",
+    "tool_compliance",
+    "periodic_joint_compliance",
+    "backlash",
+    "creep",
+    "wrench_bias",
+    "wrench_gain",
+    "sensor_misalignment",
 )
-"""Effects that a deflection shows; the others cancel in it to first order."""
+"""Effects that a deflection shows; the others cancel in it to first order.
+
+What changes with temperature changes little from an unloaded reading to the loaded ones that
+follow it; a scale of parts in a million changes a deflection by as little.
+"""
 
 EFFECTS = (
     *DEFLECTION_EFFECTS,
@@ -34,9 +46,14 @@ EFFECTS = (
     "link_geometry",
     "target_offset",
     "base_frame",
+    "thermal_growth",
+    "thermal_joint_drift",
+    "link_mass",
+    "tracker_scale",
 )
 """Every effect that can be hidden."""
 
+_SAID = ("wrench_bias", "wrench_gain", "sensor_misalignment")  # need something to misread
 READINGS_MODES = ("absolute", "deflection")
 _TOLERANCE = 1e-4
 _TRIALS = 25
@@ -98,6 +115,7 @@ def hide(
     r are the noise-free readings with the effect, r_0 without, W whitens by the covariance
     of a reading; in deflection mode r is the loaded minus the unloaded reading of one pose
     and W belongs to that difference. The direction is drawn; the length is found by secants.
+    Joints that drift with temperature do so from the states' first temperature on.
 
     Args:
         effect: one of `EFFECTS`, or "none".
@@ -115,7 +133,8 @@ def hide(
 
     Raises:
         InputError: an unknown effect or mode, an effect that deflections do not show, a
-            deflection without an unloaded reading, or a strength that cannot be reached.
+            deflection without an unloaded reading, states that lack what the effect depends
+            on, or a strength that cannot be reached.
     """
     _check(effect, strength_sigma, readings_mode, m)
     if world is None:
@@ -125,6 +144,13 @@ def hide(
             world = replace(world, physics=world.physics.with_effect("joint_compliance", softer))
     if effect == "none" or strength_sigma == 0.0:
         return world
+    if effect in _SAID and not np.any(states.wrench):
+        raise InputError(
+            f"effect {effect!r} is an error of the measured load but no state has a load; "
+            "valid: a wrench that is not zero in some states"
+        )
+    if effect == "thermal_joint_drift":
+        world = replace(world, joint_reference=_first_temperature(states))
     torque = np.maximum(
         np.abs(world.drive_torque(states)).max(axis=0), 0.1 * typical_torque(cell.arm)
     )
@@ -169,6 +195,16 @@ def _check(effect: str, strength: float, mode: str, m: int) -> None:
             f'effect {effect!r} cancels in deflections; valid with readings "deflection": '
             f"{', '.join((*DEFLECTION_EFFECTS, 'none'))}"
         )
+
+
+def _first_temperature(states: States) -> float:
+    """Return the mean temperature of the joints in the first state, °C.
+
+    Raises:
+        InputError: states without temperatures of the joints.
+    """
+    first = 0 if states.time is None else int(np.argmin(states.time))
+    return float(joint_temperature(states)[first].mean())
 
 
 def _pairs(states: States, pose: Ints | None, cycle: Ints | None) -> tuple[Ints, Ints]:

@@ -9,26 +9,20 @@ from typing import Any
 import numpy as np
 
 from drivers.simulated.blackboard import Blackboard, N
-from drivers.simulated.elastic_tree import build
 from drivers.simulated.sensor_mount import SensorMount
+from drivers.simulated.temperatures import AIR, warm_up
 from drivers.simulated.world import World
 from hilcal.config import CellConfig
 from hilcal.data.readings import States
 from hilcal.errors import InputError
 from hilcal.toml import suggest
-from hilcal.types import Floats, Ints
+from hilcal.types import Floats
 
 ENCODER_STD = 2e-6
 """Noise of a motor-side encoder at the joint, rad."""
 
-AIR = 22.0
-"""Air temperature, °C."""
-
 _REFRESH_NS = 10_000_000  # real time between two publications of an unchanged arm
 _STRONGEST = 2000.0  # N and N·m that may push or swing
-_WARM_START = 4.0  # °C above the air at the world's start
-_WARM_RISE = np.array([9.0, 11.0, 10.0, 8.0, 8.0, 7.0])  # °C above the air in the end
-_WARM_TIME = 2400.0  # s, time constant of the warm-up
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,8 +73,7 @@ class LivingWorld:
         self._world, self._board, self._seed = world, board, seed
         self._loads = config.loads
         self._mount = SensorMount.of(config)
-        self._drive = _drives(world)
-        self._drifts = bool(np.any(world.physics.tracker_drift))
+        self._ages = world.ages
         self._rng = np.random.default_rng([seed, 0])
         self._lock = threading.RLock()
         left = board.read("truth")
@@ -102,7 +95,7 @@ class LivingWorld:
             before = self._known
             due = now_ns - self._computed_ns >= _REFRESH_NS
             arrived = before is None or before[3:] != known[3:]
-            if arrived or (due and (self._drifts or known[2] or before != known)):
+            if arrived or (due and (self._ages or known[2] or before != known)):
                 try:
                     self._publish(arm)
                 except InputError as error:  # the truth stays what it was
@@ -213,6 +206,7 @@ class LivingWorld:
             wrench=wrench[None],
             time=np.array([now]),
             load_time=np.array([now - self._since]),
+            joint_temperature=warm_up(np.array([now])),
             approach=arm["side"][None].copy(),
         )
         slip = self.slip(int(arm["arrivals"]))[None]
@@ -227,7 +221,7 @@ class LivingWorld:
             target_rotation=sight.rotation[0],
             flange=flange,
             sensor_wrench=self._mount.feels(world, flange[:3, :3], wrench),
-            drive_torque=rest.torque[0, self._drive],
+            drive_torque=rest.torque[0, world.drives],
             arrivals=int(arm["arrivals"]),
             **self._passing(arm, now),
         )
@@ -248,11 +242,10 @@ class LivingWorld:
     def _passing(self, arm: Any, now: float | None = None) -> dict[str, Any]:
         """Return the fields that change while the arm rests."""
         time = self._board.time if now is None else now
-        warm = _WARM_RISE + (_WARM_START - _WARM_RISE) * np.exp(-time / _WARM_TIME)
         return {
             "time": time,
             "encoder": arm["q"] + ENCODER_STD * self._rng.standard_normal(N),
-            "joint_temperature": AIR + warm,
+            "joint_temperature": warm_up(np.array([time]))[0],
             "air_temperature": AIR,
         }
 
@@ -284,11 +277,3 @@ def _six(what: str, wrench: Sequence[float]) -> Floats:
             f"{what} {list(wrench)}; valid: six numbers, N and N·m, at most {_STRONGEST:g}"
         )
     return given
-
-
-def _drives(world: World) -> Ints:
-    """Return the (n,) numbers of the drives among the elastic degrees of freedom."""
-    cell, bends = world.cell, bool(np.any(world.physics.link_compliance))
-    return build(
-        cell.arm, cell.arm.links, cell.tool_mass, cell.tool_com, cell.gravity, beams=bends
-    ).drive

@@ -10,7 +10,23 @@ from hilcal.robot.arm import Arm
 from hilcal.types import Floats
 
 _AXES = ("x", "y", "z")
-_TWIST = (*_AXES, "rx", "ry", "rz")
+_TURNS = ("rx", "ry", "rz")
+_TWIST = (*_AXES, *_TURNS)
+_WRENCH = ("fx", "fy", "fz", "mx", "my", "mz")
+_LABELS: dict[str, tuple[str, ...]] = {
+    "base_frame": _TWIST,
+    "tracker_drift": _TWIST,
+    "base_compliance": _AXES,
+    "load_point": _AXES,
+    "target_offset": _AXES,
+    "tool_compliance": ("along", "across"),
+    "creep": ("k",),
+    "thermal_growth": ("alpha",),
+    "wrench_bias": _WRENCH,
+    "wrench_gain": _WRENCH,
+    "sensor_misalignment": _TURNS,
+    "tracker_scale": ("scale",),
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,6 +49,18 @@ class Truth:
         base_frame: (6,) twist of the base against its registration, base axes, m and rad.
         tracker_drift: (6,) twist rate of the readings about the station, tracker axes, m/s
             and rad/s: the station itself moves the other way.
+        tool_compliance: (2,) of the flange by the moment there, along and across its z axis,
+            rad/(N·m).
+        periodic_joint_compliance: (n, 2) a, b in dq = tau (a cos 2q + b sin 2q), rad/(N·m).
+        backlash: (n,) b in dq = b tanh(tau / tau_0), rad.
+        creep: (1,) k in dq = k c tau log10(1 + t / 1 s), 1 per decade of the load's time t.
+        thermal_growth: (1,) alpha: every link's translation grows by alpha (T - 20 °C), 1/K.
+        thermal_joint_drift: (n,) kappa in dq = kappa (T_j - reference), rad/K.
+        link_mass: (n, 3) first moments of the bodies beyond their own, body axes, kg·m.
+        wrench_bias: (6,) of the force sensor, flange axes, N and N·m.
+        wrench_gain: (6,) error of the gain of its six channels, 1.
+        sensor_misalignment: (3,) its axes are turned against the flange, rotation vector, rad.
+        tracker_scale: (1,) s: positions read (1 + s) times as long, 1.
     """
 
     joint_compliance: Floats
@@ -48,6 +76,17 @@ class Truth:
     target_offset: Floats
     base_frame: Floats
     tracker_drift: Floats
+    tool_compliance: Floats
+    periodic_joint_compliance: Floats
+    backlash: Floats
+    creep: Floats
+    thermal_growth: Floats
+    thermal_joint_drift: Floats
+    link_mass: Floats
+    wrench_bias: Floats
+    wrench_gain: Floats
+    sensor_misalignment: Floats
+    tracker_scale: Floats
 
     @staticmethod
     def rigid(arm: Arm, harmonics: int = 0) -> "Truth":
@@ -67,6 +106,17 @@ class Truth:
             target_offset=np.zeros(3),
             base_frame=np.zeros(6),
             tracker_drift=np.zeros(6),
+            tool_compliance=np.zeros(2),
+            periodic_joint_compliance=np.zeros((n, 2)),
+            backlash=np.zeros(n),
+            creep=np.zeros(1),
+            thermal_growth=np.zeros(1),
+            thermal_joint_drift=np.zeros(n),
+            link_mass=np.zeros((n, 3)),
+            wrench_bias=np.zeros(6),
+            wrench_gain=np.zeros(6),
+            sensor_misalignment=np.zeros(3),
+            tracker_scale=np.zeros(1),
         )
 
     def with_effect(self, effect: str, value: Floats) -> "Truth":
@@ -97,9 +147,13 @@ def _labels(effect: str, shape: tuple[int, ...], arm: Arm) -> Iterator[str]:
     elif effect == "link_compliance":
         for k in long_links(arm):
             yield from (f"link{k}.bend", f"link{k}.twist")
-    elif effect in ("base_frame", "tracker_drift"):
-        yield from _TWIST
-    elif effect in ("base_compliance", "load_point", "target_offset"):
-        yield from _AXES
+    elif effect == "link_mass":
+        for k in range(shape[0]):
+            yield from (f"link{k + 1}.{axis}" for axis in _AXES)
+    elif effect == "periodic_joint_compliance":
+        for j in range(shape[0]):
+            yield from (f"j{j + 1}.cos2", f"j{j + 1}.sin2")
+    elif effect in _LABELS:
+        yield from _LABELS[effect]
     else:
         yield from (f"j{j + 1}" for j in range(shape[0]))

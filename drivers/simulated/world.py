@@ -4,15 +4,18 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from drivers.simulated import conditions
 from drivers.simulated.elastic_tree import ElasticTree, build
-from drivers.simulated.mechanics import Equilibrium, elasticity, equilibrium
+from drivers.simulated.elasticity import Elasticity, elasticity
+from drivers.simulated.mechanics import Equilibrium, equilibrium
+from drivers.simulated.misreading import Misreading
 from drivers.simulated.rigid import displacement, inverse, moved_by, rotation_vector, turned
 from drivers.simulated.tracker import TrackerNoise
 from drivers.simulated.truth import Truth
 from hilcal.cell import Cell
 from hilcal.data.readings import States
 from hilcal.errors import InputError
-from hilcal.types import Floats
+from hilcal.types import Floats, Ints
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,6 +50,7 @@ class World:
         station: (4, 4) T_station_sensor: where the instrument stands.
         noise: the tracker's noise.
         joint_std: (n,) the arm's repeatability at each joint, rad.
+        joint_reference: temperature at which joints do not drift, °C.
     """
 
     cell: Cell
@@ -55,6 +59,7 @@ class World:
     station: Floats
     noise: TrackerNoise
     joint_std: Floats
+    joint_reference: float = 22.0
     _tree: ElasticTree = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -72,6 +77,8 @@ class World:
             self.cell.tool_com,
             self.cell.gravity,
             beams=bool(np.any(self.physics.link_compliance)),
+            tool=bool(np.any(self.physics.tool_compliance) or np.any(self.physics.thermal_growth)),
+            moments=self.physics.link_mass,
         )
         object.__setattr__(self, "_tree", tree)
 
@@ -80,28 +87,34 @@ class World:
         """The hidden parameters that are not zero, as "effect.part": value in SI."""
         return self.physics.named(self.cell.arm)
 
+    @property
+    def drives(self) -> Ints:
+        """(n,) numbers of the drives among the elastic degrees of freedom of `rest`."""
+        return self._tree.drive
+
+    @property
+    def ages(self) -> bool:
+        """Whether the target moves while arm and load rest: with time or temperature."""
+        hidden = self.physics
+        causes = (
+            hidden.tracker_drift,
+            hidden.creep,
+            hidden.thermal_growth,
+            hidden.thermal_joint_drift,
+        )
+        return any(bool(np.any(cause)) for cause in causes)
+
     def joint_errors(self, states: States) -> Floats:
         """Return the joint displacements (N, n) that do not depend on the load, rad.
 
-        dq_j = o_j + h_j s_j + sum_k a_jk cos k q_j + b_jk sin k q_j
+        dq_j = o_j + h_j s_j + kappa_j (T_j - reference)
+               + sum_k a_jk cos k q_j + b_jk sin k q_j
 
         Raises:
-            InputError: hysteresis without approach sides.
+            InputError: hysteresis without approach sides, or drifting joints without their
+                temperatures.
         """
-        hidden = self.physics
-        error = np.broadcast_to(hidden.encoder_offset, states.q.shape).copy()
-        if np.any(hidden.hysteresis):
-            if states.approach is None:
-                raise InputError(
-                    "approach: hysteresis is hidden but the states name no side from which "
-                    "the joints arrived; valid: -1 or +1 per state and joint"
-                )
-            error += hidden.hysteresis * states.approach
-        order = np.arange(1, hidden.transmission_error.shape[1] + 1)
-        phase = states.q[:, :, None] * order
-        error += (np.cos(phase) * hidden.transmission_error[:, :, 0]).sum(axis=2)
-        error += (np.sin(phase) * hidden.transmission_error[:, :, 1]).sum(axis=2)
-        return error
+        return conditions.joint_errors(self.physics, states, self.joint_reference)
 
     def rest(self, states: States, slip: Floats | None = None) -> Equilibrium:
         """Return the static equilibrium of N states.
@@ -109,38 +122,51 @@ class World:
         Args:
             states: what the arm was told and what pulls at it.
             slip: (N, n) how far each joint missed its command, rad (repeatability).
+
+        Raises:
+            InputError: the states lack what a hidden effect depends on, or find no equilibrium.
         """
+        q = states.q + self.joint_errors(states)
+        return equilibrium(
+            self._tree,
+            self._elasticity(states),
+            q if slip is None else q + slip,
+            states.wrench,
+            self.cell.load_point + self.physics.load_point,
+            growth=conditions.link_growth(self.physics, states),
+            sensor=Misreading.of(self.physics),
+        )
+
+    def _elasticity(self, states: States) -> Elasticity:
+        """Return the elastic law in N states."""
         hidden, tree = self.physics, self._tree
-        beam = hidden.link_compliance[: len(tree.beam)]
-        law = elasticity(
+        return elasticity(
             tree,
             hidden.joint_compliance,
             hidden.joint_stiffening,
             hidden.joint_tilt_compliance,
             hidden.base_compliance,
-            beam,
-        )
-        q = states.q + self.joint_errors(states)
-        return equilibrium(
-            tree,
-            law,
-            q if slip is None else q + slip,
-            states.wrench,
-            self.cell.load_point + hidden.load_point,
+            hidden.link_compliance[: len(tree.beam)],
+            tool=hidden.tool_compliance,
+            play=hidden.backlash,
+            crossing=conditions.crossing_torque(self.cell.arm),
+            extra=conditions.further_compliance(hidden, states),
         )
 
     def drive_torque(self, states: States) -> Floats:
         """Return the (N, n) torque that weight and load exert at each drive, N·m."""
-        return self.rest(states).torque[:, self._tree.drive]
+        return self.rest(states).torque[:, self.drives]
 
     def sight(self, states: States, slip: Floats | None = None) -> Sight:
         """Return what the tracker would read of N states without noise of its own.
 
         T_sensor_target = exp(t [drift]) T_sensor_base exp([base_frame]) T_base_flange
-        T_flange_target, the target shifted by its offset.
+        T_flange_target, the target shifted by its offset; the position then 1 + s times as
+        long, about the origin of the sensor's axes.
 
         Raises:
-            InputError: a drifting tracker without time stamps.
+            InputError: the states lack what a hidden effect depends on, e.g. a drifting
+                tracker without time stamps.
         """
         hidden, rest = self.physics, self.rest(states, slip)
         target = self.cell.target.copy()
@@ -160,6 +186,9 @@ class World:
             moved = np.array([displacement(hidden.tracker_drift * t) for t in states.time])
             position = (moved[:, :3, :3] @ position[:, :, None])[:, :, 0] + moved[:, :3, 3]
             rotation = moved[:, :3, :3] @ rotation
+        if np.any(hidden.tracker_scale):
+            position = position * (1.0 + hidden.tracker_scale)
+            jac[:, :3] *= 1.0 + hidden.tracker_scale
         return Sight(position, rotation, jac)
 
     def covariance(self, sight: Sight, m: int = 3) -> Floats:

@@ -16,7 +16,7 @@ from hilcal.errors import InputError
 from hilcal.types import Floats
 
 FORMAT = "hilcal-world"
-VERSION = 1
+VERSION = 2
 _CELL = ("target", "load_point", "tool_mass", "tool_com", "gravity")
 _ARM = ("links", "masses", "coms", "q_min", "q_max", "torque_max")
 
@@ -49,6 +49,7 @@ def write_world(path: Path, world: World, config: CellConfig, base_dir: Path | N
         "registration": _listed(world.registration),
         "station": _listed(world.station),
         "joint_std": _listed(world.joint_std),
+        "joint_reference": world.joint_reference,
         "noise": {
             "range_std": list(noise.range_std),
             "transverse_std": list(noise.transverse_std),
@@ -94,6 +95,7 @@ def read_world(path: Path) -> tuple[World, CellConfig]:
                 orientation_std=float(noise["orientation_std"]),
             ),
             joint_std=_array(data["joint_std"]),
+            joint_reference=float(data["joint_reference"]),
         )
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise InputError(f"{path}: damaged: {type(error).__name__} {error}") from None

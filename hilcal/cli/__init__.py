@@ -11,8 +11,8 @@ import typer
 from threadpoolctl import threadpool_limits
 
 from hilcal import __version__
-from hilcal.cli.catalogue import effects, scaling
 from hilcal.cli.demo import demo
+from hilcal.cli.effects import effects, new
 from hilcal.cli.fitting import compare, identify, validate
 from hilcal.cli.hidden import hidden
 from hilcal.cli.planning import check, plan
@@ -20,7 +20,9 @@ from hilcal.cli.refining import add, diagnose, refine, view
 from hilcal.cli.running import run
 from hilcal.cli.simulating import simulate
 from hilcal.cli.study_plans import plans
+from hilcal.cli.study_scaling import scaling
 from hilcal.cli.tables import export, import_
+from hilcal.effects.added import scope
 from hilcal.errors import HilcalError
 
 DEBUG = "HILCAL_DEBUG"
@@ -30,11 +32,12 @@ _USAGE = 2
 
 
 def _application() -> typer.Typer:
-    def make(help_text: str) -> typer.Typer:
+    def make(help_text: str, *, alone: bool = False) -> typer.Typer:
         return typer.Typer(
             add_completion=False,
             pretty_exceptions_enable=False,
-            no_args_is_help=True,
+            no_args_is_help=not alone,
+            invoke_without_command=alone,
             rich_markup_mode=None,
             help=help_text,
         )
@@ -57,10 +60,13 @@ def _application() -> typer.Typer:
         "validate": validate,
         "view": view,
         "export": export,
-        "effects": effects,
     }
     for name, command in commands.items():
         app.command(name)(command)
+    known = make("List the effects that a model can have; new: begin one of your own.", alone=True)
+    known.command("new")(new)
+    known.callback()(effects)
+    app.add_typer(known, name="effects")
     study = make("Studies of the program's own mathematics.")
     study.command("scaling")(scaling)
     study.command("hidden")(hidden)
@@ -100,7 +106,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             stream.reconfigure(errors="replace")
     debug = os.environ.get(DEBUG, "") not in ("", "0")
     # The matrices are small: more threads gain nothing, and on a busy machine cost tenfold.
-    with warnings.catch_warnings(), threadpool_limits(limits=1, user_api="blas"):
+    threads = threadpool_limits(limits=1, user_api="blas")
+    with warnings.catch_warnings(), threads, scope():
         if not debug:
             warnings.simplefilter("ignore")
         sys.exit(_run(sys.argv[1:] if arguments is None else list(arguments), debug))

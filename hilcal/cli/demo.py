@@ -8,7 +8,8 @@ import numpy as np
 import typer
 
 from drivers.simulated.rehearsal import NOTHING, RANDOM, Rehearsal, check_choice
-from hilcal.cli.files import check_record, record_story
+from hilcal.cli.effects_from import EffectsFrom
+from hilcal.cli.files import check_record, record_of, record_story
 from hilcal.cli.planning import POSES
 from hilcal.cli.refining import Row, revisions_json
 from hilcal.cli.rehearsing import in_process, on_devices
@@ -24,7 +25,6 @@ from hilcal.refine import refine as refine_model
 from hilcal.report import numbers, text, text_demo, text_refine
 from hilcal.report.build_story import Chapter
 from hilcal.report.progress import working
-from hilcal.revisions import to_record
 from hilcal.robot.catalogue import configs_dir
 
 CELL = "demo_ur10e.toml"
@@ -45,6 +45,7 @@ def demo(
         typer.Option("--without-devices", help="Draw the readings at once, through no wire."),
     ] = False,
     record: Record = None,
+    effects_from: EffectsFrom = None,
     as_json: Json = False,
 ) -> None:
     """Rehearse the whole story on a simulated cell, through real drivers and wires."""
@@ -71,7 +72,7 @@ def demo(
         found = refine_model(model, r.readings, r.mode, say)
     with Campaign.open(output) as campaign:
         numbered = [
-            campaign.append_revision(to_record(s.fit, s.diagnosis, s.added, hashed))
+            campaign.append_revision(record_of(s.fit, s.diagnosis, s.added, hashed))
             for s in found.steps
         ]
     rows: list[Row] = [

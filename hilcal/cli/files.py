@@ -2,10 +2,11 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from hilcal.cell import Cell, cell_from_config
+from hilcal.cli.effects_from import SOURCES, check_sources, sources
 from hilcal.cli.terminal import Terminal
 from hilcal.config import CellConfig
 from hilcal.data.campaign import Campaign
@@ -19,9 +20,11 @@ from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.repeatability import with_repeatability
+from hilcal.model import Model
 from hilcal.report.build_story import Chapter, build_story
 from hilcal.report.progress import Say, working
-from hilcal.revisions import chain, mode_of, restore, to_record, usual_mode
+from hilcal.revisions import chain, mode_of, restore, restore_model, to_record, usual_mode
+from hilcal.types import Floats
 
 COVARIANCE = "covariance"
 """Key among the texts about a campaign: what the stored covariances cover."""
@@ -65,15 +68,29 @@ class Opened:
 
     def store(self, found: Fit, diagnosis: Diagnosis | None, added: str | None) -> int:
         """Append a fit; returns its revision number."""
-        record = to_record(found, diagnosis, added, content_hash(self.readings))
+        record = record_of(found, diagnosis, added, content_hash(self.readings))
         return self.campaign.append_revision(record)
+
+    def restore(self, record: RevisionRecord) -> Fit:
+        """Find a stored fit again.
+
+        Raises:
+            InputError: its readings or its effects are not at hand as they were then.
+        """
+        check_sources(record, self.path)
+        return restore(record, self.cell, self.readings)
+
+    def model_of(self, record: RevisionRecord) -> tuple[Model, Floats]:
+        """Return model and parameters of a stored fit; raises as `restore` does."""
+        check_sources(record, self.path)
+        return restore_model(record, self.cell, self.readings)
 
     def latest_fit(self, t: Terminal, say: Say) -> tuple[int, Fit]:
         """Return the latest revision as a fit; without any, make and store the baseline."""
         record = self.latest()
         if record is not None:
             say(f"restoring revision {record.number}")
-            return record.number, restore(record, self.cell, self.readings)
+            return record.number, self.restore(record)
         mode = self.mode(None)
         model = baseline(self.cell, self.readings, mode)
         say(f"fitting {' + '.join(model.names) or 'the nominal arm'}")
@@ -92,7 +109,7 @@ class Opened:
         out = []
         for record in chain(self.campaign.revisions()):
             say(f"restoring revision {record.number}")
-            found = restore(record, self.cell, self.readings)
+            found = self.restore(record)
             judged = None
             if found.scaling == "gc":
                 say(f"diagnosing revision {record.number}")
@@ -116,6 +133,15 @@ def open_run(path: Path) -> Iterator[Opened]:
             scatter = config.repeatability.per_joint(cell.arm.n)
             readings = with_repeatability(cell, readings, scatter)
         yield Opened(path, campaign, config, cell, readings)
+
+
+def record_of(
+    found: Fit, diagnosis: Diagnosis | None, added: str | None, data_hash: str
+) -> RevisionRecord:
+    """Return a fit as it is stored, with the files that its effects are from."""
+    record = to_record(found, diagnosis, added, data_hash)
+    own = sources(record.effects)
+    return replace(record, options={**record.options, SOURCES: own}) if own else record
 
 
 def choice(name: str, valid: tuple[Mode, ...], option: str) -> Mode:

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from hilcal.cli.effects_from import EffectsFrom
 from hilcal.cli.files import effect_names, open_run, scalings
 from hilcal.cli.terminal import Json, Run, terminal
 from hilcal.data.whitening import Scaling
@@ -20,7 +21,7 @@ from hilcal.identify.validation import validate as predict_other
 from hilcal.report import numbers, text
 from hilcal.report.progress import working
 from hilcal.report.text_scalings import scalings_table
-from hilcal.revisions import mode_of, restore_model
+from hilcal.revisions import mode_of
 
 Readings = Annotated[
     str | None,
@@ -38,6 +39,7 @@ def identify(
         str, typer.Option("--scaling", metavar="S", help="none, gu, gc or all, side by side.")
     ] = "gc",
     readings: Readings = None,
+    effects_from: EffectsFrom = None,
     as_json: Json = False,
 ) -> None:
     """Fit a model to the readings, and keep it as a revision."""
@@ -66,7 +68,7 @@ def identify(
     t.document(document)
 
 
-def compare(run: Run, as_json: Json = False) -> None:
+def compare(run: Run, effects_from: EffectsFrom = None, as_json: Json = False) -> None:
     """Show where the latest model fails."""
     t = terminal(as_json)
     with open_run(run) as o, working(t.progress) as say:
@@ -109,6 +111,7 @@ def validate(
     register: Annotated[
         bool, typer.Option("--register", help="The tracker was set up anew: fit its place first.")
     ] = False,
+    effects_from: EffectsFrom = None,
     as_json: Json = False,
 ) -> None:
     """Predict readings of another campaign with the latest model."""
@@ -122,7 +125,7 @@ def validate(
         if record is None:
             o.latest_fit(t, say)
             record = o.campaign.revision(1)
-        model, theta = restore_model(record, o.cell, o.readings)
+        model, theta = o.model_of(record)
         say(f"predicting {len(unseen.readings)} readings")
         found = predict_other(
             model, theta, o.readings, unseen.readings, mode_of(record), registered=register

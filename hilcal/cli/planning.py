@@ -10,6 +10,7 @@ import typer
 from hilcal.acquire.connect import Answer, connect
 from hilcal.acquire.dry_run import DryRun, dry_run
 from hilcal.cell import Cell, cell_from_config
+from hilcal.cli.effects_from import EffectsFrom
 from hilcal.cli.files import check_record, open_run
 from hilcal.cli.terminal import Json, Record, Terminal, terminal
 from hilcal.config import CellConfig, load_config
@@ -68,6 +69,7 @@ def plan(
         Path | None, typer.Option("--csv", metavar="F.csv", help="The plan as a table, too.")
     ] = None,
     record: Record = None,
+    effects_from: EffectsFrom = None,
     as_json: Json = False,
 ) -> None:
     """Choose poses, loads and their order, with a proof of how near to the best they are."""

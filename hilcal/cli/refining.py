@@ -11,6 +11,7 @@ from typing import Annotated
 
 import typer
 
+from hilcal.cli.effects_from import EffectsFrom
 from hilcal.cli.files import (
     check_record,
     effect_names,
@@ -30,14 +31,13 @@ from hilcal.refine import refine as refine_model
 from hilcal.report import numbers, text, text_refine
 from hilcal.report.build_story import Chapter, build_story
 from hilcal.report.progress import working
-from hilcal.revisions import restore
 
 ENDING = 5.0
 
 Row = tuple[int, str | None, Fit, str]
 
 
-def diagnose(run: Run, as_json: Json = False) -> None:
+def diagnose(run: Run, effects_from: EffectsFrom = None, as_json: Json = False) -> None:
     """Say which effect the latest model lacks."""
     t = terminal(as_json)
     with open_run(run) as o, working(t.progress) as say:
@@ -52,6 +52,7 @@ def add(
     run: Run,
     effect: Annotated[str, typer.Argument(metavar="EFFECT", help="See hilcal effects.")],
     record: Record = None,
+    effects_from: EffectsFrom = None,
     as_json: Json = False,
 ) -> None:
     """Add an effect to the latest model: error before and after."""
@@ -111,6 +112,7 @@ def refine(
         bool, typer.Option("--from-latest", help="Start from the latest revision.")
     ] = False,
     record: Record = None,
+    effects_from: EffectsFrom = None,
     as_json: Json = False,
 ) -> None:
     """Diagnose and add until the model is adequate."""
@@ -127,7 +129,7 @@ def refine(
         with working(t.progress) as say:
             if latest is not None:
                 say(f"restoring revision {latest.number}")
-                model = restore(latest, o.cell, o.readings).model
+                model = o.restore(latest).model
             elif names is None:
                 say("registering")
                 model = baseline(o.cell, o.readings, mode)
@@ -189,6 +191,7 @@ def view(
     run: Run,
     record: Record = None,
     port: Annotated[int, typer.Option("--port", help="Port to serve viewers on.")] = 9876,
+    effects_from: EffectsFrom = None,
     as_json: Json = False,
 ) -> None:
     """Tell the story of the latest revisions in rerun."""

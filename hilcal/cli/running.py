@@ -19,6 +19,7 @@ from hilcal.acquire.progress import Watcher
 from hilcal.acquire.rig import Rig
 from hilcal.acquire.run import run as run_plan
 from hilcal.cell import Cell
+from hilcal.cli.effects_from import EffectsFrom
 from hilcal.cli.files import COVARIANCE, INSTRUMENT
 from hilcal.cli.live import LiveResidual
 from hilcal.cli.planning import (
@@ -68,6 +69,7 @@ def run(
             "they are kept.",
         ),
     ] = None,
+    effects_from: EffectsFrom = None,
     as_json: Json = False,
 ) -> None:
     """Measure a campaign: every step of the plan, each reading stored before the next motion."""

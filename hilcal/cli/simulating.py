@@ -10,6 +10,7 @@ import typer
 
 from drivers.simulated.on_the_wire import secret_of, simulated_cell
 from drivers.simulated.rehearsal import NOTHING
+from hilcal.cli.effects_from import EffectsFrom
 from hilcal.cli.planning import POSES, CellFile, PlanFile, make_plan, read_cell
 from hilcal.cli.terminal import terminal
 from hilcal.config import CellConfig
@@ -32,6 +33,7 @@ def simulate(
         str | None, typer.Option("--hide", metavar="EFFECT", help="An effect, random or nothing.")
     ] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Of everything random.")] = None,
+    effects_from: EffectsFrom = None,
 ) -> None:
     """Run simulated devices for a cell until Ctrl-C, for `check` and `run` to talk to."""
     t = terminal(False)

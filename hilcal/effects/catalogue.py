@@ -5,20 +5,34 @@ from importlib.metadata import entry_points
 
 from hilcal.cell import Cell
 from hilcal.data.readings import States
+from hilcal.effects.added import added
+from hilcal.effects.backlash import Backlash
 from hilcal.effects.base_compliance import BaseCompliance
 from hilcal.effects.base_frame import BaseFrame
+from hilcal.effects.check import accepted
+from hilcal.effects.creep import Creep
 from hilcal.effects.encoder_offset import EncoderOffset
 from hilcal.effects.hysteresis import Hysteresis
 from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.effects.joint_stiffening import JointStiffening
 from hilcal.effects.joint_tilt_compliance import JointTiltCompliance
+from hilcal.effects.link_compliance import LinkCompliance
 from hilcal.effects.link_geometry import LinkGeometry
+from hilcal.effects.link_mass import LinkMass
 from hilcal.effects.load_point import LoadPoint
 from hilcal.effects.options import Options
+from hilcal.effects.periodic_joint_compliance import PeriodicJointCompliance
 from hilcal.effects.protocol import Effect
+from hilcal.effects.sensor_misalignment import SensorMisalignment
 from hilcal.effects.target_offset import TargetOffset
+from hilcal.effects.thermal_growth import ThermalGrowth
+from hilcal.effects.thermal_joint_drift import ThermalJointDrift
+from hilcal.effects.tool_compliance import ToolCompliance
 from hilcal.effects.tracker_drift import TrackerDrift
+from hilcal.effects.tracker_scale import TrackerScale
 from hilcal.effects.transmission_error import TransmissionError
+from hilcal.effects.wrench_bias import WrenchBias
+from hilcal.effects.wrench_gain import WrenchGain
 from hilcal.errors import InputError
 from hilcal.toml import suggest
 
@@ -34,22 +48,46 @@ BUILT_IN: tuple[type[Effect], ...] = (
     JointCompliance,
     JointStiffening,
     JointTiltCompliance,
+    LinkCompliance,
     BaseCompliance,
+    ToolCompliance,
+    PeriodicJointCompliance,
+    Backlash,
+    Creep,
+    ThermalGrowth,
+    ThermalJointDrift,
+    LinkMass,
     LoadPoint,
+    WrenchBias,
+    WrenchGain,
+    SensorMisalignment,
     TrackerDrift,
+    TrackerScale,
 )
 
 
-@cache
 def catalogue() -> dict[str, type[Effect]]:
-    """All effects by name, built in and installed as entry points."""
+    """All effects by name: built in, installed as entry points, and added from files."""
+    own = {e.name: e for file in added() for e in file.effects}
+    return {**_installed(), **own}
+
+
+@cache
+def _installed() -> dict[str, type[Effect]]:
+    """Effects that are there without a file, by name."""
     found = {e.name: e for e in BUILT_IN}
     for point in entry_points(group=ENTRY_POINT_GROUP):
-        effect = point.load()
-        if not (isinstance(effect, type) and issubclass(effect, Effect)):
-            raise InputError(f"entry point {point.name} = {point.value}: not an Effect class")
+        where = f"entry point {point.name} = {point.value}"
+        try:
+            kind = point.load()
+        except Exception as error:
+            words = f"cannot be loaded ({type(error).__name__}: {error})"
+            raise InputError(f"{where}: {words}") from error
+        if not (isinstance(kind, type) and issubclass(kind, Effect)):
+            raise InputError(f"{where}: not an Effect class")
+        effect = accepted(kind, where)
         if effect.name in found:
-            raise InputError(f"entry point {point.name}: effect {effect.name} is there already")
+            raise InputError(f"{where}: effect {effect.name} is there already")
         found[effect.name] = effect
     return found
 

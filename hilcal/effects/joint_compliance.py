@@ -30,3 +30,7 @@ class JointCompliance(Effect):
     def response(self, theta: Floats, s: Situation, change: Floats) -> Response:
         """Return dq_j = c_j dτ_j."""
         return Response(dq=change[:, :, :-1, 5] * theta)
+
+    def compliance(self, theta: Floats) -> Floats:
+        """Return c itself: `creep` builds on it."""
+        return theta

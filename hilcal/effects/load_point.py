@@ -3,6 +3,7 @@
 import numpy as np
 
 from hilcal.effects.protocol import Columns, Effect, LoadChange, Parameter, Situation
+from hilcal.robot import se3
 from hilcal.robot.statics import slot_wrench_change
 from hilcal.types import Floats
 
@@ -30,8 +31,8 @@ class LoadPoint(Effect):
         """Shift of the load point."""
         return LoadChange(point=theta)
 
-    def wrench_columns(self, s: Situation) -> Floats:
+    def wrench_columns(self, theta: Floats, s: Situation) -> Floats:
         """Moment (R e) × f at the flange for a unit shift along each flange axis e."""
         axes = np.swapaxes(s.chain.rotation[-1], 1, 2)
-        moment = np.cross(axes, s.states.wrench[:, None, :3])
+        moment = se3.cross(axes, s.load.wrench[:, None, :3])
         return slot_wrench_change(s.chain, np.zeros_like(moment), moment)

@@ -2,7 +2,8 @@
 
 An effect says *where it acts* (a `Deviation`), not what the tool does; the chain does the
 rest. A new effect is one small class in one file: `parameters`, `columns`, and where it is
-elastic `response`, or where it changes the load `load_change`.
+elastic `response`. One that acts through the load has no columns: it gives `load_change` or
+`wrench_change`, and their derivative `wrench_columns`.
 """
 
 from abc import ABC, abstractmethod
@@ -18,6 +19,7 @@ from hilcal.errors import InputError
 from hilcal.robot.batch import zeros
 from hilcal.robot.chain import Chain
 from hilcal.robot.deviation import Deviation
+from hilcal.robot.statics import Load
 from hilcal.types import Bools, Floats, Ints
 
 Field = Literal["dq", "twist", "base", "station", "target", "scale"]
@@ -52,6 +54,10 @@ class Situation:
         chain: the deviated chain, or None before it is known.
         wrench: (N, n + 1, 6) wrench transmitted through each slot, slot axes; element
             (j, 5) is the torque τ of joint j + 1.
+        load: what pulls at the arm: the recorded wrench (`states.wrench`) as the model
+            corrects it, and where it acts.
+        compliance: (n,) c of the joints in force, rad/(N·m): the model's `joint_compliance`,
+            or a typical one where the model has none.
     """
 
     cell: Cell
@@ -59,6 +65,8 @@ class Situation:
     angle: Floats
     chain: Chain
     wrench: Floats
+    load: Load
+    compliance: Floats
 
     @property
     def torque(self) -> Floats:
@@ -72,7 +80,8 @@ class Columns:
 
     Attributes:
         field: the field of `Deviation` that moves.
-        parameter: (P,) indices of the parameters within the effect.
+        parameter: (P,) indices of the parameters within the effect; one that moves several
+            elements occurs several times.
         element: (P,) joint (for dq) or slot (for twist) that moves; ignored otherwise.
         values: (N, P) for dq and scale, (N, P, 6) for the others; N may be 1 (constant).
     """
@@ -106,19 +115,27 @@ class Response:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadChange:
-    """Change of the load: shift of the load point in flange axes, (3,) m."""
+    """Change of what pulls at the arm, in axes that move with it.
 
-    point: Floats
+    Attributes:
+        point: (3,) shift of the load point, flange axes, m; None for none.
+        first_moment: (n, 3) change of each link's mass × centre of mass, link axes (as
+            `Arm.coms`), kg·m; None for none.
+    """
+
+    point: Floats | None = None
+    first_moment: Floats | None = None
 
 
 class Effect(ABC):
-    """A physical cause of deviations, linear in its parameters.
+    """A physical cause of deviations, linear in its parameters; or of another load.
 
     Class attributes:
         name: canonical name.
         summary: the law in one line.
         elastic: the deviation depends on the transmitted wrenches.
-        needs: columns of `States` without which the effect cannot be computed.
+        needs: columns of `States` without which the effect cannot be computed; "a or b"
+            where one of two will do.
     """
 
     name: ClassVar[str]
@@ -139,7 +156,7 @@ class Effect(ABC):
             if key not in self.option_names:
                 valid = ", ".join(self.option_names) or "none"
                 raise InputError(f"effect {self.name}: unknown option {key!r}; valid: {valid}")
-        missing = [need for need in self.needs if getattr(states, need) is None]
+        missing = [need for need in self.needs if not _has(states, need)]
         if missing:
             raise InputError(
                 f"effect {self.name} needs {', '.join(missing)}, which the readings do not have"
@@ -163,12 +180,34 @@ class Effect(ABC):
         return Response()
 
     def load_change(self, theta: Floats) -> LoadChange | None:
-        """Return the change of the load, for effects that act through it."""
+        """Return the change of load point or weights, for effects that act through them."""
         return None
 
-    def wrench_columns(self, s: Situation) -> Floats | None:
-        """Derivative (N, P, n + 1, 6) of the slot wrenches, for effects that change the load."""
+    def wrench_change(self, theta: Floats, s: Situation) -> Floats | None:
+        """Change (N, 6) of the load's wrench at the load point, base axes, or None.
+
+        For effects by which the recorded wrench `s.states.wrench` is not what acts; at the
+        orientation of `s.chain`. The changes of several effects add.
+        """
         return None
+
+    def wrench_columns(self, theta: Floats, s: Situation) -> Floats | None:
+        """Derivative (N, P, n + 1, 6) of the slot wrenches, for effects that change the load.
+
+        At a fixed configuration.
+        """
+        return None
+
+    def compliance(self, theta: Floats) -> Floats | None:
+        """(n,) joint compliances that other effects build on, rad/(N·m); None: not told."""
+        return None
+
+    def compliance_columns(self, theta: Floats, s: Situation) -> tuple[Columns, ...]:
+        """Derivative of the deviation by `s.compliance`, for effects that build on it.
+
+        The parameters of these columns are the n joints.
+        """
+        return ()
 
     def groups(self) -> Ints | None:
         """(P,) shrinkage group of each parameter, or None for parameters without a prior.
@@ -185,7 +224,7 @@ class Effect(ABC):
     @classmethod
     def computable(cls, states: States) -> bool:
         """Whether `states` has all the columns that the effect needs."""
-        return all(getattr(states, need) is not None for need in cls.needs)
+        return all(_has(states, need) for need in cls.needs)
 
     def for_scoring(self, states: States) -> "Effect":
         """Return a version that is cheap to score as a suspect; the same unless overridden."""
@@ -210,3 +249,8 @@ class Effect(ABC):
             else:
                 total += np.einsum("np...,p->n...", c.values, t)
         return Deviation(**fields)
+
+
+def _has(states: States, need: str) -> bool:
+    """Whether the states have a column, or one of those that an "or" joins."""
+    return any(getattr(states, column) is not None for column in need.split(" or "))

@@ -6,7 +6,7 @@ import numpy as np
 
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
-from hilcal.robot.batch import empty
+from hilcal.robot.batch import empty, zeros
 from hilcal.robot.chain import Chain
 from hilcal.types import Floats
 
@@ -21,6 +21,8 @@ class Load:
         tool_mass: mass carried permanently, kg.
         tool_com: (3,) its centre of mass, flange axes, m.
         gravity: (3,) acceleration, base axes, m/s².
+        first_moment: (n, 3) what the bodies' mass × centre of mass is beyond that of the arm,
+            body axes, kg·m; None for nothing.
     """
 
     wrench: Floats
@@ -28,6 +30,7 @@ class Load:
     tool_mass: float
     tool_com: Floats
     gravity: Floats
+    first_moment: Floats | None = None
 
 
 def slot_wrenches(arm: Arm, chain: Chain, load: Load) -> Floats:
@@ -36,8 +39,9 @@ def slot_wrenches(arm: Arm, chain: Chain, load: Load) -> Floats:
         f_k = f_{k+1} + m_{k+1} g
         t_k = t_{k+1} + (p_{k+1} − p_k) × f_{k+1} + (c_{k+1} − p_k) × m_{k+1} g
 
-    at the configuration of `chain`. Element (k, 5) for k < n is the static torque τ_{k+1}
-    that load and weight exert about the axis of joint k + 1.
+    at the configuration of `chain`; a first moment s_{k+1} of body k + 1 beyond the arm's adds
+    s_{k+1} × g to t_k. Element (k, 5) for k < n is the static torque τ_{k+1} that load and
+    weight exert about the axis of joint k + 1.
     """
     n, count = arm.n, len(load.wrench)
     flange = chain.position[n]
@@ -52,6 +56,9 @@ def slot_wrenches(arm: Arm, chain: Chain, load: Load) -> Floats:
             t += se3.cross(chain.position[k + 1] - chain.position[k], f)
             t += se3.cross(chain.com[k] - chain.position[k], weight)
             f += weight
+            if load.first_moment is not None:
+                moment = se3.apply(body_axes(arm, chain, k), load.first_moment[k])
+                t += se3.cross(moment, load.gravity)
         np.einsum("nji,nj->ni", chain.rotation[k], f, out=out[:, k, :3])
         np.einsum("nji,nj->ni", chain.rotation[k], t, out=out[:, k, 3:])
     return out
@@ -73,3 +80,35 @@ def slot_wrench_change(chain: Chain, force: Floats, moment: Floats) -> Floats:
         np.einsum("nji,npj->npi", chain.rotation[k], force, out=out[:, :, k, :3])
         np.einsum("nji,npj->npi", chain.rotation[k], t, out=out[:, :, k, 3:])
     return out
+
+
+def load_wrench_change(chain: Chain, load: Load, change: Floats) -> Floats:
+    """Change (N, P, n + 1, 6) of the slot wrenches by changes (N, P, 6) of the load's wrench.
+
+    The changes are at the load point, in base axes, N and N·m.
+    """
+    lever = (chain.point(load.point) - chain.position[-1])[:, None, :]
+    force = change[..., :3]
+    return slot_wrench_change(chain, force, change[..., 3:] + se3.cross(lever, force))
+
+
+def first_moment_change(arm: Arm, chain: Chain, gravity: Floats) -> Floats:
+    """Change (N, 3 n, n + 1, 6) of the slot wrenches by unit first moments of the bodies.
+
+    A unit along axis e of body k + 1 is a moment (R_k e) × g that slots 0..k carry.
+    """
+    out = zeros(chain.position.shape[1], 3 * arm.n, arm.n + 1, 6)
+    for k in range(arm.n):
+        moment = se3.cross(np.swapaxes(body_axes(arm, chain, k), 1, 2), gravity)
+        for slot in range(k + 1):
+            part = out[:, 3 * k : 3 * k + 3, slot, 3:]
+            np.einsum("nji,npj->npi", chain.rotation[slot], moment, out=part)
+    return out
+
+
+def body_axes(arm: Arm, chain: Chain, k: int) -> Floats:
+    """Orientation (N, 3, 3) of body k + 1, base axes: back from slot k + 1, past its twist."""
+    r = chain.rotation[k + 1]
+    if chain.twist is not None and np.any(chain.twist[k + 1]):
+        r = se3.product(r, se3.rotation(-chain.twist[k + 1, :, 3:]))
+    return np.asarray(se3.product(r, arm.links[k + 1][:3, :3].T))

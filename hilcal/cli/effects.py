@@ -1,0 +1,121 @@
+"""`effects`: what a model can have, and a file to begin an effect of one's own with."""
+
+import keyword
+import re
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.text import Text
+
+from hilcal.cli.effects_from import EffectsFrom
+from hilcal.cli.terminal import Json, terminal
+from hilcal.effects import template
+from hilcal.effects.added import added, file_of
+from hilcal.effects.catalogue import BUILT_IN, catalogue
+from hilcal.effects.check import NAME
+from hilcal.effects.example import ROBOT, example_cell, example_states
+from hilcal.effects.protocol import Effect
+from hilcal.errors import InputError
+from hilcal.report import text
+
+
+def effects(
+    ctx: typer.Context,
+    effects_from: EffectsFrom = None,
+    as_json: Json = False,
+) -> None:
+    """List the effects that a model can have; `new` begins one of your own."""
+    if ctx.invoked_subcommand is not None:
+        return
+    t = terminal(as_json)
+    cell = example_cell()
+    states = example_states(cell)
+    made = [kind(cell, states) for kind in catalogue().values()]
+    out = text.table("effect", "parameters", "unit", "needs", "law", left=(0, 2, 3, 4))
+    out.columns[0].no_wrap = True
+    for e in made:
+        units = list(dict.fromkeys(p.unit for p in e.parameters))
+        out.add_row(e.name, str(len(e.parameters)), ", ".join(units), ", ".join(e.needs), e.summary)
+    t.show(out)
+    notes = [
+        f"parameters: of a {ROBOT} with 30 poses; needs: columns that the readings must have.",
+        *(f"from {file.path}: {', '.join(e.name for e in file.effects)}" for file in added()),
+    ]
+    t.show(Text("\n".join(notes), style="dim"))
+    t.document({"effects": [_document(e) for e in made]})
+
+
+def _document(e: Effect) -> dict[str, object]:
+    shown = [{"name": p.name, "unit": p.unit, "meaning": p.meaning} for p in e.parameters]
+    return {
+        "name": e.name,
+        "law": e.summary,
+        "elastic": e.elastic,
+        "needs": list(e.needs),
+        "options": list(e.option_names),
+        "parameters": shown,
+        "source": _source(e.name),
+    }
+
+
+def _source(name: str) -> str:
+    """Return where an effect is from: "built in", "installed", or a file."""
+    file = file_of(name)
+    if file is not None:
+        return file.path
+    return "built in" if any(e.name == name for e in BUILT_IN) else "installed"
+
+
+def new(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Lower case, digits and _.")],
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="FILE.py", help="The file; NAME.py by default."),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Write a file with one effect that works as it stands, to be changed into your own."""
+    t = terminal(as_json)
+    path = Path(f"{name}.py") if output is None else output
+    _check_name(name)
+    if path.suffix != ".py":
+        raise InputError(f"{path}: effects are in a Python file; end its name in .py")
+    try:
+        with path.open("x", encoding="utf-8") as stream:
+            stream.write(template_of(name))
+    except FileExistsError:
+        raise InputError(f"{path}: the file exists; choose another name") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+    t.show(
+        f"{path} has the effect {name}: change its law, then try it with:\n"
+        f"  hilcal effects --effects-from {path}\n"
+        f"  hilcal diagnose RUN.hilcal --effects-from {path}"
+    )
+    t.document({"written": str(path), "effect": name})
+
+
+def _check_name(name: str) -> None:
+    """Refuse a name that an effect cannot have.
+
+    Raises:
+        InputError: says what would be valid.
+    """
+    if not NAME.fullmatch(name) or keyword.iskeyword(name):
+        raise InputError(
+            f"NAME {name!r}; valid: lower-case letters, digits and _, a letter first, no word of "
+            "Python's own"
+        )
+    if name in catalogue():
+        raise InputError(f"NAME {name}: is in the catalogue already; choose another name")
+
+
+def template_of(name: str) -> str:
+    """Return the text of the template with the effect's name, and its class called after it."""
+    class_name = "".join(part.capitalize() for part in name.split("_"))
+    while class_name in vars(template):  # a name that the file uses for something else
+        class_name += "Effect"
+    content = Path(str(template.__file__)).read_text(encoding="utf-8")
+    names = {"template": name, "Template": class_name}
+    return re.sub(r"\b[Tt]emplate\b", lambda found: names[found[0]], content)

@@ -1,0 +1,37 @@
+"""`link_mass`: the links are not as heavy, or not balanced, as configured."""
+
+from hilcal.effects.protocol import Columns, Effect, LoadChange, Parameter, Situation
+from hilcal.robot.statics import first_moment_change
+from hilcal.types import Floats
+
+
+class LinkMass(Effect):
+    """First moment (mass × centre of mass) of link k is off by δ_k, link axes [kg·m].
+
+    It acts through the elastic effects only: the weight exerts the moment (R_k δ_k) × g more
+    about the origin of joint k. Link k is what joint k moves; its axes turn with that joint.
+    """
+
+    name = "link_mass"
+    summary = "moment (R_k δ_k) × g at joint k: links are heavier or balanced otherwise"
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Three per link; half a kilogram at a decimetre is ordinary."""
+        return tuple(
+            Parameter(f"link{k + 1}.{a}", "kg·m", 5e-2, f"first moment of link {k + 1} along {a}")
+            for k in range(self.cell.arm.n)
+            for a in "xyz"
+        )
+
+    def columns(self, s: Situation) -> tuple[Columns, ...]:
+        """No deviation of its own."""
+        return ()
+
+    def load_change(self, theta: Floats) -> LoadChange:
+        """First moments of the links."""
+        return LoadChange(first_moment=theta.reshape(self.cell.arm.n, 3))
+
+    def wrench_columns(self, theta: Floats, s: Situation) -> Floats:
+        """Moments of unit first moments, carried by all joints up to the link's."""
+        return first_moment_change(self.cell.arm, s.chain, s.load.gravity)

@@ -1,0 +1,44 @@
+"""`thermal_joint_drift`: the joints' zeros wander as they warm up."""
+
+import numpy as np
+
+from hilcal.data.readings import States
+from hilcal.effects.options import numbers
+from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
+
+
+class ThermalJointDrift(Effect):
+    """dq_j = κ_j ΔT_j, ΔT_j = T_j − T_ref,j with the joint's own temperature [rad/K].
+
+    Options:
+        reference_degC: T_ref, one number or a list of one per joint; unless given, each
+            joint's temperature at the first reading in time.
+    """
+
+    name = "thermal_joint_drift"
+    summary = "dq_j = κ_j ΔT_j: the zero of each joint wanders with its temperature"
+    needs = ("joint_temperature",)
+    option_names = ("reference_degC",)
+
+    def setup(self, states: States) -> None:
+        """Take the temperatures at the first reading as the reference unless told otherwise."""
+        warm = states.joint_temperature
+        assert warm is not None  # noqa: S101 - checked at construction
+        if "reference_degC" not in self.options:
+            first = 0 if states.time is None else int(np.argmin(states.time))
+            self.options["reference_degC"] = [float(t) for t in warm[first]]
+        self.reference = numbers(self.name, self.options, "reference_degC", self.cell.arm.n)
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """One coefficient per joint; 0.1 mrad for 20 K is ordinary."""
+        return tuple(
+            Parameter(f"j{j + 1}", "rad/K", 5e-6, f"drift of joint {j + 1} with its temperature")
+            for j in range(self.cell.arm.n)
+        )
+
+    def columns(self, s: Situation) -> tuple[Columns, ...]:
+        """Warming: ∂dq_j/∂κ_j = ΔT_j."""
+        assert s.states.joint_temperature is not None  # noqa: S101 - checked at construction
+        joints = np.arange(self.cell.arm.n)
+        return (Columns("dq", joints, joints, s.states.joint_temperature - self.reference),)

@@ -1,0 +1,43 @@
+"""`tool_compliance`: what is bolted to the flange tilts under the moment there."""
+
+import numpy as np
+
+from hilcal.effects.options import rated_torques
+from hilcal.effects.protocol import Columns, Effect, Parameter, Response, Situation
+from hilcal.types import Floats
+
+PARTS = np.array([[0, 0, 0, 0, 0, 1.0], [0, 0, 0, 1.0, 1.0, 0]])
+"""Moments about the flange's z axis and across it."""
+
+
+class ToolCompliance(Effect):
+    """Rotation at the flange of a t_z z + c t_⊥, t the moment there: adapter, sensor, changer.
+
+    t is the moment about the flange's origin of tool and load; a (along) and c (across the
+    flange's z axis) in rad/(N·m). Where the last joint turns about z, a is the same as that
+    joint's compliance.
+    """
+
+    name = "tool_compliance"
+    summary = "rotation a t_z + c t_⊥ at the flange: tool or force sensor tilts under the moment"
+    elastic = True
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Along and across; 1 mrad at the rated torque of the last joint is ordinary."""
+        scale = 1e-3 / float(rated_torques(self.cell)[-1])
+        return (
+            Parameter("along", "rad/(N·m)", scale, "turn about the flange's z axis"),
+            Parameter("across", "rad/(N·m)", scale, "tilt across the flange's z axis"),
+        )
+
+    def columns(self, s: Situation) -> tuple[Columns, ...]:
+        """Twist of slot n by the moment at the flange."""
+        slot = np.full(2, self.cell.arm.n)
+        return (Columns("twist", np.arange(2), slot, s.wrench[:, -1, None] * PARTS),)
+
+    def response(self, theta: Floats, s: Situation, change: Floats) -> Response:
+        """Twist of slot n by the change of the moment there."""
+        twist = np.zeros_like(change)
+        twist[:, :, -1] = change[:, :, -1] * (theta @ PARTS)
+        return Response(twist=twist)

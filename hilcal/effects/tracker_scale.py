@@ -1,0 +1,25 @@
+"""`tracker_scale`: the tracker's ranges are all too long or too short."""
+
+import numpy as np
+
+from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
+
+
+class TrackerScale(Effect):
+    """Position read = (1 + s) position, about the sensor's origin: refraction, units [1].
+
+    In deflections alone it is the same as a common factor on all compliances.
+    """
+
+    name = "tracker_scale"
+    summary = "position read = (1 + s) position: the tracker's ranges have a scale error"
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The scale error; 10 µm/m is ordinary (10 °C misjudged in the air)."""
+        return (Parameter("scale", "1", 1e-5, "relative error of the tracker's ranges"),)
+
+    def columns(self, s: Situation) -> tuple[Columns, ...]:
+        """Unit scale."""
+        only = np.zeros(1, dtype=np.int64)
+        return (Columns("scale", only, only, np.ones((1, 1))),)

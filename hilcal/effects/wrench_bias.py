@@ -1,0 +1,34 @@
+"""`wrench_bias`: the force sensor reads something when nothing pulls."""
+
+import numpy as np
+
+from hilcal.effects.force_sensor import ForceSensorEffect
+from hilcal.effects.protocol import Parameter
+from hilcal.types import Floats
+
+
+class WrenchBias(ForceSensorEffect):
+    """Recorded = true + b, so that acting = w − R b; b at the load point, sensor axes [N, N·m].
+
+    Options:
+        rotvec_rad: the sensor's axes in flange axes, a rotation vector; unless given, the
+            flange's own.
+    """
+
+    name = "wrench_bias"
+    summary = "wrench read = true + b: the force sensor has a constant offset, in its own axes"
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Offsets of force and moment."""
+        return tuple(
+            Parameter(f"f{a}", "N", 1.0, f"offset of the force along {a}") for a in "xyz"
+        ) + tuple(Parameter(f"m{a}", "N·m", 0.1, f"offset of the moment about {a}") for a in "xyz")
+
+    def error(self, theta: Floats, said: Floats) -> Floats:
+        """Return b."""
+        return np.broadcast_to(theta, said.shape)
+
+    def error_columns(self, theta: Floats, said: Floats) -> Floats:
+        """Units."""
+        return np.eye(6)[None]

@@ -1,0 +1,49 @@
+"""`wrench_gain`: the force sensor's axes each read too much or too little."""
+
+import numpy as np
+
+from hilcal.effects.force_sensor import ForceSensorEffect
+from hilcal.effects.protocol import Parameter
+from hilcal.errors import CannotAnswerError
+from hilcal.types import Floats
+
+
+class WrenchGain(ForceSensorEffect):
+    """Recorded = (1 + g) true on each of the sensor's axes, exactly [1].
+
+    acting = R diag(1/(1 + g)) Rᵀ w = w − R diag(g/(1 + g)) Rᵀ w. A common gain of all axes
+    is the same as a common factor on all compliances, but for what the weights do.
+
+    Options:
+        rotvec_rad: the sensor's axes in flange axes, a rotation vector; unless given, the
+            flange's own.
+    """
+
+    name = "wrench_gain"
+    summary = "wrench read = (1 + g) true per axis: the force sensor has a gain error"
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Gain errors of forces and moments; 1 % is ordinary."""
+        return tuple(
+            Parameter(f"{kind}{a}", "1", 1e-2, f"gain error of the {word} {a}")
+            for kind, word in (("f", "force along"), ("m", "moment about"))
+            for a in "xyz"
+        )
+
+    def error(self, theta: Floats, said: Floats) -> Floats:
+        """Return g/(1 + g) w per axis.
+
+        Raises:
+            CannotAnswerError: a gain of −100 % or less, which no sensor has.
+        """
+        if np.any(theta <= -1):
+            raise CannotAnswerError(
+                f"{self.name}: a gain error of {theta.min():.0%} turns the wrench round; measure "
+                "loads in more directions, or leave the effect out"
+            )
+        return np.asarray(said * (theta / (1 + theta)))
+
+    def error_columns(self, theta: Floats, said: Floats) -> Floats:
+        """Return w/(1 + g)² on its own axis."""
+        return np.asarray((said / (1 + theta) ** 2)[:, :, None] * np.eye(6))
