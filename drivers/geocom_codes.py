@@ -71,10 +71,26 @@ _ADVICE = {
 """What a person can do about other codes."""
 
 
+_MEANING = {
+    13: "busy with something else",
+    16: "its battery is empty",
+    21: "its temperature is out of range",
+    22: "its tilt is out of range",
+    25: "asleep",
+    1293: "still busy measuring",
+}
+"""What the commonest codes say, alone or after a colon."""
+
+
+def _spelled(name: str) -> str:
+    """Return geocompy's name of a code as words in quotes."""
+    return f'"{name.replace("_", " ").lower()}"'
+
+
 def words(code: int) -> str:
-    """Return a return code for people: geocompy's name of it, and the number."""
+    """Return a return code for people: what it means, and the number."""
     try:
-        return f"{GeoComCode(code).name} (code {code})"
+        return f"{_MEANING.get(code) or _spelled(GeoComCode(code).name)} (code {code})"
     except ValueError:
         return f"code {code}"
 
@@ -89,4 +105,4 @@ def failure(doing: str, code: int) -> DeviceError:
     if code in LOST:
         return TargetLostError(f"tracker: {doing}: {LOST[code]} (code {code})")
     advice = f"; {_ADVICE[code]}" if code in _ADVICE else ""
-    return DeviceError(f"tracker: {doing}: the instrument reports {words(code)}{advice}")
+    return DeviceError(f"tracker: {doing}: the instrument reports: {words(code)}{advice}")

@@ -178,7 +178,10 @@ class UrArm:
         except WorkerError as error:
             self._fail(cause.not_commanded(error))
         if not taken:
-            self._fail("it did not take the motion")
+            reading = self._read()
+            playing = reading.runtime == states.PLAYING
+            why = "" if playing else f": {cause.program_ended(reading, 0.0)}"
+            self._fail(f"it did not take the motion{why}")
 
     def moving(self) -> bool:
         """Whether the motion is still going on; see `Arm.moving`."""

@@ -64,7 +64,7 @@ TRACKER = (
     switch("tracker mute", "tracker", "mute", ("no answer",)),
     switch("tracker busy", "tracker", "busy", ("1293",)),
     unplugged("tracker", fast=True),
-    rate("tracker", 9600, 115200, "no answer"),
+    rate("tracker", 9600, 115200, "no answer|what comes is no GeoCOM"),
 )
 
 FORCE = (

@@ -200,7 +200,7 @@ def test_answer_to_another_transaction_is_refused_and_asked_for_again(device, st
 def test_busy_instrument_is_asked_again_and_given_up_in_time(device, station):
     station.admin("busy", on=True)
     seconds, text = seconds_of(DeviceError, device.measure)
-    assert "BUSY" in text
+    assert "still busy measuring (code 1293)" in text
     assert seconds < MUTE_S
     station.admin("busy", on=False)
     device.measure()

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hilcal.errors import CannotAnswerError, InputError
+from hilcal.plan.compromise import Compromise
 from hilcal.plan.criteria import A, Criterion, D, E, K, Linear, Pair, Separate
 from hilcal.plan.criterion import require_determined, soft_least
 from hilcal.plan.interior import Program
@@ -30,6 +31,14 @@ def pairs() -> tuple[Pair, ...]:
     )
 
 
+def compromise() -> Compromise:
+    """Of test poses at which the first four of the parameters count."""
+    root = np.random.default_rng(6).normal(size=(2, 4))
+    c = np.zeros((P, P))
+    c[:4, :4] = root.T @ root
+    return Compromise(Linear(c), Linear(c[:4, :4]), 0.7, 1.9)
+
+
 CRITERIA: dict[str, Callable[[], Criterion]] = {
     "D": D,
     "D of some": lambda: D(np.array([4, 1])),
@@ -39,6 +48,7 @@ CRITERIA: dict[str, Callable[[], Criterion]] = {
     "E": E,
     "K": K,
     "separate": lambda: Separate(pairs()),
+    "compromise": compromise,
 }
 CONCAVE = [name for name in CRITERIA if name != "K"]
 seeds = st.integers(0, 10**6)

@@ -63,6 +63,22 @@ def test_deflections_do_not_plan_for_what_cancels_in_them():
     assert "transmission_error" in {t.effect for t in made("absolute").terms}
 
 
+def test_a_load_that_no_pose_bears_is_as_good_as_none():
+    """As two weights of the demo at an arm of a smaller payload."""
+    config = config_of("deflection", against="catalogue")
+    q, loads = poses_of(30), len(config.loads)
+    allowed = np.ones((30, 1 + loads), dtype=bool)
+    allowed[:, -1] = False
+    borne = problem(assumed(CELL, config), config, q, allowed)
+    less = config.model_copy(update={"loads": config.loads[:-1]})
+    without = problem(assumed(CELL, less), less, q)
+    assert borne.what == without.what
+    assert borne.terms == without.terms
+    np.testing.assert_allclose(
+        borne.information(np.ones(len(borne.what))), without.information(np.ones(len(without.what)))
+    )
+
+
 def test_potential_terms_only_add_uncertainty():
     p, alone = made(), made(against=())
     mine, bare = predicted(p, everything_once(p)), predicted(alone, everything_once(alone))

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hilcal.errors import CannotAnswerError, InputError
+from hilcal.plan.compromise import Compromise
 from hilcal.plan.criteria import A, Criterion, D, E, K, Linear, Pair, Separate
 from hilcal.plan.exchange import exact, rounded
 from hilcal.plan.optimum import best, curve
@@ -16,12 +17,21 @@ from hilcal.plan.relaxation import Relaxed, relax
 from hilcal.plan.units import Units
 from hilcal.types import Floats, Ints
 
+
+def compromise() -> Compromise:
+    """Of two parameters, with a third that may be there."""
+    c = np.zeros((3, 3))
+    c[:2, :2] = [[2.0, 0.5], [0.5, 1.0]]
+    return Compromise(Linear(c), Linear(c[:2, :2]), 1.0, 2.0)
+
+
 CRITERIA: dict[str, Callable[[], Criterion]] = {
     "D": D,
     "D of some": lambda: D(np.array([1])),
     "A": A,
     "A of some": lambda: A(np.array([0, 1])),
     "test": lambda: Linear(np.outer([1.0, 2.0, -1.0], [1.0, 2.0, -1.0])),
+    "compromise": compromise,
     "E": E,
     "K": K,
     "separate": lambda: Separate(

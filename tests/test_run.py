@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hilcal.acquire.progress import Remark, Taken
+from hilcal.acquire.progress import Judged, Remark, Taken
 from hilcal.acquire.repeatability import Visit, repeatability
 from hilcal.config import ForceSensor, Load, Repeatability, Tool
 from hilcal.data.plan import Step
@@ -187,17 +187,17 @@ def test_the_judge_sees_all_readings_and_may_not_know() -> None:
     b = Bench()
     seen: list[int] = []
 
-    def judge(readings: Readings) -> tuple[float, float] | None:
+    def judge(readings: Readings) -> Judged:
         seen.append(len(readings))
         if len(readings) == 2:
             raise CannotAnswerError("too few readings")
-        return (1e-5, 0.5) if len(readings) > 3 else None
+        return Judged(1e-5, 0.5) if len(readings) > 3 else Judged()
 
     measure(b, judge=judge)
     assert seen == list(range(1, len(usual_plan().steps) + 1))
     taken = b.notes.of(Taken)
-    assert [t.residual for t in taken[:4]] == [None, None, None, 1e-5]
-    assert taken[-1].residual_sigma == 0.5
+    assert [t.judged.residual for t in taken[:4]] == [None, None, None, 1e-5]
+    assert taken[-1].judged.sigma == 0.5
 
 
 def test_drift_of_the_reference_pose_is_told() -> None:

@@ -147,6 +147,23 @@ def test_an_arm_that_does_not_stop_is_told_loudly(monkeypatch: pytest.MonkeyPatc
     assert b.store.last("interrupted")["arm_not_stopped"] == "arm: no answer to stop"
 
 
+def test_an_error_that_asks_for_the_emergency_stop_asks_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    b = bench()
+
+    def stop() -> None:
+        raise DeviceError("arm: not sure that it stands: press the emergency stop if it moves")
+
+    monkeypatch.setattr(b.rig.arm, "stop", stop)
+    b.world.fail[120] = DeviceError("arm: its link broke; press the emergency stop. Unplugged?")
+    with pytest.raises(DeviceError) as raised:
+        measure(b, small_plan())
+    said = str(raised.value)
+    assert said.count("emergency stop") == 1
+    assert said.endswith(f"Unplugged? {HOW_ON}")
+
+
 def test_impatience_does_not_keep_the_arm_from_stopping(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C while the arm is being stopped: it is stopped again."""
     b = bench()

@@ -21,6 +21,27 @@ class Remark:
 
 
 @dataclass(frozen=True, slots=True)
+class Judged:
+    """What a model fitted to the readings before says of a new one.
+
+    Attributes:
+        residual: distance of the reading from the prediction, m; None while there is none.
+        sigma: the same in standard deviations of a prediction: 1 where the model is right.
+        learning: whether the model's own uncertainty is the larger part of them, because it
+            is fitted to few readings.
+        deflection: distance of the reading from where the model sees the unloaded arm, m; None
+            for an unloaded reading, and while that is not known.
+        give: standard deviation of that distance, m, from how well the model does so far.
+    """
+
+    residual: float | None = None
+    sigma: float | None = None
+    learning: bool = False
+    deflection: float | None = None
+    give: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class Taken:
     """A reading has been stored.
 
@@ -31,9 +52,8 @@ class Taken:
         left_real: real seconds that the rest takes, from how long it took so far.
         left_cell: the same in cell seconds; differs in a simulated cell only.
         deflection: distance from the unloaded reading of the same pose and cycle, m; None for
-            an unloaded reading, and where there is none.
-        residual: distance of the reading from what a model says, m; None where none is asked.
-        residual_sigma: the same in standard deviations.
+            an unloaded reading, and where there is none yet.
+        judged: what a model says of the reading; empty where none is asked.
         settling: how long the readings took to settle, cell seconds.
         goal: how far the campaign's goal is, in words; empty without one, and while that is
             not known.
@@ -45,8 +65,7 @@ class Taken:
     left_real: float
     left_cell: float
     deflection: float | None = None
-    residual: float | None = None
-    residual_sigma: float | None = None
+    judged: Judged = Judged()
     settling: float = 0.0
     goal: str = ""
 

@@ -20,6 +20,7 @@ from hilcal.data.plan import Plan
 from hilcal.errors import DeviceError, HilcalError, InputError
 
 HOW_ON = "The campaign is safe: run again with --resume"
+EMERGENCY = "press the emergency stop"
 _STOPS = 3
 
 
@@ -123,17 +124,22 @@ def _raise(error: BaseException, trouble: str) -> None:
     if not isinstance(error, Exception) and not trouble:
         raise error
     text = _line(error)
-    if trouble:
-        text += f". THE ARM MAY STILL MOVE ({trouble}): press the emergency stop"
-    elif not isinstance(error, HilcalError):
+    if not isinstance(error, HilcalError | KeyboardInterrupt):
         text = f"unexpected {text} (its details are in the campaign)"
+    if trouble and EMERGENCY not in text:
+        text = f"{_sentence(text)}THE ARM MAY STILL MOVE ({trouble}): {EMERGENCY}"
     kind = type(error) if isinstance(error, HilcalError) and not trouble else DeviceError
-    raise kind(f"{text}. {HOW_ON}") from error
+    raise kind(_sentence(text) + HOW_ON) from error
+
+
+def _sentence(text: str) -> str:
+    """Return a text with what ends a sentence, for another to follow."""
+    return f"{text} " if text.endswith(("?", "!")) else f"{text}. "
 
 
 def _line(error: BaseException) -> str:
     """Return an error as one line."""
     if isinstance(error, KeyboardInterrupt):
         return "interrupted"
-    words = " ".join(str(error).split()).rstrip(".")
+    words = " ".join(str(error).split()).rstrip(".;")
     return words if isinstance(error, HilcalError) else f"{type(error).__name__}: {words}"

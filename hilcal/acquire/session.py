@@ -17,7 +17,7 @@ from hilcal.acquire.loads import Hook, payload
 from hilcal.acquire.memory import Memory
 from hilcal.acquire.motion import Mover
 from hilcal.acquire.pace import Pace
-from hilcal.acquire.progress import Phase, Remark, Taken, Watcher
+from hilcal.acquire.progress import Judged, Phase, Remark, Taken, Watcher
 from hilcal.acquire.raw import plain
 from hilcal.acquire.rig import Rig
 from hilcal.acquire.route import Stop
@@ -32,7 +32,7 @@ from hilcal.data.readings import Readings
 from hilcal.errors import DeviceError, HilcalError
 from hilcal.types import Floats
 
-Judge = Callable[[Readings], tuple[float, float] | None]
+Judge = Callable[[Readings], Judged]
 """Returns how far the last of all readings is from what a model says, m and sigma."""
 
 
@@ -284,7 +284,7 @@ class Session:
         self, step: Step, reading: Readings, total: int, left: float, settling: float
     ) -> None:
         deflection = self._memory.deflection(step, reading.value[0, :3])
-        judged = None
+        judged = Judged()
         if self._judge is not None and (readings := self._store.readings()) is not None:
             with suppress(HilcalError):  # too early for a model; nothing depends on it
                 judged = self._judge(readings)
@@ -296,8 +296,7 @@ class Session:
                 self._clock.real(left),
                 left,
                 deflection,
-                None if judged is None else judged[0],
-                None if judged is None else judged[1],
+                judged,
                 settling,
                 self._aim.standing.words,
             )

@@ -1,17 +1,18 @@
 """What a model fitted to the readings so far says of the last one."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hilcal.acquire.progress import Judged
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import whitening
 from hilcal.errors import HilcalError
-from hilcal.identify.baseline import baseline
+from hilcal.identify.baseline import with_effects
 from hilcal.identify.fit import mahalanobis2
-from hilcal.identify.gauss_newton import solve
+from hilcal.identify.gauss_newton import Solution, scales_of, solve
 from hilcal.identify.poses import distinct_poses
 from hilcal.identify.repeatability import with_repeatability
 from hilcal.identify.residual import residual
@@ -22,23 +23,39 @@ LEAST = 8
 """Distinct poses before a registration is worth believing."""
 GROWTH = 1.15
 """The model is fitted again when there are so many times as many readings."""
+ORDINARY = 3.0
+"""What the data do not tell of a parameter is unknown to so many ordinary magnitudes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Known:
-    """A model as fitted to the first readings of a campaign."""
+    """A model as fitted to the first readings of a campaign.
+
+    Attributes:
+        model: the model.
+        theta: (P,) its parameters.
+        covariance: (P, P) of the parameters, for noise of the stated size.
+        rms: 3-D distance of the readings from the fit, root mean square, m.
+        count: readings that it was fitted to.
+        loaded: whether any of them was loaded.
+    """
 
     model: Model
     theta: Floats
+    covariance: Floats
+    rms: float
     count: int
     loaded: bool
 
 
-class LiveResidual:
+class LiveModel:
     """Predicts each reading from those before it, by the frames and joint compliance.
 
     The residual is what this baseline model gets wrong of the newest reading, which took no
-    part in its fit. It is for the eye of the operator, so the fit is renewed now and then only.
+    part in its fit; sigma counts the model's own uncertainty, J C Jᵀ, beside the reading's
+    covariance. Where the unloaded reading of a pose comes later than a loaded one, the deflection
+    is told against where the model sees the unloaded arm. All is for the eye of the operator, so
+    the fit is renewed now and then only.
     """
 
     def __init__(self, cell: Cell, config: CellConfig) -> None:
@@ -47,23 +64,18 @@ class LiveResidual:
         self._scatter = config.repeatability.per_joint(cell.arm.n)
         self._known: _Known | None = None
 
-    def __call__(self, readings: Readings) -> tuple[float, float] | None:
-        """Return the residual of the last reading in m and in sigma; None while it is unknown.
+    def __call__(self, readings: Readings) -> Judged:
+        """Judge the last reading by those before it; empty while they are too few.
 
-        Sigma is sqrt(rᵀ V⁻¹ r / m): about 1 where the model is right.
+        Sigma is sqrt(rᵀ (V + J C Jᵀ)⁻¹ r / m): about 1 where the model is right.
         """
         readings = with_repeatability(self._cell, readings, self._scatter)
         before, last = readings[:-1], readings[-1:]
         try:
             known = self._renewed(before)
-            if known is None or (not known.loaded and np.any(last.states.wrench)):
-                return None
-            w = whitening(last, "absolute", "gc")
-            off = residual(last, known.model.predict(last.states, known.theta), w)
+            return Judged() if known is None else _judged(known, last)
         except HilcalError:
-            return None
-        sigma = float(np.sqrt(mahalanobis2(off, last.covariance)[0] / last.m))
-        return float(np.linalg.norm(off[0, :3])), sigma
+            return Judged()
 
     def _renewed(self, readings: Readings) -> _Known | None:
         """Return the model, fitted anew where much has come since."""
@@ -71,7 +83,48 @@ class LiveResidual:
         loaded = bool(np.any(readings.states.wrench))
         stale = known is None or loaded != known.loaded or count > GROWTH * known.count
         if stale and len(np.unique(distinct_poses(readings))) >= LEAST:
-            model = baseline(self._cell, readings, "absolute")
-            found = solve(model, readings, whitening(readings, "absolute", "gc"))
-            self._known = _Known(model, found.theta, count, loaded)
+            # The arm's own weight bends it, too, so unloaded readings need the joints to give.
+            model = with_effects(self._cell, readings, "absolute", ("joint_compliance",))
+            w = whitening(readings, "absolute", "gc")
+            found = solve(model, readings, w)
+            rows = w.whiten(found.jacobian).reshape(-1, len(found.live))
+            rms = float(np.sqrt(np.mean(np.sum(found.raw[:, :3] ** 2, axis=1))))
+            covariance = _covariance(model, found, rows)
+            self._known = _Known(model, found.theta, covariance, rms, count, loaded)
         return self._known
+
+
+def _covariance(model: Model, found: Solution, rows: Floats) -> Floats:
+    """(P, P) covariance of the parameters; what the data do not tell is wide, not zero."""
+    scale = ORDINARY * scales_of(model)
+    a = np.zeros((len(rows), model.size))
+    a[:, found.live] = rows * scale[found.live]
+    return np.asarray(scale[:, None] * np.linalg.inv(a.T @ a + np.eye(model.size)) * scale)
+
+
+def _judged(known: _Known, last: Readings) -> Judged:
+    """Judge one reading by a fitted model."""
+    loaded = bool(np.any(last.states.wrench))
+    own, off = _spread(known, last), _residual(known, last)
+    sigma = float(np.sqrt(mahalanobis2(off, last.covariance + own)[0] / last.m))
+    learning = bool(np.trace(own[0, :3, :3]) > np.trace(last.covariance[0, :3, :3]))
+    residual_m = float(np.linalg.norm(off[0, :3]))
+    if not loaded:
+        return Judged(residual_m, sigma, learning)
+    rest = replace(last, states=replace(last.states, wrench=np.zeros_like(last.states.wrench)))
+    give = float(np.sqrt(known.rms**2 + np.trace(_spread(known, rest)[0, :3, :3])))
+    deflection = float(np.linalg.norm(_residual(known, rest)[0, :3]))
+    return Judged(residual_m, sigma, learning, deflection, give)
+
+
+def _residual(known: _Known, last: Readings) -> Floats:
+    """(1, m) what the model gets wrong of a reading."""
+    w = whitening(last, "absolute", "gc")
+    return residual(last, known.model.predict(last.states, known.theta), w)
+
+
+def _spread(known: _Known, last: Readings) -> Floats:
+    """(1, m, m) covariance of the prediction of a reading, J C Jᵀ."""
+    told = known.model.predict(last.states, known.theta)
+    jac = known.model.jacobian(told, known.theta, last.m)
+    return np.asarray(jac @ known.covariance @ np.swapaxes(jac, 1, 2))

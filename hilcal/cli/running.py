@@ -21,7 +21,7 @@ from hilcal.acquire.run import run as run_plan
 from hilcal.cell import Cell
 from hilcal.cli.effects_from import EffectsFrom
 from hilcal.cli.files import COVARIANCE, INSTRUMENT
-from hilcal.cli.live import LiveResidual
+from hilcal.cli.live import LiveModel
 from hilcal.cli.planning import (
     POSES,
     CellFile,
@@ -160,7 +160,7 @@ def measure(
         watcher: Watcher = stack.enter_context(watching(t.progress, len(log.plan.steps)))
         log.event("devices", {"answers": [answer_json(answer) for answer in answers]})
         clock = Clock(config.simulation.clock)
-        judge = LiveResidual(cell, config)
+        judge = LiveModel(cell, config)
         run_plan(rig, cell, config, log.plan, log, clock, watcher, judge=judge, goal=goal)
     return campaign.n_readings
 

@@ -139,9 +139,10 @@ def deflection_rows(of: Sensed, which: Ints, loads: tuple[int, ...]) -> Floats:
     jacobian, v = of.jacobian[which], of.covariance[which]
     count, _, m, size = jacobian.shape
     each, taken = np.arange(len(loads)), list(loads)
-    change = (jacobian[:, taken] - jacobian[:, :1]).reshape(count, -1, size)
+    height = len(loads) * m
+    change = (jacobian[:, taken] - jacobian[:, :1]).reshape(count, height, size)
     shape = (count, len(loads), m, len(loads), m)
     shared = np.broadcast_to(v[:, 0][:, None, :, None, :], shape).copy()
     shared[:, each, :, each, :] += np.moveaxis(v[:, taken], 1, 0)
-    covariance = shared.reshape(count, len(loads) * m, -1)
+    covariance = shared.reshape(count, height, height)
     return np.asarray(np.linalg.solve(np.linalg.cholesky(covariance), change))

@@ -20,10 +20,10 @@ from hilcal.plan.choice import (
     choose,
     only,
     promising,
-    question,
     within,
     worthwhile,
 )
+from hilcal.plan.compromise import robust_question
 from hilcal.plan.draw import Drawn, draw
 from hilcal.plan.feasible import Space
 from hilcal.plan.information import Problem, problem, readings_of
@@ -134,8 +134,8 @@ def make(
     model = assumed(cell, config) if known is None else after(known, config)
     of = problem(model, config, drawn.q, drawn.allowed)
     work = work_poses(model, config, drawn.q, space.clear)
-    asked = question(of, criterion, work)
     budget = _budget(request, of)
+    asked = robust_question(of, criterion, work, budget, rng)
     say("choosing loads")
     seconds = pace(config)
     # so many readings and no more: then there is nothing to be had for a load's time

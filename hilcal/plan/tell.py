@@ -8,7 +8,8 @@ from hilcal.config import CellConfig
 from hilcal.data.plan import REFERENCE
 from hilcal.errors import CannotAnswerError
 from hilcal.plan.candidates import sense
-from hilcal.plan.choice import Question, choose, only, question, unknown
+from hilcal.plan.choice import choose, only, unknown
+from hilcal.plan.compromise import robust_question
 from hilcal.plan.confounding import Confounding
 from hilcal.plan.planner import Planned, Say
 from hilcal.plan.predicted import Predicted, predicted
@@ -117,9 +118,9 @@ def _bought(made: Planned, rng: np.random.Generator) -> Iterator[Bought]:
         if name == made.criterion:
             yield _row(made, name, made.counts, made.design.efficiency)
             continue
-        asked: Question = only(question(of, name, made.work), made.usable)
         try:
-            design = choose(asked, made.budget, rng, 1)
+            whole = robust_question(of, name, made.work, made.budget, rng)
+            design = choose(only(whole, made.usable), made.budget, rng, 1)
         except CannotAnswerError:
             continue
         counts = np.zeros(len(of.units))

@@ -83,13 +83,22 @@ def watching(console: Console, total: int) -> Iterator[_Lines | _Bar]:
 
 
 def figures(event: Taken) -> str:
-    """Return deflection and residual of a reading for people."""
-    out = ""
+    """Return deflection and residual of a reading for people.
+
+    A deflection against a model, where the unloaded reading comes later, is marked by ≈.
+    """
+    parts = []
+    judged = event.judged
     if event.deflection is not None:
-        out += f": deflection {numbers.length(event.deflection)}"
-    if event.residual is not None:
-        sigma = "" if event.residual_sigma is None else f" ({event.residual_sigma:.1f} σ)"
-        out += f"{', ' if out else ': '}residual {numbers.length(event.residual)}{sigma}"
+        parts.append(f"deflection {numbers.length(event.deflection)}")
+    elif judged.deflection is not None:
+        unit, factor = numbers.unit_for("m", [judged.deflection])
+        value, give = numbers.with_std(factor * judged.deflection, factor * judged.give)
+        parts.append(f"deflection ≈ {value} ± {give} {unit}")
+    if judged.residual is not None:
+        sigma = "" if judged.sigma is None else f"{judged.sigma:.1f} σ"
+        words = ", ".join(w for w in (sigma, "few readings yet" if judged.learning else "") if w)
+        parts.append(f"residual {numbers.length(judged.residual)}" + (f" ({words})" * bool(words)))
     if event.goal:
-        out += f"{', ' if out else ': '}{event.goal}"
-    return out
+        parts.append(event.goal)
+    return f": {', '.join(parts)}" if parts else ""

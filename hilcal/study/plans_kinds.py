@@ -10,7 +10,8 @@ from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.errors import CannotAnswerError
 from hilcal.plan.assumed import Assumed, assumed
-from hilcal.plan.choice import choose, question
+from hilcal.plan.choice import choose
+from hilcal.plan.compromise import robust_question
 from hilcal.plan.draw import draw
 from hilcal.plan.feasible import Space
 from hilcal.plan.information import Problem, problem
@@ -123,7 +124,8 @@ def optimal(
         robust: whether it keeps power against the potential terms.
     """
     of_plan = of.robust if robust and of.robust is not None else of.exact
-    design = choose(question(of_plan, criterion, of.work), float(budget), rng)
+    asked = robust_question(of_plan, criterion, of.work, float(budget), rng)
+    design = choose(asked, float(budget), rng)
     counts = np.asarray(design.counts, dtype=float)
     told = predicted(of_plan, counts, work=of.work)
     return Chosen(of_plan, counts, told, design.efficiency)
