@@ -1,36 +1,37 @@
-"""Diagnose and add, until the model is adequate or something must be measured."""
+"""Diagnose and change the model, until it is adequate or something must be measured."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
-
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode
+from hilcal.diagnose.revise import add, predicts_better, remove, rivals_of
 from hilcal.diagnose.verdict import Diagnosis, Verdict, diagnose
-from hilcal.effects.catalogue import make
-from hilcal.effects.options import reading_options
-from hilcal.errors import InputError
 from hilcal.identify.fit import Fit, fit
 from hilcal.model import Model
-from hilcal.types import Floats
+
+__all__ = ["Refinement", "Step", "add", "predicts_better", "refine", "remove"]
 
 MOST_REVISIONS = 15
-LEAST_GAIN = 0.002
-"""Share by which the error on poses left out must fall for an effect to stay ..."""
-SURE = 2.0
-"""... and by how many of its standard errors, from pose to pose."""
 
 Say = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Step:
-    """One revision: a fit, its diagnosis, and the effect that was added to get there."""
+    """One revision: a fit, its diagnosis, and what was changed to get there.
+
+    Attributes:
+        fit: the fit.
+        diagnosis: of it.
+        added: the effect that was added to the revision before.
+        removed: the effect that was removed from it.
+    """
 
     fit: Fit
     diagnosis: Diagnosis
     added: str | None
+    removed: str | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,30 +52,14 @@ class Refinement:
     rejected: tuple[str, ...]
 
 
-def add(before: Fit, effect: str) -> Fit:
-    """Refit with one more effect, from where the fit stands.
-
-    Raises:
-        InputError: unknown effect, one that is there already, or one that these readings
-            cannot show.
-    """
-    readings = before.readings
-    if effect in before.model.names:
-        raise InputError(
-            f"effect {effect} is in the model already: {', '.join(before.model.names)}"
-        )
-    options = reading_options(effect, readings.m)
-    model = before.model + make(effect, before.model.cell, readings.states, options)
-    start = np.concatenate([before.theta, np.zeros(model.size - before.model.size)])
-    return fit(model, readings, before.mode, before.scaling, start)
-
-
 def refine(model: Model, readings: Readings, mode: Mode, say: Say | None = None) -> Refinement:
     """Fit, diagnose, add the leading suspect, and repeat.
 
     An effect stays only if the error on poses left out falls. Where the leading suspect
-    cannot be told from others it is added all the same, since any of them lowers the error,
-    but the final verdict names the doubt.
+    cannot be told from others it is added all the same, since any of them lowers the error.
+    When nothing more is found, every addition is reconsidered in the light of the later ones:
+    one that has become needless is removed, one whose part another effect plays better is
+    exchanged, and the final verdict names the doubts that are left.
 
     Args:
         model: the starting model.
@@ -86,55 +71,90 @@ def refine(model: Model, readings: Readings, mode: Mode, say: Say | None = None)
     tell(f"fitting {_names(model)}")
     current = fit(model, readings, mode)
     tell("diagnosing")
-    steps = [Step(current, diagnose(current), None)]
-    rejected: list[str] = []
+    work = _Work([Step(current, diagnose(current), None)], model.names, tell)
     doubts: list[str] = []
-    while len(steps) < MOST_REVISIONS:
-        diagnosis = steps[-1].diagnosis
-        for name in diagnosis.significant:
-            if name in rejected:
-                continue
-            tell(f"adding {name}")
-            trial = add(steps[-1].fit, name)
-            if predicts_better(steps[-1].fit, trial):
-                same = next(s.same_as for s in diagnosis.suspects if s.effect == name)
-                if same:
-                    doubts.append(f"{name} could as well be {' or '.join(same)}")
-                tell(f"added {name}; diagnosing")
-                steps.append(Step(trial, diagnose(trial), name))
-                break
-            rejected.append(name)
-        else:
-            break
-    last = steps[-1].diagnosis
+    changed = True
+    while changed:
+        work.extend()
+        doubts.clear()
+        changed = work.reconsider(doubts)
+    last = work.steps[-1].diagnosis
     verdict, message = last.verdict, last.message
-    if verdict in ("missing_effect", "ambiguous") and rejected:
+    if verdict in ("missing_effect", "ambiguous") and work.rejected:
         verdict = "unknown_effect"
         message = (
-            f"{', '.join(rejected)} would explain part of the misfit, but does not lower the error "
-            f"on poses left out; {message}"
+            f"{', '.join(work.rejected)} would explain part of the misfit, but does not lower the "
+            f"error on poses left out; {message}"
         )
     if doubts and verdict == "adequate":
         verdict = "ambiguous"
         message = f"{message}; but {'; '.join(doubts)}: measure what separates them"
-    return Refinement(tuple(steps), verdict, message, tuple(rejected))
+    return Refinement(tuple(work.steps), verdict, message, tuple(work.rejected))
 
 
-def predicts_better(before: Fit, after: Fit) -> bool:
-    """Whether the error on poses left out falls, by more than it scatters from pose to pose."""
-    if after.holdout.rms_sigma >= (1 - LEAST_GAIN) * before.holdout.rms_sigma:
+class _Work:
+    """The revisions so far, and what was tried."""
+
+    def __init__(self, steps: list[Step], given: tuple[str, ...], tell: Say) -> None:
+        """Begin with a first step; effects that are `given` are never taken out again."""
+        self.steps = steps
+        self.rejected: list[str] = []
+        self._out: set[str] = set()
+        self._given, self._tell = given, tell
+
+    @property
+    def _room(self) -> bool:
+        return len(self.steps) < MOST_REVISIONS
+
+    def extend(self) -> None:
+        """Add suspects while any lowers the error on poses left out."""
+        while self._room and self._add_one():
+            pass
+
+    def _add_one(self) -> bool:
+        last = self.steps[-1]
+        for name in last.diagnosis.significant:
+            if name in self.rejected or name in self._out:
+                continue
+            self._tell(f"adding {name}")
+            trial = add(last.fit, name)
+            if predicts_better(last.fit, trial):
+                self._tell(f"added {name}; diagnosing")
+                self.steps.append(Step(trial, diagnose(trial), name))
+                return True
+            self.rejected.append(name)
         return False
-    if np.any(before.outlier != after.outlier):
-        return True
-    gain = _squares_by_pose(before) - _squares_by_pose(after)
-    error = float(np.std(gain)) / np.sqrt(max(len(gain) - 1, 1))
-    return bool(np.mean(gain) > SURE * error)
 
+    def reconsider(self, doubts: list[str]) -> bool:
+        """Judge every addition anew; returns whether one was removed or exchanged.
 
-def _squares_by_pose(f: Fit) -> Floats:
-    """Squared whitened residual of each pose, predicted without it."""
-    white = f.whitening.whiten(f.left_out).reshape(len(f.left_out), -1)
-    return np.asarray(np.bincount(f.pose, weights=np.sum(white**2, axis=1)), dtype=float)
+        Args:
+            doubts: takes the additions that could as well be other effects.
+        """
+        last = self.steps[-1]
+        for name in last.fit.model.names:
+            if name in self._given or not self._room:
+                continue
+            self._tell(f"reconsidering {name}")
+            without = remove(last.fit, name)
+            if name in last.diagnosis.needless and not predicts_better(without, last.fit):
+                self._change(without, None, name)
+                return True
+            own, better = rivals_of(without, name)
+            for rival in better:
+                trial = add(without, rival.effect)
+                if rival.effect not in self._out and predicts_better(last.fit, trial):
+                    self._change(trial, rival.effect, name)
+                    return True
+            if own.same_as:
+                doubts.append(f"{name} could as well be {' or '.join(own.same_as)}")
+        return False
+
+    def _change(self, trial: Fit, added: str | None, removed: str) -> None:
+        self._out.add(removed)
+        what = f"removed {removed}" if added is None else f"{added} in place of {removed}"
+        self._tell(f"{what}; diagnosing")
+        self.steps.append(Step(trial, diagnose(trial), added, removed))
 
 
 def _names(model: Model) -> str:

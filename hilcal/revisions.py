@@ -23,15 +23,21 @@ from hilcal.types import Floats
 
 
 def to_record(
-    found: Fit, diagnosis: Diagnosis | None, added: str | None, data_hash: str
+    found: Fit,
+    diagnosis: Diagnosis | None,
+    added: str | None,
+    data_hash: str,
+    removed: str | None = None,
 ) -> RevisionRecord:
     """Store a fit: enough to find it again, and what was reported of it.
 
     Args:
         found: the fit.
         diagnosis: of it, where it was diagnosed.
-        added: the effect that made it from the revision before; None starts a new chain.
+        added: the effect that made it from the revision before; without any change a new chain
+            starts.
         data_hash: `content_hash` of its readings.
+        removed: the effect that was taken out of the revision before.
     """
     effects, cell = found.model.effects, found.model.cell
     result: dict[str, object] = {"identify": fit_document.to_json(found)}
@@ -40,6 +46,7 @@ def to_record(
     return RevisionRecord(
         effects=found.model.names,
         added=added,
+        removed=removed,
         options={
             "readings": found.mode,
             "scaling": found.scaling,
@@ -119,7 +126,7 @@ def scaling_of(record: RevisionRecord) -> Scaling:
 def chain(records: tuple[RevisionRecord, ...]) -> tuple[RevisionRecord, ...]:
     """Return the latest revision and those that it was made from, oldest first."""
     first = len(records) - 1
-    while first > 0 and records[first].added is not None:
+    while first > 0 and records[first].follows:
         first -= 1
     return records[max(first, 0) :]
 

@@ -46,7 +46,7 @@ def test_a_story_holds_together(
         check(story)
         first, last = story.revisions
         assert (first.revision, last.revision) == (4, 5)
-        assert (first.added, last.added) == (None, r.hidden)
+        assert (first.change, last.change) == ("", f"+ {r.hidden}")
         assert first.verdict == "missing_effect"
         assert last.verdict == "adequate"
         assert first.suspects[0].effect == r.hidden

@@ -4,9 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from campaigns import campaign, noiseless, plan, with_noise
+from campaigns import Campaign, campaign, noiseless, plan, with_noise
 from scipy.stats import poisson
 
+from hilcal.data.readings import Readings
+from hilcal.diagnose.verdict import diagnose
 from hilcal.identify.baseline import baseline
 from hilcal.identify.document import outliers
 from hilcal.identify.fit import fit
@@ -111,3 +113,97 @@ def test_a_true_effect_is_not_mistaken_for_gross_errors():
         c = campaign(effect, seed=seed, plan_seed=0, poses=20, strength=8.0)
         found = fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute")
         assert not found.outlier.any()
+
+
+# --- as campaigns spoil their readings ------------------------------------------------------
+
+
+def gross(
+    readings: Readings, rng: np.random.Generator, share: float = 0.05
+) -> tuple[Readings, dict]:
+    """Far off by 10 to 1000 σ, the load not hung, or the reading before once more."""
+    r, value, what = readings, readings.value.copy(), {}
+    for row in np.sort(rng.choice(np.arange(1, len(r)), int(share * len(r)), replace=False)):
+        kind = rng.choice(["far", "far" if r.unloaded[row] else "not hung", "stale"])
+        if kind == "far":
+            direction = rng.normal(size=3)
+            std = np.sqrt(np.trace(r.covariance[row, :3, :3]) / 3)
+            size = std * 10 ** rng.uniform(1, 3)
+            value[row, :3] += size * direction / np.linalg.norm(direction)
+        elif kind == "not hung":
+            same = (r.pose == r.pose[row]) & (r.cycle == r.cycle[row]) & r.unloaded
+            error = np.linalg.cholesky(r.covariance[row]) @ rng.normal(size=r.m)
+            value[row] = r.value[np.flatnonzero(same)[0]] + error
+        else:
+            value[row] = r.value[row - 1]
+        what[int(row)] = str(kind)
+    return replace(r, value=value), what
+
+
+def judged(c: Campaign, readings: Readings) -> tuple:
+    d = diagnose(fit(baseline(c.cell, readings, c.mode), readings, c.mode))
+    return d.verdict, d.significant[:1]
+
+
+def without(readings: Readings, rows: list[int], mode: str) -> Readings:
+    """The readings without some; deflections go with their unloaded reading."""
+    lost = np.isin(np.arange(len(readings)), rows)
+    if mode == "deflection":
+        lost |= np.isin(readings.pose, readings.pose[lost & readings.unloaded])
+    return readings[~lost]
+
+
+def check_verdict(effect: str, mode: str, seed: int) -> None:
+    c = campaign(effect, mode, seed, poses=30)
+    spoilt_readings, what = gross(c.readings, np.random.default_rng(1000 + seed))
+    verdict = judged(c, spoilt_readings)
+    if verdict != judged(c, c.readings):
+        # Near a limit, what remains may say less, or more, than all: not because of the errors.
+        assert verdict == judged(c, without(c.readings, list(what), mode)), what
+
+
+SPOILT = [(e, m) for m in MODES for e in ("none", "joint_tilt_compliance", "base_compliance")]
+SPOILT += [(e, "absolute") for e in ("hysteresis", "encoder_offset", "link_geometry")]
+
+
+@pytest.mark.parametrize(("effect", "mode"), SPOILT)
+def test_a_twentieth_of_gross_errors_changes_no_verdict(effect, mode):
+    check_verdict(effect, mode, 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("effect", "mode"), SPOILT)
+def test_gross_errors_change_no_verdict_over_many_seeds(effect, mode):
+    for seed in range(1, 15):
+        check_verdict(effect, mode, seed)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_gross_errors_say_what_they_look_like(mode):
+    c = campaign(plan_seed=0, poses=30, registration_known=True)
+    r, value = c.readings, c.readings.value.copy()
+    far, stale, bare = 7, 21, 33
+    assert not r.unloaded[[far, stale, bare]].any()
+    value[far, 2] += 2e-3
+    value[stale] = value[stale - 1]
+    value[bare] = value[30] + 1e-6
+    assert r.unloaded[30]
+    assert r.pose[30] == r.pose[bare]
+    read = replace(r, value=value)
+    listed = {(o["pose"], o["load"]): o["reason"] for o in
+              outliers(fit(baseline(c.cell, read, mode), read, mode))}  # fmt: skip
+    reasons = [listed[r.pose_names[r.pose[k]], r.load_names[r.load[k]]] for k in (far, stale, bare)]
+    assert len(listed) == 3
+    assert reasons[0].endswith("σ off in z")
+    assert "equal to the reading before" in reasons[1]
+    assert "was the load hung" in reasons[2]
+
+
+def test_a_bad_unloaded_reading_is_listed_once_with_what_it_took_along():
+    c = campaign(plan_seed=0, poses=30, registration_known=True)
+    read = spoilt(c.readings, [45], 5e-3)
+    found = fit(baseline(c.cell, read, "deflection"), read, "deflection")
+    (listed,) = outliers(found)
+    assert listed["load"] == "none"
+    assert "its 4 deflections set aside with it" in listed["reason"]
+    assert listed["sigma"] > 50

@@ -9,13 +9,14 @@ from campaigns import campaign, cell_of, measured, plan, world_of
 from drivers.simulated.hidden import hide
 from hilcal.data.readings import Readings
 from hilcal.diagnose.projection import projection
+from hilcal.diagnose.revise import LEAST_GAIN
 from hilcal.diagnose.suspects import candidates, rank_suspects
 from hilcal.effects.catalogue import make
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import fit
 from hilcal.model import Model
-from hilcal.refine import LEAST_GAIN, MOST_REVISIONS, Refinement, add, refine
+from hilcal.refine import MOST_REVISIONS, Refinement, add, refine
 
 
 def check_steps(r: Refinement) -> None:

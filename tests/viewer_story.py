@@ -134,7 +134,7 @@ def _revision(k, parts, truth, offset, covariance, torque, names):
     adequate = not left
     return StoryRevision(
         revision=k,
-        added=None if k == 0 else EFFECTS[k] + names,
+        change="" if k == 0 else "+ " + EFFECTS[k] + names,
         model=EFFECTS[: k + 1],
         verdict="adequate" if adequate else "missing_effect",
         message="What is left looks like noise."

@@ -1,6 +1,6 @@
 """`demo`: the whole story on a simulated cell with a hidden effect."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -72,24 +72,26 @@ def demo(
         found = refine_model(model, r.readings, r.mode, say)
     with Campaign.open(output) as campaign:
         numbered = [
-            campaign.append_revision(record_of(s.fit, s.diagnosis, s.added, hashed))
+            campaign.append_revision(record_of(s.fit, s.diagnosis, s.added, hashed, s.removed))
             for s in found.steps
         ]
     rows: list[Row] = [
-        (k, s.added, s.fit, s.diagnosis.verdict) for k, s in zip(numbered, found.steps, strict=True)
+        Row(k, s.fit, s.diagnosis.verdict, s.added, s.removed)
+        for k, s in zip(numbered, found.steps, strict=True)
     ]
-    for k, s in zip(numbered, found.steps, strict=True):
-        t.show(text_demo.step_report(k, s.added, s.diagnosis))
-    rows[-1] = (*rows[-1][:3], found.verdict)
+    for row, s in zip(rows, found.steps, strict=True):
+        t.show(text_demo.step_report(row.number, row.shown[1], s.diagnosis))
+    rows[-1] = replace(rows[-1], verdict=found.verdict)
     t.show(text.heading("The error, revision by revision"))
-    t.show([text_refine.revisions_table(rows), text_refine.key()])
+    t.show([text_refine.revisions_table([r.shown for r in rows]), text_refine.key()])
     truth = text_demo.compared(found.steps[-1].fit, r.world.truth)
     if truth:
         t.show([text.heading("What was found against what is true"), *text_demo.truth_table(truth)])
     ok, words = _judge(r, found)
     t.show([text_refine.verdict_line(found.verdict, found.message), "", text.heading(words)])
     chapters = [
-        Chapter(k, s.added, s.fit, s.diagnosis) for k, s in zip(numbered, found.steps, strict=True)
+        Chapter(k, s.added, s.fit, s.diagnosis, s.removed)
+        for k, s in zip(numbered, found.steps, strict=True)
     ]
     record_story(t, chapters, record)
     t.show(f"\nThe campaign is in {output}. Go on with: hilcal view {output}")

@@ -66,9 +66,15 @@ class Opened:
         record = self.latest()
         return usual_mode(self.readings) if record is None else mode_of(record)
 
-    def store(self, found: Fit, diagnosis: Diagnosis | None, added: str | None) -> int:
+    def store(
+        self,
+        found: Fit,
+        diagnosis: Diagnosis | None,
+        added: str | None,
+        removed: str | None = None,
+    ) -> int:
         """Append a fit; returns its revision number."""
-        record = record_of(found, diagnosis, added, content_hash(self.readings))
+        record = record_of(found, diagnosis, added, content_hash(self.readings), removed)
         return self.campaign.append_revision(record)
 
     def restore(self, record: RevisionRecord) -> Fit:
@@ -114,7 +120,7 @@ class Opened:
             if found.scaling == "gc":
                 say(f"diagnosing revision {record.number}")
                 judged = diagnose(found)
-            out.append(Chapter(record.number, record.added, found, judged))
+            out.append(Chapter(record.number, record.added, found, judged, record.removed))
         return out
 
 
@@ -136,10 +142,14 @@ def open_run(path: Path) -> Iterator[Opened]:
 
 
 def record_of(
-    found: Fit, diagnosis: Diagnosis | None, added: str | None, data_hash: str
+    found: Fit,
+    diagnosis: Diagnosis | None,
+    added: str | None,
+    data_hash: str,
+    removed: str | None = None,
 ) -> RevisionRecord:
     """Return a fit as it is stored, with the files that its effects are from."""
-    record = to_record(found, diagnosis, added, data_hash)
+    record = to_record(found, diagnosis, added, data_hash, removed)
     own = sources(record.effects)
     return replace(record, options={**record.options, SOURCES: own}) if own else record
 

@@ -5,7 +5,8 @@ import shutil
 import signal
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -20,6 +21,7 @@ from hilcal.cli.files import (
 )
 from hilcal.cli.fitting import Readings
 from hilcal.cli.terminal import Json, Record, Run, terminal
+from hilcal.data.revision import change
 from hilcal.diagnose.document import to_json
 from hilcal.diagnose.verdict import diagnose as judge
 from hilcal.effects.catalogue import effect_class
@@ -27,14 +29,30 @@ from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline, with_effects
 from hilcal.identify.fit import Fit
 from hilcal.refine import add as add_effect
+from hilcal.refine import predicts_better
 from hilcal.refine import refine as refine_model
+from hilcal.refine import remove as remove_effect
 from hilcal.report import numbers, text, text_refine
 from hilcal.report.build_story import Chapter, build_story
 from hilcal.report.progress import working
 
 ENDING = 5.0
 
-Row = tuple[int, str | None, Fit, str]
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Row:
+    """A revision as it is listed: what it changed, its fit and the verdict on it."""
+
+    number: int
+    fit: Fit
+    verdict: str
+    added: str | None = None
+    removed: str | None = None
+
+    @property
+    def shown(self) -> tuple[int, str, Fit, str]:
+        """The same as `revisions_table` takes it."""
+        return self.number, change(self.added, self.removed), self.fit, self.verdict
 
 
 def diagnose(run: Run, effects_from: EffectsFrom = None, as_json: Json = False) -> None:
@@ -56,25 +74,50 @@ def add(
     as_json: Json = False,
 ) -> None:
     """Add an effect to the latest model: error before and after."""
+    _change(run, effect, record, as_json, add_effect, adds=True)
+
+
+def remove(
+    run: Run,
+    effect: Annotated[str, typer.Argument(metavar="EFFECT", help="One of the latest model.")],
+    record: Record = None,
+    effects_from: EffectsFrom = None,
+    as_json: Json = False,
+) -> None:
+    """Take an effect out of the latest model: error before and after."""
+    _change(run, effect, record, as_json, remove_effect, adds=False)
+
+
+def _change(
+    run: Path,
+    effect: str,
+    record: Path | None,
+    as_json: bool,
+    make: Callable[[Fit, str], Fit],
+    *,
+    adds: bool,
+) -> None:
+    """Make a revision with one effect more or less."""
     t = terminal(as_json)
     effect_class(effect)
     check_record(record)
     with open_run(run) as o:
         with working(t.progress) as say:
             before_number, before = o.latest_fit(t, say)
-            say(f"adding {effect}")
-            after = add_effect(before, effect)
+            say(f"{'adding' if adds else 'removing'} {effect}")
+            after = make(before, effect)
             say("diagnosing")
             d = judge(after)
-            number = o.store(after, d, effect)
+            added, removed = (effect, None) if adds else (None, effect)
+            number = o.store(after, d, added, removed)
         stored = o.campaign.revision(before_number)
         verdict = str(stored.result_json.get("diagnose", {}).get("verdict", ""))
         rows: list[Row] = [
-            (before_number, stored.added, before, verdict),
-            (number, effect, after, d.verdict),
+            Row(before_number, before, verdict, stored.added, stored.removed),
+            Row(number, after, d.verdict, added, removed),
         ]
-        t.show([text_refine.revisions_table(rows), text_refine.key()])
-        t.show(_fell(before, after, effect))
+        t.show([text_refine.revisions_table([r.shown for r in rows]), text_refine.key()])
+        t.show(_fell(before, after, effect) if adds else _rose(before, after, effect))
         t.show(["", text_refine.verdict_line(d.verdict, d.message)])
         if record is not None:
             with working(t.progress) as say:
@@ -99,6 +142,14 @@ def _fell(before: Fit, after: Fit, effect: str) -> str:
         f"With {effect} the error on poses left out does not fall ({change}): these readings do "
         "not show this effect. The revisions before it are still there."
     )
+
+
+def _rose(before: Fit, after: Fit, effect: str) -> str:
+    a, b = before.holdout, after.holdout
+    change = f"from {numbers.length(a.rms_m)} to {numbers.length(b.rms_m)}"
+    if predicts_better(after, before):
+        return f"Without {effect} the error on poses left out rises {change}: it belongs there."
+    return f"Without {effect} the error on poses left out goes {change}: it is not needed."
 
 
 def refine(
@@ -142,10 +193,11 @@ def refine(
             if k == 0 and latest is not None:
                 number = latest.number
             else:
-                number = o.store(step.fit, step.diagnosis, step.added)
-            rows.append((number, step.added, step.fit, step.diagnosis.verdict))
-        rows[-1] = (*rows[-1][:3], found.verdict)
-        t.show(text_refine.revisions_table(rows))
+                number = o.store(step.fit, step.diagnosis, step.added, step.removed)
+            verdict = step.diagnosis.verdict
+            rows.append(Row(number, step.fit, verdict, step.added, step.removed))
+        rows[-1] = replace(rows[-1], verdict=found.verdict)
+        t.show(text_refine.revisions_table([r.shown for r in rows]))
         t.show(text_refine.key())
         t.show(text_refine.verdict_line(found.verdict, found.message))
         if found.rejected:
@@ -157,7 +209,7 @@ def refine(
         if last.verdict != "adequate":
             t.show(text.follows(last.where))
         steps = zip(rows, found.steps, strict=True)
-        chapters = [Chapter(row[0], s.added, s.fit, s.diagnosis) for row, s in steps]
+        chapters = [Chapter(r.number, r.added, r.fit, s.diagnosis, r.removed) for r, s in steps]
         record_story(t, chapters, record)
     t.document(
         {
@@ -174,16 +226,17 @@ def revisions_json(rows: Sequence[Row]) -> list[dict[str, object]]:
     """Return what the contract says of each revision."""
     return [
         {
-            "revision": number,
-            "model": list(fit.model.names),
-            "added": added,
-            "readings": fit.mode,
-            "variance_factor": fit.variance_factor,
-            "variance_factor_interval": list(fit.variance_factor_interval),
-            "error": {"fit": fit.error.to_json(), "holdout": fit.holdout.to_json()},
-            "verdict": verdict or None,
+            "revision": r.number,
+            "model": list(r.fit.model.names),
+            "added": r.added,
+            "removed": r.removed,
+            "readings": r.fit.mode,
+            "variance_factor": r.fit.variance_factor,
+            "variance_factor_interval": list(r.fit.variance_factor_interval),
+            "error": {"fit": r.fit.error.to_json(), "holdout": r.fit.holdout.to_json()},
+            "verdict": r.verdict or None,
         }
-        for number, added, fit, verdict in rows
+        for r in rows
     ]
 
 

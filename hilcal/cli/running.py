@@ -56,6 +56,10 @@ def run(
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on with what is missing in RUN.hilcal.")
     ] = False,
+    append: Annotated[
+        bool,
+        typer.Option("--append", help="Measure a further plan into RUN.hilcal, see hilcal next."),
+    ] = False,
     rehearse: Annotated[
         bool, typer.Option("--rehearse", help="On simulated devices, started for this run.")
     ] = False,
@@ -79,15 +83,21 @@ def run(
     base_dir = cell.absolute().parent
     with ExitStack() as stack:
         if resume:
+            if append:
+                raise InputError("--append begins a further plan, --resume goes on; give one")
             if plan is not None:
                 raise InputError("--plan with --resume: the plan is in the campaign; leave it out")
             campaign = stack.enter_context(Campaign.open(output))
             _same_cell(campaign, config)
-            made = RunLog(campaign).plan
+            made = RunLog(campaign).plans[0]
+        elif append:
+            campaign, further = _append(stack, output, plan, config, numbers)
+            made = RunLog(campaign).plans[0]
         else:
             if output.exists():
                 raise InputError(
-                    f"{output}: the file exists; go on with it by --resume, or choose another name"
+                    f"{output}: the file exists; go on with it by --resume, add a plan by "
+                    "--append, or choose another name"
                 )
             seed = config.simulation.seed
             made = make_plan(numbers, config, POSES, seed) if plan is None else load_plan(plan)
@@ -99,10 +109,12 @@ def run(
                 secret = secret_of(config, made, choice, config.simulation.seed)
                 simulated = simulated_cell(secret, config.simulation.seed, base_dir)
                 config = stack.enter_context(simulated).config
-        if not resume:
+        if append:
+            RunLog(campaign).append(further)
+        elif not resume:
             campaign = stack.enter_context(create(output, config, base_dir, made))
         measured = measure(t, config, numbers, campaign, goal)
-    planned = len(made.steps)
+        planned = len(RunLog(campaign).plan.steps)
     document: dict[str, object] = {"campaign": str(output), "readings": measured}
     document["planned"] = planned
     if goal is not None:
@@ -115,6 +127,23 @@ def run(
     if goal is not None and not goal.standing.met:
         on = f"hilcal plan {cell} --after {output}"
         raise CannotAnswerError(f"{goal.missed(measured)}; plan on with: {on}")
+
+
+def _append(
+    stack: ExitStack, output: Path, plan: Path | None, config: CellConfig, cell: Cell
+) -> tuple[Campaign, Plan]:
+    """Open a campaign, and return it with a further plan that has been checked.
+
+    Raises:
+        InputError: no plan is given, the campaign is of another cell, or the plan cannot be run.
+    """
+    if plan is None:
+        raise InputError("--append needs the further plan: give it with --plan PLAN")
+    campaign = stack.enter_context(Campaign.open(output))
+    _same_cell(campaign, config)
+    further = RunLog(campaign).fitted(load_plan(plan))
+    refuse(dry_run(cell, config, further), str(plan))
+    return campaign, further
 
 
 def create(

@@ -26,6 +26,7 @@ class RevisionRecord:
         result_json: what `identify --json` or `diagnose --json` reported.
         created: ISO 8601, UTC.
         number: 1, 2, ... in one campaign; the campaign gives it.
+        removed: the effect that this revision took out of the one before.
     """
 
     effects: tuple[str, ...]
@@ -37,6 +38,18 @@ class RevisionRecord:
     result_json: Mapping[str, Any]
     created: str = field(default_factory=utc_now)
     number: int = 0
+    removed: str | None = None
+
+    @property
+    def follows(self) -> bool:
+        """Whether it was made from the revision before."""
+        return self.added is not None or self.removed is not None
+
+
+def change(added: str | None, removed: str | None) -> str:
+    """Return what a revision changed, as "+ a", "− b" or "+ a − b"; empty for a first model."""
+    parts = [f"+ {added}"] if added else []
+    return " ".join([*parts, f"− {removed}"] if removed else parts)
 
 
 def to_text(record: RevisionRecord) -> str:

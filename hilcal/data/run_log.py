@@ -4,7 +4,10 @@ import json
 import sqlite3
 from typing import Any
 
+import numpy as np
+
 from hilcal.data import rows, schema
+from hilcal.data.appended import fitted_on, joined
 from hilcal.data.campaign import Campaign
 from hilcal.data.plan import Plan, Step, read_plan
 from hilcal.data.readings import Readings
@@ -12,7 +15,7 @@ from hilcal.data.revision import utc_now
 from hilcal.errors import InputError
 
 PLAN = "plan"
-"""Key of the plan among the texts about a campaign."""
+"""Key of the plan among the texts about a campaign; further ones are "plan 2" and so on."""
 
 
 class RunLog:
@@ -34,7 +37,61 @@ class RunLog:
                 "it cannot be resumed"
             )
         self._campaign = campaign
-        self.plan: Plan = read_plan(text, f"{campaign.path}, its plan")
+        plans = [read_plan(text, f"{campaign.path}, its plan")]
+        with schema.sqlite_errors(campaign.path):
+            meta = rows.fetch_meta(campaign.connection, campaign.path)
+        while (text := meta.get(f"{PLAN} {len(plans) + 1}")) is not None:
+            plans.append(read_plan(text, f"{campaign.path}, its plan {len(plans) + 1}"))
+        self.plans: tuple[Plan, ...] = tuple(plans)
+
+    @property
+    def plan(self) -> Plan:
+        """All plans in one; of those before the last one only what was measured."""
+        if len(self.plans) == 1:
+            return self.plans[0]
+        done, whole = self.done(), self.plans[0]
+        for further in self.plans[1:]:
+            whole = joined(whole, done, further)
+        return whole
+
+    def fitted(self, plan: Plan) -> Plan:
+        """Return a further plan with names and cycles that the campaign does not have yet.
+
+        Raises:
+            InputError: it does not go with the campaign, or is the last one and not done yet.
+        """
+        last, whole = self.plans[-1], self.plan
+        missing = len(last.without(self.done()).steps)
+        made = fitted_on(plan, whole, len(self.plans) + 1)
+        again = fitted_on(plan, self._before_last(), len(self.plans))
+        if missing and again.steps == last.steps and np.array_equal(again.q, last.q):
+            raise InputError(
+                f"{self._campaign.path}: this plan is in the campaign already, and {missing} of "
+                f"its {len(last.steps)} readings are missing; go on with --resume"
+            )
+        return made
+
+    def _before_last(self) -> Plan:
+        """Return what was planned before the last plan, as far as that matters for names."""
+        if len(self.plans) == 1:
+            first = self.plans[0]
+            return Plan(first.pose_names, first.q, ())
+        done, whole = self.done(), self.plans[0]
+        for further in self.plans[1:-1]:
+            whole = joined(whole, done, further)
+        kept = tuple(s for s in whole.steps if s in done)
+        return Plan(whole.pose_names, whole.q, kept)
+
+    def append(self, plan: Plan) -> None:
+        """Take in a further plan, see `fitted`; what is missing of those before is given up.
+
+        Raises:
+            DeviceError: the disk is full or failed.
+        """
+        path, connection = self._campaign.path, self._campaign.connection
+        with schema.sqlite_errors(path), schema.transaction(connection):
+            rows.insert_meta(connection, f"{PLAN} {len(self.plans) + 1}", plan.to_json())
+        self.plans = (*self.plans, plan)
 
     def record(self, reading: Readings, step: Step, detail: dict[str, Any]) -> None:
         """Append one reading of one step, with everything raw that belongs to it.

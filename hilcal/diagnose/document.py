@@ -1,5 +1,10 @@
 """The JSON of a diagnosis."""
 
+from collections.abc import Sequence
+
+from hilcal.diagnose.dependence import Dependence
+from hilcal.diagnose.noise import PureError
+from hilcal.diagnose.sensitivity import Strength
 from hilcal.diagnose.verdict import Diagnosis
 
 
@@ -25,15 +30,64 @@ def to_json(d: Diagnosis) -> dict[str, object]:
                 "log_evidence": s.score.log_evidence,
                 "significant": s.effect in d.significant,
                 "same_as": list(s.same_as),
+                "least": least(s.least),
             }
             for s in d.suspects
         ],
-        "pure_error": None
-        if d.pure_error is None
+        "apart": [
+            {"effect": a.effect, "unlike": a.unlike, "times": a.times if a.possible else None}
+            for a in d.apart
+        ],
+        "needless": list(d.needless),
+        "carriers": carriers(d.carriers),
+        "pure_error": None if d.pure_error is None else repeats(d.pure_error),
+    }
+
+
+def least(s: Strength) -> dict[str, object] | None:
+    """Smallest strength that would have been revealed, SI; null where none would."""
+    if not s.visible:
+        return None
+    return {
+        "displacement_m": s.displacement_m,
+        "parameters": [{"unit": unit, "rms": rms} for unit, rms in s.parameters],
+    }
+
+
+def repeats(e: PureError) -> dict[str, object]:
+    """What repeats say of the noise; `where` is null where it is everywhere the same."""
+    w = e.where
+    return {
+        "variance_factor": e.factor,
+        "interval": list(e.interval),
+        "dof": e.dof,
+        "lack_of_fit_p": e.lack_of_fit_p,
+        "where": None
+        if w is None
         else {
-            "variance_factor": d.pure_error.factor,
-            "interval": list(d.pure_error.interval),
-            "dof": d.pure_error.dof,
-            "lack_of_fit_p": d.pure_error.lack_of_fit_p,
+            "kind": w.kind,
+            "name": w.name,
+            "variance_factor": w.factor,
+            "interval": list(w.interval),
+            "p_value": w.p_value,
         },
     }
+
+
+def carriers(found: Sequence[Dependence]) -> list[dict[str, object]]:
+    """Variables that carry what is predictable, with their curves, SI units."""
+    return [
+        {
+            "variable": v.variable,
+            "unit": v.unit,
+            "share": v.share,
+            "moves": v.moves,
+            "direction": v.direction.tolist(),
+            "labels": list(v.labels),
+            "x": v.x.tolist(),
+            "y": v.y.tolist(),
+            "error": v.error.tolist(),
+            "y_unit": v.y_unit,
+        }
+        for v in found
+    ]

@@ -1,13 +1,18 @@
 """How much of the misfit is predictable at all, before any cause is known.
 
-An off-the-shelf learner (extremely randomised trees) predicts the residual, in units of its
-noise, from everything that is recorded of the state; on poses that took no part in learning.
-What it predicts is not noise. Source: Geurts, Ernst and Wehenkel, *Extremely randomized
-trees*, Machine Learning 63 (2006) 3-42; implementation of scikit-learn.
+Smooth laws of the recorded variables come first (see `dependence`): they know how the arm
+moves, and say what the misfit depends on. Only where they find little, an off-the-shelf learner
+(extremely randomised trees) predicts the residual, in units of its noise, from everything that
+is recorded of the state. Both are judged on poses that took no part in learning: what they
+predict is not noise. Source: Geurts, Ernst and Wehenkel, *Extremely randomized trees*, Machine
+Learning 63 (2006) 3-42; implementation of scikit-learn.
 """
+
+from dataclasses import replace
 
 import numpy as np
 
+from hilcal.diagnose.dependence import Predicted, dependence
 from hilcal.diagnose.projection import Projection
 from hilcal.identify.poses import random_folds
 from hilcal.types import Floats
@@ -18,9 +23,20 @@ FOLDS = 5
 MOST = 4000
 """Measurements that are used at most; more make it slower, not wiser."""
 
+LITTLE = 0.1
+"""Share below which smooth laws have found little, and trees are asked as well."""
+
+
+def predictable(p: Projection) -> Predicted:
+    """Share of the misfit that can be predicted on poses left out, and what carries it."""
+    found = dependence(p)
+    if found.share >= LITTLE:
+        return found
+    return replace(found, share=max(found.share, predictable_share(p)))
+
 
 def predictable_share(p: Projection) -> float:
-    """Share of the misfit that can be predicted on poses left out, within [0, 1]."""
+    """Share of the misfit that trees predict on poses left out, within [0, 1]."""
     from sklearn.ensemble import ExtraTreesRegressor
 
     fit, w = p.fit, p.fit.whitening

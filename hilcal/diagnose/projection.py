@@ -58,7 +58,11 @@ class Projection:
 
     def score(self, x: Floats) -> Score:
         """Score whitened columns X (R, P)."""
-        return score(x.T @ self.free(x), x.T @ self.fit.white, self.yy, self.fit.dof)
+        return self.score_of(x.T @ self.free(x), x)
+
+    def score_of(self, s: Floats, x: Floats) -> Score:
+        """Score whitened columns X (R, P) whose S = Xᵀ M X (P, P) is known."""
+        return score(s, x.T @ self.fit.white, self.yy, self.fit.dof)
 
     def misfit(self) -> float:
         """‖r‖² − dof, the part that noise does not explain, at least three of its σ."""

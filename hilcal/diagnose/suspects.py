@@ -6,6 +6,7 @@ import numpy as np
 
 from hilcal.diagnose.projection import Projection
 from hilcal.diagnose.score import Score
+from hilcal.diagnose.sensitivity import Strength, least_strength
 from hilcal.effects.catalogue import catalogue, make
 from hilcal.effects.options import reading_options
 from hilcal.effects.protocol import Effect
@@ -24,6 +25,7 @@ class Suspect:
         score: the joint test of the whole family.
         share: share of the misfit it explains.
         holdout_share: the same on poses left out.
+        least: the smallest strength of it that these readings would reveal.
         same_as: other suspects that these data cannot tell from it.
     """
 
@@ -31,7 +33,25 @@ class Suspect:
     score: Score
     share: float
     holdout_share: float
+    least: Strength
     same_as: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Family:
+    """The columns of an effect in ordinary magnitudes of its parameters.
+
+    Attributes:
+        effect: the effect.
+        scale: (P,) ordinary magnitudes, SI.
+        white: (R, P) whitened columns.
+        motion: (D, 3, P) displacement of each measured position, m.
+    """
+
+    effect: Effect
+    scale: Floats
+    white: Floats
+    motion: Floats
 
 
 def candidates(p: Projection) -> tuple[Effect, ...]:
@@ -46,24 +66,27 @@ def candidates(p: Projection) -> tuple[Effect, ...]:
     return tuple(out)
 
 
-def columns(p: Projection, effect: Effect) -> Floats:
-    """Whitened columns (R, P) of an effect in ordinary magnitudes of its parameters."""
+def family(p: Projection, effect: Effect) -> Family:
+    """Return the columns of an effect, at the parameters of the fit."""
     fit, w = p.fit, p.fit.whitening
     s = fit.solution
     jacobian = fit.model.jacobian_of((effect,), s.prediction, s.theta, w.m)
     scale = np.array([q.scale for q in effect.parameters])
-    return w.whiten(w.raw(jacobian * scale)).reshape(-1, len(scale))
+    raw = w.raw(jacobian * scale)
+    return Family(effect, scale, w.whiten(raw).reshape(-1, len(scale)), raw[:, :3])
 
 
-def rank_suspects(p: Projection, effects: tuple[Effect, ...]) -> tuple[Suspect, ...]:
-    """Score all effects; best first by evidence, with those that cannot be told apart named."""
-    found = []
-    for effect in effects:
-        x = columns(p, effect)
-        result = p.score(x)
-        found.append(
-            Suspect(effect.name, result, p.share(result.gain), p.held_out_share(x, result))
-        )
+def rank_suspects(
+    p: Projection, effects: tuple[Effect, ...], level: float = 0.001
+) -> tuple[Suspect, ...]:
+    """Score all effects; best first by evidence, with those that cannot be told apart named.
+
+    Args:
+        p: the fitted model's part.
+        effects: that are not in the model.
+        level: of the test over all of them together.
+    """
+    found = [_suspect(p, family(p, e), level / len(effects)) for e in effects]
     found.sort(key=lambda s: (-s.score.log_evidence, s.score.p_value))
     return tuple(
         replace(
@@ -77,4 +100,24 @@ def rank_suspects(p: Projection, effects: tuple[Effect, ...]) -> tuple[Suspect, 
             ),
         )
         for s in found
+    )
+
+
+def _suspect(p: Projection, of: Family, level: float) -> Suspect:
+    s = of.white.T @ p.free(of.white)
+    result = p.score_of(s, of.white)
+    return Suspect(
+        effect=of.effect.name,
+        score=result,
+        share=p.share(result.gain),
+        holdout_share=p.held_out_share(of.white, result),
+        least=least_strength(
+            s,
+            of.motion,
+            of.scale,
+            tuple(q.unit for q in of.effect.parameters),
+            p.fit.dof,
+            max(p.fit.variance_factor, 1.0),
+            level,
+        ),
     )

@@ -3,10 +3,12 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from scipy.stats import chi2
-
-from hilcal.diagnose.learner import predictable_share
+from hilcal.diagnose.apart import Apart, apart
+from hilcal.diagnose.dependence import Dependence, Predicted
+from hilcal.diagnose.learner import predictable
+from hilcal.diagnose.needless import needless
 from hilcal.diagnose.noise import PureError, pure_error
+from hilcal.diagnose.noise_verdict import PREDICTABLE, judge_noise
 from hilcal.diagnose.projection import Projection, projection
 from hilcal.diagnose.suspects import Suspect, candidates, rank_suspects
 from hilcal.diagnose.where import Where, where
@@ -16,11 +18,8 @@ from hilcal.identify.fit import Fit
 Verdict = Literal["adequate", "missing_effect", "ambiguous", "unknown_effect", "noise_misjudged"]
 FALSE_ALARM = 0.001
 """Chance of naming any effect where none is missing, over the whole catalogue."""
-MISFIT_ALARM = 0.0005
-"""Chance of calling the variance factor wrong where it is right, each side."""
 LEAST_SHARE = 0.01
 """An effect that explains less of the misfit on poses left out is not worth adding."""
-PREDICTABLE = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,6 +35,9 @@ class Diagnosis:
         suspects: effects that could be missing, best first.
         significant: names of the suspects that pass the test over the whole catalogue.
         pure_error: what repeats say of the noise, or None without repeats.
+        needless: effects of the model that these readings do not ask for.
+        carriers: variables that carry what is predictable, with the dependence on each.
+        apart: how the leading suspect differs from those that it is not told from.
     """
 
     fit: Fit
@@ -46,6 +48,9 @@ class Diagnosis:
     suspects: tuple[Suspect, ...]
     significant: tuple[str, ...]
     pure_error: PureError | None
+    needless: tuple[str, ...] = ()
+    carriers: tuple[Dependence, ...] = ()
+    apart: tuple[Apart, ...] = ()
 
 
 def diagnose(fit: Fit) -> Diagnosis:
@@ -57,9 +62,10 @@ def diagnose(fit: Fit) -> Diagnosis:
     if fit.scaling != "gc":
         raise InputError(f"diagnosis needs scaling gc, this fit has {fit.scaling}")
     p = projection(fit)
-    suspects = rank_suspects(p, candidates(p))
+    effects = candidates(p)
+    suspects = rank_suspects(p, effects, FALSE_ALARM)
     places = where(p)
-    share = predictable_share(p)
+    told = predictable(p)
     repeats = pure_error(fit)
     tested = max(sum(s.score.rank > 0 for s in suspects), 1)
     significant = tuple(
@@ -69,73 +75,66 @@ def diagnose(fit: Fit) -> Diagnosis:
         and s.score.log_evidence > 0
         and s.holdout_share >= LEAST_SHARE
     )
-    verdict, message = _judge(p, significant, places, share, repeats)
+    lead = significant[0] if significant else None
+    rivals = apart(p, lead, effects) if lead is not None and lead.same_as else ()
+    if lead is not None:
+        verdict, message = _named(lead, rivals)
+    else:
+        verdict, message = _judge(p, places, told, repeats)
     return Diagnosis(
         fit,
         verdict,
         message,
-        share,
+        told.share,
         places,
         suspects,
         tuple(s.effect for s in significant),
         repeats,
+        tuple(n.effect for n in needless(fit)),
+        told.carriers,
+        rivals,
+    )
+
+
+def _named(lead: Suspect, rivals: tuple[Apart, ...]) -> tuple[Verdict, str]:
+    """Return the verdict where an effect of the catalogue is missing."""
+    explains = (
+        f"explains {lead.share:.0%} of the misfit, {max(lead.holdout_share, 0):.0%} on poses "
+        f"left out (p = {lead.score.p_value:.1g})"
+    )
+    if not rivals:
+        return "missing_effect", f"{lead.effect} is missing: it {explains}"
+    others = ", ".join(r.words for r in rivals)
+    advice = "hilcal next plans what separates them, or add one and judge on new poses"
+    if not any(r.possible for r in rivals):
+        advice = "add one; for what these readings are used for it does not matter which"
+    return "ambiguous", (
+        f"{lead.effect} {explains}, but these data do not tell it from {others}; {advice}"
     )
 
 
 def _judge(
-    p: Projection,
-    significant: tuple[Suspect, ...],
-    places: tuple[Where, ...],
-    share: float,
-    repeats: PureError | None,
+    p: Projection, places: tuple[Where, ...], told: Predicted, repeats: PureError | None
 ) -> tuple[Verdict, str]:
+    """Return the verdict where no effect of the catalogue is missing."""
     fit = p.fit
     factor = fit.variance_factor
     spread = f"{factor**0.5:.2g} times the stated noise"
-    if significant:
-        lead = significant[0]
-        explains = (
-            f"explains {lead.share:.0%} of the misfit, {max(lead.holdout_share, 0):.0%} on poses "
-            f"left out (p = {lead.score.p_value:.1g})"
-        )
-        if lead.same_as:
-            others = ", ".join(lead.same_as)
-            return "ambiguous", (
-                f"{lead.effect} {explains}, but these data do not tell it from {others}; "
-                "measure what separates them, or add one and judge on new poses"
-            )
-        return "missing_effect", f"{lead.effect} is missing: it {explains}"
-    high = float(chi2.sf(fit.chi2, fit.dof)) < MISFIT_ALARM
-    low = float(chi2.cdf(fit.chi2, fit.dof)) < MISFIT_ALARM
-    if not high and not low:
-        return "adequate", (
-            f"Residuals are what the noise explains: variance factor {factor:.2f}; no effect of "
-            "the catalogue is missing"
-        )
-    if (
-        repeats is not None
-        and not repeats.interval[0] <= 1 <= repeats.interval[1]
-        and (low or repeats.lack_of_fit_p > MISFIT_ALARM)
-    ):
-        return "noise_misjudged", (
-            f"Repeated readings scatter {repeats.factor**0.5:.2g} times as much as stated, and the "
-            f"residuals no more than the repeats: scale the covariance by {repeats.factor:.2g}; no "
-            "effect is missing"
-        )
-    if low:
-        return "noise_misjudged", (
-            f"Residuals are only {spread}: the stated covariance is too large"
-        )
     kinds = [v for v in places if v.variable.split()[0] not in ("pose", "direction")]
     follow = [v for v in kinds if v.p_value * len(kinds) < FALSE_ALARM]
-    if share > PREDICTABLE or repeats is not None or follow:
-        named = [v.variable for v in follow if v.share >= LEAST_SHARE][:2]
-        follows = f"; it follows {' and '.join(named)}" if named else ""
-        return "unknown_effect", (
-            f"Residuals are {spread}, a generic learner predicts {share:.0%} of the misfit, and no "
-            f"effect of the catalogue explains {LEAST_SHARE:.0%} of it or more{follows}"
+    noise = judge_noise(fit, repeats, told.share > PREDICTABLE or bool(follow))
+    if noise.misjudged:
+        return "noise_misjudged", noise.message
+    if not noise.off:
+        return "adequate", (
+            f"Residuals are what the noise explains: variance factor {factor:.2f}; no effect of "
+            f"the catalogue is missing{noise.message}"
         )
-    return "noise_misjudged", (
-        f"Residuals are {spread} and nothing predicts them; without repeated readings the program "
-        "cannot know whether the noise is larger than stated: repeat some readings"
+    carry = [v.variable for v in told.carriers if v.share >= LEAST_SHARE]
+    named = (carry or [v.variable for v in follow if v.share >= LEAST_SHARE])[:2]
+    follows = f"; it follows {' and '.join(named)}" if named else ""
+    return "unknown_effect", (
+        f"Residuals are {spread}, a generic learner predicts {told.share:.0%} of the misfit, and "
+        f"no effect of the catalogue explains {LEAST_SHARE:.0%} of it or more"
+        f"{follows}{noise.message}"
     )

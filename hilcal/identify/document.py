@@ -4,8 +4,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from hilcal.identify.everything import everything, names
+from hilcal.identify.everything import everything
 from hilcal.identify.fit import Fit
+from hilcal.identify.gross_reason import gross_errors
 from hilcal.robot import se3
 from hilcal.types import Floats
 
@@ -66,14 +67,11 @@ def parameters(fit: Fit) -> list[dict[str, object]]:
 
 
 def outliers(fit: Fit) -> list[dict[str, object]]:
-    """Readings that were set aside, with their Mahalanobis distance."""
-    if not fit.outlier.any():
-        return []
-    e = everything(fit)
-    distance = np.sqrt(e.mahalanobis2)
-    rows = [k for k, row in enumerate(e.whitening.reading) if fit.outlier[row]]
-    found = [(*names(fit.readings, int(e.whitening.reading[k])), float(distance[k])) for k in rows]
-    return [{"pose": pose, "load": load, "sigma": sigma} for pose, load, sigma in found]
+    """Readings that were set aside, with their Mahalanobis distance and what they look like."""
+    return [
+        {"pose": g.pose, "load": g.load, "sigma": g.sigma, "reason": g.reason}
+        for g in gross_errors(fit)
+    ]
 
 
 def registration(fit: Fit) -> Floats:

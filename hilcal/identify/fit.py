@@ -10,8 +10,9 @@ from hilcal.data.whitening import Mode, Scaling, Whitening, inverse_root, whiten
 from hilcal.errors import CannotAnswerError
 from hilcal.identify.errors import ErrorBlock, error_block
 from hilcal.identify.gauss_newton import Solution, solve
+from hilcal.identify.gross import find_gross
 from hilcal.identify.holdout import leave_out
-from hilcal.identify.outliers import find_outliers
+from hilcal.identify.outliers import limit
 from hilcal.identify.poses import distinct_poses, random_folds
 from hilcal.identify.residual import residual
 from hilcal.identify.uncertainty import Uncertainty, uncertainty
@@ -19,7 +20,7 @@ from hilcal.model import Model
 from hilcal.types import Bools, Floats, Ints
 
 CONFIDENCE = 0.95
-OUTLIER_ROUNDS = 3
+OUTLIER_ROUNDS = 6
 MAX_OUTLIER_SHARE = 0.05
 
 
@@ -123,16 +124,30 @@ def fit(
         CannotAnswerError: fewer measured elements than identifiable parameters.
         InputError: from `whitening`, where a deflection lacks its unloaded reading.
     """
+    used, solution, w = _set_aside(model, readings, mode, start, prior)
+    if scaling != "gc":
+        solution, w = _solve(model, readings[used], mode, scaling, start, prior)
+    return _assemble(model, readings, ~used, mode, scaling, w, solution)
+
+
+def _set_aside(
+    model: Model, readings: Readings, mode: Mode, start: Floats | None, prior: Floats | None
+) -> tuple[Bools, Solution, Whitening]:
+    """Readings (N,) without gross errors, and their solution in scaling gc."""
     used = np.ones(len(readings), dtype=bool)
-    solution, w = _solve(model, readings, mode, scaling, start, prior)
+    solution, w = _solve(model, readings, mode, "gc", start, prior)
+    left = int(MAX_OUTLIER_SHARE * len(readings))
     for _ in range(OUTLIER_ROUNDS):
         distance2 = mahalanobis2(solution.raw, w.covariance)
-        rows = np.flatnonzero(used)[w.reading[find_outliers(distance2, w.m)]]
-        if not len(rows) or len(rows) + np.sum(~used) > MAX_OUTLIER_SHARE * len(readings):
+        if distance2.max() <= limit(w.m, len(distance2)):
             break
-        used[rows] = False
-        solution, w = _solve(model, readings[used], mode, scaling, solution.theta, prior)
-    return _assemble(model, readings, ~used, mode, scaling, w, solution)
+        found = find_gross(model, solution, readings[used], w, left)
+        if not found.count:
+            break
+        used[np.flatnonzero(used)[found.drop]] = False
+        left -= found.count
+        solution, w = _solve(model, readings[used], mode, "gc", solution.theta, prior)
+    return used, solution, w
 
 
 def _solve(

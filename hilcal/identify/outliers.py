@@ -12,15 +12,21 @@ MISFIT_FACTOR = 6.25
 MISFIT = 1.3
 
 
-def find_outliers(distance2: Floats, m: int) -> Bools:
-    """Which measurements (D,) are gross errors, by their squared Mahalanobis distances.
+def bulk(distance2: Floats, m: int) -> float:
+    """Scale of most squared distances: their median over that of χ²_m."""
+    return float(np.median(distance2) / chi2.median(m))
 
-    The limit is the χ²_m quantile that all good readings together exceed once in a thousand
-    campaigns, times the scale of the bulk (median of the distances over that of χ²_m) where
-    the bulk is wider than the stated noise.
+
+def limit(m: int, count: int, scale: float = 1.0) -> float:
+    """Squared distance from which on one of `count` measurements is a gross error.
+
+    It is the χ²_m quantile that all good readings together exceed once in a thousand
+    campaigns, times the scale of the bulk where that is wider than the stated noise.
     """
-    scale = float(np.median(distance2) / chi2.median(m))
-    limit = float(chi2.isf(FALSE_ALARMS / len(distance2), m)) * max(1.0, scale)
-    if scale > MISFIT:
-        limit *= MISFIT_FACTOR
-    return np.asarray(distance2 > limit)
+    far = float(chi2.isf(FALSE_ALARMS / count, m)) * max(1.0, scale)
+    return far * MISFIT_FACTOR if scale > MISFIT else far
+
+
+def find_outliers(distance2: Floats, m: int) -> Bools:
+    """Which measurements (D,) are gross errors, by their squared Mahalanobis distances."""
+    return np.asarray(distance2 > limit(m, len(distance2), bulk(distance2, m)))

@@ -25,6 +25,9 @@ FRAME_PRIOR = {"prior_m": 3e-3, "prior_rad": 6e-3}
 """In deflections the frames act only by turning them; they are known from the positions, about
 as well as the arm's elastic sag lets them be."""
 DURATION_S = 3600.0
+LOAD_TIMES_S = (5.0, 100.0)
+TEMPERATURES = (25.0, 35.0)
+"""Of joints that warm up while they are measured, °C."""
 _SEED = 20240607
 
 
@@ -204,7 +207,7 @@ def tracker_place(cell: Cell, config: CellConfig) -> tuple[Floats, bool]:
 
 
 def nominal_states(q: Floats, wrench: Floats) -> States:
-    """Return states (N) with a time and sides of approach, as a shuffled order would have them.
+    """Return states (N) with times, temperatures and sides, as a shuffled order would have them.
 
     Args:
         q: (N, n) joint angles, rad.
@@ -212,7 +215,15 @@ def nominal_states(q: Floats, wrench: Floats) -> States:
     """
     rng = np.random.default_rng(_SEED)
     time = rng.uniform(0.0, DURATION_S, len(q))
-    return States(q=q, wrench=wrench, time=time, approach=rng.choice([-1.0, 1.0], q.shape))
+    approach = rng.choice([-1.0, 1.0], q.shape)
+    return States(
+        q=q,
+        wrench=wrench,
+        time=time,
+        load_time=rng.uniform(*LOAD_TIMES_S, len(q)),
+        joint_temperature=rng.uniform(*TEMPERATURES, q.shape),
+        approach=approach,
+    )
 
 
 def _registered(cell: Cell, config: CellConfig, place: Floats) -> tuple[Cell, Floats]:

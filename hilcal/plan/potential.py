@@ -24,7 +24,7 @@ from hilcal.plan.candidates import (
 )
 from hilcal.types import Floats
 
-MOST_PARAMETERS = 150
+MOST_PARAMETERS = 200
 SAMPLE = 300
 """Candidate poses by which strengths are judged."""
 MOST_ORDINARY = 5.0

@@ -8,6 +8,7 @@ import numpy as np
 import scipy.linalg as sl
 
 from hilcal.cell import Cell
+from hilcal.data.revision import change
 from hilcal.data.whitening import Mode
 from hilcal.diagnose.projection import projection
 from hilcal.diagnose.suspects import Suspect, candidates
@@ -40,12 +41,14 @@ class Chapter:
         added: the effect that it added.
         fit: the fit.
         diagnosis: of it, or None where it was not diagnosed.
+        removed: the effect that it took out.
     """
 
     number: int
     added: str | None
     fit: Fit
     diagnosis: Diagnosis | None
+    removed: str | None = None
 
 
 def build_story(chapters: Sequence[Chapter]) -> Story:
@@ -117,7 +120,7 @@ def _revision(c: Chapter, e: Everything, axes: Floats, measured: Floats) -> Stor
     told = () if d is None else _told(d)
     return StoryRevision(
         revision=c.number,
-        added=c.added,
+        change=change(c.added, c.removed),
         model=c.fit.model.names,
         verdict=UNDIAGNOSED if d is None else d.verdict,
         message="run hilcal diagnose for a verdict" if d is None else d.message,

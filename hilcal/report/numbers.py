@@ -12,6 +12,10 @@ _UNITS: dict[str, tuple[tuple[str, float, float], ...]] = {
     "rad/(N·m)³": (("prad/(N·m)³", 1e12, math.inf),),
     "m/s": (("µm/h", 3.6e9, math.inf),),
     "rad/s": (("µrad/h", 3.6e9, math.inf),),
+    "rad/K": (("µrad/K", 1e6, math.inf),),
+    "1/K": (("ppm/K", 1e6, math.inf),),
+    "1/(N·m²)": (("1/(MN·m²)", 1e6, math.inf),),
+    "1": (("ppm", 1e6, 1e-3), ("%", 1e2, math.inf)),
 }
 
 

@@ -66,7 +66,7 @@ class StoryRevision:
 
     Attributes:
         revision: its number, growing along the story.
-        added: the effect that this revision added; None for the first.
+        change: what it changed, e.g. "+ hysteresis"; empty for the first.
         model: names of all effects in it.
         verdict: one of the verdicts of `diagnose`.
         message: the verdict in words.
@@ -82,7 +82,7 @@ class StoryRevision:
     """
 
     revision: int
-    added: str | None
+    change: str
     model: tuple[str, ...]
     verdict: str
     message: str

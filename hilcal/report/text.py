@@ -11,9 +11,10 @@ from rich.text import Text
 
 from hilcal.diagnose.where import Where
 from hilcal.effects.protocol import Effect
-from hilcal.identify.document import notes, outliers, registration
+from hilcal.identify.document import notes, registration
 from hilcal.identify.everything import Everything, everything
 from hilcal.identify.fit import Fit
+from hilcal.identify.gross_reason import gross_errors
 from hilcal.report import numbers
 from hilcal.robot import se3
 from hilcal.types import Ints
@@ -21,6 +22,7 @@ from hilcal.types import Ints
 ALL_ROWS = 60
 STRONGEST = 5
 DIRECTIONS = 8
+GROSS = 8
 POSE = "pose"
 CERTAIN = 0.005
 
@@ -159,11 +161,12 @@ def remarks(fit: Fit) -> Iterator[RenderableType]:
         yield placed(fit)
     for note in notes(fit):
         yield note[0].upper() + note[1:] + "."
-    gross = outliers(fit)
+    gross = gross_errors(fit)
     if gross:
-        listed = ", ".join(f"{o['pose']}/{o['load']} ({o['sigma']:.0f} σ)" for o in gross[:8])
-        more = f" and {len(gross) - 8} more" if len(gross) > 8 else ""
-        yield f"{len(gross)} readings set aside as gross errors (pose/load): {listed}{more}."
+        yield f"{len(gross)} readings set aside as gross errors (pose/load):"
+        yield from (f"  {g.pose}/{g.load}: {g.reason}" for g in gross[:GROSS])
+        if len(gross) > GROSS:
+            yield f"  ... and {len(gross) - GROSS} more; --json lists all"
 
 
 def placed(fit: Fit) -> str:

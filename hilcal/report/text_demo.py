@@ -13,9 +13,9 @@ from hilcal.report import numbers, text, text_refine
 MOST = 24
 
 
-def step_report(number: int, added: str | None, d: Diagnosis) -> Iterator[RenderableType]:
+def step_report(number: int, change: str, d: Diagnosis) -> Iterator[RenderableType]:
     """Yield what one revision shows: how far off, where, and which effect would explain it."""
-    name = f"+ {added}" if added else text.model_name(d.fit.model.names)
+    name = change or text.model_name(d.fit.model.names)
     yield text.heading(f"Revision {number}: {name}")
     yield text.misses(d.fit)
     if d.verdict != "adequate":

@@ -10,6 +10,8 @@ from hilcal.effects.catalogue import catalogue
 from hilcal.identify.everything import everything
 from hilcal.identify.fit import Fit
 from hilcal.report import numbers, text
+from hilcal.report.text_seen import could_have_been_seen, needless_line
+from hilcal.report.text_unknown import curves, repeats
 
 VERDICTS: Mapping[str, str] = {
     "adequate": "adequate: what is left is noise",
@@ -74,15 +76,15 @@ def diagnosis_report(d: Diagnosis) -> Iterator[RenderableType]:
             f"A generic learner that knows nothing of robots predicts "
             f"{numbers.percent(d.predictable_share)} of the misfit."
         )
+        yield from curves(d.carriers)
     if d.pure_error is not None:
-        yield (
-            f"Repeated readings scatter {d.pure_error.factor**0.5:.2f} times as much as stated "
-            f"({d.pure_error.dof:.0f} degrees of freedom)."
-        )
+        yield from repeats(d.pure_error)
+    yield from needless_line(d)
+    yield from could_have_been_seen(d)
 
 
-def revisions_table(rows: Sequence[tuple[int, str | None, Fit, str]]) -> RenderableType:
-    """Return the table in which the error falls, from (number, added, fit, verdict)."""
+def revisions_table(rows: Sequence[tuple[int, str, Fit, str]]) -> RenderableType:
+    """Return the table in which the error falls, from (number, change, fit, verdict)."""
     out = text.table(
         "rev.",
         "model",
@@ -94,10 +96,10 @@ def revisions_table(rows: Sequence[tuple[int, str | None, Fit, str]]) -> Rendera
         "verdict",
         left=(0, 1, 7),
     )
-    for number, added, fit, verdict in rows:
+    for number, change, fit, verdict in rows:
         out.add_row(
             str(number),
-            f"+ {added}" if added else text.model_name(fit.model.names),
+            change or text.model_name(fit.model.names),
             numbers.length(fit.error.rms_m),
             f"{fit.error.rms_sigma:.2f}",
             numbers.length(fit.holdout.rms_m),

@@ -105,7 +105,7 @@ def recording_id(story: Story) -> str:
     for array in (story.q, story.pose, story.anchor, story.measured, story.covariance):
         sha.update(np.ascontiguousarray(array).tobytes())
     for r in story.revisions:
-        sha.update(f"{r.revision} {r.added} {r.model} {r.suspects} {r.parameters}".encode())
+        sha.update(f"{r.revision} {r.change} {r.model} {r.suspects} {r.parameters}".encode())
         sha.update(np.ascontiguousarray(r.residual).tobytes())
     return str(uuid.UUID(bytes=sha.digest()[:16]))
 

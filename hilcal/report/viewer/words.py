@@ -35,9 +35,9 @@ def verdict(d: Digest, r: StoryRevision) -> str:
 
 
 def title(r: StoryRevision) -> str:
-    """Return a revision's number and what it added."""
-    if r.added:
-        return f"Revision {r.revision}: + {escaped(r.added)}"
+    """Return a revision's number and what it changed."""
+    if r.change:
+        return f"Revision {r.revision}: {escaped(r.change)}"
     return f"Revision {r.revision}: {model(r, 3)}"
 
 
@@ -134,14 +134,15 @@ def _parameter(p: StoryParameter) -> str:
 def revisions(d: Digest, upto: int) -> str:
     """Return the table of revisions up to one of them: errors falling, step by step."""
     lines = [
-        "| revision | added | fit rms | held-out rms | worst | σ rms | variance factor | verdict |",
+        "| revision | change | fit rms | held-out rms | worst | σ rms "
+        "| variance factor | verdict |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for r in d.story.revisions:
         if r.revision > upto:
             break
         lines.append(
-            f"| {r.revision} | {escaped(r.added or 'the first model')} "
+            f"| {r.revision} | {escaped(r.change or 'the first model')} "
             f"| {micrometres(r.error_fit['rms_m'])} | {micrometres(r.error_holdout['rms_m'])} "
             f"| {micrometres(r.error_fit['max_m'])} | {number(r.error_fit['rms_sigma'])} "
             f"| {number(r.variance_factor)} | {escaped(r.verdict.replace('_', ' '))} |"
@@ -152,7 +153,7 @@ def revisions(d: Digest, upto: int) -> str:
 
 def log_line(d: Digest, r: StoryRevision) -> str:
     """Return a revision in one line."""
-    what = f"+ {r.added}" if r.added else "first model"
+    what = r.change or "first model"
     return style.safe(
         f"revision {r.revision} ({what}): {micrometres(r.error_fit['rms_m'])} rms, "
         f"held out {micrometres(r.error_holdout['rms_m'])}, "

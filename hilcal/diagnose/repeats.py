@@ -1,0 +1,273 @@
+"""Contrasts of repeated readings: what is left when all that the state explains is taken out.
+
+Readings of one pose under one load are repeats. Whatever the model misses is equal in them,
+so with W the whitening of the measurements (loaded readings share their unloaded one) and C
+the columns that say which class of repeats a measurement is of,
+
+    y = Nᵀ W r,   Nᵀ W C = 0,   Nᵀ N = I     ⇒     y ~ N(0, f I)
+
+with f the factor by which the stated covariance is wrong. What differs between repeats, the
+side of approach, time, temperatures and small differences of the load, moves joints and target
+to first order; those columns are taken out as well.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from hilcal.data.readings import Readings
+from hilcal.data.whitening import Bucket, Whitening, whitening
+from hilcal.identify.fit import Fit
+from hilcal.observe import motion
+from hilcal.types import Floats, Ints
+
+SAME_ANGLE = 1e-6
+"""Commanded joints of repeats agree within this, rad."""
+SAME_LOAD = 0.05
+"""Wrenches of repeats agree within this share of the campaign's largest."""
+ROUNDING = 1e-9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Block:
+    """Repeats that share something: the readings behind them and their contrasts.
+
+    Attributes:
+        reading: (k,) rows of the fitted readings.
+        pull: (c, k·m) change of the contrasts by a change of each element of those readings.
+        contrast: (c, r) contrasts of whitened rows.
+        rows: (r,) whitened rows.
+    """
+
+    reading: Ints
+    pull: Floats
+    contrast: Floats
+    rows: Ints
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Contrasts:
+    """All contrasts of a fit's repeats.
+
+    Attributes:
+        readings: the fitted readings, repeats with their mean covariance.
+        whitening: of those.
+        blocks: by shared class.
+        y: (c,) contrasts of the residual, free of nuisance.
+        nuisance: (c, k) orthonormal contrasts of what differed between repeats.
+        bias: factor by which estimated covariances make ‖y‖² too large.
+        moves: (N, m, n) motion of each reading by each joint, sensor axes.
+    """
+
+    readings: Readings
+    whitening: Whitening
+    blocks: tuple[Block, ...]
+    y: Floats
+    nuisance: Floats
+    bias: float
+    moves: Floats
+
+    @property
+    def dof(self) -> int:
+        """Degrees of freedom."""
+        return int(len(self.y) - self.nuisance.shape[1])
+
+    def free(self, x: Floats) -> Floats:
+        """Take the nuisance out of contrasts (c, ...)."""
+        return np.asarray(x - self.nuisance @ (self.nuisance.T @ x))
+
+    def slopes(self, x: Floats) -> Floats:
+        """(N, m, S) derivative of ½‖y‖² by a change of each reading, contrasts x (c, S)."""
+        m = self.whitening.m
+        out = np.zeros((len(self.readings), m, x.shape[1]))
+        at = 0
+        for b in self.blocks:
+            stop = at + len(b.contrast)
+            out[b.reading] = (b.pull.T @ x[at:stop]).reshape(len(b.reading), m, -1)
+            at = stop
+        return out
+
+
+def classes(readings: Readings) -> Ints:
+    """(N,) class of each reading: same joints, same name of the load, same wrench."""
+    s = readings.states
+    size = np.repeat(
+        [
+            np.linalg.norm(s.wrench[:, part], axis=1).max(initial=0.0)
+            for part in (slice(3), slice(3, 6))
+        ],
+        3,
+    )
+    wrench = s.wrench / np.where(size > 0, SAME_LOAD * size, 1.0)
+    points = np.concatenate([s.q / SAME_ANGLE, wrench, 10.0 * readings.load[:, None]], axis=1)
+    pairs = cKDTree(points).query_pairs(1.0, p=np.inf, output_type="ndarray")
+    shape = (len(points),) * 2
+    links = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=shape)
+    return np.asarray(connected_components(links, directed=False)[1])
+
+
+def contrasts(fit: Fit) -> Contrasts | None:
+    """Contrasts of the repeats of a fit; None where nothing was repeated."""
+    kept = fit.readings[~fit.outlier]
+    kind = classes(kept)
+    if len(np.unique(kind)) == len(kind):
+        return None
+    readings, bias = _pooled(kept, kind)
+    w = whitening(readings, fit.mode, "gc")
+    blocks = _blocks(w, kind)
+    if not blocks:
+        return None
+    solution = fit.solution
+    moves = motion(
+        fit.model.cell,
+        solution.prediction.observation,
+        solution.prediction.situation.chain,
+        solution.prediction.deviation,
+        w.m,
+    ).dq
+    y = _apply(blocks, w.whiten(fit.raw).reshape(-1, 1))[:, 0]
+    other = w.whiten(w.raw(_differences(fit, readings, kind, moves))).reshape(w.m * len(w), -1)
+    nuisance = _orthonormal(_apply(blocks, other))
+    return Contrasts(readings, w, blocks, y - nuisance @ (nuisance.T @ y), nuisance, bias, moves)
+
+
+def _pooled(readings: Readings, kind: Ints) -> tuple[Readings, float]:
+    """Give repeats their mean covariance; and the bias that is left where it was estimated.
+
+    Variances estimated from ν degrees of freedom scatter by 2/ν in their logarithm, which the
+    repeats show, and E[V̂⁻¹] = V⁻¹ ν/(ν − m − 1).
+    """
+    v, m = readings.covariance, readings.m
+    count = np.bincount(kind)
+    mean = np.zeros((len(count), m, m))
+    np.add.at(mean, kind, v)
+    mean /= count[:, None, None]
+    variance = np.maximum(np.diagonal(v, axis1=1, axis2=2), 1e-300)
+    spread = np.log(variance)
+    centre = np.zeros((len(count), m))
+    np.add.at(centre, kind, spread)
+    spread = spread - (centre / count[:, None])[kind]
+    per = float(np.sum(spread**2)) / (m * max(int(np.sum(count - 1)), 1))
+    repeats = float(np.sum(count[count > 1])) / max(int(np.sum(count > 1)), 1)
+    off = min(per / 2 * (m + 1) / repeats, 0.5)
+    return replace(readings, covariance=mean[kind]), 1.0 / (1.0 - off)
+
+
+def _blocks(w: Whitening, kind: Ints) -> tuple[Block, ...]:
+    """Contrasts by groups of measurements that have classes in common."""
+    m = w.m
+    # Class of a measurement: of its loaded reading, and of the unloaded ones it is taken from.
+    label = []
+    groups: list[Group] = []
+    first = 0
+    for b in w.buckets:
+        of = kind[b.loaded]
+        if b.reference.shape[1]:
+            ends = np.stack([kind[b.reference].min(axis=1), kind[b.reference].max(axis=1)], axis=1)
+            ends = np.broadcast_to(ends[:, None, :], (*of.shape, 2))
+        else:
+            ends = np.zeros((*of.shape, 2), dtype=of.dtype)
+        label.append(np.concatenate([of[:, :, None], ends], axis=2).reshape(-1, 3))
+        size = b.loaded.shape[1]
+        for g in range(len(b.loaded)):
+            groups.append((first + g * size + np.arange(size), b, g))
+        first += b.loaded.size
+    number = np.unique(np.concatenate(label), axis=0, return_inverse=True)[1].reshape(-1)
+    owner = np.repeat(np.arange(len(groups)), [len(rows) for rows, _, _ in groups])
+    # Groups are joined where they share a class of measurements or, through an unloaded
+    # reading of several groups, an error; the latter does not occur (see `whitening`).
+    total = len(groups) + int(number.max()) + 1
+    links = coo_matrix((np.ones(len(owner)), (owner, len(groups) + number)), shape=(total, total))
+    joined = connected_components(links, directed=False)[1][: len(groups)]
+    out = []
+    for rows in np.split(
+        np.argsort(joined, kind="stable"), np.flatnonzero(np.diff(np.sort(joined))) + 1
+    ):
+        found = _block([groups[k] for k in rows], number, m)
+        if found is not None:
+            out.append(found)
+    return tuple(out)
+
+
+Group = tuple[Ints, Bucket, int]
+"""Rows of the measurements, and their bucket and place in it."""
+
+
+def _block(groups: list[Group], number: Ints, m: int) -> Block | None:
+    measured = np.concatenate([rows for rows, _, _ in groups])
+    column = np.unique(number[measured], return_inverse=True)[1].reshape(-1)
+    if column.max() + 1 == len(measured):
+        return None
+    readings = np.concatenate([np.concatenate([b.loaded[g], b.reference[g]]) for _, b, g in groups])
+    size = len(measured) * m
+    factor, pick = np.zeros((size, size)), np.zeros((size, len(readings) * m))
+    at, first = 0, 0
+    for rows, b, g in groups:
+        count, refs = len(rows), b.reference.shape[1]
+        span = slice(at, at + count * m)
+        factor[span, span] = b.factor[g]
+        pick[span, first : first + count * m] = np.eye(count * m)
+        for k in range(refs):
+            start = first + (count + k) * m
+            pick[span, start : start + m] = -np.tile(np.eye(m), (count, 1)) / refs
+        at += count * m
+        first += (count + refs) * m
+    member = np.kron(np.eye(int(column.max()) + 1)[column], np.eye(m))
+    seen = np.any(factor != 0, axis=1)
+    u, s, _ = np.linalg.svd((factor @ member)[seen], full_matrices=True)
+    rank = int(np.sum(s > ROUNDING * s.max(initial=0.0)))
+    if rank == u.shape[1]:
+        return None
+    contrast = np.zeros((u.shape[1] - rank, size))
+    contrast[:, seen] = u[:, rank:].T
+    rows = (measured[:, None] * m + np.arange(m)).reshape(-1)
+    return Block(readings, contrast @ factor @ pick, contrast, rows)
+
+
+def _apply(blocks: tuple[Block, ...], white: Floats) -> Floats:
+    """Contrasts (c, P) of whitened rows (R, P)."""
+    return np.concatenate([b.contrast @ white[b.rows] for b in blocks])
+
+
+def _differences(fit: Fit, readings: Readings, kind: Ints, moves: Floats) -> Floats:
+    """(N, m, P) motions by what differs between repeats, first order; 1 mrad or 1 mm each."""
+    s, situation = readings.states, fit.solution.prediction.situation
+    count = np.maximum(np.bincount(kind), 1)
+    axes = np.zeros((*moves.shape[:2], 3))
+    axes[:, :3] = fit.solution.prediction.observation.axes
+    both = 1e-3 * np.concatenate([moves, axes], axis=2)
+    joint = 1e-3 * moves
+    out = []
+
+    def add(motions: Floats, values: Floats) -> None:
+        mean = np.zeros((len(count), values.shape[1]))
+        np.add.at(mean, kind, values)
+        away = values - (mean / count[:, None])[kind]
+        size = np.abs(away).max(axis=0)
+        away = np.where(
+            size > 1e-6 * np.abs(values).max(axis=0), away / np.where(size > 0, size, 1), 0
+        )
+        out.append(motions * away[:, None, :])
+
+    n = moves.shape[2]
+    add(joint, situation.torque)
+    for wide in (s.approach, s.joint_temperature):
+        if wide is not None:
+            add(joint, wide)
+    for values, motions in ((s.time, both), (s.air_temperature, both), (s.load_time, joint)):
+        if values is not None:
+            factor = situation.torque if motions is joint else np.ones((len(values), n + 3))
+            add(motions, factor * values[:, None])
+    found = np.concatenate(out, axis=2)
+    return found[:, :, np.any(found, axis=(0, 1))]
+
+
+def _orthonormal(x: Floats) -> Floats:
+    """Orthonormal basis of the visible columns of x (c, P)."""
+    if x.shape[1] == 0:
+        return np.zeros((len(x), 0))
+    u, s, _ = np.linalg.svd(x, full_matrices=False)
+    return np.asarray(u[:, s > 1e-2])

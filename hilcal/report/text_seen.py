@@ -1,0 +1,50 @@
+"""What could have been seen: effects that were not found, and from which strength they would be."""
+
+from collections.abc import Iterator
+
+from rich.console import RenderableType
+from rich.text import Text
+
+from hilcal.diagnose.sensitivity import Strength
+from hilcal.diagnose.verdict import Diagnosis
+from hilcal.report import numbers, text
+
+
+def could_have_been_seen(d: Diagnosis) -> Iterator[RenderableType]:
+    """Yield the table of effects that were not found, the best visible first."""
+    rest = [s for s in d.suspects if s.effect not in d.significant]
+    seen = sorted((s for s in rest if s.least.visible), key=lambda s: s.least.displacement_m)
+    hidden = [s.effect for s in rest if not s.least.visible]
+    if seen:
+        yield ""
+        out = text.table("not found", "would be seen from", "its parameters, rms", left=(0, 2))
+        for s in seen:
+            out.add_row(s.effect, numbers.length(s.least.displacement_m), own_units(s.least))
+        yield out
+        yield Text(
+            "would be seen from: rms displacement of the target at which nine campaigns like this "
+            "one in ten would name the effect; rms of the parameters that make it.\n",
+            style="dim",
+        )
+    if hidden:
+        yield f"These readings cannot show {', '.join(hidden)}, however strong.\n"
+
+
+def own_units(least: Strength) -> str:
+    """Write a strength in the units of the effect's parameters."""
+    parts = []
+    for unit, rms in least.parameters:
+        name, factor = numbers.unit_for(unit, [rms])
+        parts.append(f"{numbers.digits(factor * rms, 2)} {name}")
+    return ", ".join(parts)
+
+
+def needless_line(d: Diagnosis) -> Iterator[str]:
+    """Yield a sentence on effects of the model that the readings do not ask for."""
+    if d.needless:
+        names = ", ".join(d.needless)
+        it = "it" if len(d.needless) == 1 else "them"
+        yield (
+            f"These readings do not ask for {names}: without {it} they are explained as well "
+            f"(hilcal remove RUN {d.needless[0]})."
+        )
