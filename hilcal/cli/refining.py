@@ -35,6 +35,7 @@ from hilcal.refine import remove as remove_effect
 from hilcal.report import numbers, text, text_refine
 from hilcal.report.build_story import Chapter, build_story
 from hilcal.report.progress import working
+from hilcal.report.text_unknown import curves
 
 ENDING = 5.0
 
@@ -206,8 +207,9 @@ def refine(
                 f"{', '.join(found.rejected)}."
             )
         last = found.steps[-1].diagnosis
-        if last.verdict != "adequate":
+        if last.verdict != "adequate" and not last.carriers:
             t.show(text.follows(last.where))
+        t.show([*curves(last.carriers)])
         steps = zip(rows, found.steps, strict=True)
         chapters = [Chapter(r.number, r.added, r.fit, s.diagnosis, r.removed) for r, s in steps]
         record_story(t, chapters, record)

@@ -3,12 +3,14 @@
 from dataclasses import dataclass
 from typing import Literal
 
+from scipy.stats import chi2
+
 from hilcal.diagnose.apart import Apart, apart
 from hilcal.diagnose.dependence import Dependence, Predicted
-from hilcal.diagnose.learner import predictable
+from hilcal.diagnose.learner import predictable, predictable_share
 from hilcal.diagnose.needless import needless
 from hilcal.diagnose.noise import PureError, pure_error
-from hilcal.diagnose.noise_verdict import PREDICTABLE, judge_noise
+from hilcal.diagnose.noise_verdict import MISFIT_ALARM, PREDICTABLE, judge_noise
 from hilcal.diagnose.projection import Projection, projection
 from hilcal.diagnose.suspects import Suspect, candidates, rank_suspects
 from hilcal.diagnose.where import Where, where
@@ -30,7 +32,8 @@ class Diagnosis:
         fit: the fit.
         verdict: in a word.
         message: in a sentence.
-        predictable_share: share of the misfit that a generic learner predicts.
+        predictable_share: share of the misfit that a generic learner predicts; 0 where there
+            is no misfit.
         where: variables that the misfit follows, largest share first.
         suspects: effects that could be missing, best first.
         significant: names of the suspects that pass the test over the whole catalogue.
@@ -65,7 +68,6 @@ def diagnose(fit: Fit) -> Diagnosis:
     effects = candidates(p)
     suspects = rank_suspects(p, effects, FALSE_ALARM)
     places = where(p)
-    told = predictable(p)
     repeats = pure_error(fit)
     tested = max(sum(s.score.rank > 0 for s in suspects), 1)
     significant = tuple(
@@ -76,6 +78,9 @@ def diagnose(fit: Fit) -> Diagnosis:
         and s.holdout_share >= LEAST_SHARE
     )
     lead = significant[0] if significant else None
+    told = Predicted(0.0, ())
+    if float(chi2.sf(fit.chi2, fit.dof)) < MISFIT_ALARM:
+        told = predictable(p) if lead is None else Predicted(predictable_share(p), ())
     rivals = apart(p, lead, effects) if lead is not None and lead.same_as else ()
     if lead is not None:
         verdict, message = _named(lead, rivals)

@@ -57,7 +57,7 @@ def diagnosis_report(d: Diagnosis) -> Iterator[RenderableType]:
     """Yield the verdict, where the model fails and the suspects."""
     yield text.heading(f"Model: {text.model_name(d.fit.model.names)}")
     yield text.misses(d.fit)
-    if d.verdict != "adequate":
+    if d.verdict != "adequate" and not d.carriers:
         yield text.follows(d.where)
     yield ""
     yield verdict_line(d.verdict, d.message)
