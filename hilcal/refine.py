@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode
-from hilcal.diagnose.revise import add, predicts_better, remove, rivals_of
+from hilcal.diagnose.revise import Alternative, add, alternative, predicts_better, remove
 from hilcal.diagnose.verdict import Diagnosis, Verdict, diagnose
 from hilcal.identify.fit import Fit, fit
 from hilcal.model import Model
@@ -140,15 +140,24 @@ class _Work:
             if name in last.diagnosis.needless and not predicts_better(without, last.fit):
                 self._change(without, None, name)
                 return True
-            own, better = rivals_of(without, name)
-            for rival in better:
-                trial = add(without, rival.effect)
-                if rival.effect not in self._out and predicts_better(last.fit, trial):
-                    self._change(trial, rival.effect, name)
-                    return True
-            if own.same_as:
-                doubts.append(f"{name} could as well be {' or '.join(own.same_as)}")
+            other = alternative(without, name, self._out)
+            if other.better and not predicts_better(other.fits[-1], last.fit):
+                self._exchange(name, other)
+                return True
+            doubt = " or ".join(n for n in other.own.same_as if n not in self._out)
+            if other.as_good and len(other.effects) > 1:
+                doubt = f"{doubt} or {' and '.join(other.effects)}".removeprefix(" or ")
+            if doubt:
+                doubts.append(f"{name} could as well be {doubt}")
         return False
+
+    def _exchange(self, name: str, other: Alternative) -> None:
+        """Put others in the place of an effect."""
+        first, *rest = zip(other.effects, other.fits, strict=True)
+        self._change(first[1], first[0], name)
+        for effect, trial in rest:
+            self._tell(f"added {effect}; diagnosing")
+            self.steps.append(Step(trial, diagnose(trial), effect))
 
     def _change(self, trial: Fit, added: str | None, removed: str) -> None:
         self._out.add(removed)

@@ -1,14 +1,17 @@
 """Additions reconsidered: needless effects, exchanged ones, doubts; what could have been seen."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from campaigns import NOTHING, Campaign, campaign
+from campaigns import NOTHING, Campaign, campaign, measured, plan, world_of
 from scipy.stats import f as f_distribution
 from scipy.stats import ncf
 
+from drivers.simulated.hidden import hide
 from hilcal.diagnose.needless import CHANCE, needless
 from hilcal.diagnose.projection import projection
-from hilcal.diagnose.revise import add, remove, rivals_of
+from hilcal.diagnose.revise import add, alternative, remove
 from hilcal.diagnose.sensitivity import POWER, least_strength, noncentrality
 from hilcal.diagnose.suspects import candidates, family
 from hilcal.diagnose.verdict import diagnose
@@ -95,13 +98,30 @@ def test_a_wrong_choice_is_exchanged_for_the_right_one():
     assert last.diagnosis.verdict == "adequate"
 
 
+def test_a_large_family_that_took_the_part_of_two_effects_is_exchanged_for_them():
+    c = campaign("encoder_offset", "absolute", 2, poses=30)
+    cell, p = c.cell, plan(30, 1002)
+    rng = np.random.default_rng(2)
+    world = world_of(cell, rng)
+    for effect in ("encoder_offset", "tracker_drift"):
+        world = hide(effect, cell, p.states, 3.0, "absolute", rng, world=world)
+    w = work(replace(c, world=world, readings=measured(world, p, rng)), "link_geometry")
+    w.extend()
+    while w.reconsider([]):
+        w.extend()
+    names = w.steps[-1].fit.model.names
+    assert {"encoder_offset", "tracker_drift"} <= set(names)
+    assert "link_geometry" not in names
+
+
 def test_an_addition_that_cannot_be_told_from_another_is_a_doubt():
     c = campaign("tracker_scale", "absolute", 1, poses=20, strength=1.0)
     w = work(c, "tracker_scale")
-    own, _ = rivals_of(w.steps[0].fit, "tracker_scale")
+    other = alternative(w.steps[0].fit, "tracker_scale")
+    assert other.own.effect == "tracker_scale"
     doubts: list[str] = []
     changed = w.reconsider(doubts)
-    assert changed or bool(doubts) == bool(own.same_as)
+    assert changed or bool(doubts) == bool(other.own.same_as)
 
 
 def test_an_effect_that_is_not_there_cannot_be_removed():
@@ -136,9 +156,7 @@ def test_the_least_strength_scales_as_it_should():
     scale, units = np.array([1e-3, 1e-3, 2.0, 2.0]), ("m", "m", "N", "N")
 
     def least(factor=1.0, variance=1.0):
-        return least_strength(
-            factor**2 * x.T @ x, motion, scale, units, 50.0, variance, 1e-4
-        )
+        return least_strength(factor**2 * x.T @ x, motion, scale, units, 50.0, variance, 1e-4)
 
     one = least()
     assert one.visible

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg as sl
 
+from hilcal.diagnose.gain import improves
 from hilcal.diagnose.score import Score, score
 from hilcal.identify.fit import Fit
 from hilcal.identify.holdout import fold_ridge
@@ -30,6 +31,19 @@ class Fold:
     rhs: Floats
 
 
+@dataclass(frozen=True, slots=True)
+class HeldOut:
+    """What a family explains on poses left out.
+
+    Attributes:
+        share: of the misfit; negative where it misleads.
+        sure: whether the error falls by more than it scatters from pose to pose.
+    """
+
+    share: float
+    sure: bool
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Projection:
     """The fitted model's part of the regression, ready to score families.
@@ -39,7 +53,7 @@ class Projection:
         rows: (R, K) whitened Jacobian of the model, identifiable coordinates.
         factor: Cholesky factor of H.
         yy: ‖r‖².
-        left_out: the same of poses predicted without themselves.
+        left_out: (poses,) the same of each pose, predicted without itself.
         folds: the model without each fold of poses.
     """
 
@@ -47,7 +61,7 @@ class Projection:
     rows: Floats
     factor: tuple[Floats, bool]
     yy: float
-    left_out: float
+    left_out: Floats
     folds: tuple[Fold, ...]
 
     def free(self, x: Floats) -> Floats:
@@ -74,7 +88,11 @@ class Projection:
         return float(np.clip(gain / self.misfit(), 0.0, 1.0))
 
     def held_out_share(self, x: Floats, found: Score) -> float:
-        """Share of the misfit explained on poses left out; negative where it misleads.
+        """Share of the misfit explained on poses left out; see `held_out`."""
+        return self.held_out(x, found).share
+
+    def held_out(self, x: Floats, found: Score) -> HeldOut:
+        """What a family explains on poses left out.
 
         Model and family are both refitted without the fold: the residual of a fit to all poses
         would already know of those left out.
@@ -84,12 +102,12 @@ class Projection:
             found: their score, for the strength of the prior.
         """
         if found.rank == 0:
-            return 0.0
+            return HeldOut(0.0, False)
         white = self.fit.white
         across, gram, rhs = self.rows.T @ x, x.T @ x, x.T @ white
         precision = self.yy / (self.fit.dof * found.strength**2)
         gram[np.diag_indices_from(gram)] += max(precision, ROUNDING * float(gram.max()))
-        left = 0.0
+        left = np.zeros(len(white))
         for fold in self.folds:
             out, own, r = x[fold.mine], self.rows[fold.mine], white[fold.mine]
             # Eliminate the model's own coordinates, then solve for the family.
@@ -99,24 +117,36 @@ class Projection:
             b = rhs - out.T @ r - c.T @ solved[:, -1]
             step = sl.solve(h, b, assume_a="pos", check_finite=False)
             model_step = solved[:, -1] - solved[:, :-1] @ step
-            left += float(np.sum((r - own @ model_step - out @ step) ** 2))
+            left[fold.mine] = r - own @ model_step - out @ step
         noise = self.fit.whitening.rank
-        misfit = max(self.left_out - noise, 3 * np.sqrt(2 * noise))
-        return float(np.clip((self.left_out - left) / misfit, -1.0, 1.0))
+        before, after = self.left_out, by_pose(self.fit, left)
+        misfit = max(float(before.sum()) - noise, 3 * np.sqrt(2 * noise))
+        gain = float(before.sum() - after.sum())
+        return HeldOut(float(np.clip(gain / misfit, -1.0, 1.0)), improves(before, after))
 
 
 def projection(fit: Fit) -> Projection:
     """Prepare the scoring of families against a gc-scaled fit."""
     s = fit.solution
-    left_out = fit.whitening.whiten(fit.left_out)
     return Projection(
         fit,
         s.rows,
         s.equations.factor(s.beta),
         float(fit.white @ fit.white),
-        float(np.sum(left_out**2)),
+        left_out_by_pose(fit),
         tuple(_folds(fit)),
     )
+
+
+def by_pose(fit: Fit, white: Floats) -> Floats:
+    """(poses,) sums of squared whitened residuals (R,)."""
+    squares = np.sum(white.reshape(len(fit.pose), -1) ** 2, axis=1)
+    return np.asarray(np.bincount(fit.pose, weights=squares), dtype=float)
+
+
+def left_out_by_pose(fit: Fit) -> Floats:
+    """(poses,) squared whitened residual of each pose, predicted without it."""
+    return by_pose(fit, fit.whitening.whiten(fit.left_out).reshape(-1))
 
 
 def _folds(fit: Fit) -> Iterator[Fold]:

@@ -1,36 +1,46 @@
 """Changes of a model: an effect more, one less, one in place of another."""
 
+from collections.abc import Collection
+from dataclasses import dataclass
+
 import numpy as np
 
-from hilcal.diagnose.projection import projection
+from hilcal.diagnose.gain import LEAST_GAIN, improves
+from hilcal.diagnose.projection import left_out_by_pose, projection
 from hilcal.diagnose.suspects import SAME_EVIDENCE, Suspect, candidates, rank_suspects
 from hilcal.effects.catalogue import make
-from hilcal.effects.options import reading_options
+from hilcal.effects.options import Options, reading_options
+from hilcal.effects.per_joint import check_builders
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit, fit
 from hilcal.model import Model
-from hilcal.types import Floats
 
-LEAST_GAIN = 0.002
-"""Share by which the error on poses left out must fall for an effect to stay ..."""
-SURE = 2.0
-"""... and by how many of its standard errors, from pose to pose."""
+MOST_TOGETHER = 3
+"""Effects that are tried together in place of one."""
+PRICE = 1.0
+"""Evidence that each further effect costs: its strength was chosen by the data, too."""
 
 
-def add(before: Fit, effect: str) -> Fit:
+def add(before: Fit, effect: str, options: Options | None = None) -> Fit:
     """Refit with one more effect, from where the fit stands.
+
+    Args:
+        before: the fit.
+        effect: its name.
+        options: of the effect, where they are not the usual ones.
 
     Raises:
         InputError: unknown effect, one that is there already, or one that these readings
-            cannot show.
+            cannot show; an unknown option, or a bad value.
     """
     readings = before.readings
     if effect in before.model.names:
         raise InputError(
             f"effect {effect} is in the model already: {', '.join(before.model.names)}"
         )
-    options = reading_options(effect, readings.m)
-    model = before.model + make(effect, before.model.cell, readings.states, options)
+    all_options = {**reading_options(effect, readings.m), **(options or {})}
+    model = before.model + make(effect, before.model.cell, readings.states, all_options)
+    check_builders(model.effects)
     start = np.concatenate([before.theta, np.zeros(model.size - before.model.size)])
     return fit(model, readings, before.mode, before.scaling, start)
 
@@ -50,36 +60,68 @@ def remove(before: Fit, effect: str) -> Fit:
     return fit(Model(model.cell, rest), before.readings, before.mode, before.scaling, start)
 
 
-def rivals_of(without: Fit, effect: str) -> tuple[Suspect, tuple[Suspect, ...]]:
-    """Score an effect anew, against the model without it; returns it and those that are better.
+@dataclass(frozen=True, slots=True, eq=False)
+class Alternative:
+    """Other effects in place of one.
+
+    Attributes:
+        own: the one, scored anew against the model without it.
+        effects: the others, in the order in which they were added.
+        fits: with the first of them, with the first two, ...
+        log_evidence: of all of them together.
+    """
+
+    own: Suspect
+    effects: tuple[str, ...]
+    fits: tuple[Fit, ...]
+    log_evidence: float
+
+    @property
+    def better(self) -> bool:
+        """Whether the readings prefer the others, beyond doubt."""
+        return self.log_evidence > self.own.score.log_evidence + SAME_EVIDENCE
+
+    @property
+    def as_good(self) -> bool:
+        """Whether the readings do not tell the others from the one."""
+        return self.log_evidence > self.own.score.log_evidence - SAME_EVIDENCE
+
+
+def alternative(without: Fit, effect: str, never: Collection[str] = ()) -> Alternative:
+    """Look for other effects that explain together what one does.
+
+    The evidence of a chain of additions is the sum of theirs, ln p(r | all) − ln p(r | none), so
+    that one large family and several small effects compare.
 
     Args:
         without: a fit that lacks the effect.
         effect: that was in the model.
-
-    Returns:
-        The effect as a suspect, with what it is not told from now; and the suspects that the
-        readings prefer beyond doubt, best first.
+        never: effects that were taken out before.
     """
-    p = projection(without)
-    ranked = rank_suspects(p, candidates(p))
-    own = next(s for s in ranked if s.effect == effect)
-    limit = own.score.log_evidence + SAME_EVIDENCE
-    return own, tuple(s for s in ranked if s.score.log_evidence > limit)
+    own: Suspect | None = None
+    names: list[str] = []
+    fits: list[Fit] = []
+    total, current = 0.0, without
+    for _ in range(MOST_TOGETHER):
+        p = projection(current)
+        ranked = rank_suspects(p, candidates(p))
+        if own is None:
+            own = next(s for s in ranked if s.effect == effect)
+        best = next((s for s in ranked if s.effect != effect and s.effect not in never), None)
+        if best is None or best.score.log_evidence <= SAME_EVIDENCE:
+            break
+        names.append(best.effect)
+        total += best.score.log_evidence - (PRICE if fits else 0.0)
+        current = add(current, best.effect)
+        fits.append(current)
+        if total > own.score.log_evidence + SAME_EVIDENCE or total < own.score.log_evidence / 4:
+            break
+    assert own is not None  # noqa: S101 - the first round finds it
+    return Alternative(own, tuple(names), tuple(fits), total)
 
 
 def predicts_better(before: Fit, after: Fit) -> bool:
     """Whether the error on poses left out falls, by more than it scatters from pose to pose."""
-    if after.holdout.rms_sigma >= (1 - LEAST_GAIN) * before.holdout.rms_sigma:
-        return False
     if np.any(before.outlier != after.outlier):
-        return True
-    gain = _squares_by_pose(before) - _squares_by_pose(after)
-    error = float(np.std(gain)) / np.sqrt(max(len(gain) - 1, 1))
-    return bool(np.mean(gain) > SURE * error)
-
-
-def _squares_by_pose(f: Fit) -> Floats:
-    """Squared whitened residual of each pose, predicted without it."""
-    white = f.whitening.whiten(f.left_out).reshape(len(f.left_out), -1)
-    return np.asarray(np.bincount(f.pose, weights=np.sum(white**2, axis=1)), dtype=float)
+        return after.holdout.rms_sigma < (1 - LEAST_GAIN) * before.holdout.rms_sigma
+    return improves(left_out_by_pose(before), left_out_by_pose(after))

@@ -25,6 +25,7 @@ class Suspect:
         score: the joint test of the whole family.
         share: share of the misfit it explains.
         holdout_share: the same on poses left out.
+        sure: whether the error there falls by more than it scatters from pose to pose.
         least: the smallest strength of it that these readings would reveal.
         same_as: other suspects that these data cannot tell from it.
     """
@@ -33,6 +34,7 @@ class Suspect:
     score: Score
     share: float
     holdout_share: float
+    sure: bool
     least: Strength
     same_as: tuple[str, ...] = ()
 
@@ -106,11 +108,13 @@ def rank_suspects(
 def _suspect(p: Projection, of: Family, level: float) -> Suspect:
     s = of.white.T @ p.free(of.white)
     result = p.score_of(s, of.white)
+    held = p.held_out(of.white, result)
     return Suspect(
         effect=of.effect.name,
         score=result,
         share=p.share(result.gain),
-        holdout_share=p.held_out_share(of.white, result),
+        holdout_share=held.share,
+        sure=held.sure,
         least=least_strength(
             s,
             of.motion,

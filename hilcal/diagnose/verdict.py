@@ -1,5 +1,6 @@
 """A diagnosis: the verdict on a fitted model, in a word and in a sentence."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -70,13 +71,14 @@ def diagnose(fit: Fit) -> Diagnosis:
     places = where(p)
     repeats = pure_error(fit)
     tested = max(sum(s.score.rank > 0 for s in suspects), 1)
-    significant = tuple(
+    explaining = [
         s
         for s in suspects
         if s.score.p_value * tested < FALSE_ALARM
         and s.score.log_evidence > 0
         and s.holdout_share >= LEAST_SHARE
-    )
+    ]
+    significant = tuple(s for s in explaining if s.sure)
     lead = significant[0] if significant else None
     told = Predicted(0.0, ())
     if float(chi2.sf(fit.chi2, fit.dof)) < MISFIT_ALARM:
@@ -85,7 +87,7 @@ def diagnose(fit: Fit) -> Diagnosis:
     if lead is not None:
         verdict, message = _named(lead, rivals)
     else:
-        verdict, message = _judge(p, places, told, repeats)
+        verdict, message = _judge(p, places, told, repeats, explaining)
     return Diagnosis(
         fit,
         verdict,
@@ -119,7 +121,11 @@ def _named(lead: Suspect, rivals: tuple[Apart, ...]) -> tuple[Verdict, str]:
 
 
 def _judge(
-    p: Projection, places: tuple[Where, ...], told: Predicted, repeats: PureError | None
+    p: Projection,
+    places: tuple[Where, ...],
+    told: Predicted,
+    repeats: PureError | None,
+    unsure: Sequence[Suspect],
 ) -> tuple[Verdict, str]:
     """Return the verdict where no effect of the catalogue is missing."""
     fit = p.fit
@@ -127,7 +133,7 @@ def _judge(
     spread = f"{factor**0.5:.2g} times the stated noise"
     kinds = [v for v in places if v.variable.split()[0] not in ("pose", "direction")]
     follow = [v for v in kinds if v.p_value * len(kinds) < FALSE_ALARM]
-    noise = judge_noise(fit, repeats, told.share > PREDICTABLE or bool(follow))
+    noise = judge_noise(fit, repeats, told.share > PREDICTABLE or bool(follow) or bool(unsure))
     if noise.misjudged:
         return "noise_misjudged", noise.message
     if not noise.off:
@@ -138,8 +144,14 @@ def _judge(
     carry = [v.variable for v in told.carriers if v.share >= LEAST_SHARE]
     named = (carry or [v.variable for v in follow if v.share >= LEAST_SHARE])[:2]
     follows = f"; it follows {' and '.join(named)}" if named else ""
+    none = f"no effect of the catalogue explains {LEAST_SHARE:.0%} of it or more"
+    if unsure:
+        best = unsure[0]
+        none = (
+            f"the best effect of the catalogue, {best.effect}, explains {best.share:.0%} of it, "
+            "but does not surely lower the error on poses left out"
+        )
     return "unknown_effect", (
         f"Residuals are {spread}, a generic learner predicts {told.share:.0%} of the misfit, and "
-        f"no effect of the catalogue explains {LEAST_SHARE:.0%} of it or more"
-        f"{follows}{noise.message}"
+        f"{none}{follows}{noise.message}"
     )
