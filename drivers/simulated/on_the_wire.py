@@ -1,7 +1,7 @@
 """A simulated cell with something hidden in it, behind real wires or behind none."""
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -49,11 +49,23 @@ def rehearse_plan(config: CellConfig, plan: Plan, choice: str, seed: int) -> Reh
     Raises:
         InputError: an unknown choice, or a cell without loads.
     """
-    s = secret_of(config, plan, choice, seed)
+    return read_plan(secret_of(config, plan, choice, seed), plan, [seed, 1])
+
+
+def read_plan(s: Secret, plan: Plan, seed: Sequence[int], begun: float = 0.0) -> Rehearsal:
+    """Draw the readings of a plan in a simulated cell that is there already.
+
+    Args:
+        s: what is told and what is true.
+        plan: what is measured, each reading the mean of several measurements.
+        seed: of the noise.
+        begun: when, in the time of the campaign, s.
+    """
+    config = s.config
     world = replace(s.world, noise=measurement_noise(config, config.acquire.samples))
-    v = planned_states(s.cell, s.config, plan)
+    v = planned_states(s.cell, config, plan, begun)
     names = (UNLOADED, *(load.name for load in config.loads))
-    rng = np.random.default_rng([seed, 1])
+    rng = np.random.default_rng(seed)
     readings = simulate(world, v.states, v.pose, v.load, v.cycle, names, rng)
     readings = replace(readings, pose_names=plan.pose_names)
     return Rehearsal(s.config, s.cell, s.mode, world, s.hidden, s.strength_sigma, readings)

@@ -3,6 +3,7 @@
 import numpy as np
 
 from drivers.simulated.rehearsal import Visit
+from drivers.simulated.temperatures import warm_up
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.data.plan import UNLOADED, Plan
@@ -12,16 +13,18 @@ _LOADING = 60.0  # s, to change a load
 _MEASURING = 5.0  # s, to settle and to measure
 
 
-def planned_states(cell: Cell, config: CellConfig, plan: Plan) -> Visit:
+def planned_states(cell: Cell, config: CellConfig, plan: Plan, begun: float = 0.0) -> Visit:
     """Return the N states of a plan's steps in order, with times as they will about be.
 
     A joint's approach side is the direction of its last motion; the first step is reached by
-    a move in the positive direction of every joint.
+    a move in the positive direction of every joint. The joints warm up as those of the cell
+    behind the wires do.
 
     Args:
         cell: the cell.
         config: its loads and motion.
         plan: what is visited.
+        begun: when, in the time of the campaign, s.
     """
     names = [UNLOADED, *(load.name for load in config.loads)]
     pulls = {load.name: load.wrench(cell.gravity) for load in config.loads}
@@ -35,10 +38,15 @@ def planned_states(cell: Cell, config: CellConfig, plan: Plan) -> Visit:
     speed, acceleration = config.motion.speed_rad_s, config.motion.acceleration_rad_s2
     changed = np.diff(load, prepend=0) != 0
     lasts = np.abs(moved).max(axis=1) / speed + speed / acceleration + _MEASURING
-    time = np.cumsum(lasts + _LOADING * changed)
-    begun = np.maximum.accumulate(np.where(changed, time - _MEASURING, 0.0))
+    time = begun + np.cumsum(lasts + _LOADING * changed)
+    hung = np.maximum.accumulate(np.where(changed, time - _MEASURING, begun))
     states = States(
-        q=q, wrench=wrench, time=time, load_time=np.maximum(time - begun, 1.0), approach=side
+        q=q,
+        wrench=wrench,
+        time=time,
+        load_time=np.maximum(time - hung, 1.0),
+        joint_temperature=warm_up(time, cell.arm.n),
+        approach=side,
     )
     pose = np.array([plan.pose_names.index(step.pose) for step in plan.steps])
     return Visit(states, pose, load, np.array([step.cycle for step in plan.steps]))

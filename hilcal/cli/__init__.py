@@ -15,10 +15,12 @@ from hilcal.cli.demo import demo
 from hilcal.cli.effects import effects, new
 from hilcal.cli.fitting import compare, identify, validate
 from hilcal.cli.hidden import hidden
+from hilcal.cli.next import next_
 from hilcal.cli.planning import check, plan
-from hilcal.cli.refining import add, diagnose, refine, view
+from hilcal.cli.refining import add, diagnose, refine, remove, view
 from hilcal.cli.running import run
 from hilcal.cli.simulating import simulate
+from hilcal.cli.study_diagnosis import diagnosis
 from hilcal.cli.study_plans import plans
 from hilcal.cli.study_scaling import scaling
 from hilcal.cli.tables import export, import_
@@ -56,7 +58,9 @@ def _application() -> typer.Typer:
         "compare": compare,
         "diagnose": diagnose,
         "add": add,
+        "remove": remove,
         "refine": refine,
+        "next": next_,
         "validate": validate,
         "view": view,
         "export": export,
@@ -71,6 +75,7 @@ def _application() -> typer.Typer:
     study.command("scaling")(scaling)
     study.command("hidden")(hidden)
     study.command("plans")(plans)
+    study.command("diagnosis")(diagnosis)
     study.callback()(_group)
     app.add_typer(study, name="study")
     app.callback()(_top)

@@ -8,14 +8,16 @@ import numpy as np
 import typer
 
 from drivers.simulated.rehearsal import NOTHING, RANDOM, Rehearsal, check_choice
+from hilcal.cli.doubting import FIRST, STRENGTH, Doubted, doubted, in_doubt
 from hilcal.cli.effects_from import EffectsFrom
 from hilcal.cli.files import check_record, record_of, record_story
 from hilcal.cli.planning import POSES
 from hilcal.cli.refining import Row, revisions_json
-from hilcal.cli.rehearsing import in_process, on_devices
+from hilcal.cli.rehearsing import Told, first_plan, in_process, on_devices
 from hilcal.cli.terminal import Json, Record, Terminal, terminal
 from hilcal.config import load_config
 from hilcal.data.campaign import Campaign
+from hilcal.data.plan import Plan
 from hilcal.data.records import content_hash
 from hilcal.diagnose.document import to_json
 from hilcal.errors import InputError
@@ -24,7 +26,7 @@ from hilcal.refine import Refinement
 from hilcal.refine import refine as refine_model
 from hilcal.report import numbers, text, text_demo, text_refine
 from hilcal.report.build_story import Chapter
-from hilcal.report.progress import working
+from hilcal.report.progress import Say, working
 from hilcal.robot.catalogue import configs_dir
 
 CELL = "demo_ur10e.toml"
@@ -44,6 +46,13 @@ def demo(
         bool,
         typer.Option("--without-devices", help="Draw the readings at once, through no wire."),
     ] = False,
+    ambiguous: Annotated[
+        bool,
+        typer.Option(
+            "--ambiguous",
+            help="Measure little at first, so that the effect is in doubt; then what settles it.",
+        ),
+    ] = False,
     record: Record = None,
     effects_from: EffectsFrom = None,
     as_json: Json = False,
@@ -53,24 +62,36 @@ def demo(
     check_record(record)
     path = configs_dir() / "cells" / CELL
     config = load_config(path)
-    choice = hide or config.simulation.hide or RANDOM
     number = config.simulation.seed if seed is None else seed
     if number < 0:
         raise InputError(f"--seed {number}; valid: a whole number, 0 or more")
+    choice = hide or config.simulation.hide or (in_doubt(number) if ambiguous else RANDOM)
     check_choice(choice)
+    if ambiguous:
+        weaker = config.simulation.model_copy(update={"strength_sigma": STRENGTH})
+        config = config.model_copy(update={"simulation": weaker})
     there = output.exists()
-    if without_devices:
-        r = in_process(t, config, choice, number, output, path.parent, poses)
-    else:
-        r = on_devices(t, config, choice, number, output, path.parent, poses)
-    if there:
-        t.notice(f"{output} existed and is replaced")
+    told = Told(config, choice, number, output, path.parent)
+    doubt: Doubted | None = None
+    with working(t.progress) as say:
+        plan = _plan(told, poses, ambiguous, say)
+    with (in_process if without_devices else on_devices)(t, told, plan) as (r, further):
+        if there:
+            t.notice(f"{output} existed and is replaced")
+        _introduce(t, r, choice, number)
+        if ambiguous:
+            doubt = doubted(t, r, number, plan, poses)
+            if doubt.plan is not None:
+                r = further(doubt.plan)
+                new = len(r.readings) - doubt.readings
+                t.show(f"\n{new} readings were added. All {len(r.readings)} together:\n")
     hashed = content_hash(r.readings)
-    _introduce(t, r, choice, number)
     with working(t.progress) as say:
         model = baseline(r.cell, r.readings, r.mode)
         found = refine_model(model, r.readings, r.mode, say)
     with Campaign.open(output) as campaign:
+        if doubt is not None and doubt.plan is not None:
+            campaign.append_revision(record_of(doubt.fit, doubt.diagnosis, None, doubt.hashed))
         numbered = [
             campaign.append_revision(record_of(s.fit, s.diagnosis, s.added, hashed, s.removed))
             for s in found.steps
@@ -103,6 +124,7 @@ def demo(
             "seed": number,
             "readings": r.mode,
             "found": ok,
+            **({} if doubt is None else {"doubt": doubt.document}),
             "verdict": found.verdict,
             "message": found.message,
             "rejected": list(found.rejected),
@@ -112,6 +134,14 @@ def demo(
             "diagnoses": [to_json(s.diagnosis) for s in found.steps],
         }
     )
+
+
+def _plan(told: Told, poses: int, ambiguous: bool, say: Say) -> Plan:
+    """Return the first plan; a small one under some of the loads where there is to be doubt."""
+    if not ambiguous:
+        return first_plan(told, told.config, poses, say)
+    some = told.config.model_copy(update={"loads": told.config.loads[1::2] or told.config.loads})
+    return first_plan(told, some, FIRST, say)
 
 
 def _introduce(t: Terminal, r: Rehearsal, choice: str, seed: int) -> None:

@@ -1,46 +1,79 @@
 """A campaign in a simulated cell: on its devices over real wires, or by drawing of lots alone."""
 
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from drivers.simulated.on_the_wire import rehearse_plan, secret_of, simulated_cell
-from drivers.simulated.rehearsal import Rehearsal, as_told
+from drivers.simulated.on_the_wire import read_plan, secret_of, simulated_cell
+from drivers.simulated.rehearsal import Rehearsal, Secret, as_told
 from hilcal.acquire.dry_run import dry_run
-from hilcal.cell import cell_from_config
+from hilcal.cell import Cell, cell_from_config
+from hilcal.cli.files import COVARIANCE, INSTRUMENT
 from hilcal.cli.planning import make_plan, refuse
 from hilcal.cli.running import create, measure
 from hilcal.cli.terminal import Terminal
 from hilcal.config import CellConfig
+from hilcal.data.appended import fitted_on
 from hilcal.data.campaign import Campaign
 from hilcal.data.plan import Plan
+from hilcal.data.readings import Readings
+from hilcal.data.run_log import RunLog
 from hilcal.identify.repeatability import with_repeatability
 from hilcal.report.progress import Say, counting, working
 
+BREAK = 600.0
+"""Between two plans of a campaign that is drawn by lots, s."""
 
-def on_devices(
-    t: Terminal,
-    config: CellConfig,
-    choice: str,
-    seed: int,
-    output: Path,
-    base_dir: Path,
-    poses: int,
-) -> Rehearsal:
-    """Plan a campaign, run it on simulated devices, and return what was measured.
 
-    The drivers are the real ones; what they talk to are the simulated devices of one world, each
-    a process of its own.
+@dataclass(frozen=True, slots=True)
+class Told:
+    """What a rehearsal is of.
 
-    Args:
-        t: where progress goes.
-        config: the cell; its loads are all used.
-        choice: an effect, "random" or "nothing".
+    Attributes:
+        config: the cell; its loads are all there.
+        choice: an effect that is hidden, "random" or "nothing".
         seed: of everything random.
         output: the campaign file to make.
         base_dir: directory that paths in the configuration are relative to.
-        poses: number of poses beside the reference.
+    """
+
+    config: CellConfig
+    choice: str
+    seed: int
+    output: Path
+    base_dir: Path
+
+
+Further = Callable[[Plan], Rehearsal]
+"""Measures one further plan in the same cell, into the same campaign; returns all readings."""
+
+
+def first_plan(told: Told, config: CellConfig, poses: int, say: Say) -> Plan:
+    """Plan a campaign, as the program that is not told what is hidden would.
+
+    Args:
+        told: what the rehearsal is of.
+        config: the cell, perhaps with some of its loads only.
+        poses: number of poses.
+        say: told what is being done.
+    """
+    config = as_told(config, told.choice)
+    cell = cell_from_config(config, told.base_dir)
+    plan = make_plan(cell, config, poses, told.seed, say)
+    refuse(dry_run(cell, config, plan), "the plan")
+    return plan
+
+
+@contextmanager
+def on_devices(t: Terminal, told: Told, plan: Plan) -> Iterator[tuple[Rehearsal, Further]]:
+    """Run a plan on simulated devices; they stay for further plans as long as the block lasts.
+
+    The drivers are the real ones; what they talk to are the simulated devices of one world, each
+    a process of its own.
 
     Raises:
         InputError: an unknown choice, or a cell without loads.
@@ -48,62 +81,75 @@ def on_devices(
     """
     with ExitStack() as stack:
         with working(t.progress) as say:
-            plan = _plan(config, choice, seed, base_dir, poses, say)
-            secret = secret_of(config, plan, choice, seed)
-            cell = secret.cell
+            secret = secret_of(told.config, plan, told.choice, told.seed)
             say("starting the simulated devices")
-            there = stack.enter_context(simulated_cell(secret, seed, base_dir))
-        campaign = stack.enter_context(create(output, there.config, base_dir, plan, True))
-        measure(t, there.config, cell, campaign)
-        readings = campaign.readings()
-    scatter = there.config.repeatability.per_joint(cell.arm.n)
+            there = stack.enter_context(simulated_cell(secret, told.seed, told.base_dir))
+        made = create(told.output, there.config, told.base_dir, plan, True)
+        campaign = stack.enter_context(made)
+
+        def measured() -> Rehearsal:
+            measure(t, there.config, secret.cell, campaign)
+            readings = _whole(secret.cell, there.config, campaign)
+            return _rehearsal(secret, there.config, readings)
+
+        def further(more: Plan) -> Rehearsal:
+            log = RunLog(campaign)
+            log.append(log.fitted(more))
+            return measured()
+
+        yield measured(), further
+
+
+@contextmanager
+def in_process(t: Terminal, told: Told, plan: Plan) -> Iterator[tuple[Rehearsal, Further]]:
+    """Draw the readings of a plan from the simulated world without any device.
+
+    They are written bit by bit, as a real campaign grows.
+    """
+    with working(t.progress):
+        secret = secret_of(told.config, plan, told.choice, told.seed)
+    source = "rehearsal in a simulated cell, without devices"
+    made = secret.config.to_json()
+    with Campaign.create(told.output, made, str(told.base_dir), source, overwrite=True) as campaign:
+
+        def measured(part: Plan, number: int, begun: float) -> Rehearsal:
+            r = read_plan(secret, part, [told.seed, number], begun)
+            _write(t, campaign, r.readings)
+            return _rehearsal(secret, secret.config, campaign.readings())
+
+        def further(more: Plan) -> Rehearsal:
+            time = campaign.readings().states.time
+            last = 0.0 if time is None else float(time.max())
+            return measured(fitted_on(more, plan, 2), 2, last + BREAK)
+
+        yield measured(plan, 1, 0.0), further
+
+
+def _write(t: Terminal, campaign: Campaign, readings: Readings) -> None:
+    """Append readings in their order, pose after pose."""
+    starts = [0, *(np.flatnonzero(np.diff(readings.pose)) + 1).tolist(), len(readings)]
+    with counting(t.progress, "measuring poses", len(starts) - 1) as advance:
+        for begin, end in pairwise(starts):
+            campaign.append_readings(readings[slice(begin, end)])
+            advance(1)
+
+
+def _whole(cell: Cell, config: CellConfig, campaign: Campaign) -> Readings:
+    """Return all readings as the commands see them."""
+    readings = campaign.readings()
+    if campaign.about(COVARIANCE) == INSTRUMENT:
+        scatter = config.repeatability.per_joint(cell.arm.n)
+        readings = with_repeatability(cell, readings, scatter)
+    return readings
+
+
+def _rehearsal(secret: Secret, config: CellConfig, readings: Readings) -> Rehearsal:
     return Rehearsal(
-        config=there.config,
-        cell=cell,
+        config=config,
+        cell=secret.cell,
         mode=secret.mode,
         world=secret.world,
         hidden=secret.hidden,
         strength_sigma=secret.strength_sigma,
-        readings=with_repeatability(cell, readings, scatter),
+        readings=readings,
     )
-
-
-def _plan(config: CellConfig, choice: str, seed: int, base_dir: Path, poses: int, say: Say) -> Plan:
-    """Plan a campaign, as the program that is not told what is hidden would."""
-    told = as_told(config, choice)
-    plan = make_plan(cell_from_config(told, base_dir), told, poses, seed, say)
-    refuse(dry_run(cell_from_config(told, base_dir), told, plan), "the plan")
-    return plan
-
-
-def in_process(
-    t: Terminal,
-    config: CellConfig,
-    choice: str,
-    seed: int,
-    output: Path,
-    base_dir: Path,
-    poses: int,
-) -> Rehearsal:
-    """Plan a campaign and draw its readings from the simulated world without any device.
-
-    It is written pose by pose, as a real one grows. Arguments as in `on_devices`.
-    """
-    with working(t.progress) as say:
-        plan = _plan(config, choice, seed, base_dir, poses, say)
-        r = rehearse_plan(config, plan, choice, seed)
-    visited = list(dict.fromkeys(r.readings.pose.tolist()))
-    with (
-        Campaign.create(
-            output,
-            r.config.to_json(),
-            str(base_dir),
-            "rehearsal in a simulated cell, without devices",
-            overwrite=True,
-        ) as campaign,
-        counting(t.progress, "measuring poses", len(visited)) as advance,
-    ):
-        for pose in visited:
-            campaign.append_readings(r.readings[np.equal(r.readings.pose, pose)])
-            advance(1)
-    return r

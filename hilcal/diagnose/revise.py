@@ -120,6 +120,12 @@ def alternative(without: Fit, effect: str, never: Collection[str] = ()) -> Alter
     return Alternative(own, tuple(names), tuple(fits), total)
 
 
+def again(without: Fit, effect: str) -> Suspect:
+    """Score an effect anew, against a fit that lacks it."""
+    p = projection(without)
+    return next(s for s in rank_suspects(p, candidates(p)) if s.effect == effect)
+
+
 def predicts_better(before: Fit, after: Fit) -> bool:
     """Whether the error on poses left out falls, by more than it scatters from pose to pose."""
     if np.any(before.outlier != after.outlier):

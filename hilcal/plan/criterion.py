@@ -28,7 +28,7 @@ class Smooth:
     Attributes:
         value: f(M).
         gradient: (P, P) of f.
-        products: terms of its curvature.
+        products: terms of its curvature; a vector x (P,) in the place of X stands for x xᵀ.
         squares: terms of its curvature.
         above: (P, P) Z such that φ(N) ≤ tr(Z N) for every information N ⪰ 0,
         below: or with Y (P, P): φ(N) ≤ tr(Z N) / tr(Y N).

@@ -52,14 +52,22 @@ class Program:
         n, size, p = self.rows.shape
         flat = self.rows.reshape(-1, p)
         out = np.zeros((n, n))
+        plain = [(c, x, y) for c, x, y in smooth.products if x.ndim == 2]
+        thin = [(c, x, y) for c, x, y in smooth.products if x.ndim == 1]
+        if thin:  # tr(x xᵀ H_k Y H_l) = (H_k x)ᵀ Y H_l x
+            seen = (flat @ np.stack([x for _, x, _ in thin], axis=1)).reshape(n, size, -1)
+            moved = np.matmul(seen.transpose(0, 2, 1), self.rows)
+            for k, (c, _, y) in enumerate(thin):
+                v = moved[:, k]
+                out -= c * (v @ y @ v.T)
         if size * size <= p:  # by the rows
-            for c, x, y in smooth.products:
+            for c, x, y in plain:
                 left = flat @ x @ flat.T
                 left *= left if y is x else flat @ y @ flat.T
                 out -= c * left.reshape(n, size, n, size).sum(axis=3).sum(axis=1)
-        else:  # by the matrices
+        elif plain:  # by the matrices
             h = np.matmul(self.rows.transpose(0, 2, 1), self.rows)
-            for c, x, y in smooth.products:
+            for c, x, y in plain:
                 out -= c * (h.reshape(n, -1) @ (x @ h @ y).reshape(n, -1).T)
         for c, v in smooth.squares:
             price = prices(self.rows, v)

@@ -16,9 +16,11 @@ import numpy as np
 from scipy import stats
 
 from hilcal.data.plan import UNLOADED
-from hilcal.errors import InputError
+from hilcal.errors import CannotAnswerError, InputError
 from hilcal.plan.information import Problem
-from hilcal.plan.separation import Pair
+from hilcal.plan.relaxation import relax
+from hilcal.plan.separation import Pair, Separate
+from hilcal.plan.suspects import estimate
 from hilcal.types import Floats
 
 LEVEL = 0.01
@@ -26,6 +28,11 @@ LEVEL = 0.01
 VISIBLE = 1e-4
 """Eigenvalue of S, in the scales of the problem, from which a direction counts as seen."""
 DRAWS = 3
+MANY = 100
+"""Readings by which a pair is called hopeless ..."""
+LEAST_POWER = 0.2
+"""... where the best of so many do not tell it with this power."""
+_LOOSE = 0.05
 _SEED = 20240609
 
 
@@ -38,11 +45,13 @@ class Rivals:
         names: (effect that is there, rival that is fitted) of each pair.
         prior: (P, P) what is known before, without the priors of potential terms: neither must
             an effect be found by what was supposed of it, nor a rival be held small.
+        hopeless: names of the pairs that no measurement separates; they are left out.
     """
 
     pairs: tuple[Pair, ...]
     names: tuple[tuple[str, str], ...]
     prior: Floats
+    hopeless: tuple[tuple[str, str], ...] = ()
 
 
 def rivals(
@@ -50,17 +59,22 @@ def rivals(
     suspects: Sequence[str] | None = None,
     fitted: Mapping[str, Floats] | None = None,
 ) -> Rivals:
-    """Return all pairs of suspects, both ways round.
+    """Return the pairs of suspects, both ways round, that some measurement separates.
+
+    None does where the best of all plans of `MANY` readings, with what is known already, has a
+    power below `LEAST_POWER`: for the first of the parameters of the effect that is there.
 
     Args:
         problem: with all suspects among its potential terms.
         suspects: at least two effects; all families of the problem by default.
-        fitted: estimated parameters (E,) of suspects, SI; of the others a few directions are
-            drawn (always the same), each of an RMS strength of 1 σ of a measured element over
-            all units.
+        fitted: parameters (D, E) of suspects, SI: D that could be; one vector (E,) will do. By
+            default those that the readings so far speak for, see `estimated`. Of the others a
+            few directions are drawn (always the same), each of an RMS strength of 1 σ of a
+            measured element over all units.
 
     Raises:
         InputError: fewer than two suspects, or one that is not among the potential terms.
+        CannotAnswerError: no pair can be separated.
     """
     known = tuple(e.name for e in problem.families)
     names = known if suspects is None else tuple(dict.fromkeys(suspects))
@@ -70,12 +84,14 @@ def rivals(
             raise InputError(f"{name} is not among the potential terms; valid: {valid}")
     if len(names) < 2:
         raise InputError(f"{len(names)} effects to tell apart; valid: two or more")
-    given = dict(fitted or {})
+    given = dict(estimated(problem, DRAWS) if fitted is None else fitted)
     model = np.arange(problem.model_size)
     pairs, both = [], []
     for e in names:
         where = problem.of_effect(e)
-        strengths = [given[e] / problem.scale[where]] if e in given else _strengths(problem, e)
+        strengths = _strengths(problem, e)
+        if e in given:
+            strengths = [x / problem.scale[where] for x in np.atleast_2d(given[e])]
         for f in names:
             if f != e:
                 nuisance = np.concatenate([model, problem.of_effect(f)])
@@ -83,7 +99,58 @@ def rivals(
                 both += [(e, f)] * len(strengths)
     prior, size = problem.measured.copy(), problem.model_size
     prior[:size, :size] = problem.prior[:size, :size]
-    return Rivals(tuple(pairs), tuple(both), prior)
+    return _feasible(problem, Rivals(tuple(pairs), tuple(both), prior))
+
+
+def estimated(problem: Problem, count: int) -> dict[str, Floats]:
+    """Return (count, E) parameters of the families that the readings so far speak for, SI.
+
+    Draws from what is known of them, the estimate first; see `suspects`.
+    """
+    fit, out = problem.assumed.fit, {}
+    if fit is None:
+        return {}
+    for family in problem.families:
+        found = estimate(fit, family)
+        if found is not None and found.told:
+            out[family.name] = found.draws(count, np.random.default_rng(_SEED))
+    return out
+
+
+def _feasible(problem: Problem, of: Rivals) -> Rivals:
+    """Leave out the pairs that no measurement separates."""
+    spread = of.prior + problem.units.information(
+        np.full(len(problem.units), MANY / float(problem.units.cost.sum()))
+    )
+    hopeless = []
+    for names in dict.fromkeys(of.names):
+        pair = of.pairs[of.names.index(names)]
+        if power(pair, spread) < LEAST_POWER and _best_power(problem, of, pair) < LEAST_POWER:
+            hopeless.append(names)
+    keep = [k for k, names in enumerate(of.names) if names not in hopeless]
+    if not keep:
+        raise CannotAnswerError(never(hopeless))
+    pairs, both = tuple(of.pairs[k] for k in keep), tuple(of.names[k] for k in keep)
+    return Rivals(pairs, both, of.prior, tuple(hopeless))
+
+
+def never(hopeless: Sequence[tuple[str, str]]) -> str:
+    """Say in words which pairs no measurement separates."""
+    told: dict[str, list[str]] = {}
+    for e, f in hopeless:
+        if e not in told.get(f, ()):
+            told.setdefault(e, []).append(f)
+    said = [f"{e} from {' or '.join(fs)}" for e, fs in told.items()]
+    return f"no measurement in this cell separates {', nor '.join(said)}"
+
+
+def _best_power(problem: Problem, of: Rivals, pair: Pair) -> float:
+    """Power of the best plan of `MANY` readings for one pair."""
+    try:
+        found = relax(problem.units, Separate((pair,)), MANY, of.prior, tolerance=_LOOSE)
+    except CannotAnswerError:
+        return LEVEL
+    return power(pair, found.information)
 
 
 def power(pair: Pair, information: Floats) -> float:

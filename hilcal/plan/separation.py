@@ -172,7 +172,7 @@ class Separate:
             if p_i > _FELT
         ]
         products = [
-            (-2.0 * p_i / scale, np.outer(u, u), solver)
+            (-2.0 * p_i / scale, u, solver)
             for p_i, (u, solver) in zip(p, found, strict=True)
             if p_i > _FELT
         ]

@@ -1,0 +1,199 @@
+"""Laws that no catalogue knows: what an effect outside of it does to the readings.
+
+A law moves joints or the target by something that is recorded, in a way that no effect of the
+catalogue describes: a joint errs with the angle of another, a bench sways with the air. It is
+added to readings to first order, r + J dq + d, at the strength that is asked for.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivers.simulated.world import World
+from hilcal.data.readings import States
+from hilcal.errors import InputError
+from hilcal.types import Bools, Floats, Ints
+
+ABSOLUTE, DEFLECTION = "absolute", "deflection"
+_NOTHING = 1e-6  # σ of a law at size 1; rounding
+Law = Callable[[States, Floats], Floats]
+"""Motions (N, n + 3) of joints and target (sensor axes) from states and torques (N, n)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Invented:
+    """An effect outside of the catalogue.
+
+    Attributes:
+        name: a few words.
+        law: the law in one line.
+        variables: what it depends on, as a diagnosis would call it.
+        readings: kinds of readings that show it.
+        motion: the law, at any size.
+    """
+
+    name: str
+    law: str
+    variables: tuple[str, ...]
+    readings: tuple[str, ...]
+    motion: Law
+
+
+def _of_joint(j: int, states: States, values: Floats) -> Floats:
+    """Return motions of joint j alone."""
+    out = np.zeros((len(states), states.q.shape[1] + 3))
+    out[:, j - 1] = values
+    return out
+
+
+def _upwards(states: States, values: Floats) -> Floats:
+    """Return motions of the target along the third axis of the sensor."""
+    out = np.zeros((len(states), states.q.shape[1] + 3))
+    out[:, -1] = values
+    return out
+
+
+def _given(values: Floats | None, what: str) -> Floats:
+    """Return a column that the law depends on.
+
+    Raises:
+        InputError: the states lack it.
+    """
+    if values is None:
+        raise InputError(f"states: no {what}; valid: states that tell it")
+    return values
+
+
+def _crossed(s: States, torque: Floats) -> Floats:
+    return _of_joint(2, s, np.sin(3.0 * s.q[:, 3]))
+
+
+def _settled(s: States, torque: Floats) -> Floats:
+    time = _given(s.time, "time")
+    return _of_joint(3, s, np.tanh((time / max(float(time.max()), 1.0) - 0.3) / 0.1))
+
+
+def _swaying(s: States, torque: Floats) -> Floats:
+    air = _given(s.air_temperature, "air temperature")
+    return _upwards(s, air - air.mean())
+
+
+def _dragged(s: States, torque: Floats) -> Floats:
+    return _of_joint(5, s, _given(s.approach, "approach")[:, 2])
+
+
+def _coupled(s: States, torque: Floats) -> Floats:
+    return _of_joint(4, s, torque[:, 1] ** 2)
+
+
+def _relaxing(s: States, torque: Floats) -> Floats:
+    return _upwards(s, -np.sqrt(_given(s.load_time, "time under the load")))
+
+
+def _turned(s: States, torque: Floats) -> Floats:
+    pull = np.linalg.norm(s.wrench[:, :3], axis=1)
+    return _of_joint(2, s, pull * np.cos(2.0 * s.q[:, 0]))
+
+
+INVENTED: tuple[Invented, ...] = (
+    Invented("crossed gear", "dq_2 = a sin 3 q_4", ("joint 4 angle",), (ABSOLUTE,), _crossed),
+    Invented("slip in time", "dq_3 = a tanh of time", ("time",), (ABSOLUTE,), _settled),
+    Invented(
+        "swaying bench", "target rises with the air", ("air temperature",), (ABSOLUTE,), _swaying
+    ),
+    Invented(
+        "dragging cable",
+        "dq_5 = a s_3, the side joint 3 came from",
+        ("joint 3 approach",),
+        (ABSOLUTE, DEFLECTION),
+        _dragged,
+    ),
+    Invented(
+        "coupled joint",
+        "dq_4 = a tau_2²",
+        ("joint 2 torque",),
+        (ABSOLUTE, DEFLECTION),
+        _coupled,
+    ),
+    Invented(
+        "relaxing bench",
+        "target sinks by a sqrt(time under the load)",
+        ("time under load",),
+        (DEFLECTION,),
+        _relaxing,
+    ),
+    Invented(
+        "base that turns",
+        "dq_2 = a |f| cos 2 q_1",
+        ("joint 1 angle", "load"),
+        (DEFLECTION,),
+        _turned,
+    ),
+)
+"""Every law, by what shows it."""
+
+
+def invented(name: str) -> Invented:
+    """Return a law by name.
+
+    Raises:
+        InputError: lists the valid names.
+    """
+    for law in INVENTED:
+        if law.name == name:
+            return law
+    raise InputError(f"law {name!r}; valid: {', '.join(law.name for law in INVENTED)}")
+
+
+def shift(
+    law: Invented,
+    world: World,
+    states: States,
+    strength_sigma: float,
+    mode: str,
+    pose: Ints,
+    cycle: Ints,
+) -> Floats:
+    """Return (N, 3) by how much the law moves the readings, sensor axes, m.
+
+    The size is such that sqrt(mean |W d|²) = strength_sigma, as in `hidden.hide`: d what it
+    changes in a reading, or in a loaded minus its unloaded reading; W whitens that.
+
+    Raises:
+        InputError: a mode that does not show the law, or states that lack what it depends on.
+    """
+    if mode not in law.readings:
+        raise InputError(f"law {law.name!r} needs readings {' or '.join(law.readings)}, not {mode}")
+    motion = law.motion(states, world.drive_torque(states))
+    sight = world.sight(states)
+    n = states.q.shape[1]
+    moved = np.einsum("nij,nj->ni", sight.jacobian[:, :3], motion[:, :n]) + motion[:, n:]
+    covariance, change = world.covariance(sight), moved
+    if mode == DEFLECTION:
+        loaded = np.any(states.wrench != 0.0, axis=1)
+        rows, first = _pairs(loaded, pose, cycle)
+        covariance = covariance[rows] + covariance[first]
+        change = moved[rows] - moved[first]
+    white = np.linalg.solve(np.linalg.cholesky(covariance), change[:, :, None])
+    size = float(np.sqrt(np.mean(white**2)))
+    if size <= _NOTHING:
+        raise InputError(f"law {law.name!r} changes nothing in these states ({mode} readings)")
+    return np.asarray(strength_sigma / size * moved)
+
+
+def _pairs(loaded: Bools, pose: Ints, cycle: Ints) -> tuple[Ints, Ints]:
+    """Return rows of loaded readings, and of the unloaded one of their pose and cycle.
+
+    Raises:
+        InputError: no loaded reading, or a pose without an unloaded one.
+    """
+    if not loaded.any():
+        raise InputError("states: no loaded reading; valid: one with a wrench that is not zero")
+    first = {(int(pose[row]), int(cycle[row])): int(row) for row in np.flatnonzero(~loaded)[::-1]}
+    rows = np.flatnonzero(loaded)
+    keys = [(int(pose[row]), int(cycle[row])) for row in rows]
+    lacking = [key for key in keys if key not in first]
+    if lacking:
+        raise InputError(f"pose {lacking[0][0]} has no unloaded reading; valid: one per cycle")
+    return rows, np.array([first[key] for key in keys], dtype=np.int64)

@@ -1,0 +1,222 @@
+"""`next`: the measurements that separate the leading suspects."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from hilcal.acquire.dry_run import dry_run
+from hilcal.cli.effects_from import EffectsFrom
+from hilcal.cli.files import Opened, check_record, effect_names, open_run
+from hilcal.cli.planning import POSES, plan_json, read_cell, refuse
+from hilcal.cli.terminal import Json, Record, Run, Terminal, terminal
+from hilcal.data.plan import REFERENCE, Plan, read_plan
+from hilcal.data.plan_csv import plan_csv
+from hilcal.data.run_log import PLAN
+from hilcal.diagnose.revise import remove
+from hilcal.diagnose.verdict import diagnose
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.identify.fit import Fit
+from hilcal.plan.next import Next, measure_next
+from hilcal.plan.planner import Request
+from hilcal.plan.tell import about, story
+from hilcal.report import numbers as words_of
+from hilcal.report.progress import Say, working
+from hilcal.report.text_next import next_report
+from hilcal.report.text_plan import story_report
+from hilcal.revisions import chain
+from hilcal.types import Floats
+
+MOST = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Doubt:
+    """Suspects that these readings do not tell apart, and a fit of the model without them."""
+
+    fit: Fit
+    suspects: tuple[str, ...]
+
+
+def next_(
+    run: Run,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="PLAN", help="The plan file to make.")
+    ],
+    poses: Annotated[
+        int,
+        typer.Option("--poses", help="As many readings as so many poses take under every load."),
+    ] = POSES,
+    suspects: Annotated[
+        str | None,
+        typer.Option("--suspects", metavar="A,B", help="Tell these apart, whatever is diagnosed."),
+    ] = None,
+    cell: Annotated[
+        Path | None,
+        typer.Option("--cell", metavar="CELL.toml", help="The cell, where it has other loads now."),
+    ] = None,
+    seed: Annotated[int, typer.Option("--seed", help="Of the random candidates.")] = 0,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Without comparing criteria and numbers of poses.")
+    ] = False,
+    csv: Annotated[
+        Path | None, typer.Option("--csv", metavar="F.csv", help="The plan as a table, too.")
+    ] = None,
+    record: Record = None,
+    effects_from: EffectsFrom = None,
+    as_json: Json = False,
+) -> None:
+    """Plan the measurements that separate the leading suspects; exit 4 where there is no doubt."""
+    t = terminal(as_json)
+    check_record(record)
+    if seed < 0:
+        raise InputError(f"--seed {seed}; valid: a whole number, 0 or more")
+    if poses < 1:
+        raise InputError(f"--poses {poses}; valid: a whole number from 1")
+    rng = np.random.default_rng(seed)
+    with open_run(run) as o, working(t.progress) as say:
+        config, numbers = (o.config, o.cell) if cell is None else read_cell(cell)
+        doubt = doubt_of(t, o, _named(suspects), say)
+        place = reference_of(o)
+        found = measure_next(
+            numbers, config, doubt.fit, doubt.suspects, Request(poses), rng, say, place
+        )
+        told = story(found.planned, config, rng, say, compare=not quick)
+        made = plan_of(found, doubt.suspects)
+        say("going through it in thought")
+        dry = dry_run(numbers, config, made)
+    refuse(dry, "the plan")
+    told = replace(told, remarks=tuple(dict.fromkeys((*dry.remarks, *told.remarks))))
+    _write(output, made.to_json() + "\n")
+    if csv is not None:
+        pulls = {load.name: load.wrench(numbers.gravity) for load in config.loads}
+        _write(csv, plan_csv(made, pulls))
+    if record is not None:
+        from hilcal.report.viewer.plan_stream import record_plan  # loads the viewer, which lasts
+
+        with working(t.progress) as say:
+            say(f"recording {record}")
+            record_plan(numbers, config, made, told, record)
+    t.show(f"In doubt: {words_of.names(doubt.suspects, 'or')}.\n")
+    t.show(next_report(found, told.poses, told.readings))
+    t.show(story_report(told))
+    t.show(f"The plan is in {output}. Measure it into the same campaign with:")
+    t.show(f"  hilcal run {cell or 'CELL.toml'} -o {run} --append --plan {output}")
+    t.document(
+        {
+            **plan_json(made, dry, told),
+            "plan": str(output),
+            "suspects": list(doubt.suspects),
+            **separates(found),
+        }
+    )
+
+
+def separates(found: Next) -> dict[str, object]:
+    """Return what a JSON document says of pairs; powers are those with the planned readings."""
+    return {
+        "separates": [[t.effect, t.rival, t.then] for t in found.told],
+        "separates_now": [[t.effect, t.rival, t.now] for t in found.told],
+        "inseparable": [[t.effect, t.rival] for t in found.told if t.hopeless],
+        "difference": found.shares,
+        "notes": list(found.notes),
+    }
+
+
+def plan_of(found: Next, suspects: tuple[str, ...]) -> Plan:
+    """Return the plan with what its file says of it."""
+    told = [[t.effect, t.rival, round(t.then, 4)] for t in found.told]
+    more = {**about(found.planned), "suspects": list(suspects), "separates": told}
+    return replace(found.planned.ordered.plan, about=more)
+
+
+def doubt_of(t: Terminal, o: Opened, named: tuple[str, ...] | None, say: Say) -> Doubt:
+    """Return what is to be told apart: as named, or the leading suspect and its rivals.
+
+    Where the newest revision has none, but an effect that was added on the way could as well
+    have been another, it is these.
+
+    Raises:
+        InputError: named suspects that are in the model.
+        CannotAnswerError: nothing is in doubt; says what else to do.
+    """
+    number, newest = o.latest_fit(t, say)
+    if newest.scaling != "gc":
+        raise InputError(
+            f"revision {number} has scaling {newest.scaling}; next needs gc: run hilcal identify "
+            "again"
+        )
+    if named is not None:
+        for name in named:
+            if name in newest.model.names:
+                say(f"fitting without {name}")
+                newest = remove(newest, name)
+        return Doubt(newest, named)
+    say(f"diagnosing revision {number}")
+    d = diagnose(newest)
+    leading = [s for s in d.suspects if s.effect in d.significant]
+    if leading and leading[0].same_as:
+        return Doubt(newest, (leading[0].effect, *leading[0].same_as)[:MOST])
+    if leading:
+        raise CannotAnswerError(
+            f"nothing to tell apart: {leading[0].effect} is the only leading suspect; add it with: "
+            f"hilcal add {o.path} {leading[0].effect}"
+        )
+    added = {r.added for r in chain(o.campaign.revisions())}
+    for name in newest.model.names:
+        if name in added:
+            say(f"reconsidering {name}")
+            without = remove(newest, name)
+            own = next(s for s in diagnose(without).suspects if s.effect == name)
+            if own.same_as:
+                return Doubt(without, (name, *own.same_as)[:MOST])
+    raise CannotAnswerError(_settled(o, d.verdict))
+
+
+def _settled(o: Opened, verdict: str) -> str:
+    """Say that nothing is to be told apart, and what else to do."""
+    if verdict == "adequate":
+        return (
+            "nothing to tell apart: the model is adequate; to sharpen it, plan on with: hilcal "
+            f"plan CELL.toml --after {o.path}, or tell named effects apart with --suspects A,B"
+        )
+    if verdict == "noise_misjudged":
+        return (
+            f"nothing to tell apart: the noise is misjudged, see hilcal diagnose {o.path}; repeat "
+            "some readings, or state the covariance anew"
+        )
+    return (
+        "nothing to tell apart: no effect of the catalogue explains the misfit, so there is no "
+        f"suspect; see hilcal compare {o.path}, or give an effect of your own by --effects-from"
+    )
+
+
+def reference_of(o: Opened) -> Floats | None:
+    """Return the joints (n,) of the campaign's reference pose; None where it has none."""
+    text = o.campaign.about(PLAN)
+    if text is None:
+        return None
+    plan = read_plan(text, f"{o.path}, its plan")
+    return plan.joints(REFERENCE) if REFERENCE in plan.pose_names else None
+
+
+def _named(text: str | None) -> tuple[str, ...] | None:
+    """Split and check --suspects."""
+    if text is None:
+        return None
+    try:
+        names = effect_names(text) or ()
+    except InputError as error:
+        raise InputError(str(error).replace("--effects", "--suspects")) from None
+    if not 2 <= len(names) <= MOST:
+        raise InputError(f"--suspects has {len(names)} names; valid: 2 to {MOST}")
+    return names
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from None

@@ -1,0 +1,246 @@
+"""The measurements that separate suspects: a plan for them, and the power it will have."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hilcal.cell import Cell
+from hilcal.config import CellConfig
+from hilcal.data.plan import REFERENCE, UNLOADED
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.identify.fit import Fit
+from hilcal.plan.feasible import Space
+from hilcal.plan.information import Problem, readings_of
+from hilcal.plan.order import Chosen, Ordering, order_plan
+from hilcal.plan.planner import Planned, Request, Say, make
+from hilcal.plan.rivals import LEVEL, Rivals, estimated, never, power, rivals
+from hilcal.plan.separation import Pair
+from hilcal.robot.chain import evaluate
+from hilcal.types import Floats
+
+CANDIDATES = 600
+"""Most poses to choose from: more cost time, and hardly help."""
+FEW = 2
+"""Suspects up to which loads are looked through one by one."""
+DRAWS = 24
+"""Parameters of each suspect over which a power is averaged."""
+SURE = 0.9
+"""Power from which on two suspects count as told apart."""
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """How well one suspect is told from another.
+
+    Attributes:
+        effect: the effect that is there.
+        rival: the one that is fitted in its stead.
+        now: chance that the readings so far reject the rival, by a test at 1 %.
+        then: the same with the planned readings.
+        hopeless: whether no measurement in this cell would do.
+    """
+
+    effect: str
+    rival: str
+    now: float
+    then: float
+    hopeless: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Next:
+    """The measurements that separate suspects.
+
+    Attributes:
+        planned: the plan.
+        told: of each pair, both ways round.
+        shares: by load, the share of what separates the weakest pair.
+        stretched: how far the arm reaches in the poses that separate it most, by that in an
+            ordinary candidate.
+        notes: what was left out, one line each.
+    """
+
+    planned: Planned
+    told: tuple[Told, ...]
+    shares: dict[str, float]
+    stretched: float
+    notes: tuple[str, ...]
+
+
+def measure_next(
+    cell: Cell,
+    config: CellConfig,
+    fit: Fit,
+    suspects: Sequence[str],
+    request: Request,
+    rng: np.random.Generator,
+    say: Say = lambda words: None,
+    reference: Floats | None = None,
+) -> Next:
+    """Plan the measurements that separate suspects.
+
+    The criterion is the least non-centrality over all pairs of them, at the parameters that the
+    readings so far tell of each and at others that could be as well; see `rivals`.
+
+    Args:
+        cell: the cell.
+        config: its limits, loads and noise.
+        fit: what has been measured, in scaling gc, of a model without the suspects.
+        suspects: two effects or more.
+        request: how many readings.
+        rng: generator.
+        say: told what is being done.
+        reference: (n,) joints of the campaign's reference pose, rad; a new one where None.
+
+    Raises:
+        InputError: suspects that cannot be.
+        CannotAnswerError: no measurement separates any two of them, or no plan can be made.
+    """
+    names = tuple(dict.fromkeys(suspects))
+    if len(names) < 2:
+        raise InputError(f"{len(names)} suspects; two or more are needed to tell them apart")
+    asked = {
+        "readings": fit.mode,
+        "against": names,
+        "candidates": min(config.planning.candidates, CANDIDATES),
+    }
+    planning = config.planning.model_copy(update=asked)
+    config = config.model_copy(update={"planning": planning})
+    wanted = replace(request, criterion="separate")
+    if len(names) > FEW and request.readings is None:
+        # leaving out loads, one after the other, would take minutes
+        wanted = replace(wanted, readings=request.poses * (1 + len(config.loads)))
+    try:
+        made = make(cell, config, wanted, rng, fit, say)
+    except InputError as error:
+        if "effects to tell apart" not in str(error):
+            raise
+        lines = f"at most one of {', '.join(names)} changes what can be measured in this cell"
+        raise CannotAnswerError(f"{lines}: no measurement separates them") from None
+    if reference is not None and not np.array_equal(reference, made.ordered.plan.q[0]):
+        made = _from_reference(cell, config, made, reference, rng, request)
+    say("working out what it will tell")
+    of = rivals(made.problem)
+    then = of.prior + made.problem.units.information(made.counts)
+    told = tuple(_told(made.problem, of, names, then))
+    seen = {e.name for e in made.problem.families}
+    lost = [n for n in names if n not in seen]
+    notes = tuple(n for n in made.problem.notes if n.split(":")[0] in lost)
+    if of.hopeless:
+        notes = (*notes, never(of.hopeless))
+    weakest = min(of.pairs, key=lambda pair: power(pair, then))
+    shares, stretched = _where(made, weakest, then)
+    return Next(made, told, shares, stretched, notes)
+
+
+def expected(problem: Problem, names: tuple[str, str], of: Rivals, information: Floats) -> float:
+    """Return the power of a pair, the mean over what its effect could be.
+
+    Args:
+        problem: the design problem.
+        names: effect that is there, rival that is fitted.
+        of: all pairs.
+        information: (P, P) of all readings, with `Rivals.prior`.
+    """
+    e, f = names
+    where = problem.of_effect(e)
+    nuisance = np.concatenate([np.arange(problem.model_size), problem.of_effect(f)])
+    draws = estimated(problem, DRAWS).get(e)
+    if draws is None:
+        betas = [p.beta for p, n in zip(of.pairs, of.names, strict=True) if n[0] == e]
+    else:
+        betas = list(draws / problem.scale[where])
+    each = [power(Pair(where, b, nuisance, f"{e} from {f}"), information) for b in betas]
+    return float(np.mean(each)) if each else LEVEL
+
+
+def _told(problem: Problem, of: Rivals, names: tuple[str, ...], then: Floats) -> list[Told]:
+    """All pairs of the suspects, those that need more first."""
+    seen = {e.name for e in problem.families}
+    out = []
+    for e in names:
+        for f in names:
+            if e == f:
+                continue
+            if e not in seen or f not in seen:
+                out.append(Told(e, f, LEVEL, LEVEL, e not in seen))
+                continue
+            now = expected(problem, (e, f), of, of.prior)
+            hopeless = (e, f) in of.hopeless
+            out.append(Told(e, f, now, expected(problem, (e, f), of, then), hopeless))
+    return out
+
+
+def _from_reference(
+    cell: Cell,
+    config: CellConfig,
+    made: Planned,
+    reference: Floats,
+    rng: np.random.Generator,
+    request: Request,
+) -> Planned:
+    """Return the plan in an order from another reference pose, without what that cannot reach."""
+    space, of = Space(cell, config), made.problem
+    counts, usable = made.counts.astype(np.int64), np.flatnonzero(made.usable)
+    for load in of.candidates.loads:
+        taken = [k for k in np.flatnonzero(counts) if load in readings_of(of.what[k], of.mode)]
+        if taken:
+            q = of.candidates.q[[of.what[k][0] for k in taken]]
+            counts[np.array(taken)[~space.passable(reference, q, load)]] = 0
+    taken = list(np.flatnonzero(counts))
+    if not taken:
+        raise CannotAnswerError(
+            "none of the poses that separate the suspects is reached from the campaign's "
+            "reference pose; start another campaign for them"
+        )
+    plan = made.ordered.plan
+    poses = sorted({of.what[k][0] for k in taken})
+    names = {pose: f"p{k}" for k, pose in enumerate(poses, start=1)}
+    chosen = [
+        Chosen(names[of.what[k][0]], readings_of(of.what[k], of.mode), int(counts[k]))
+        for k in taken
+    ]
+    repeats = sum(s.load == UNLOADED and s.cycle > 0 and s.pose != REFERENCE for s in plan.steps)
+    how = Ordering(unloaded=request.unloaded, repeats=repeats)
+    ordered = order_plan(
+        cell, config, list(names.values()), of.candidates.q[poses], reference, chosen,
+        space.passable, rng, how,
+    )  # fmt: skip
+    information = made.asked.prior + of.units.information(counts.astype(float))
+    design = replace(
+        made.design,
+        counts=counts[usable],
+        value=float(made.asked.criterion.value(information)),
+        information=information,
+        cost=float(counts @ of.units.cost),
+    )
+    return replace(made, ordered=ordered, design=design)
+
+
+def _where(made: Planned, pair: Pair, then: Floats) -> tuple[dict[str, float], float]:
+    """Shares of the loads in uᵀ M u of a pair, and how far the arm reaches where it is largest.
+
+    Deflections that share an unloaded reading are correlated: a load's share is then what it
+    adds to those before it.
+    """
+    of, u = made.problem, pair.best(then)[0]
+    taken = np.flatnonzero(made.counts)
+    worth = np.array([float(np.sum((of.units.rows[k] @ u) ** 2)) for k in taken])
+    worth *= made.counts[taken]
+    total = max(float(worth.sum()), 1e-300)
+    shares: dict[str, float] = {}
+    for k, value in zip(taken, worth, strict=True):
+        loads = of.what[k][1]
+        m = of.assumed.m
+        rows = of.units.rows[k][: m * len(loads)] @ u
+        by = np.sum(rows.reshape(len(loads), m) ** 2, axis=1)
+        for load, part in zip(loads, by, strict=True):
+            share = float(part / max(float(by.sum()), 1e-300) * value / total)
+            shares[load] = shares.get(load, 0.0) + share
+
+    arm, cell = of.assumed.cell.arm, of.assumed.cell
+    at = np.linalg.norm(evaluate(arm, of.candidates.q).point(cell.target[:3, 3])[:, :2], axis=1)
+    poses = np.array([of.what[k][0] for k in taken])
+    reach = float(at[poses] @ worth) / total
+    return shares, reach / float(np.mean(at))

@@ -1,0 +1,69 @@
+"""What `next` says: which suspects the planned measurements will tell apart, and how well."""
+
+from collections.abc import Iterator, Sequence
+
+from rich.console import RenderableType
+from rich.text import Text
+
+from hilcal.data.plan import UNLOADED
+from hilcal.plan.next import SURE, Next, Told
+from hilcal.report import numbers, text
+
+_STRETCHED = 1.15
+_MOST_LOADS = 2
+_LEAST_SHARE = 0.1
+
+
+def next_report(found: Next, poses: int, readings: int) -> Iterator[RenderableType]:
+    """Yield the powers of all pairs, now and then, and what makes the difference.
+
+    Args:
+        found: the plan and what it tells.
+        poses: of the plan, beside the reference.
+        readings: of the plan.
+    """
+    yield text.heading("Telling the suspects apart")
+    out = text.table("if this is there", "this is ruled out", "now", "then", left=(0, 1))
+    for t in found.told:
+        then = "never" if t.hopeless else numbers.percent(t.then)
+        out.add_row(t.effect, t.rival, numbers.percent(t.now), then)
+    yield out
+    yield Text(
+        "now, then: chance that the test at 1 % rules it out, with the readings so far and with "
+        "those planned as well.\n",
+        style="dim",
+    )
+    yield f"{summary(found.told, poses, readings)} {_difference(found)}\n"
+    for note in found.notes:
+        yield f"note: {note}"
+
+
+def summary(told: Sequence[Told], poses: int, readings: int) -> str:
+    """Say in a sentence what the plan will settle."""
+    able = [t for t in told if not t.hopeless]
+    least = min(able, key=lambda t: t.then)
+    head = f"{readings} readings at {poses} poses"
+    if least.then >= SURE and len(able) == len(told):
+        return f"{head} will tell: whichever is there, the others are ruled out with at least " + (
+            f"{numbers.percent(least.then)} chance."
+        )
+    return (
+        f"{head}: the weakest pair is {least.effect} from {least.rival}, told with a chance of "
+        f"{numbers.percent(least.then)} ({numbers.percent(least.now)} now); more poses raise it."
+    )
+
+
+def _difference(found: Next) -> str:
+    """Say which loads and poses make the difference."""
+    by = sorted(found.shares.items(), key=lambda pair: -pair[1])
+    named = [
+        f"{'the unloaded readings' if load == UNLOADED else load} ({numbers.percent(share)})"
+        for load, share in by[:_MOST_LOADS]
+        if share >= _LEAST_SHARE
+    ]
+    words = f"What separates the weakest pair comes from {numbers.names(named)}"
+    if found.stretched > _STRETCHED:
+        words += ", most of it with the arm stretched out"
+    elif found.stretched < 1 / _STRETCHED:
+        words += ", most of it with the arm drawn in"
+    return f"{words}."

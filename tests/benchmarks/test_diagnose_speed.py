@@ -1,0 +1,88 @@
+"""Cost of scoring the whole catalogue against one fit of the largest model, in one run.
+
+The machine's speed cancels in the ratio: the two are timed in turn, and the shortest times are
+compared; of one thread's own work, so that what else runs does not count. Nothing is asserted of
+times; `make bench` prints them and stores them in `extra_info`.
+"""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from campaigns import campaign
+
+from hilcal.data.whitening import Mode
+from hilcal.diagnose.projection import projection
+from hilcal.diagnose.suspects import Suspect, candidates, rank_suspects
+from hilcal.diagnose.verdict import diagnose
+from hilcal.effects.catalogue import make
+from hilcal.effects.options import reading_options
+from hilcal.identify.baseline import baseline
+from hilcal.identify.fit import Fit, fit
+from hilcal.model import Model
+
+pytestmark = pytest.mark.slow
+
+LOADS = 5  # readings of a pose
+ROUNDS = 3
+
+
+def shortest(works: dict[str, Callable[[], object]]) -> dict[str, float]:
+    """Shortest processor time of each piece of work, s; they are done in turn."""
+    times: dict[str, list[float]] = {name: [] for name in works}
+    for _ in range(ROUNDS):
+        for name, work in works.items():
+            start = time.process_time()
+            work()
+            times[name].append(time.process_time() - start)
+    return {name: min(seconds) for name, seconds in times.items()}
+
+
+def fitted(readings: int, mode: Mode) -> Fit:
+    c = campaign("hysteresis", mode, poses=readings // LOADS, strength=2.0)
+    assert len(c.readings) == readings
+    return fit(baseline(c.cell, c.readings, mode), c.readings, mode)
+
+
+def largest(found: Fit) -> Model:
+    """The baseline and the suspect with most parameters."""
+    names = {e.name: len(e.parameters) for e in candidates(projection(found))}
+    name = max(names, key=lambda n: names[n])
+    states = found.readings.states
+    options = reading_options(name, found.readings.m)
+    return found.model + make(name, found.model.cell, states, options)
+
+
+def score(found: Fit) -> tuple[Suspect, ...]:
+    """Score every suspect of the catalogue."""
+    p = projection(found)
+    return rank_suspects(p, candidates(p))
+
+
+@pytest.mark.parametrize("mode", ["absolute", "deflection"])
+@pytest.mark.parametrize("readings", [180, 1000])
+def test_scoring_against_a_fit_of_the_largest_model(
+    readings: int, mode: Mode, benchmark: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`ratio`: scoring the catalogue over one fit of the largest model; `diagnose_s`: all of it."""
+    found = fitted(readings, mode)
+    model = largest(found)
+    seconds = shortest(
+        {
+            "fit": lambda: fit(model, found.readings, mode),
+            "scoring": lambda: score(found),
+            "diagnose": lambda: diagnose(found),
+        }
+    )
+    ratio = seconds["scoring"] / seconds["fit"]
+    benchmark.extra_info.update(
+        ratio=ratio, readings=readings, parameters=model.size, diagnose_s=seconds["diagnose"]
+    )
+    with capsys.disabled():
+        print(
+            f"\n{readings} {mode} readings: scoring {seconds['scoring']:.2f} s, {ratio:.2f} fits "
+            f"of {model.size} parameters ({model.names[-1]}); diagnose {seconds['diagnose']:.2f} s"
+        )
+    suspects = benchmark.pedantic(score, args=(found,), rounds=1)
+    assert "hysteresis" in {s.effect for s in suspects}
