@@ -4,17 +4,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from campaigns import Campaign, campaign
 from cli_cases import rehearsal
+from test_diagnose_unknown import hidden
 
 from drivers.simulated.rehearsal import Rehearsal
-from hilcal.diagnose.verdict import diagnose
+from hilcal.diagnose.dependence import Dependence
+from hilcal.diagnose.verdict import Diagnosis, diagnose
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.everything import everything
 from hilcal.identify.fit import fit
 from hilcal.refine import add
-from hilcal.report.build_story import Chapter, build_story, pose_numbers
-from hilcal.report.story import Story, check
+from hilcal.report.build_story import Chapter, build_story, curve, pose_numbers
+from hilcal.report.story import Story, StoryRevision, check
 from hilcal.robot.chain import evaluate
 
 
@@ -98,6 +101,104 @@ def test_the_right_suspect_lies_on_the_line_of_slope_one(
         assert (g.x > 0).any()
         assert (g.x < 0).any()
         assert story.revisions[-1].regressor is None
+
+
+def judged(c: Campaign) -> tuple[Diagnosis, StoryRevision]:
+    found = fit(baseline(c.cell, c.readings, c.mode), c.readings, c.mode)
+    d = diagnose(found)
+    story = build_story([Chapter(1, None, found, d)])
+    check(story)
+    return d, story.revisions[0]
+
+
+def test_an_unknown_effect_has_a_curve_in_units_for_people() -> None:
+    d, r = judged(hidden("dq2 = sin 3 q4", "absolute", 0, 1.5))
+    assert r.verdict == "unknown_effect"
+    assert r.regressor is None
+    assert r.suspects == ()
+    lead = r.curves[0]
+    assert (lead.variable, lead.x_label) == ("joint 4 angle", "joint 4 angle [°]")
+    assert lead.y_label == "error of joint 2 [µrad]"
+    np.testing.assert_allclose(np.deg2rad(lead.x), d.carriers[0].x)
+    np.testing.assert_allclose(lead.y * 1e-6, d.carriers[0].y)
+    np.testing.assert_allclose(lead.error * 1e-6, d.carriers[0].error)
+    assert lead.share == d.carriers[0].share > 0.9
+
+
+@pytest.mark.parametrize(("explains", "curves"), [(0.03, 1), (0.6, 0)])
+def test_a_suspect_that_explains_little_leaves_the_picture_to_the_variable(
+    explains: float, curves: int
+) -> None:
+    d, _ = judged(hidden("dq2 = sin 3 q4", "absolute", 0, 1.5))
+    lead = replace(d.suspects[1], holdout_share=explains)
+    named = replace(
+        d, verdict="missing_effect", suspects=(d.suspects[0], lead), significant=(lead.effect,)
+    )
+    r = build_story([Chapter(1, None, d.fit, named)]).revisions[0]
+    assert r.suspects[0].effect == lead.effect
+    assert len(r.curves) == curves
+    assert (r.regressor is None) == bool(curves)
+
+
+def test_a_suspect_that_explains_much_keeps_the_picture(
+    deflections: tuple[Rehearsal, Story], positions: tuple[Rehearsal, Story]
+) -> None:
+    for _, story in (deflections, positions):
+        assert all(r.curves == () for r in story.revisions)
+
+
+def test_rivals_are_those_of_the_leading_suspect() -> None:
+    d, r = judged(campaign("thermal_growth", "absolute", 0, strength=1.0))
+    assert r.verdict == "ambiguous"
+    assert r.suspects[0].effect == d.significant[0]
+    assert {o.effect for o in r.rivals} == set(r.suspects[0].same_as)
+    assert [o.times for o in r.rivals] == [a.times for a in d.apart]
+
+
+def test_what_could_have_been_seen_is_told_of_all_that_was_not_found(
+    deflections: tuple[Rehearsal, Story],
+) -> None:
+    first, last = deflections[1].revisions
+    strength = [s.displacement_m for s in last.limits]
+    assert strength == sorted(strength)
+    assert all(s > 0 for s in strength)
+    assert {s.effect for s in last.limits}.isdisjoint(
+        {*last.model, *(s.effect for s in last.suspects)}
+    )
+    assert len(last.limits) > 8
+    assert all(s.parameters for s in last.limits if np.isfinite(s.displacement_m))
+    assert deflections[0].hidden not in {s.effect for s in first.limits}
+
+
+@pytest.mark.parametrize(
+    ("unit", "end", "label", "factor"),
+    [
+        ("s", 90.0, "time [s]", 1.0),
+        ("s", 1800.0, "time [min]", 1 / 60),
+        ("s", 36000.0, "time [h]", 1 / 3600),
+        ("rad", 3.0, "time [°]", 180 / np.pi),
+        ("°C", 40.0, "time [°C]", 1.0),
+        ("", 2.0, "time", 1.0),
+    ],
+)
+def test_units_of_a_variable_are_those_of_people(
+    unit: str, end: float, label: str, factor: float
+) -> None:
+    x, up = np.array([0.0, end]), np.array([0.0, 0.0, 1.0])
+    y, error = np.array([-2e-3, 2e-3]), np.array([1e-4, 1e-4])
+    told = curve(Dependence("time", unit, 0.5, "target", up, x, y, error, "m"))
+    assert told.x_label == label
+    np.testing.assert_allclose(told.x, factor * x)
+    assert told.y_label == "error of target along base z [mm]"
+    np.testing.assert_allclose(told.y, [-2.0, 2.0])
+
+
+def test_a_direction_between_axes_is_told_by_its_components() -> None:
+    one = np.ones(1)
+    told = curve(
+        Dependence("load", "", 0.5, "target", np.array([0.6, 0.0, 0.8]), one, one, one, "m")
+    )
+    assert told.y_label == "error of target along (0.60, 0.00, 0.80) [mm]"
 
 
 def test_gross_errors_are_shown_as_well() -> None:

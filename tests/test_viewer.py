@@ -302,7 +302,7 @@ def entities(path: Path) -> set[str]:
         return set()
     try:
         return {str(c.entity_path) for c in RrdReader(path).stream().to_chunks()}
-    except ValueError:
+    except (ValueError, RuntimeError):  # nothing in it yet; a part of a message
         return set()
 
 

@@ -105,7 +105,7 @@ def test_every_view_is_drawn_without_a_report(recording, tmp_path):
         layout.residual_title(d),
         layout.deflection_title(d),
         layout.bars_title(d),
-        *("Verdict", "How to read this", "Residual against suspect", "Table", "Log"),
+        *("Verdict", "How to read this", layout.FOLLOWS, layout.LIMITS, "Table", "Log"),
         *("Parameters ± σ", "Parameters in σ (whiskers ±2 σ)"),
     ]
     shots = [Shot(tmp_path / f"{i}.png", "revision", 1, n) for i, n in enumerate(names)]

@@ -1,13 +1,18 @@
 """A believable story for the tests of the viewer: a UR10e whose model grows by three effects."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from hilcal.report.primitive_arm import body_poses
 from hilcal.report.story import (
     Regressor,
     Story,
+    StoryCurve,
+    StoryLimit,
     StoryParameter,
     StoryRevision,
+    StoryRival,
     StorySuspect,
 )
 from hilcal.robot.arm import Arm
@@ -96,6 +101,52 @@ def story(
         noise_floor_m=floor,
         revisions=revisions,
     )
+
+
+ANGLE = StoryCurve(
+    variable="joint 4 angle",
+    share=0.71,
+    x=np.array([-150.0, -90.0, -20.0, 35.0, 110.0]),
+    y=np.array([-40.0, 12.0, 31.0, 8.0, -25.0]),
+    error=np.array([6.0, 4.0, 3.0, 4.0, 9.0]),
+    x_label="joint 4 angle [°]",
+    y_label="error of joint 2 [µrad]",
+)
+LOAD = StoryCurve(
+    variable="load",
+    share=0.23,
+    x=np.arange(3.0),
+    y=np.array([-60.0, 5.0, 55.0]),
+    error=np.array([8.0, 8.0, 9.0]),
+    x_label="load",
+    y_label="error of target along (0.51, -0.30, 0.81) [µm]",
+    names=("none", "5kg", "10kg"),
+)
+LIMITS = (
+    StoryLimit("hysteresis", 11e-6, "9.6 µrad"),
+    StoryLimit("tracker_scale", 46e-6, "21 ppm"),
+    StoryLimit("creep", np.inf, ""),
+)
+
+
+def doubtful(names: str = "") -> Story:
+    """A story with doubts: a missing effect, an ambiguous one, an unknown one, and none left."""
+    told = story(poses=12, names=names)
+    first, second, third, last = told.revisions
+    second = replace(
+        second,
+        verdict="ambiguous",
+        rivals=(StoryRival("hysteresis" + names, 0.04, 4.5), StoryRival("creep", 1e-5, np.inf)),
+    )
+    third = replace(
+        third,
+        verdict="unknown_effect",
+        suspects=(),
+        regressor=None,
+        curves=tuple(replace(c, variable=c.variable + names) for c in (ANGLE, LOAD)),
+    )
+    limits = tuple(replace(s, effect=s.effect + names) for s in LIMITS)
+    return replace(told, revisions=(first, second, third, replace(last, limits=limits)))
 
 
 def _revision(k, parts, truth, offset, covariance, torque, names):

@@ -14,7 +14,6 @@ from hilcal import __version__
 from hilcal.cli.demo import demo
 from hilcal.cli.effects import effects, new
 from hilcal.cli.fitting import compare, identify, validate
-from hilcal.cli.hidden import hidden
 from hilcal.cli.next import next_
 from hilcal.cli.planning import check, plan
 from hilcal.cli.refining import add, diagnose, refine, remove, view
@@ -73,7 +72,6 @@ def _application() -> typer.Typer:
     app.add_typer(known, name="effects")
     study = make("Studies of the program's own mathematics.")
     study.command("scaling")(scaling)
-    study.command("hidden")(hidden)
     study.command("plans")(plans)
     study.command("diagnosis")(diagnosis)
     study.callback()(_group)

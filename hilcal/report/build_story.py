@@ -10,6 +10,7 @@ import scipy.linalg as sl
 from hilcal.cell import Cell
 from hilcal.data.revision import change
 from hilcal.data.whitening import Mode
+from hilcal.diagnose.dependence import Dependence
 from hilcal.diagnose.projection import projection
 from hilcal.diagnose.suspects import Suspect, candidates
 from hilcal.diagnose.verdict import Diagnosis
@@ -18,18 +19,28 @@ from hilcal.identify.document import finite
 from hilcal.identify.everything import Everything, everything
 from hilcal.identify.fit import Fit, mahalanobis2
 from hilcal.model import Model
+from hilcal.report import numbers
 from hilcal.report.story import (
     Regressor,
     Story,
+    StoryCurve,
+    StoryLimit,
     StoryParameter,
     StoryRevision,
+    StoryRival,
     StorySuspect,
 )
+from hilcal.report.text_seen import own_units
 from hilcal.types import Floats, Ints
 
 CERTAIN = 0.005
 MOST_NUMBER = 10**9
+NEAR = 0.99  # component from which a direction is called an axis
 UNDIAGNOSED = "not diagnosed"
+LITTLE = 0.2
+"""A suspect that explains less of what is predictable of the misfit is not what it follows."""
+LEAST_CARRIED = 0.02
+"""Share of the misfit below which a variable is not worth a word."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,6 +129,7 @@ def _revision(c: Chapter, e: Everything, axes: Floats, measured: Floats) -> Stor
     residual = _turn(axes, e.raw[:, :3])
     d = c.diagnosis
     told = () if d is None else _told(d)
+    curves = () if d is None else _curves(d)
     return StoryRevision(
         revision=c.number,
         change=change(c.added, c.removed),
@@ -135,16 +147,73 @@ def _revision(c: Chapter, e: Everything, axes: Floats, measured: Floats) -> Stor
             for s in told
         ),
         parameters=story_parameters(c.fit),
-        regressor=None if d is None or not told else regressor(c.fit, told[0]),
+        regressor=regressor(c.fit, told[0]) if told and not curves else None,
+        curves=curves,
+        rivals=() if d is None else tuple(StoryRival(r.effect, r.unlike, r.times) for r in d.apart),
+        limits=() if d is None else _limits(d),
     )
 
 
 def _told(d: Diagnosis) -> tuple[Suspect, ...]:
-    """Suspects worth showing: those that pass the test, best first; none where nothing is wrong."""
+    """Suspects worth showing: those that pass the test, then those that nearly do, each best first.
+
+    None where nothing is wrong.
+    """
+    passed = [s for s in d.suspects if s.effect in d.significant]
+    rest = [s for s in d.suspects if s not in passed and s.score.p_value < CERTAIN]
+    return (*passed, *rest) if passed else ()
+
+
+def _curves(d: Diagnosis) -> tuple[StoryCurve, ...]:
+    """Variables that carry the misfit, where the lead explains little of what is predictable."""
+    known = next((s.holdout_share for s in d.suspects if s.effect in d.significant), 0.0)
+    if d.verdict == "adequate" or known >= LITTLE * d.predictable_share:
+        return ()
+    return tuple(curve(v) for v in d.carriers if v.share >= LEAST_CARRIED)
+
+
+def curve(d: Dependence) -> StoryCurve:
+    """Return a dependence in units for people."""
+    x_unit, x_factor = _unit_of(d)
+    y_unit, y_factor = numbers.unit_for(d.y_unit, list(d.y))
+    return StoryCurve(
+        variable=d.variable,
+        share=d.share,
+        x=x_factor * d.x,
+        y=y_factor * d.y,
+        error=y_factor * d.error,
+        x_label=f"{d.variable} [{x_unit}]" if x_unit else d.variable,
+        y_label=f"error of {_moved(d)} [{y_unit}]",
+        names=d.labels,
+    )
+
+
+def _moved(d: Dependence) -> str:
+    """What errs with a variable; a direction is in base axes."""
+    if d.y_unit == "rad":
+        return d.moves
+    main = int(np.argmax(np.abs(d.direction)))
+    if d.direction[main] > NEAR:
+        return f"{d.moves} along base {'xyz'[main]}"
+    return f"{d.moves} along ({', '.join(f'{v:.2f}' for v in d.direction)})"
+
+
+def _unit_of(d: Dependence) -> tuple[str, float]:
+    """Unit for people, and its factor, of the variable."""
+    if d.unit == "rad":
+        return "°", 180.0 / np.pi
+    if d.unit == "s":
+        span = float(np.ptp(d.x))
+        return ("h", 1 / 3600) if span > 7200 else ("min", 1 / 60) if span > 120 else ("s", 1.0)
+    return d.unit, 1.0
+
+
+def _limits(d: Diagnosis) -> tuple[StoryLimit, ...]:
+    """What could have been seen of the effects that were not found, the best visible first."""
+    rest = [s for s in d.suspects if s.effect not in d.significant]
     return tuple(
-        s
-        for s in d.suspects
-        if s.effect in d.significant or (d.significant and s.score.p_value < CERTAIN)
+        StoryLimit(s.effect, s.least.displacement_m, own_units(s.least) if s.least.visible else "")
+        for s in sorted(rest, key=lambda s: s.least.displacement_m)
     )
 
 

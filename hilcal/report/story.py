@@ -61,6 +61,61 @@ class Regressor:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class StoryCurve:
+    """How the misfit depends on one recorded variable; units as the labels name them.
+
+    Attributes:
+        variable: e.g. "joint 4 angle".
+        share: share of the misfit on poses left out that is lost without the variable.
+        x: (K,) centres of bins of the variable.
+        y: (K,) mean error in each bin.
+        error: (K,) its standard uncertainty.
+        x_label: the variable with its unit.
+        y_label: what errs, with its unit.
+        names: (K,) names of the bins, where x only counts them; else empty.
+    """
+
+    variable: str
+    share: float
+    x: Floats
+    y: Floats
+    error: Floats
+    x_label: str
+    y_label: str
+    names: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class StoryLimit:
+    """The smallest strength at which an effect that was not found would have been named.
+
+    Attributes:
+        effect: its name.
+        displacement_m: rms displacement of the target, m; infinite where no strength would do.
+        parameters: rms of the parameters that make it, in words.
+    """
+
+    effect: str
+    displacement_m: float
+    parameters: str
+
+
+@dataclass(frozen=True, slots=True)
+class StoryRival:
+    """An effect that the data do not tell from the leading suspect.
+
+    Attributes:
+        effect: its name.
+        unlike: share of what the suspect does that the rival cannot imitate.
+        times: how many times as many readings would tell them apart; infinite where none would.
+    """
+
+    effect: str
+    unlike: float
+    times: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class StoryRevision:
     """One fitted model revision.
 
@@ -79,6 +134,10 @@ class StoryRevision:
         suspects: missing effects, best first.
         parameters: the fit's parameters.
         regressor: what the leading suspect would bend straight; None when there is none.
+        curves: variables that carry the misfit, largest share first, where the leading suspect
+            explains little of it or there is none; else empty.
+        rivals: effects that the data do not tell from the leading suspect.
+        limits: from which strength the effects that were not found would have been named.
     """
 
     revision: int
@@ -95,6 +154,9 @@ class StoryRevision:
     suspects: tuple[StorySuspect, ...] = ()
     parameters: tuple[StoryParameter, ...] = ()
     regressor: Regressor | None = None
+    curves: tuple[StoryCurve, ...] = ()
+    rivals: tuple[StoryRival, ...] = ()
+    limits: tuple[StoryLimit, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -165,6 +227,11 @@ def check(story: Story) -> None:
                 )
         if r.regressor is not None and r.regressor.x.shape != r.regressor.y.shape:
             raise InputError(f"{where}: regressor x and y differ in length")
+        for c in r.curves:
+            for name, value in (("x", c.x), ("y", c.y), ("error", c.error)):
+                _array(f"{where}: {name} of the curve of {c.variable}", value, (len(c.x),))
+            if len(c.x) == 0 or len(c.names) not in (0, len(c.x)):
+                raise InputError(f"{where}: the curve of {c.variable} lacks points or their names")
 
 
 def _array(name: str, value: Floats, shape: tuple[int, ...]) -> None:

@@ -1,31 +1,32 @@
-"""The flat views: bars per pose, error per revision, regressor, parameters."""
+"""The flat views: bars per pose, error per revision, parameters."""
 
 import numpy as np
 import rerun as rr
 
-from hilcal.report.story import Regressor, StoryRevision
+from hilcal.report.story import StoryParameter, StoryRevision
 from hilcal.report.viewer import style
-from hilcal.report.viewer.digest import Digest, worst_and_even
+from hilcal.report.viewer.digest import Digest
+from hilcal.report.viewer.flat import BELOW, FOOT, HEIGHT, RAISED, WIDTH, nothing, write
+from hilcal.report.viewer.residuals import residual_chart
 from hilcal.types import Floats, Ints
 
-WIDTH, HEIGHT = 220.0, 80.0  # of the flat pictures, their own units; y points down
 SERIES = (
     ("fit", "fitted poses, rms", style.MEASURED, 3.0),
     ("holdout", "poses left out, rms", style.HOLDOUT, 3.0),
     ("worst", "worst reading", style.RED, 1.5),
     ("noise", "noise floor, rms", style.NOISE, 2.0),
 )
-_TREND_BINS = 12
 _FOREST_SIGMAS = 10.0
-_FOREST_ROWS = 16
+_FOREST_ROWS = 10
 
 
-def static_charts(rec: rr.RecordingStream) -> None:
-    """Log the names and colours of the series."""
+def static_charts(rec: rr.RecordingStream, revisions: int) -> None:
+    """Log the names and colours of the series; one revision makes a dot, not a line."""
     for name, words, color, width in SERIES:
         line = rr.SeriesLines(names=[words], colors=[color], widths=[width])
         dots = rr.SeriesPoints(names=[words], colors=[color], marker_sizes=[3.5])
-        rec.log(f"error/{name}", line, *([] if name == "noise" else [dots]), static=True)
+        bare = name == "noise" and revisions > 1
+        rec.log(f"error/{name}", line, *([] if bare else [dots]), static=True)
     rec.log(
         "error/along/residual",
         rr.SeriesLines(names=["residual, rms"], colors=[style.MEASURED], widths=[1.5]),
@@ -41,7 +42,7 @@ def static_charts(rec: rr.RecordingStream) -> None:
 def revision_charts(rec: rr.RecordingStream, d: Digest, r: StoryRevision) -> None:
     """Log one revision at the recording's current time."""
     pose_bars(rec, d, r)
-    regressor_chart(rec, d, r)
+    residual_chart(rec, d, r)
     parameter_chart(rec, r)
 
 
@@ -100,65 +101,13 @@ def _bar_places(d: Digest) -> tuple[Ints, Floats, Floats]:
     return starts, edges[:-1], np.diff(edges)
 
 
-def regressor_chart(rec: rr.RecordingStream, d: Digest, r: StoryRevision) -> None:
-    """Log the residual against what the leading suspect depends on, with its running mean."""
-    g = r.regressor
-    if g is None or len(g.x) == 0:
-        _write(rec, "regressor/labels", [(WIDTH / 2, HEIGHT / 2)], ["no suspect to plot against"])
-        rec.log("regressor/points", rr.Points2D([]))
-        rec.log("regressor/trend", rr.LineStrips2D([]))
-        rec.log("regressor/axes", rr.LineStrips2D([]))
-        return
-    chosen = worst_and_even(np.abs(g.y), d.limits.points)
-    x, y = _place(g, g.x[chosen], g.y[chosen])
-    level = (
-        style.levels(r.whitened_norm2)[chosen]
-        if len(g.x) == len(d.row)
-        else np.zeros(len(chosen), dtype=np.int64)
-    )
-    rec.log(
-        "regressor/points",
-        rr.Points2D(
-            np.stack([x, y], 1),
-            colors=style.LEVEL_COLORS[level],
-            radii=rr.Radius.ui_points(2.5 if len(x) > 300 else 4.0),
-        ),
-    )
-    rec.log(
-        "regressor/trend",
-        rr.LineStrips2D(
-            [_trend(g)], colors=[style.MEASURED], radii=rr.Radius.ui_points(2.0), draw_order=40.0
-        ),
-    )
-    zero = _place(g, np.array([g.x.min(), g.x.max()]), np.zeros(2))
-    rec.log(
-        "regressor/axes",
-        rr.LineStrips2D(
-            [np.stack(zero, 1), [(0, 0), (0, HEIGHT)]],
-            colors=[style.GREY],
-            radii=rr.Radius.ui_points(0.8),
-        ),
-    )
-    top = float(np.abs(g.y).max())
-    texts = [
-        f"+{style.number(top)}",
-        f"-{style.number(top)}",
-        style.number(float(g.x.min())),
-        style.number(float(g.x.max())),
-        f"{g.y_label} against {g.x_label}",
-    ]
-    places = [(0, -2), (0, HEIGHT - 2), (10, HEIGHT + 8), (WIDTH, HEIGHT + 8)]
-    places += [(WIDTH / 2, -9)]
-    _write(rec, "regressor/labels", places, texts)
-
-
 def parameter_chart(rec: rr.RecordingStream, r: StoryRevision) -> None:
     """Log each parameter as its value in units of its standard uncertainty, with ±2 σ."""
     known = [p for p in r.parameters if p.identifiable and p.value is not None and p.std]
     if not known:
-        _write(rec, "parameters/labels", [(WIDTH / 2, HEIGHT / 2)], ["no identifiable parameter"])
+        write(rec, "parameters/labels", [(WIDTH / 2, HEIGHT / 2)], ["no identifiable parameter"])
         for part in ("points", "whiskers", "axes"):
-            rec.log(f"parameters/{part}", rr.Points2D([]) if part == "points" else _nothing())
+            rec.log(f"parameters/{part}", rr.Points2D([]) if part == "points" else nothing())
         return
     t = np.array([float(p.value or 0.0) / float(p.std or 1.0) for p in known])
     strongest = np.sort(np.argsort(-np.abs(t), kind="stable")[:_FOREST_ROWS])
@@ -188,44 +137,14 @@ def parameter_chart(rec: rr.RecordingStream, r: StoryRevision) -> None:
         "parameters/axes",
         rr.LineStrips2D(lines, colors=[(90, 92, 100)], radii=rr.Radius.ui_points(0.6)),
     )
-    names = [known[i].name for i in strongest]
-    values = [
-        f"{names[k]} = {style.number(float(known[i].value or 0), 3)} {known[i].unit}"
-        for k, i in enumerate(strongest)
-    ]
-    places = [(0.38 * left, y) for y in row] + [(a, HEIGHT + 6) for a in at(ticks)]
-    _write(rec, "parameters/labels", places, [*values, *(f"{s:g}" for s in ticks)])
+    names = [_in_words(known[i]) for i in strongest]
+    few = f"; the {len(t)} strongest of {len(known)}" if len(t) < len(known) else ""
+    places = [(0.38 * left, y + RAISED) for y in row] + [(a, FOOT) for a in at(ticks)]
+    places += [(WIDTH / 2, BELOW)]
+    words = [*names, *(f"{s:g}" for s in ticks), f"value in units of its standard uncertainty{few}"]
+    write(rec, "parameters/labels", places, words)
 
 
-def _place(g: Regressor, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    span = float(np.ptp(g.x)) or 1.0
-    top = float(np.abs(g.y).max()) or 1.0
-    return (x - g.x.min()) / span * WIDTH, (1 - y / top) * HEIGHT / 2
-
-
-def _trend(g: Regressor) -> Floats:
-    """(K, 2) mean of the residual over bins of equal count."""
-    order = np.argsort(g.x, kind="stable")
-    bins = np.array_split(order, min(_TREND_BINS, max(1, len(order) // 4)))
-    x = np.array([g.x[b].mean() for b in bins])
-    y = np.array([g.y[b].mean() for b in bins])
-    return np.stack(_place(g, x, y), 1)
-
-
-def _nothing() -> rr.LineStrips2D:
-    return rr.LineStrips2D([])
-
-
-def _write(
-    rec: rr.RecordingStream, path: str, places: list[tuple[float, float]], texts: list[str]
-) -> None:
-    rec.log(
-        path,
-        rr.Points2D(
-            places,
-            labels=[style.safe(t) for t in texts],
-            radii=rr.Radius.ui_points(0.1),
-            colors=[style.GREY],
-            show_labels=True,
-        ),
-    )
+def _in_words(p: StoryParameter) -> str:
+    value, _, unit = style.quantity(float(p.value or 0), p.std, p.unit)
+    return f"{p.name} = {value} {unit}"

@@ -4,10 +4,12 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from hilcal.report.viewer import charts, style
+from hilcal.report.viewer import charts, flat, style
 from hilcal.report.viewer.digest import Digest
 from hilcal.report.viewer.scene import center
 
+FOLLOWS = "Residual against suspect"
+LIMITS = "Could have been seen"
 _EYE = np.array([1.05, -1.35, 0.55])
 _CHART_TOP = 4.0  # the error axis reaches at most so many times the second revision's error
 # Views that draw with light colours stay dark in the light theme too.
@@ -28,11 +30,12 @@ def blueprint(d: Digest) -> rrb.Blueprint:
     right = rrb.Vertical(
         rrb.Tabs(
             rrb.TextDocumentView(origin="words/verdict", name="Verdict"),
+            rrb.TextDocumentView(origin="words/limits", name=LIMITS),
             rrb.TextDocumentView(origin="words/guide", name="How to read this"),
         ),
         _errors(d),
         rrb.Tabs(
-            _flat("regressor", "Residual against suspect"),
+            _flat("regressor", FOLLOWS),
             _flat("parameters", "Parameters in σ (whiskers ±2 σ)"),
             rrb.TextDocumentView(origin="words/parameters", name="Parameters ± σ"),
             rrb.TextDocumentView(origin="words/revisions", name="Table"),
@@ -74,7 +77,7 @@ def error_top(d: Digest) -> float:
     """Return the top of the error axis, µm: what is left stays legible, a first huge error not."""
     rms = [max(r.error_fit["rms_m"], r.error_holdout["rms_m"]) for r in d.story.revisions]
     worst = max(r.error_fit["max_m"] for r in d.story.revisions)
-    later = max([*rms[1:], d.story.noise_floor_m])
+    later = max([*(rms[1:] or rms), d.story.noise_floor_m])
     return 1.1e6 * min(max(worst, *rms, later), _CHART_TOP * later) or 1.0
 
 
@@ -120,16 +123,16 @@ def _errors(d: Digest) -> rrb.TimeSeriesView:
         overrides={
             f"error/{name}": [rr.SeriesLines.from_fields(), rr.SeriesPoints.from_fields()]
             for name, *_ in charts.SERIES
-            if name != "noise"
+            if name != "noise" or len(d.story.revisions) == 1
         },
     )
 
 
 def _flat(origin: str, name: str) -> rrb.Spatial2DView:
-    w, h = charts.WIDTH, charts.HEIGHT
+    w = flat.WIDTH
     return rrb.Spatial2DView(
         origin=origin,
         name=name,
         background=_DARK,
-        visual_bounds=rrb.VisualBounds2D(x_range=(-0.06 * w, 1.06 * w), y_range=(-17.0, h + 22.0)),
+        visual_bounds=rrb.VisualBounds2D(x_range=(-0.06 * w, 1.06 * w), y_range=flat.BOUNDS),
     )

@@ -105,7 +105,8 @@ def recording_id(story: Story) -> str:
     for array in (story.q, story.pose, story.anchor, story.measured, story.covariance):
         sha.update(np.ascontiguousarray(array).tobytes())
     for r in story.revisions:
-        sha.update(f"{r.revision} {r.change} {r.model} {r.suspects} {r.parameters}".encode())
+        told = (r.revision, r.change, r.model, r.verdict, r.suspects, r.parameters, r.rivals)
+        sha.update(repr((*told, r.limits, [c.variable for c in r.curves])).encode())
         sha.update(np.ascontiguousarray(r.residual).tobytes())
     return str(uuid.UUID(bytes=sha.digest()[:16]))
 
@@ -194,7 +195,7 @@ def _tell(rec: rr.RecordingStream, d: Digest) -> None:
     """Log the whole story, flushed after each revision."""
     rec.send_recording_name(f"hilcal: {style.safe(d.story.arm.name)}, {len(d.story)} readings")
     scene.static_scene(rec, d)
-    charts.static_charts(rec)
+    charts.static_charts(rec, len(d.story.revisions))
     rec.log("words/guide", _markdown(words.GUIDE), static=True)
     for r in d.story.revisions:
         rec.set_time("revision", sequence=r.revision)
@@ -212,6 +213,7 @@ def _revision(rec: rr.RecordingStream, d: Digest, r: StoryRevision, on_revisions
     charts.revision_charts(rec, d, r)
     rec.log("words/verdict", _markdown(words.verdict(d, r)))
     rec.log("words/parameters", _markdown(words.parameters(r, d.limits.parameters)))
+    rec.log("words/limits", _markdown(words.limits(r)))
     rec.log("words/revisions", _markdown(words.revisions(d, r.revision)))
     level = "INFO" if r.verdict == "adequate" else "WARN"
     rec.log("log", rr.TextLog(words.log_line(d, r), level=level))

@@ -6,6 +6,7 @@ import re
 import numpy as np
 from scipy import stats
 
+from hilcal.report import numbers
 from hilcal.types import Floats, Ints
 
 Color = tuple[int, int, int]
@@ -77,6 +78,14 @@ def micrometres(length: float) -> str:
     if abs(length) >= 0.01:
         return f"{number(length * 1e3)} mm"
     return f"{number(length * 1e6)} µm" if abs(length) < 1e-5 else f"{length * 1e6:.0f} µm"
+
+
+def quantity(value: float, std: float | None, unit: str) -> tuple[str, str, str]:
+    """Return a value and its standard uncertainty in a unit for people, and that unit."""
+    name, factor = numbers.unit_for(unit, [value])
+    if std is None:
+        return number(factor * value), "", name
+    return (*numbers.with_std(factor * value, factor * std), name)
 
 
 def bars(share: float, width: int = 10) -> str:

@@ -1,9 +1,12 @@
 """The story in words: markdown that the viewer shows beside the pictures."""
 
+import math
+
 import numpy as np
 from scipy import stats
 
-from hilcal.report.story import StoryParameter, StoryRevision
+from hilcal.report import numbers
+from hilcal.report.story import StoryLimit, StoryParameter, StoryRevision, StoryRival
 from hilcal.report.viewer import style
 from hilcal.report.viewer.digest import Digest
 from hilcal.report.viewer.style import escaped, micrometres, number
@@ -11,6 +14,9 @@ from hilcal.report.viewer.style import escaped, micrometres, number
 _MARKS = {"adequate": "✓", "missing_effect": "✗", "unknown_effect": "✗"}
 _SUSPECTS = 5
 _POSE_LOADS = 12
+_CARRIERS = 4
+_RIVALS = 2
+_HIDDEN = 4
 
 
 def verdict(d: Digest, r: StoryRevision) -> str:
@@ -19,11 +25,12 @@ def verdict(d: Digest, r: StoryRevision) -> str:
     mark = _MARKS.get(r.verdict, "⚠")
     lines = [
         f"# {title(r)}",
-        f"## {mark} {escaped(r.verdict.replace('_', ' ').capitalize())}",
-        escaped(r.message),
+        f"## {mark} {escaped(r.verdict.replace('_', ' ').capitalize())}{_which(r)}",
+        escaped(numbers.sentence(r.message, [s.effect for s in r.suspects])),
         "",
         _errors(d, r),
         "",
+        *_doubt(r),
         suspects(r),
         f"**{style.percent(outside)}** of readings outside their 99 % noise ball "
         f"(noise alone: 1 %); variance factor **{number(r.variance_factor)}** "
@@ -65,10 +72,55 @@ def _worst(d: Digest, r: StoryRevision) -> str:
     )
 
 
+def _which(r: StoryRevision) -> str:
+    """Return the suspects between which the data do not decide."""
+    if not (r.suspects and r.rivals):
+        return ""
+    named = [r.suspects[0].effect, *(o.effect for o in r.rivals[:_RIVALS])]
+    more = f" (or {len(r.rivals) - _RIVALS} more)" if len(r.rivals) > _RIVALS else ""
+    return f": {numbers.names([escaped(e) for e in named], 'or')}{more}?"
+
+
+def _doubt(r: StoryRevision) -> list[str]:
+    """Return a paragraph each on rivals of the leading suspect and on what carries a misfit."""
+    out = [rivals(r.suspects[0].effect, r.rivals)] if r.suspects and r.rivals else []
+    out += [carriers(r)] if r.curves else []
+    return [line for paragraph in out for line in (paragraph, "")]
+
+
+def rivals(lead: str, others: tuple[StoryRival, ...]) -> str:
+    """Return what would tell the leading suspect from each of its rivals."""
+    return " ".join(_rival(escaped(lead), r) for r in others[:_RIVALS])
+
+
+def _rival(lead: str, r: StoryRival) -> str:
+    alike = style.percent(max(1.0 - r.unlike, 0.0))
+    told = f"**{escaped(r.effect)}** can imitate {alike} of what **{lead}** does"
+    if not math.isfinite(r.times):
+        return f"{told}: no number of readings like these tells them apart."
+    if r.times <= 1.0:
+        return (
+            f"{told}; if {lead} were the whole cause, these readings would tell: perhaps it is "
+            "neither."
+        )
+    return f"{told}; {number(r.times, 2)} times as many readings like these would tell them apart."
+
+
+def carriers(r: StoryRevision) -> str:
+    """Return the variables that carry the misfit, with their shares of it."""
+    named = ", ".join(
+        f"**{escaped(c.variable)} {style.percent(c.share)}**" for c in r.curves[:_CARRIERS]
+    )
+    which = "the picture below shows the first" if len(r.curves) > 1 else "the picture is below"
+    return f"What carries the misfit on poses left out: {named}; {which}."
+
+
 def suspects(r: StoryRevision) -> str:
     """Return the table of ranked suspects, or the sentence that there are none."""
+    if not r.suspects and r.verdict == "adequate" and r.limits:
+        return f"{visible(r.limits)}\n"
     if not r.suspects:
-        return "No suspect: nothing in the catalogue explains what is left.\n"
+        return "No suspect: no effect of the catalogue surely explains what is left.\n"
     rows = [
         "| missing effect | explains | | held out | p-value | not separable from |",
         "|---|---|---|---|---|---|",
@@ -77,11 +129,53 @@ def suspects(r: StoryRevision) -> str:
         same = ", ".join(escaped(e) for e in s.same_as) or " "
         rows.append(
             f"| {escaped(s.effect)} | {style.bars(s.share)} | {style.percent(s.share)} "
-            f"| {style.percent(s.holdout_share)} | {style.p_value(s.p_value)} | {same} |"
+            f"| {style.percent(max(s.holdout_share, 0.0))} | {style.p_value(s.p_value)} | {same} |"
         )
     if len(r.suspects) > _SUSPECTS:
         rows.append(f"| and {len(r.suspects) - _SUSPECTS} weaker | | | | | |")
     return "\n".join(rows) + "\n"
+
+
+def visible(found: tuple[StoryLimit, ...]) -> str:
+    """Return in a sentence how strong an effect must be to be seen."""
+    seen = [s for s in found if math.isfinite(s.displacement_m)]
+    if not seen:
+        return "These readings cannot show any effect that is not in the model."
+    least, most = seen[0], seen[-1]
+    told = (
+        f"Would have been seen: {escaped(least.effect)} from "
+        f"**{numbers.length(least.displacement_m)}** rms at the target"
+    )
+    if len(seen) > 1:
+        told += f", ... {escaped(most.effect)} from **{numbers.length(most.displacement_m)}**"
+    hidden = [escaped(s.effect) for s in found if not math.isfinite(s.displacement_m)]
+    rest = f"; cannot be seen: {numbers.few(hidden, _HIDDEN)}" if hidden else ""
+    return f"{told}{rest}."
+
+
+def limits(r: StoryRevision) -> str:
+    """Return the table of effects that were not found, with the strength that would be seen."""
+    seen = [s for s in r.limits if math.isfinite(s.displacement_m)]
+    hidden = [escaped(s.effect) for s in r.limits if not math.isfinite(s.displacement_m)]
+    if not r.limits:
+        return "Nothing was looked for: run hilcal diagnose."
+    lines = []
+    if seen:
+        lines = ["| not found | would be seen from | its parameters, rms |", "|---|---|---|"]
+        lines += [
+            f"| {escaped(s.effect)} | {numbers.length(s.displacement_m)} "
+            f"| {escaped(s.parameters)} |"
+            for s in seen
+        ]
+        lines += [
+            "",
+            "Would be seen from: rms displacement of the target at which nine campaigns like this "
+            "one in ten would name the effect.",
+            "",
+        ]
+    if hidden:
+        lines.append(f"These readings cannot show {', '.join(hidden)}, however strong.")
+    return "\n".join(lines)
 
 
 def pose_card(d: Digest, k: int) -> str:
@@ -127,8 +221,8 @@ def parameters(r: StoryRevision, limit: int) -> str:
 def _parameter(p: StoryParameter) -> str:
     if not p.identifiable or p.value is None:
         return f"| {escaped(p.name)} | not identifiable | | {escaped(p.unit)} |"
-    std = number(p.std, 2) if p.std is not None else " "
-    return f"| {escaped(p.name)} | {number(p.value, 4)} | ± {std} | {escaped(p.unit)} |"
+    value, std, unit = style.quantity(p.value, p.std, p.unit)
+    return f"| {escaped(p.name)} | {value} | {f'± {std}' if std else ' '} | {escaped(unit)} |"
 
 
 def revisions(d: Digest, upto: int) -> str:
@@ -169,6 +263,11 @@ Red: beyond 99.99 %. The arm stands in the pose with the worst reading.
 **Deflection** (3-D): blue is measured, white is predicted, both enlarged; one pair per pose, of
 its largest deflection. The line between their tips is what the model misses. Where only blue is
 seen, the model is right.
+
+**Residual against suspect**: what the residual follows. Where the leading suspect explains
+little of it, the mean error in bins of the recorded variable that carries most of it, with ±2 σ.
+
+**Could have been seen**: how strong an effect must be for these readings to show it.
 
 **Error per revision**: rms over fitted poses, over poses left out, and the worst reading,
 against the noise floor. Held-out error far above the fitted one = too many parameters.
