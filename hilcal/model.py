@@ -189,7 +189,7 @@ class Model:
             columns = e.columns(s)
             if e in self.effects and e.compliance(at) is not None:
                 for other, part in mine:
-                    columns += other.compliance_columns(part, s)
+                    columns += tuple(map(e.of_compliance, other.compliance_columns(part, s)))
             block = zeros(len(s.states), m, len(wanted))
             for c in columns:
                 c = c.only(within[c.parameter] >= 0)

@@ -8,8 +8,8 @@ from campaigns import campaign, cell_of, measured, plan, world_of
 
 from drivers.simulated.hidden import hide
 from hilcal.data.readings import Readings
-from hilcal.diagnose.projection import projection
 from hilcal.diagnose.gain import LEAST_GAIN
+from hilcal.diagnose.projection import projection
 from hilcal.diagnose.suspects import candidates, rank_suspects
 from hilcal.effects.catalogue import make
 from hilcal.errors import InputError

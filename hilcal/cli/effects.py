@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.table import Table
 from rich.text import Text
 
 from hilcal.cli.effects_from import EffectsFrom
@@ -15,9 +16,17 @@ from hilcal.effects.added import added, file_of
 from hilcal.effects.catalogue import BUILT_IN, catalogue
 from hilcal.effects.check import NAME
 from hilcal.effects.example import ROBOT, example_cell, example_states
+from hilcal.effects.option_help import option_defaults, option_help
 from hilcal.effects.protocol import Effect
+from hilcal.effects.written import written
 from hilcal.errors import InputError
+from hilcal.identify.document import plain
 from hilcal.report import text
+
+OPTIONS_NOTE = (
+    'options are given in parentheses: --effects "joint_compliance, hysteresis(joints=1-3)"; no '
+    "default: none, or one that follows from the readings."
+)
 
 
 def effects(
@@ -32,6 +41,7 @@ def effects(
     cell = example_cell()
     states = example_states(cell)
     made = [kind(cell, states) for kind in catalogue().values()]
+    defaults = {e.name: option_defaults(type(e), cell, states) for e in made}
     out = text.table("effect", "parameters", "unit", "needs", "law", left=(0, 2, 3, 4))
     out.columns[0].no_wrap = True
     for e in made:
@@ -43,10 +53,26 @@ def effects(
         *(f"from {file.path}: {', '.join(e.name for e in file.effects)}" for file in added()),
     ]
     t.show(Text("\n".join(notes), style="dim"))
-    t.document({"effects": [_document(e) for e in made]})
+    t.show(["", _options_table(made, defaults)])
+    t.show(Text(OPTIONS_NOTE, style="dim"))
+    t.document({"effects": [_document(e, defaults[e.name]) for e in made]})
 
 
-def _document(e: Effect) -> dict[str, object]:
+def _options_table(made: list[Effect], defaults: dict[str, dict[str, object]]) -> Table:
+    """Return the options of effects; an option that others have too is explained once."""
+    out = text.table("effect", "option", "default", "what it chooses", left=(0, 1, 2, 3))
+    out.columns[0].no_wrap = out.columns[1].no_wrap = True
+    seen: dict[tuple[str, str], str] = {}
+    for e in made:
+        for option, meaning in option_help(type(e)).items():
+            first = seen.setdefault((option, meaning), e.name)
+            told = meaning if first == e.name else f"as for {first}"
+            default = written(defaults[e.name][option])
+            out.add_row(e.name, option, Text(default), Text(told))
+    return out
+
+
+def _document(e: Effect, defaults: dict[str, object]) -> dict[str, object]:
     shown = [{"name": p.name, "unit": p.unit, "meaning": p.meaning} for p in e.parameters]
     return {
         "name": e.name,
@@ -54,6 +80,8 @@ def _document(e: Effect) -> dict[str, object]:
         "elastic": e.elastic,
         "needs": list(e.needs),
         "options": list(e.option_names),
+        "defaults": plain(defaults),
+        "option_help": option_help(type(e)),
         "parameters": shown,
         "source": _source(e.name),
     }

@@ -1,6 +1,6 @@
 """Campaign files as the commands see them: open, fit, and keep what was fitted."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +15,9 @@ from hilcal.data.records import content_hash
 from hilcal.data.revision import RevisionRecord
 from hilcal.data.whitening import MODES, SCALINGS, Mode, Scaling
 from hilcal.diagnose.verdict import Diagnosis, diagnose
-from hilcal.effects.catalogue import effect_class
+from hilcal.effects.catalogue import make
+from hilcal.effects.options import Options
+from hilcal.effects.written import chosen_options, read_effects_text, write_effect
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
@@ -180,22 +182,55 @@ def scalings(name: str) -> tuple[Scaling, ...]:
     return found
 
 
-def effect_names(text: str | None) -> tuple[str, ...] | None:
-    """Split and check `--effects a,b`.
+def wanted_effects(text: str | None) -> dict[str, dict[str, object]] | None:
+    """Read `--effects "a, b(option=value)"`: options by name, see `read_effects_text`.
 
     Raises:
-        InputError: an unknown name (lists the valid ones), or one that is there twice.
+        InputError: an unknown name (lists the valid ones), one that is there twice, or options
+            that cannot be read.
     """
     if text is None:
         return None
-    names = tuple(part.strip() for part in text.split(",") if part.strip())
-    if not names:
+    wanted = read_effects_text(text, "--effects")
+    if not wanted:
         raise InputError("--effects is empty; give one name or several, separated by commas")
-    for name in names:
-        effect_class(name)
-        if names.count(name) > 1:
-            raise InputError(f"--effects: {name} is there twice")
-    return names
+    return wanted
+
+
+def effect_names(text: str | None) -> tuple[str, ...] | None:
+    """Read names of effects where they cannot have options; raises as `wanted_effects` does."""
+    wanted = wanted_effects(text)
+    for name, options in (wanted or {}).items():
+        if options:
+            raise InputError(f"--effects: {name} takes no options here; valid: {name}")
+    return None if wanted is None else tuple(wanted)
+
+
+def check_options(o: Opened, wanted: Mapping[str, Options]) -> None:
+    """Refuse options of effects before any work is done.
+
+    Raises:
+        InputError: an unknown option, a bad value, or readings that lack what an effect needs.
+    """
+    for name, options in wanted.items():
+        make(name, o.cell, o.readings.states, options).prior_std()
+
+
+def chosen(found: Fit) -> dict[str, dict[str, object]]:
+    """Options of the effects of a fit that are not the usual ones, by name."""
+    return chosen_of(found.model, found.readings)
+
+
+def chosen_of(model: Model, readings: Readings) -> dict[str, dict[str, object]]:
+    """Options of the effects of a model that are not the usual ones for its readings, by name."""
+    options = {e.name: chosen_options(e, readings.states, readings.m) for e in model.effects}
+    return {name: given for name, given in options.items() if given}
+
+
+def titles(model: Model, readings: Readings) -> tuple[str, ...]:
+    """Names of a model's effects, with the options that are not the usual ones."""
+    given = chosen_of(model, readings)
+    return tuple(write_effect(name, given.get(name, {})) for name in model.names)
 
 
 def check_record(path: Path | None) -> None:

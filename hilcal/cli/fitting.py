@@ -7,11 +7,19 @@ from typing import Annotated
 import typer
 
 from hilcal.cli.effects_from import EffectsFrom
-from hilcal.cli.files import effect_names, open_run, scalings
+from hilcal.cli.files import (
+    check_options,
+    chosen,
+    open_run,
+    scalings,
+    titles,
+    wanted_effects,
+)
 from hilcal.cli.terminal import Json, Run, terminal
 from hilcal.data.whitening import Scaling
 from hilcal.diagnose.projection import projection
 from hilcal.diagnose.where import where
+from hilcal.effects.written import write_effect
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline, with_effects
 from hilcal.identify.document import to_json
@@ -33,7 +41,11 @@ def identify(
     run: Run,
     effects: Annotated[
         str | None,
-        typer.Option("--effects", metavar="A,B", help="Effects to fit, besides unknown frames."),
+        typer.Option(
+            "--effects",
+            metavar="A,B",
+            help="Effects to fit, besides unknown frames; with options: creep(joints=each).",
+        ),
     ] = None,
     scaling: Annotated[
         str, typer.Option("--scaling", metavar="S", help="none, gu, gc or all, side by side.")
@@ -44,28 +56,43 @@ def identify(
 ) -> None:
     """Fit a model to the readings, and keep it as a revision."""
     t = terminal(as_json)
-    wanted, names = scalings(scaling), effect_names(effects)
+    wanted, named = scalings(scaling), wanted_effects(effects)
     with open_run(run) as o:
         mode = o.mode(readings)
+        check_options(o, named or {})
         fits: dict[Scaling, Fit] = {}
         with working(t.progress) as say:
             say("registering")
-            if names is None:
+            if named is None:
                 model = baseline(o.cell, o.readings, mode)
             else:
-                model = with_effects(o.cell, o.readings, mode, names)
+                model = with_effects(o.cell, o.readings, mode, named, named)
             for s in wanted:
-                say(f"fitting {text.model_name(model.names)}, scaling {s}")
+                say(f"fitting {text.model_name(titles(model, o.readings))}, scaling {s}")
                 fits[s] = fit(model, o.readings, mode, s)
         kept = fits[wanted[-1]]
         number = o.store(kept, None, None)
     t.show(text.fit_report(kept))
-    document = {"revision": number, **to_json(kept)}
+    t.show(options_line(kept))
+    document = {"revision": number, **to_json(kept), "options": options_json(kept)}
     if len(fits) > 1:
         t.show(["", *scalings_table(fits)])
         document["scalings"] = {s: to_json(found) for s, found in fits.items()}
     t.show(f"\nStored as revision {number} of {run}.")
     t.document(document)
+
+
+def options_line(found: Fit) -> list[str]:
+    """Return a line with the options that are not the usual ones; none where all are usual."""
+    given = chosen(found)
+    if not given:
+        return []
+    return [f"Options: {', '.join(write_effect(name, of) for name, of in given.items())}."]
+
+
+def options_json(found: Fit) -> dict[str, dict[str, object]]:
+    """Return all options of the effects, by name."""
+    return {e.name: dict(e.options) for e in found.model.effects}
 
 
 def compare(run: Run, effects_from: EffectsFrom = None, as_json: Json = False) -> None:
@@ -82,7 +109,8 @@ def compare(run: Run, effects_from: EffectsFrom = None, as_json: Json = False) -
         places = where(projection(found))
     e = everything(found)
     worst = text.worst_poses(e)
-    t.show(text.heading(f"Revision {number}: {text.model_name(found.model.names)}"))
+    name = text.model_name(titles(found.model, found.readings))
+    t.show(text.heading(f"Revision {number}: {name}"))
     t.show([text.misses(found), text.follows(places), "", text.errors(found), ""])
     t.show([text.where_table(places), ""])
     t.show(text.worst_table(worst))
@@ -130,7 +158,8 @@ def validate(
         found = predict_other(
             model, theta, o.readings, unseen.readings, mode_of(record), registered=register
         )
-    t.show(text.heading(f"Revision {record.number}: {text.model_name(model.names)}"))
+    name = text.model_name(titles(model, o.readings))
+    t.show(text.heading(f"Revision {record.number}: {name}"))
     what = "deflections" if mode_of(record) == "deflection" else "positions"
     out = text.table("3-D position error", "rms", "mean", "largest", "rms in σ")
     e = found.error

@@ -7,6 +7,7 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -14,17 +15,20 @@ import typer
 
 from hilcal.cli.effects_from import EffectsFrom
 from hilcal.cli.files import (
+    check_options,
     check_record,
-    effect_names,
     open_run,
     record_story,
+    wanted_effects,
 )
-from hilcal.cli.fitting import Readings
+from hilcal.cli.fitting import Readings, options_json, options_line
 from hilcal.cli.terminal import Json, Record, Run, terminal
 from hilcal.data.revision import change
 from hilcal.diagnose.document import to_json
 from hilcal.diagnose.verdict import diagnose as judge
 from hilcal.effects.catalogue import effect_class
+from hilcal.effects.options import Options
+from hilcal.effects.written import read_effects_text, write_effect
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline, with_effects
 from hilcal.identify.fit import Fit
@@ -69,13 +73,22 @@ def diagnose(run: Run, effects_from: EffectsFrom = None, as_json: Json = False) 
 
 def add(
     run: Run,
-    effect: Annotated[str, typer.Argument(metavar="EFFECT", help="See hilcal effects.")],
+    effect: Annotated[
+        str,
+        typer.Argument(
+            metavar="EFFECT", help='See hilcal effects; with options: "creep(joints=each)".'
+        ),
+    ],
     record: Record = None,
     effects_from: EffectsFrom = None,
     as_json: Json = False,
 ) -> None:
     """Add an effect to the latest model: error before and after."""
-    _change(run, effect, record, as_json, add_effect, adds=True)
+    wanted = read_effects_text(effect, "EFFECT")
+    if len(wanted) != 1:
+        raise InputError(f"EFFECT {effect!r} has {len(wanted)} effects; valid: one")
+    ((name, options),) = wanted.items()
+    _change(run, name, record, as_json, partial(add_effect, options=options), options)
 
 
 def remove(
@@ -86,7 +99,8 @@ def remove(
     as_json: Json = False,
 ) -> None:
     """Take an effect out of the latest model: error before and after."""
-    _change(run, effect, record, as_json, remove_effect, adds=False)
+    effect_class(effect)
+    _change(run, effect, record, as_json, remove_effect)
 
 
 def _change(
@@ -95,17 +109,17 @@ def _change(
     record: Path | None,
     as_json: bool,
     make: Callable[[Fit, str], Fit],
-    *,
-    adds: bool,
+    options: Options | None = None,
 ) -> None:
-    """Make a revision with one effect more or less."""
-    t = terminal(as_json)
-    effect_class(effect)
+    """Make a revision with one effect more, which has `options`, or one less."""
+    t, adds = terminal(as_json), options is not None
+    named = write_effect(effect, options or {})
     check_record(record)
     with open_run(run) as o:
+        check_options(o, {effect: options or {}} if adds else {})
         with working(t.progress) as say:
             before_number, before = o.latest_fit(t, say)
-            say(f"{'adding' if adds else 'removing'} {effect}")
+            say(f"{'adding' if adds else 'removing'} {named}")
             after = make(before, effect)
             say("diagnosing")
             d = judge(after)
@@ -118,7 +132,7 @@ def _change(
             Row(number, after, d.verdict, added, removed),
         ]
         t.show([text_refine.revisions_table([r.shown for r in rows]), text_refine.key()])
-        t.show(_fell(before, after, effect) if adds else _rose(before, after, effect))
+        t.show(_fell(before, after, named) if adds else _rose(before, after, effect))
         t.show(["", text_refine.verdict_line(d.verdict, d.message)])
         if record is not None:
             with working(t.progress) as say:
@@ -157,7 +171,7 @@ def refine(
     run: Run,
     effects: Annotated[
         str | None,
-        typer.Option("--effects", metavar="A,B", help="Effects to start from."),
+        typer.Option("--effects", metavar="A,B", help="Effects to start from, as for identify."),
     ] = None,
     readings: Readings = None,
     from_latest: Annotated[
@@ -169,25 +183,26 @@ def refine(
 ) -> None:
     """Diagnose and add until the model is adequate."""
     t = terminal(as_json)
-    names = effect_names(effects)
+    named = wanted_effects(effects)
     check_record(record)
-    if from_latest and (names is not None or readings is not None):
+    if from_latest and (named is not None or readings is not None):
         raise InputError("--from-latest keeps effects and readings; leave out the other options")
     with open_run(run) as o:
         latest = o.latest() if from_latest else None
         if from_latest and latest is None:
             raise InputError(f"{run}: no revision yet; leave out --from-latest")
         mode = o.mode(readings)
+        check_options(o, named or {})
         with working(t.progress) as say:
             if latest is not None:
                 say(f"restoring revision {latest.number}")
                 model = o.restore(latest).model
-            elif names is None:
+            elif named is None:
                 say("registering")
                 model = baseline(o.cell, o.readings, mode)
             else:
                 say("registering")
-                model = with_effects(o.cell, o.readings, mode, names)
+                model = with_effects(o.cell, o.readings, mode, named, named)
             found = refine_model(model, o.readings, mode, say)
         rows: list[Row] = []
         for k, step in enumerate(found.steps):
@@ -200,6 +215,7 @@ def refine(
         rows[-1] = replace(rows[-1], verdict=found.verdict)
         t.show(text_refine.revisions_table([r.shown for r in rows]))
         t.show(text_refine.key())
+        t.show(options_line(rows[-1].fit))
         t.show(text_refine.verdict_line(found.verdict, found.message))
         if found.rejected:
             t.show(
@@ -230,6 +246,7 @@ def revisions_json(rows: Sequence[Row]) -> list[dict[str, object]]:
         {
             "revision": r.number,
             "model": list(r.fit.model.names),
+            "options": options_json(r.fit),
             "added": r.added,
             "removed": r.removed,
             "readings": r.fit.mode,

@@ -10,7 +10,6 @@ from hilcal.diagnose.projection import left_out_by_pose, projection
 from hilcal.diagnose.suspects import SAME_EVIDENCE, Suspect, candidates, rank_suspects
 from hilcal.effects.catalogue import make
 from hilcal.effects.options import Options, reading_options
-from hilcal.effects.per_joint import check_builders
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit, fit
 from hilcal.model import Model
@@ -40,7 +39,6 @@ def add(before: Fit, effect: str, options: Options | None = None) -> Fit:
         )
     all_options = {**reading_options(effect, readings.m), **(options or {})}
     model = before.model + make(effect, before.model.cell, readings.states, all_options)
-    check_builders(model.effects)
     start = np.concatenate([before.theta, np.zeros(model.size - before.model.size)])
     return fit(model, readings, before.mode, before.scaling, start)
 

@@ -4,41 +4,41 @@ import numpy as np
 
 from hilcal.data.readings import States
 from hilcal.effects.options import positive, rated_torques
-from hilcal.effects.protocol import Columns, Effect, Parameter, Response, Situation
+from hilcal.effects.per_joint import PerJoint
+from hilcal.effects.protocol import Columns, Parameter, Response, Situation
 from hilcal.types import Floats
 
 
-class Backlash(Effect):
+class Backlash(PerJoint):
     """dq_j = b_j sign(τ_j), crossing smoothly: b_j tanh(τ_j/τ0_j) [rad].
 
     Options:
-        crossing: τ0_j as a share of the joint's rated torque; unless given, 0.01.
+        crossing: τ0_j as a share of the joint's rated torque, more than 0; unless given, 0.01.
     """
 
     name = "backlash"
     summary = "dq_j = b_j sign(τ_j): the joint's play is taken up to the side of the torque"
     elastic = True
-    option_names = ("crossing",)
+    option_names = (*PerJoint.option_names, "crossing")
 
     def setup(self, states: States) -> None:
         """Read how wide the crossing is."""
+        super().setup(states)
         self.options.setdefault("crossing", 0.01)
         self.crossing = positive(self.name, self.options, "crossing") * rated_torques(self.cell)
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """Half the play, per joint."""
-        return tuple(
-            Parameter(f"j{j + 1}", "rad", 5e-5, f"half the play of joint {j + 1}")
-            for j in range(self.cell.arm.n)
-        )
+        ordinary = np.full(self.cell.arm.n, 5e-5)
+        return self.group_parameters("rad", ordinary, "half the play of {joint}")
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:
         """Sides: ∂dq_j/∂b_j = tanh(τ_j/τ0_j)."""
-        joints = np.arange(self.cell.arm.n)
-        return (Columns("dq", joints, joints, np.tanh(s.torque / self.crossing)),)
+        return (self.joint_columns("dq", np.tanh(s.torque / self.crossing)),)
 
     def response(self, theta: Floats, s: Situation, change: Floats) -> Response:
         """Return b_j (1 − tanh²(τ_j/τ0_j))/τ0_j dτ_j."""
-        slope = theta * (1 - np.tanh(s.torque / self.crossing) ** 2) / self.crossing
+        side = np.tanh(s.torque / self.crossing)
+        slope = self.of_joints(theta) * (1 - side**2) / self.crossing
         return Response(dq=change[:, :, :-1, 5] * slope[:, None, :])

@@ -2,45 +2,54 @@
 
 import numpy as np
 
+from hilcal.cell import Cell
 from hilcal.data.readings import States
-from hilcal.effects.options import choice
-from hilcal.effects.protocol import Columns, Effect, Parameter, Response, Situation
+from hilcal.effects.options import Options, choice
+from hilcal.effects.per_joint import COMMON, EACH, PerJoint
+from hilcal.effects.protocol import Columns, Parameter, Response, Situation
+from hilcal.errors import InputError
 from hilcal.types import Floats
 
 SECOND = 1.0
-FORMS = ("common", "each")
 
 
-class Creep(Effect):
+class Creep(PerJoint):
     """dq_j = k c_j τ_j log10(1 + t/1 s), t the time under the present load [1 per decade].
 
     c_j is the joint's compliance: the model's `joint_compliance`, or where the model has
     none a typical one from the joint's rated torque.
 
     Options:
-        form: "common", one k for all joints (default), or "each", one per joint.
+        joints: which joints share a k: "common", all of them, "each" its own, or groups as
+            2/3/4-6 (2+5 for joints apart); joints that are not named do not creep. Unless given,
+            common.
+
+    `form`, "common" or "each", is an older name of `joints`.
     """
 
     name = "creep"
     summary = "dq_j = k c_j τ_j log10(1 + t/1 s): joints go on giving way under the load"
     elastic = True
     needs = ("load_time",)
-    option_names = ("form",)
+    usual_joints = COMMON
 
-    def setup(self, states: States) -> None:
-        """Read whether the joints share one k."""
-        self.options.setdefault("form", "common")
-        self.each = choice(self.name, self.options, "form", FORMS) == "each"
+    def __init__(self, cell: Cell, states: States, options: Options | None = None) -> None:
+        """Build the effect; raises InputError as every effect does."""
+        given = dict(options or {})
+        if "form" in given:
+            form = choice(self.name, given, "form", (COMMON, EACH))
+            if "joints" in given:
+                raise InputError(f"effect {self.name}: form and joints; valid: joints alone")
+            given = {**{k: v for k, v in given.items() if k != "form"}, "joints": form}
+        super().__init__(cell, states, given)
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """The share of the elastic twist that every decade of time adds."""
-        if not self.each:
+        if self.shared.text == COMMON:
             return (Parameter("k", "1", 0.02, "creep of all joints per decade of time"),)
-        return tuple(
-            Parameter(f"j{j + 1}", "1", 0.02, f"creep of joint {j + 1} per decade of time")
-            for j in range(self.cell.arm.n)
-        )
+        ordinary = np.full(self.cell.arm.n, 0.02)
+        return self.group_parameters("1", ordinary, "creep of {joint} per decade of time")
 
     def _decades(self, s: Situation) -> Floats:
         """(N, 1) log10(1 + t/1 s)."""
@@ -49,16 +58,15 @@ class Creep(Effect):
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:
         """Elastic twist times decades: ∂dq_j/∂k = c_j τ_j log10(1 + t/1 s)."""
-        joints = np.arange(self.cell.arm.n)
-        values = s.compliance * s.torque * self._decades(s)
-        return (Columns("dq", joints if self.each else 0 * joints, joints, values),)
+        return (self.joint_columns("dq", s.compliance * s.torque * self._decades(s)),)
 
     def response(self, theta: Floats, s: Situation, change: Floats) -> Response:
         """Return k c_j log10(1 + t/1 s) dτ_j."""
-        slope = theta * s.compliance * self._decades(s)
+        slope = self.of_joints(theta) * s.compliance * self._decades(s)
         return Response(dq=change[:, :, :-1, 5] * slope[:, None, :])
 
     def compliance_columns(self, theta: Floats, s: Situation) -> tuple[Columns, ...]:
         """Return ∂dq_j/∂c_j = k τ_j log10(1 + t/1 s)."""
         joints = np.arange(self.cell.arm.n)
-        return (Columns("dq", joints, joints, theta * s.torque * self._decades(s)),)
+        values = self.of_joints(theta) * s.torque * self._decades(s)
+        return (Columns("dq", joints, joints, values),)

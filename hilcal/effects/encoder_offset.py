@@ -2,10 +2,11 @@
 
 import numpy as np
 
-from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
+from hilcal.effects.per_joint import PerJoint
+from hilcal.effects.protocol import Columns, Parameter, Situation
 
 
-class EncoderOffset(Effect):
+class EncoderOffset(PerJoint):
     """dq_j = o_j, constant [rad]."""
 
     name = "encoder_offset"
@@ -14,12 +15,9 @@ class EncoderOffset(Effect):
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """One offset per joint."""
-        return tuple(
-            Parameter(f"j{j + 1}", "rad", 1e-3, f"zero offset of joint {j + 1}")
-            for j in range(self.cell.arm.n)
-        )
+        ordinary = np.full(self.cell.arm.n, 1e-3)
+        return self.group_parameters("rad", ordinary, "zero offset of {joint}")
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:
         """Unit steps: ∂dq_j/∂o_j = 1."""
-        joints = np.arange(self.cell.arm.n)
-        return (Columns("dq", joints, joints, np.ones((1, len(joints)))),)
+        return (self.joint_columns("dq", np.ones((1, self.cell.arm.n))),)

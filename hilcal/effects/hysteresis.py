@@ -2,10 +2,11 @@
 
 import numpy as np
 
-from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
+from hilcal.effects.per_joint import PerJoint
+from hilcal.effects.protocol import Columns, Parameter, Situation
 
 
-class Hysteresis(Effect):
+class Hysteresis(PerJoint):
     """dq_j = h_j s_j with s_j = ±1 the side from which joint j arrived [rad]."""
 
     name = "hysteresis"
@@ -15,13 +16,10 @@ class Hysteresis(Effect):
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """Half width of the loop, per joint."""
-        return tuple(
-            Parameter(f"j{j + 1}", "rad", 2e-5, f"half hysteresis of joint {j + 1}")
-            for j in range(self.cell.arm.n)
-        )
+        ordinary = np.full(self.cell.arm.n, 2e-5)
+        return self.group_parameters("rad", ordinary, "half hysteresis of {joint}")
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:
         """Sides: ∂dq_j/∂h_j = s_j."""
-        joints = np.arange(self.cell.arm.n)
         assert s.states.approach is not None  # noqa: S101 - checked at construction
-        return (Columns("dq", joints, joints, s.states.approach),)
+        return (self.joint_columns("dq", s.states.approach),)

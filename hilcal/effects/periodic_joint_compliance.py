@@ -4,28 +4,32 @@ import numpy as np
 
 from hilcal.data.readings import States
 from hilcal.effects.options import rated_torques
-from hilcal.effects.protocol import Columns, Effect, Parameter, Response, Situation
+from hilcal.effects.per_joint import PerJoint
+from hilcal.effects.protocol import Columns, Parameter, Response, Situation
 from hilcal.errors import InputError
 from hilcal.types import Floats
 
 MOST_ORDER = 1000
 
 
-class PeriodicJointCompliance(Effect):
+class PeriodicJointCompliance(PerJoint):
     """dq_j = τ_j Σ_k (a_jk cos k q_j + b_jk sin k q_j) beside the mean c_j τ_j [rad/(N·m)].
 
+    Joints that share parameters have the same phase at their zeros.
+
     Options:
-        orders: periods k per turn of the joint, a list; unless given, [2]: the two-lobed wave
-            generator of a strain wave gear.
+        orders: periods k per turn of the joint, a list of whole numbers, 1 to 1000; unless
+            given, [2]: the two-lobed wave generator of a strain wave gear.
     """
 
     name = "periodic_joint_compliance"
     summary = "dq_j = τ_j (a_j cos 2q_j + b_j sin 2q_j): compliance changes with the joint angle"
     elastic = True
-    option_names = ("orders",)
+    option_names = (*PerJoint.option_names, "orders")
 
     def setup(self, states: States) -> None:
         """Read the orders."""
+        super().setup(states)
         given = self.options.setdefault("orders", [2])
         if (
             not isinstance(given, list | tuple)
@@ -42,17 +46,10 @@ class PeriodicJointCompliance(Effect):
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """Two per joint and order; a fifth of an ordinary compliance."""
-        return tuple(
-            Parameter(
-                f"j{j + 1}.{wave}{k}",
-                "rad/(N·m)",
-                6e-4 / rated,
-                f"part of joint {j + 1}'s compliance that goes with {wave} {k} q",
-            )
-            for j, rated in enumerate(rated_torques(self.cell))
-            for k in self.orders
-            for wave in ("cos", "sin")
-        )
+        kinds = {f".{w}{k}": f"{w} {k} q" for k in self.orders for w in ("cos", "sin")}
+        meaning = "part of the compliance of {joint} that goes with {kind}"
+        ordinary = 6e-4 / rated_torques(self.cell)
+        return self.group_parameters("rad/(N·m)", ordinary, meaning, kinds)
 
     def _waves(self, s: Situation) -> Floats:
         """(N, n, 2 K) cosine and sine of each order."""
@@ -62,11 +59,10 @@ class PeriodicJointCompliance(Effect):
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:
         """Torque times wave: ∂dq_j/∂a_jk = τ_j cos k q_j."""
-        values = (s.torque[:, :, None] * self._waves(s)).reshape(len(s.angle), -1)
-        joints = np.repeat(np.arange(self.cell.arm.n), 2 * len(self.orders))
-        return (Columns("dq", np.arange(len(joints)), joints, values),)
+        return (self.kind_columns(s.torque[:, :, None] * self._waves(s)),)
 
     def response(self, theta: Floats, s: Situation, change: Floats) -> Response:
         """Return the compliance at the angle times dτ_j."""
-        here = np.sum(self._waves(s) * theta.reshape(self.cell.arm.n, -1), axis=2)
+        mine = self.of_joints(theta.reshape(-1, 2 * len(self.orders)))
+        here = np.sum(self._waves(s) * mine, axis=2)
         return Response(dq=change[:, :, :-1, 5] * here[:, None, :])

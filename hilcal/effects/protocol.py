@@ -209,6 +209,13 @@ class Effect(ABC):
         """
         return ()
 
+    def of_compliance(self, columns: Columns) -> Columns:
+        """Turn columns by the compliances of the n joints into such by this effect's parameters.
+
+        For effects that tell a `compliance`; here joint j's is parameter j.
+        """
+        return columns
+
     def groups(self) -> Ints | None:
         """(P,) shrinkage group of each parameter, or None for parameters without a prior.
 

@@ -4,10 +4,11 @@ import numpy as np
 
 from hilcal.data.readings import States
 from hilcal.effects.options import numbers
-from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
+from hilcal.effects.per_joint import PerJoint
+from hilcal.effects.protocol import Columns, Parameter, Situation
 
 
-class ThermalJointDrift(Effect):
+class ThermalJointDrift(PerJoint):
     """dq_j = κ_j ΔT_j, ΔT_j = T_j − T_ref,j with the joint's own temperature [rad/K].
 
     Options:
@@ -18,10 +19,11 @@ class ThermalJointDrift(Effect):
     name = "thermal_joint_drift"
     summary = "dq_j = κ_j ΔT_j: the zero of each joint wanders with its temperature"
     needs = ("joint_temperature",)
-    option_names = ("reference_degC",)
+    option_names = (*PerJoint.option_names, "reference_degC")
 
     def setup(self, states: States) -> None:
         """Take the temperatures at the first reading as the reference unless told otherwise."""
+        super().setup(states)
         warm = states.joint_temperature
         assert warm is not None  # noqa: S101 - checked at construction
         if "reference_degC" not in self.options:
@@ -32,13 +34,10 @@ class ThermalJointDrift(Effect):
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """One coefficient per joint; 0.1 mrad for 20 K is ordinary."""
-        return tuple(
-            Parameter(f"j{j + 1}", "rad/K", 5e-6, f"drift of joint {j + 1} with its temperature")
-            for j in range(self.cell.arm.n)
-        )
+        ordinary = np.full(self.cell.arm.n, 5e-6)
+        return self.group_parameters("rad/K", ordinary, "drift of {joint} with the temperature")
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:
         """Warming: ∂dq_j/∂κ_j = ΔT_j."""
         assert s.states.joint_temperature is not None  # noqa: S101 - checked at construction
-        joints = np.arange(self.cell.arm.n)
-        return (Columns("dq", joints, joints, s.states.joint_temperature - self.reference),)
+        return (self.joint_columns("dq", s.states.joint_temperature - self.reference),)

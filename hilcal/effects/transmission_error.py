@@ -3,6 +3,7 @@
 import numpy as np
 
 from hilcal.data.readings import States
+from hilcal.effects.per_joint import PerJoint
 from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
 from hilcal.errors import InputError
 from hilcal.types import Ints
@@ -13,23 +14,24 @@ POSES_PER_HARMONIC = 5
 SCORED_HARMONICS = 40
 
 
-class TransmissionError(Effect):
+class TransmissionError(PerJoint):
     """dq_j = Σ_k a_jk cos k q_j + b_jk sin k q_j, k = 1..K [rad].
 
     The evidence decides how strong each harmonic of each joint is, and drops the needless
-    ones; K only bounds the search.
+    ones; K only bounds the search. Joints that share parameters have the same phase at their zeros.
 
     Options:
-        harmonics: K, the harmonics tried per joint; unless given, one for every five distinct
-            poses, at least 4 and at most 120.
+        harmonics: K, the harmonics tried per joint, 1 to 1000; unless given, one for every five
+            distinct poses, at least 4 and at most 120.
     """
 
     name = "transmission_error"
     summary = "dq_j = Σ a_jk cos k q_j + b_jk sin k q_j: gear and encoder error"
-    option_names = ("harmonics",)
+    option_names = (*PerJoint.option_names, "harmonics")
 
     def setup(self, states: States) -> None:
         """Read or choose the number of harmonics."""
+        super().setup(states)
         poses = len(np.unique(np.round(states.q, 3), axis=0))
         chosen = int(np.clip(poses // POSES_PER_HARMONIC, FEWEST_HARMONICS, MOST_HARMONICS))
         count = self.options.setdefault("harmonics", chosen)
@@ -40,24 +42,18 @@ class TransmissionError(Effect):
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """Cosine and sine amplitude of each harmonic of each joint."""
-        return tuple(
-            Parameter(f"j{j + 1}.{wave}{k}", "rad", 5e-5)
-            for j in range(self.cell.arm.n)
-            for k in self.harmonics
-            for wave in ("cos", "sin")
-        )
+        kinds = {f".{w}{k}": "" for k in self.harmonics for w in ("cos", "sin")}
+        return self.group_parameters("rad", np.full(self.cell.arm.n, 5e-5), "", kinds)
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:
         """Waves: ∂dq_j/∂a_jk = cos k q_j, ∂dq_j/∂b_jk = sin k q_j."""
         phase = s.angle[:, :, None] * self.harmonics
-        values = np.stack([np.cos(phase), np.sin(phase)], axis=-1).reshape(len(phase), -1)
-        per_joint = 2 * len(self.harmonics)
-        joints = np.repeat(np.arange(self.cell.arm.n), per_joint)
-        return (Columns("dq", np.arange(len(joints)), joints, values),)
+        waves = np.stack([np.cos(phase), np.sin(phase)], axis=-1)
+        return (self.kind_columns(waves.reshape(*s.angle.shape, -1)),)
 
     def groups(self) -> Ints:
-        """One variance per joint and harmonic."""
-        return np.repeat(np.arange(self.cell.arm.n * len(self.harmonics)), 2)
+        """One variance per group of joints and harmonic."""
+        return np.repeat(np.arange(len(self.shared.labels) * len(self.harmonics)), 2)
 
     def for_scoring(self, states: States) -> Effect:
         """As a suspect, fewer harmonics are scored than a fit tries."""

@@ -1,5 +1,6 @@
 """The model that every campaign starts from: the frames, and the joints where loads act."""
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,7 +9,7 @@ from hilcal.cell import Cell
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode
 from hilcal.effects.catalogue import make
-from hilcal.effects.options import reading_options
+from hilcal.effects.options import Options, reading_options
 from hilcal.effects.protocol import Effect
 from hilcal.identify.registration import register
 from hilcal.model import Model
@@ -65,12 +66,34 @@ def baseline(cell: Cell, readings: Readings, mode: Mode) -> Model:
     return model
 
 
-def with_effects(cell: Cell, readings: Readings, mode: Mode, names: tuple[str, ...]) -> Model:
-    """Frames where unknown, and the named effects."""
-    begun = start(cell, readings, mode)
-    model = Model(begun.cell, begun.frames)
+def with_effects(
+    cell: Cell,
+    readings: Readings,
+    mode: Mode,
+    names: Iterable[str],
+    options: Mapping[str, Options] | None = None,
+) -> Model:
+    """Frames where unknown, and the named effects.
+
+    Args:
+        cell: the cell.
+        readings: what is to be fitted.
+        mode: "deflection" or "absolute".
+        names: of the effects.
+        options: by name, where they are not the usual ones.
+
+    Raises:
+        InputError: an unknown effect or option, a bad value, or readings that lack what an
+            effect needs.
+    """
+    begun, given = start(cell, readings, mode), options or {}
+    frames = (
+        e.with_options(readings.states, **given[e.name]) if given.get(e.name) else e
+        for e in begun.frames
+    )
+    model = Model(begun.cell, tuple(frames))
     for name in names:
         if name not in model.names:
-            options = reading_options(name, readings.m)
-            model = model + make(name, begun.cell, readings.states, options)
+            all_options = {**reading_options(name, readings.m), **given.get(name, {})}
+            model = model + make(name, begun.cell, readings.states, all_options)
     return model

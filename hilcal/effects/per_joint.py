@@ -1,0 +1,188 @@
+"""What effects with parameters of joints share: which joints have one, and which share one."""
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from hilcal.data.readings import States
+from hilcal.effects.options import Options
+from hilcal.effects.protocol import Columns, Effect, Parameter
+from hilcal.errors import InputError
+from hilcal.types import Floats, Ints
+
+EACH, COMMON = "each", "common"
+JointField = Literal["dq", "twist"]
+_RANGE = re.compile(r"([0-9]{1,3})(?:-([0-9]{1,3}))?")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointGroups:
+    """Which joints have a parameter, and which of them share one.
+
+    Attributes:
+        text: "each", "common", or the groups, as "2/3/4-6".
+        labels: (G,) joints of each group, as "2" or "4-6".
+        joint: (J,) indices of the joints that have a parameter, ascending.
+        group: (J,) the group of each of them, 0..G−1.
+    """
+
+    text: str
+    labels: tuple[str, ...]
+    joint: Ints
+    group: Ints
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """(G,) the groups in words, as "joint 2" or "joints 4-6"."""
+        return tuple(f"joint{'' if k.isdigit() else 's'} {k}" for k in self.labels)
+
+
+def joint_groups(effect: str, options: Options, count: int) -> JointGroups:
+    """Read the option `joints` for an arm of `count` joints.
+
+    Groups are separated by "/", the joints of a group by "+" or as a range: "2/3/4-6" is one
+    parameter for joint 2, one for 3 and one for 4 to 6; a joint that is not named has none.
+
+    Raises:
+        InputError: says what is wrong with it, and what would be valid.
+    """
+    given = options["joints"]
+    text = str(given) if type(given) is int else given
+    if text == EACH:
+        groups = [[j] for j in range(count)]
+    elif text == COMMON:
+        groups = [list(range(count))]
+    else:
+        found, wrong = _read(text, count) if isinstance(text, str) else ([], "")
+        if not found:
+            raise InputError(
+                f"effect {effect}: joints = {given!r}{wrong}; valid: each, common, or joints 1 to "
+                f"{count} in groups, as 2/3/4-6: one parameter for joint 2, one for 3, one for "
+                "4 to 6"
+            )
+        groups = sorted(sorted(group) for group in found)
+    members = sorted((j, k) for k, group in enumerate(groups) for j in group)
+    labels = tuple(_label(group) for group in groups)
+    if len(members) < count or 1 < len(groups) < count:
+        text = "/".join(labels)
+    else:
+        text = EACH if len(groups) == count else COMMON
+    return JointGroups(
+        text, labels, np.array([j for j, _ in members]), np.array([k for _, k in members])
+    )
+
+
+def _read(text: str, count: int) -> tuple[list[list[int]], str]:
+    """Return the groups of joint indices; or none, and what is wrong."""
+    groups: list[list[int]] = []
+    seen: set[int] = set()
+    for part in text.split("/"):
+        group: list[int] = []
+        for piece in part.split("+"):
+            found = _RANGE.fullmatch(piece.strip())
+            if found is None:
+                return [], f", {piece.strip()!r} is no joint and no range"
+            first = int(found[1])
+            last = first if found[2] is None else int(found[2])
+            if last < first:
+                return [], f", {piece.strip()} runs backwards"
+            for joint in range(first, last + 1):
+                if not 1 <= joint <= count:
+                    return [], f", there is no joint {joint}"
+                if joint in seen:
+                    return [], f", joint {joint} is there twice"
+                seen.add(joint)
+                group.append(joint - 1)
+        groups.append(group)
+    return groups, ""
+
+
+def _label(group: list[int]) -> str:
+    """Write ascending joint indices, as "1+4-6"."""
+    runs: list[list[int]] = []
+    for j in group:
+        if runs and runs[-1][-1] == j - 1:
+            runs[-1].append(j)
+        else:
+            runs.append([j])
+    return "+".join(
+        str(run[0] + 1) if len(run) == 1 else f"{run[0] + 1}-{run[-1] + 1}" for run in runs
+    )
+
+
+class PerJoint(Effect):
+    """An effect whose parameters belong to joints: each has its own, or some share one.
+
+    Options:
+        joints: which joints have a parameter: "each" its own, "common", one for all, or groups
+            as 2/3/4-6, one parameter for joint 2, one for 3 and one for 4 to 6 (2+5 for joints
+            apart); joints that are not named have none. Unless given, each.
+    """
+
+    option_names: ClassVar[tuple[str, ...]] = ("joints",)
+    usual_joints: ClassVar[str] = EACH
+
+    def setup(self, states: States) -> None:
+        """Read which joints share a parameter."""
+        self.options.setdefault("joints", self.usual_joints)
+        self.shared = joint_groups(self.name, self.options, self.cell.arm.n)
+        self.options["joints"] = self.shared.text
+
+    def group_parameters(
+        self, unit: str, ordinary: Floats, meaning: str, kinds: Mapping[str, str] | None = None
+    ) -> tuple[Parameter, ...]:
+        """Parameters of all groups, one for each, or one for each of `kinds`.
+
+        Args:
+            unit: of all of them.
+            ordinary: (n,) ordinary magnitude at each joint; that of a group is the geometric
+                mean of its joints'.
+            meaning: with "{joint}" and "{kind}" where they belong.
+            kinds: what tells the parameters of one group apart, as ".cos2", with its words.
+        """
+        g = self.shared
+        sizes: list[list[float]] = [[] for _ in g.labels]
+        for size, k in zip(ordinary[g.joint].tolist(), g.group.tolist(), strict=True):
+            sizes[k].append(size)
+        scales = [math.prod(s) ** (1 / len(s)) for s in sizes]
+        each = (kinds or {"": ""}).items()
+        return tuple(
+            Parameter(f"j{label}{kind}", unit, scale, meaning.format(joint=words, kind=said))
+            for label, words, scale in zip(g.labels, g.words, scales, strict=True)
+            for kind, said in each
+        )
+
+    def joint_columns(self, field: JointField, values: Floats) -> Columns:
+        """Columns of one parameter per group: values (N, n) for dq, (N, n, 6) for twist."""
+        g = self.shared
+        return Columns(field, g.group, g.joint, self._of_named(values))
+
+    def kind_columns(self, values: Floats) -> Columns:
+        """Columns for dq of K parameters per group, values (N, n, K)."""
+        g, kinds = self.shared, values.shape[2]
+        parameter = (kinds * g.group[:, None] + np.arange(kinds)).reshape(-1)
+        flat = self._of_named(values).reshape(len(values), -1)
+        return Columns("dq", parameter, np.repeat(g.joint, kinds), flat)
+
+    def of_joints(self, theta: Floats) -> Floats:
+        """(n, ...) parameters of each joint's group, of (G, ...); 0 where it has none."""
+        g = self.shared
+        out = np.zeros((self.cell.arm.n, *theta.shape[1:]))
+        out[g.joint] = theta[g.group]
+        return out
+
+    def of_compliance(self, columns: Columns) -> Columns:
+        """Turn columns by each joint's compliance into such by those of the groups."""
+        group = np.full(self.cell.arm.n, -1)
+        group[self.shared.joint] = self.shared.group
+        mine = columns.only(group[columns.parameter] >= 0)
+        return replace(mine, parameter=group[mine.parameter])
+
+    def _of_named(self, values: Floats) -> Floats:
+        """(N, J, ...) values of the joints that have a parameter, of (N, n, ...)."""
+        joint = self.shared.joint
+        return values if len(joint) == self.cell.arm.n else values[:, joint]
