@@ -22,9 +22,11 @@ from hilcal.data.campaign import Campaign
 from hilcal.data.plan import Plan
 from hilcal.data.readings import Readings
 from hilcal.data.run_log import RunLog
+from hilcal.errors import DeviceError
 from hilcal.identify.repeatability import with_repeatability
 from hilcal.report.progress import Say, counting, working
 
+TRIES = 4
 BREAK = 600.0
 """Between two plans of a campaign that is drawn by lots, s."""
 
@@ -88,7 +90,7 @@ def on_devices(t: Terminal, told: Told, plan: Plan) -> Iterator[tuple[Rehearsal,
         campaign = stack.enter_context(made)
 
         def measured() -> Rehearsal:
-            measure(t, there.config, secret.cell, campaign)
+            _to_the_end(t, lambda: measure(t, there.config, secret.cell, campaign))
             readings = _whole(secret.cell, there.config, campaign)
             return _rehearsal(secret, there.config, readings)
 
@@ -123,6 +125,27 @@ def in_process(t: Terminal, told: Told, plan: Plan) -> Iterator[tuple[Rehearsal,
             return measured(fitted_on(more, plan, 2), 2, last + BREAK)
 
         yield measured(plan, 1, 0.0), further
+
+
+def _to_the_end(t: Terminal, work: Callable[[], object]) -> None:
+    """Measure, and go on after a failure as `run --resume` does.
+
+    A busy computer gives a simulated device no turn for a while, which is the same to the driver
+    as a device that fails.
+
+    Raises:
+        DeviceError: it failed `TRIES` times.
+    """
+    for left in reversed(range(TRIES)):
+        try:
+            work()
+        except DeviceError as error:
+            if not left:
+                raise
+            t.notice(f"note: {error}")
+            t.notice("going on with what is missing")
+        else:
+            return
 
 
 def _write(t: Terminal, campaign: Campaign, readings: Readings) -> None:

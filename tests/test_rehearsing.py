@@ -1,0 +1,40 @@
+"""A demo on devices goes on after a failure, as `run --resume` does, but not for ever."""
+
+import pytest
+
+from hilcal.cli.rehearsing import TRIES, _to_the_end
+from hilcal.cli.terminal import terminal
+from hilcal.errors import DeviceError, InputError
+
+
+def work(failures: int, kind: type[Exception] = DeviceError):
+    calls = []
+
+    def once() -> None:
+        calls.append(1)
+        if len(calls) <= failures:
+            raise kind("force sensor: nothing came for 0.2 s")
+
+    return once, calls
+
+
+def test_what_is_missing_is_measured_after_a_failure(capsys):
+    once, calls = work(2)
+    _to_the_end(terminal(False), once)
+    assert len(calls) == 3
+    said = capsys.readouterr()
+    assert (said.out + said.err).count("nothing came for 0.2 s") == 2
+
+
+def test_a_device_that_always_fails_ends_it(capsys):
+    once, calls = work(TRIES)
+    with pytest.raises(DeviceError, match=r"nothing came for 0\.2 s"):
+        _to_the_end(terminal(False), once)
+    assert len(calls) == TRIES
+
+
+def test_other_errors_end_it_at_once(capsys):
+    once, calls = work(1, InputError)
+    with pytest.raises(InputError):
+        _to_the_end(terminal(False), once)
+    assert len(calls) == 1
