@@ -151,6 +151,25 @@ def test_add_shows_the_error_before_and_after(campaign: Path, capsys: Capsys) ->
     assert "does not fall" in words or "falls" in words
 
 
+def test_remove_takes_out_what_is_needless_and_says_what_is_not(
+    campaign: Path, capsys: Capsys
+) -> None:
+    ok(capsys, "add", campaign, "hysteresis")
+    ok(capsys, "add", campaign, "tracker_scale")
+    d = ok(capsys, "diagnose", campaign, "--json").document
+    assert d["needless"] == ["tracker_scale"]
+    assert "do not ask for tracker_scale" in ok(capsys, "diagnose", campaign).out
+    d = ok(capsys, "remove", campaign, "tracker_scale", "--json").document
+    assert (d["revisions"][-1]["added"], d["revisions"][-1]["removed"]) == (None, "tracker_scale")
+    assert d["revisions"][-1]["model"] == ["base_frame", "joint_compliance", "hysteresis"]
+    assert d["verdict"] == "adequate"
+    result = ok(capsys, "remove", campaign, "hysteresis")
+    assert "− hysteresis" in result.out
+    assert "it belongs there" in result.out
+    assert "not in the model" in refused(capsys, 2, "remove", campaign, "hysteresis")
+    assert "unknown effect" in refused(capsys, 2, "remove", campaign, "friction")
+
+
 def test_refine_ends_adequate_and_keeps_every_revision(campaign: Path, capsys: Capsys) -> None:
     result = ok(capsys, "refine", campaign, "--json")
     d = result.document
