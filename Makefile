@@ -34,7 +34,7 @@ demo: $(STAMP)
 	$(BIN)/hilcal demo
 
 test: $(STAMP)
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
 
 check: $(STAMP)
 	$(BIN)/ruff check .
@@ -47,7 +47,7 @@ format: $(STAMP)
 	$(BIN)/ruff format .
 
 slow: $(STAMP)
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m slow
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m slow
 
 bench: $(STAMP)
 	$(BIN)/python -m pytest -q -m "slow or not slow" --benchmark-enable --benchmark-only

@@ -35,3 +35,24 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         default=None,
         help="run tests/test_devices.py on the real devices of this cell; the arm moves",
     )
+
+
+LONG = (
+    "test_demo",
+    "test_stops",
+    "test_fault_matrix_arm",
+    "test_fault_matrix_serial",
+    "test_diagnose",
+    "test_revise",
+    "test_refine",
+    "test_live",
+    "test_p_values",
+    "test_planner",
+)
+"""Files that take longest: they begin first, so that none of them is left over at the end."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the long files first; each file's tests stay together, in their order."""
+    place = {name: k for k, name in enumerate(LONG)}
+    items.sort(key=lambda item: place.get(item.path.stem, len(LONG)))

@@ -22,7 +22,6 @@ ENCODER_STD = 2e-6
 """Noise of a motor-side encoder at the joint, rad."""
 
 _REFRESH_NS = 10_000_000  # real time between two publications of an unchanged arm
-_AGE_NS = 50_000_000  # the same where only time goes on: drift, creep, warmth
 _STRONGEST = 2000.0  # N and N·m that may push or swing
 
 
@@ -96,8 +95,7 @@ class LivingWorld:
             before = self._known
             due = now_ns - self._computed_ns >= _REFRESH_NS
             arrived = before is None or before[3:] != known[3:]
-            aged = self._ages and now_ns - self._computed_ns >= _AGE_NS
-            if arrived or aged or (due and (known[2] or before != known)):
+            if arrived or (due and (self._ages or known[2] or before != known)):
                 try:
                     self._publish(arm)
                 except InputError as error:  # the truth stays what it was

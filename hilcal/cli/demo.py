@@ -16,7 +16,7 @@ from hilcal.cli.refining import Row, revisions_json
 from hilcal.cli.rehearsing import Told, first_plan, in_process, on_devices
 from hilcal.cli.terminal import Json, Record, Terminal, terminal
 from hilcal.config import load_config
-from hilcal.data.campaign import Campaign
+from hilcal.data.campaign import Campaign, may_write
 from hilcal.data.plan import Plan
 from hilcal.data.records import content_hash
 from hilcal.diagnose.document import to_json
@@ -67,6 +67,7 @@ def demo(
         raise InputError(f"--seed {number}; valid: a whole number, 0 or more")
     choice = hide or config.simulation.hide or (in_doubt(number) if ambiguous else RANDOM)
     check_choice(choice)
+    may_write(output, True)  # before the planning, which takes a while
     if ambiguous:
         weaker = config.simulation.model_copy(update={"strength_sigma": STRENGTH})
         config = config.model_copy(update={"simulation": weaker})

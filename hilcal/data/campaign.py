@@ -62,7 +62,7 @@ class Campaign:
         )
         try:
             meta |= more or {}
-            _may_write(path, overwrite)
+            may_write(path, overwrite)
             for leftover in (new, *_sidecars(new)):
                 leftover.unlink(missing_ok=True)
             new.touch()
@@ -269,7 +269,12 @@ def _sidecars(path: Path) -> tuple[Path, ...]:
     return tuple(path.with_name(path.name + end) for end in ("-journal", "-wal", "-shm"))
 
 
-def _may_write(path: Path, overwrite: bool) -> None:
+def may_write(path: Path, overwrite: bool) -> None:
+    """Refuse to replace a file that is no campaign, or any without `overwrite`.
+
+    Raises:
+        InputError: says which file, and why.
+    """
     if not path.exists():
         return
     if not overwrite:
