@@ -100,7 +100,7 @@ def alternative(without: Fit, effect: str, never: Collection[str] = ()) -> Alter
     names: list[str] = []
     fits: list[Fit] = []
     total, current = 0.0, without
-    for _ in range(MOST_TOGETHER):
+    for left in range(MOST_TOGETHER, 0, -1):
         p = projection(current)
         ranked = rank_suspects(p, candidates(p))
         if own is None:
@@ -108,11 +108,14 @@ def alternative(without: Fit, effect: str, never: Collection[str] = ()) -> Alter
         best = next((s for s in ranked if s.effect != effect and s.effect not in never), None)
         if best is None or best.score.log_evidence <= SAME_EVIDENCE:
             break
+        # The best one comes first, so those that follow hardly add more than it does.
+        if total + left * best.score.log_evidence < own.score.log_evidence - SAME_EVIDENCE:
+            break
         names.append(best.effect)
         total += best.score.log_evidence - (PRICE if fits else 0.0)
         current = add(current, best.effect)
         fits.append(current)
-        if total > own.score.log_evidence + SAME_EVIDENCE or total < own.score.log_evidence / 4:
+        if total > own.score.log_evidence + SAME_EVIDENCE:
             break
     assert own is not None  # noqa: S101 - the first round finds it
     return Alternative(own, tuple(names), tuple(fits), total)
