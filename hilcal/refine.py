@@ -5,7 +5,16 @@ from dataclasses import dataclass
 
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode
-from hilcal.diagnose.revise import Alternative, add, alternative, predicts_better, remove
+from hilcal.diagnose.projection import projection
+from hilcal.diagnose.revise import (
+    MOST_TOGETHER,
+    Alternative,
+    add,
+    alternative,
+    predicts_better,
+    remove,
+)
+from hilcal.diagnose.rivals import Rivals
 from hilcal.diagnose.verdict import Diagnosis, Verdict, diagnose
 from hilcal.identify.fit import Fit, fit
 from hilcal.model import Model
@@ -132,12 +141,18 @@ class _Work:
             doubts: takes the additions that could as well be other effects.
         """
         last = self.steps[-1]
-        for name in last.fit.model.names:
-            if name in self._given or not self._room:
+        names = [n for n in last.fit.model.names if n not in self._given]
+        if not names or not self._room:
+            return False
+        self._tell(f"reconsidering {', '.join(names)}")
+        rivals = Rivals(projection(last.fit))
+        for name in names:
+            idle = name in last.diagnosis.needless
+            if not idle and not rivals.near(name, MOST_TOGETHER, self._out):
                 continue
-            self._tell(f"reconsidering {name}")
+            self._tell(f"refitting without {name}")
             without = remove(last.fit, name)
-            if name in last.diagnosis.needless and not predicts_better(without, last.fit):
+            if idle and not predicts_better(without, last.fit):
                 self._change(without, None, name)
                 return True
             other = alternative(without, name, self._out)

@@ -12,6 +12,7 @@ from hilcal.plan.compromise import Compromise
 from hilcal.plan.criteria import A, Criterion, D, E, K, Linear, Pair, Separate
 from hilcal.plan.criterion import require_determined, soft_least
 from hilcal.plan.interior import Program
+from hilcal.plan.volumes import Volumes
 from hilcal.types import Floats
 
 P = 6
@@ -49,6 +50,7 @@ CRITERIA: dict[str, Callable[[], Criterion]] = {
     "K": K,
     "separate": lambda: Separate(pairs()),
     "compromise": compromise,
+    "volumes": lambda: Volumes(4),
 }
 CONCAVE = [name for name in CRITERIA if name != "K"]
 seeds = st.integers(0, 10**6)

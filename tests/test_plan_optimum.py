@@ -15,6 +15,7 @@ from hilcal.plan.exchange import exact, rounded
 from hilcal.plan.optimum import best, curve
 from hilcal.plan.relaxation import Relaxed, relax
 from hilcal.plan.units import Units
+from hilcal.plan.volumes import Volumes
 from hilcal.types import Floats, Ints
 
 
@@ -32,6 +33,7 @@ CRITERIA: dict[str, Callable[[], Criterion]] = {
     "A of some": lambda: A(np.array([0, 1])),
     "test": lambda: Linear(np.outer([1.0, 2.0, -1.0], [1.0, 2.0, -1.0])),
     "compromise": compromise,
+    "volumes": lambda: Volumes(2),
     "E": E,
     "K": K,
     "separate": lambda: Separate(

@@ -6,8 +6,8 @@ same when only the s parameters of the model are, and q*, q_s* the least of them
 
     1/φ = ½ q(M)/q* + ½ q_s(M_ss)/q_s*
 
-is the mean of both inefficiencies: a compound criterion. Source: Atkinson, Donev and Tobias,
-*Optimum Experimental Designs, with SAS* (2007), chapter 21.
+is the mean of both inefficiencies: a compound criterion; for volumes see `volumes`. Source:
+Atkinson, Donev and Tobias, *Optimum Experimental Designs, with SAS* (2007), chapter 21.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,11 +22,12 @@ from hilcal.plan.criterion import Smooth, inverse
 from hilcal.plan.information import Problem
 from hilcal.plan.relaxation import relax
 from hilcal.plan.units import Units
+from hilcal.plan.volumes import Volumes
 from hilcal.plan.work import WorkPoses
 from hilcal.types import Floats
 
 BOTH = ("A", "test")
-"""Criteria of the model's parameters, which the potential terms are in the way of."""
+"""Criteria of the model's parameters whose two optima have to be known; D's need not."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,7 +102,7 @@ class Compromise:
 def robust_question(
     problem: Problem, name: str, work: WorkPoses | None, budget: float, rng: np.random.Generator
 ) -> Question:
-    """Return what a criterion asks, A and test as the compromise where there are potential terms.
+    """Return what a criterion asks; D, A and test as a compromise where terms are potential.
 
     Args:
         problem: the design problem.
@@ -115,7 +116,11 @@ def robust_question(
         InputError: from `question`.
     """
     asked, size = question(problem, name, work), problem.model_size
-    if name not in BOTH or size == len(problem.terms):
+    if size == len(problem.terms):
+        return asked
+    if name == "D":
+        return replace(asked, criterion=Volumes(size))
+    if name not in BOTH:
         return asked
     c = np.diag(np.where(np.arange(len(problem.terms)) < size, 1.0 / size, 0.0))
     if isinstance(asked.criterion, Linear):
