@@ -5,16 +5,8 @@ from dataclasses import dataclass
 
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode
-from hilcal.diagnose.projection import projection
-from hilcal.diagnose.revise import (
-    MOST_TOGETHER,
-    Alternative,
-    add,
-    alternative,
-    predicts_better,
-    remove,
-)
-from hilcal.diagnose.rivals import Rivals
+from hilcal.diagnose.revise import add, exchange, predicts_better, remove
+from hilcal.diagnose.rivals import Alternative, Rivals
 from hilcal.diagnose.verdict import Diagnosis, Verdict, diagnose
 from hilcal.identify.fit import Fit, fit
 from hilcal.model import Model
@@ -22,6 +14,8 @@ from hilcal.model import Model
 __all__ = ["Refinement", "Step", "add", "predicts_better", "refine", "remove"]
 
 MOST_REVISIONS = 15
+FAR = 0.1
+"""Share of an effect's evidence by which others must be better while the model is not adequate."""
 
 Say = Callable[[str], None]
 
@@ -145,34 +139,49 @@ class _Work:
         if not names or not self._room:
             return False
         self._tell(f"reconsidering {', '.join(names)}")
-        rivals = Rivals(projection(last.fit))
+        rivals = Rivals(last.fit)
         for name in names:
-            idle = name in last.diagnosis.needless
-            if not idle and not rivals.near(name, MOST_TOGETHER, self._out):
-                continue
-            self._tell(f"refitting without {name}")
-            without = remove(last.fit, name)
-            if idle and not predicts_better(without, last.fit):
-                self._change(without, None, name)
+            if name in last.diagnosis.needless:
+                without = remove(last.fit, name)
+                if not predicts_better(without, last.fit):
+                    self._change(without, None, name)
+                    return True
+            other = rivals.of(name, self._out)
+            if self._better(last, other) and self._exchange(last, other):
                 return True
-            other = alternative(without, name, self._out)
-            if other.better and not predicts_better(other.fits[-1], last.fit):
-                self._exchange(name, other)
-                return True
-            doubt = " or ".join(n for n in other.own.same_as if n not in self._out)
-            if other.as_good and len(other.effects) > 1:
-                doubt = f"{doubt} or {' and '.join(other.effects)}".removeprefix(" or ")
+            doubt = " or ".join(n for n in other.same_as if n not in self._out)
+            if other.as_good and len(other.others) > 1:
+                doubt = f"{doubt} or {' and '.join(other.others)}".removeprefix(" or ")
             if doubt:
                 doubts.append(f"{name} could as well be {doubt}")
         return False
 
-    def _exchange(self, name: str, other: Alternative) -> None:
-        """Put others in the place of an effect."""
-        first, *rest = zip(other.effects, other.fits, strict=True)
-        self._change(first[1], first[0], name)
-        for effect, trial in rest:
-            self._tell(f"added {effect}; diagnosing")
-            self.steps.append(Step(trial, diagnose(trial), effect))
+    def _better(self, last: Step, other: Alternative) -> bool:
+        """Whether others are worth a trial: while something unknown is left, far better ones."""
+        known = last.diagnosis.verdict == "adequate"
+        return other.better and (known or other.log_evidence > (1.0 + FAR) * other.own)
+
+    def _exchange(self, last: Step, other: Alternative) -> bool:
+        """Put others in the place of an effect, unless the error on poses left out rises.
+
+        While something unknown is left, which the evidence takes for noise, it must surely fall.
+        """
+        self._tell(f"trying {' + '.join(other.others)} in place of {other.effect}")
+        first, *rest = other.others
+        trials = [exchange(last.fit, other.effect, first)]
+        for name in rest:
+            trials.append(add(trials[-1], name))
+        found = trials[-1]
+        if last.diagnosis.verdict == "adequate":
+            if found.holdout.rms_sigma > last.fit.holdout.rms_sigma:
+                return False
+        elif not predicts_better(last.fit, found):
+            return False
+        self._change(trials[0], first, other.effect)
+        for name, trial in zip(rest, trials[1:], strict=True):
+            self._tell(f"added {name}; diagnosing")
+            self.steps.append(Step(trial, diagnose(trial), name))
+        return True
 
     def _change(self, trial: Fit, added: str | None, removed: str) -> None:
         self._out.add(removed)

@@ -57,7 +57,7 @@ def null_p_values(
         if found.outlier.any():
             continue  # once in a thousand, and then not the same design
         p = projection(found)
-        for s in rank_suspects(p, candidates(p)):
+        for s in rank_suspects(p, candidates(p.fit)):
             if s.score.rank:
                 out.setdefault(s.effect, []).append(s.score.p_value)
         for v in where(p) if places else ():
@@ -105,7 +105,7 @@ def test_nothing_hidden_is_adequate(mode):
 @pytest.mark.parametrize(("effect", "mode"), HIDDEN)
 def test_a_hidden_effect_leads(effect, mode):
     p = projection(fit_of(hidden(effect, mode, 0)))
-    lead = rank_suspects(p, candidates(p))[0]
+    lead = rank_suspects(p, candidates(p.fit))[0]
     assert effect in (lead.effect, *lead.same_as)
     assert lead.score.p_value < 1e-6
     assert lead.share > 0.5
@@ -133,7 +133,7 @@ def test_scores_foretell_what_adding_does(mode):
     """The F-test of a family is that of the refit with all its columns free."""
     found = fit_of(hidden("joint_tilt_compliance", mode, 0, strength=0.8, poses=15))
     p = projection(found)
-    for s in rank_suspects(p, candidates(p)):
+    for s in rank_suspects(p, candidates(p.fit)):
         if s.effect not in ("base_compliance", "hysteresis", "joint_tilt_compliance"):
             continue
         after = add(found, s.effect)
@@ -150,7 +150,7 @@ def test_effects_that_cannot_be_told_apart_name_each_other():
     """Turning the base about z is turning the first joint, elastically as well."""
     found = fit_of(campaign("base_compliance", "deflection", 3, poses=8))
     p = projection(found)
-    by_name = {s.effect: s for s in rank_suspects(p, candidates(p))}
+    by_name = {s.effect: s for s in rank_suspects(p, candidates(p.fit))}
     for s in by_name.values():
         for other in s.same_as:
             assert s.effect in by_name[other].same_as

@@ -78,7 +78,7 @@ def test_the_power_is_the_share_of_rejections_in_the_simulated_world() -> None:
     for _ in range(100):
         rival = fit(start.model, with_noise(clean, rng), "deflection", start=start.theta)
         f = projection(rival)
-        x = family(f, next(e for e in candidates(f) if e.name == TILT)).white
+        x = family(rival, next(e for e in candidates(rival) if e.name == TILT)).white
         s, g = x.T @ f.free(x), x.T @ rival.white
         rejected += bool(g @ np.linalg.solve(s, g) > stats.chi2.isf(LEVEL, len(g)))
     assert share_is(rejected, 100, promised)

@@ -53,7 +53,7 @@ def p_values(kind: str, mode: str, seeds: range) -> dict[str, list[float]]:
             for name in IN_THE_MODEL[mode]:
                 found = add(found, name)
         p = projection(found)
-        for s in rank_suspects(p, candidates(p)):
+        for s in rank_suspects(p, candidates(p.fit)):
             if s.score.rank:
                 out.setdefault(s.effect, []).append(s.score.p_value)
     return out

@@ -99,7 +99,7 @@ def test_shares_on_poses_left_out_are_what_a_refit_reaches_there():
     readings = with_pose_errors(c.readings, 1)
     before = fit(baseline(c.cell, readings, "absolute"), readings, "absolute")
     p = projection(before)
-    for s in rank_suspects(p, candidates(p)):
+    for s in rank_suspects(p, candidates(p.fit)):
         if s.effect not in ("transmission_error", "link_geometry", "encoder_offset"):
             continue
         after = add(before, s.effect)

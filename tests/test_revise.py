@@ -11,7 +11,8 @@ from scipy.stats import ncf
 from drivers.simulated.hidden import hide
 from hilcal.diagnose.needless import CHANCE, needless
 from hilcal.diagnose.projection import projection
-from hilcal.diagnose.revise import add, alternative, remove
+from hilcal.diagnose.revise import add, remove
+from hilcal.diagnose.rivals import Rivals
 from hilcal.diagnose.sensitivity import POWER, least_strength, noncentrality
 from hilcal.diagnose.suspects import candidates, family
 from hilcal.diagnose.verdict import diagnose
@@ -117,11 +118,10 @@ def test_a_large_family_that_took_the_part_of_two_effects_is_exchanged_for_them(
 def test_an_addition_that_cannot_be_told_from_another_is_a_doubt():
     c = campaign("tracker_scale", "absolute", 1, poses=20, strength=1.0)
     w = work(c, "tracker_scale")
-    other = alternative(w.steps[0].fit, "tracker_scale")
-    assert other.own.effect == "tracker_scale"
+    other = Rivals(w.steps[-1].fit).of("tracker_scale")
     doubts: list[str] = []
     changed = w.reconsider(doubts)
-    assert changed or bool(doubts) == bool(other.own.same_as)
+    assert changed or bool(doubts) == bool(other.same_as)
 
 
 def test_an_effect_that_is_not_there_cannot_be_removed():
@@ -173,8 +173,8 @@ def test_at_its_least_strength_an_effect_is_found_as_often_as_said(effect):
     c = campaign(NOTHING, "deflection", 5, poses=20)
     found = fitted(c)
     p = projection(found)
-    (e,) = (e for e in candidates(p) if e.name == effect)
-    of = family(p, e)
+    (e,) = (e for e in candidates(p.fit) if e.name == effect)
+    of = family(p.fit, e)
     s = of.white.T @ p.free(of.white)
     units = tuple(q.unit for q in e.parameters)
     level = 1e-3

@@ -6,11 +6,14 @@ from typing import Annotated
 
 import typer
 
-from drivers.simulated.study_cases import effects_shown, laws_shown, study_case
+from drivers.simulated.study_cases import StudyCase, effects_shown, laws_shown, study_case
+from drivers.simulated.study_more import measure_more
 from hilcal.cli.demo import CELL
 from hilcal.cli.terminal import Json, terminal
 from hilcal.config import CellConfig, load_config
+from hilcal.data.readings import Readings
 from hilcal.data.whitening import MODES, Mode
+from hilcal.diagnose.verdict import Diagnosis
 from hilcal.errors import InputError
 from hilcal.report.progress import counting
 from hilcal.robot.catalogue import configs_dir, robot_names
@@ -58,6 +61,10 @@ def diagnosis(
     refine: Annotated[
         bool, typer.Option("--refine/--no-refine", help="Also add what is found to be missing.")
     ] = True,
+    again: Annotated[
+        bool,
+        typer.Option("--next", help="At 0.5 σ, also plan and measure what separates suspects."),
+    ] = False,
     jobs: Annotated[int, typer.Option("--jobs", help="Processes.")] = 2,
     as_json: Json = False,
 ) -> None:
@@ -81,11 +88,12 @@ def diagnosis(
         noise=noise,
         pairs=pairs,
         first_seed=first_seed,
+        again=again,
     )
     asked = questions(extent)
     begun = time.monotonic()
     with counting(t.progress, "campaigns", len(asked)) as advance:
-        run = partial(run_case, simulate=simulate, refined=refine)
+        run = partial(run_case, simulate=simulate, more=more, refined=refine)
         outcomes, complete = run_all(asked, run, jobs, advance)
     t.notice(f"{len(outcomes)} of {len(asked)} campaigns in {time.monotonic() - begun:.0f} s")
     if outcomes:
@@ -99,11 +107,20 @@ def diagnosis(
 
 def simulate(asked: Asked) -> Sample:
     """Measure what a question asks for in the simulated world."""
-    c = study_case(
+    c = _case(asked)
+    return Sample(c.cell, c.readings, c.noise, c.world.truth, c.variables)
+
+
+def more(asked: Asked, diagnosis: Diagnosis) -> Readings | None:
+    """Measure what separates the suspects of a diagnosis, in the same world."""
+    return measure_more(_config(), asked.robot, _case(asked), diagnosis, asked.seed)
+
+
+def _case(asked: Asked) -> StudyCase:
+    return study_case(
         _config(), asked.robot, asked.mode, asked.hidden, asked.strength, asked.seed,
         stated=asked.stated, cycles=asked.cycles,
     )  # fmt: skip
-    return Sample(c.cell, c.readings, c.noise, c.world.truth, c.variables)
 
 
 @cache

@@ -65,12 +65,12 @@ def apart(p: Projection, lead: Suspect, effects: tuple[Effect, ...]) -> tuple[Ap
         effects: all candidates.
     """
     by_name = {e.name: e for e in effects}
-    own = p.free(family(p, by_name[lead.effect]).white)
+    own = p.free(family(p.fit, by_name[lead.effect]).white)
     y = own @ lead.score.step
     total = float(y @ y)
     out = []
     for name in lead.same_as:
-        rival = p.free(family(p, by_name[name]).white)
+        rival = p.free(family(p.fit, by_name[name]).white)
         unlike = float(np.sum(_left(rival, y) ** 2)) / max(total, 1e-300)
         times = np.inf if unlike < ALIKE else NEEDED / max(unlike * total, 1e-300)
         out.append(Apart(name, unlike, times))

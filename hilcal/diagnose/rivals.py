@@ -1,75 +1,113 @@
 """Whether other effects could take the place of one, at the linearisation of the fit.
 
 A refit without an effect, and with others in its place, takes seconds to minutes on a large
-campaign, and hardly ever comes near. So that it is done only where it could, the others are
-first added to the model without the effect by algebra alone, the best one first: with S and g of
-all families and ‖r‖² (see `score`), a family f whose parameters have the prior precision λ is
-added by
+campaign, and hardly ever comes near. So the others are added to the model without the effect by
+algebra alone, the best one first: with S and g of all families and ‖r‖² (see `score`), a family f
+whose parameters have the prior precision λ is added by
 
     S ← S − S_f (S_ff + λ I)⁻¹ S_fᵀ,    g ← g − S_f (S_ff + λ I)⁻¹ g_f,    ‖r‖² ← ‖r‖² − gain
 """
 
 from collections.abc import Collection
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg as sl
 
 from hilcal.diagnose.needless import own_score
-from hilcal.diagnose.projection import Projection
 from hilcal.diagnose.score import Score, score
 from hilcal.diagnose.suspects import SAME_EVIDENCE, candidates, family
 from hilcal.diagnose.without import leave_out_effect, whitened_columns
 from hilcal.identify.fit import Fit
 from hilcal.types import Floats
 
-NEAR = 0.1
-"""Share of an effect's evidence by which the linearisation may misjudge what is in its place."""
+MOST_TOGETHER = 3
+"""Effects that are tried together in place of one."""
+PRICE = 1.0
+"""Evidence that each further effect costs: its strength was chosen by the data, too."""
+
+
+@dataclass(frozen=True, slots=True)
+class Alternative:
+    """Other effects in place of one.
+
+    Attributes:
+        effect: the one.
+        own: its log evidence against the model without it.
+        same_as: single effects that the readings do not tell from it.
+        others: effects that explain together what it does, in the order of adding them.
+        log_evidence: of all of them together.
+    """
+
+    effect: str
+    own: float
+    same_as: tuple[str, ...]
+    others: tuple[str, ...]
+    log_evidence: float
+
+    @property
+    def better(self) -> bool:
+        """Whether the readings prefer the others, beyond doubt."""
+        return self.log_evidence > self.own + SAME_EVIDENCE
+
+    @property
+    def as_good(self) -> bool:
+        """Whether the readings do not tell the others from the one."""
+        return self.log_evidence > self.own - SAME_EVIDENCE
 
 
 class Rivals:
     """The columns of a fitted model and of all effects outside of it."""
 
-    def __init__(self, p: Projection) -> None:
+    def __init__(self, fit: Fit) -> None:
         """Compute them."""
-        self._fit: Fit = p.fit
-        self._model = whitened_columns(p.fit)
-        families = [family(p, e) for e in candidates(p)]
-        self._outside = np.column_stack(
-            [np.zeros((len(p.fit.white), 0))] + [f.white for f in families]
-        )
+        self._fit = fit
+        self._model = whitened_columns(fit)
+        families = [family(fit, e) for e in candidates(fit)]
         ends = np.cumsum([0] + [f.white.shape[1] for f in families])
+        self._outside = np.hstack([np.zeros((len(fit.white), 0)), *(f.white for f in families)])
         self._slices = {
             f.effect.name: slice(int(a), int(b))
             for f, a, b in zip(families, ends[:-1], ends[1:], strict=True)
         }
         self._gram = self._outside.T @ self._outside
 
-    def near(self, effect: str, most: int, never: Collection[str] = ()) -> bool:
-        """Whether others, at most so many together, come near an effect of the model.
+    def of(self, effect: str, never: Collection[str] = ()) -> Alternative:
+        """Look for other effects that explain together what one of the model does.
+
+        The evidence of a chain of additions is the sum of theirs, ln p(r | all) − ln p(r | none),
+        so that one large family and several small effects compare.
 
         Args:
             effect: of the model.
-            most: others that are added together.
             never: effects that are not to be added.
         """
         w = leave_out_effect(self._fit, self._model, effect)
         own = own_score(w).log_evidence
-        enough = (1 - NEAR) * own - SAME_EVIDENCE
         across = w.rows.T @ self._outside
         s = self._gram - across.T @ sl.cho_solve(w.factor, across, check_finite=False)
         g, yy = self._outside.T @ w.rest, float(w.rest @ w.rest)
         left = {n: k for n, k in self._slices.items() if n not in never}
+        same: tuple[str, ...] = ()
+        others: list[str] = []
         total = 0.0
-        for _ in range(most):
+        while left and len(others) < MOST_TOGETHER:
             scores = {n: score(s[k, k], g[k], yy, w.dof) for n, k in left.items()}
-            best = max(scores, key=lambda n: scores[n].log_evidence, default=None)
-            if best is None or scores[best].log_evidence <= 0:
+            best = max(scores, key=lambda n: scores[n].log_evidence)
+            if not others:
+                same = tuple(n for n, found in scores.items() if _same(found.log_evidence, own))
+            if scores[best].log_evidence <= SAME_EVIDENCE:
                 break
-            total += scores[best].log_evidence
-            if total >= enough:
-                return True
+            total += scores[best].log_evidence - (PRICE if others else 0.0)
+            others.append(best)
+            if total > own + SAME_EVIDENCE:
+                break
             s, g, yy = _add(s, g, yy, w.dof, left.pop(best), scores[best])
-        return total >= enough
+        return Alternative(effect, own, same, tuple(others), total)
+
+
+def _same(one: float, other: float) -> bool:
+    return min(one, other) > SAME_EVIDENCE and abs(one - other) < SAME_EVIDENCE
 
 
 def _add(

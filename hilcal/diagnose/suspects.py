@@ -10,6 +10,7 @@ from hilcal.diagnose.sensitivity import Strength, least_strength
 from hilcal.effects.catalogue import catalogue, make
 from hilcal.effects.options import reading_options
 from hilcal.effects.protocol import Effect
+from hilcal.identify.fit import Fit
 from hilcal.types import Floats
 
 SAME_EVIDENCE = 3.0
@@ -56,9 +57,8 @@ class Family:
     motion: Floats
 
 
-def candidates(p: Projection) -> tuple[Effect, ...]:
+def candidates(fit: Fit) -> tuple[Effect, ...]:
     """Effects that are not in the model and can be computed from these readings."""
-    fit = p.fit
     states = fit.readings[~fit.outlier].states
     out = []
     for name, kind in catalogue().items():
@@ -68,10 +68,9 @@ def candidates(p: Projection) -> tuple[Effect, ...]:
     return tuple(out)
 
 
-def family(p: Projection, effect: Effect) -> Family:
+def family(fit: Fit, effect: Effect) -> Family:
     """Return the columns of an effect, at the parameters of the fit."""
-    fit, w = p.fit, p.fit.whitening
-    s = fit.solution
+    s, w = fit.solution, fit.whitening
     jacobian = fit.model.jacobian_of((effect,), s.prediction, s.theta, w.m)
     scale = np.array([q.scale for q in effect.parameters])
     raw = w.raw(jacobian * scale)
@@ -88,7 +87,7 @@ def rank_suspects(
         effects: that are not in the model.
         level: of the test over all of them together.
     """
-    found = [_suspect(p, family(p, e), level / len(effects)) for e in effects]
+    found = [_suspect(p, family(p.fit, e), level / len(effects)) for e in effects]
     found.sort(key=lambda s: (-s.score.log_evidence, s.score.p_value))
     return tuple(
         replace(

@@ -66,7 +66,7 @@ def diagnose(fit: Fit) -> Diagnosis:
     if fit.scaling != "gc":
         raise InputError(f"diagnosis needs scaling gc, this fit has {fit.scaling}")
     p = projection(fit)
-    effects = candidates(p)
+    effects = candidates(p.fit)
     suspects = rank_suspects(p, effects, FALSE_ALARM)
     places = where(p)
     repeats = pure_error(fit)

@@ -8,6 +8,9 @@ space:
 
     Var(θ_p) = (G − 1)/G Σ_g (θ_p without g − mean)²
 
+Parameters of shrunk families are less certain by what is not known of their strength; see
+`strength_spread`.
+
 Source: Efron and Tibshirani, *An Introduction to the Bootstrap*, chapter 11.
 """
 
@@ -18,9 +21,10 @@ from scipy.stats import chi2
 
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Whitening
-from hilcal.identify.gauss_newton import Solution, scales_of
+from hilcal.identify.gauss_newton import Solution, prior_of, scales_of
 from hilcal.identify.holdout import leave_out
 from hilcal.identify.poses import block_folds, region_folds
+from hilcal.identify.strength_spread import widened
 from hilcal.model import Model
 from hilcal.types import Bools, Floats, Ints
 
@@ -67,7 +71,8 @@ def uncertainty(
     basis = solution.equations.basis
     scale = scales_of(model)
     spread = solution.equations.inverse(solution.beta)
-    variance = np.einsum("pk,kl,pl->p", basis.transform, spread, basis.transform)
+    covariance = basis.transform @ spread @ basis.transform.T
+    variance = np.diag(covariance)
     noise = solution.beta if w.scaling == "none" else 1.0
     formal = np.sqrt(np.maximum(variance, 0.0) * noise)
     misfit = w.scaling != "none" and bool(chi2.sf(total, dof) < MISFIT_CHANCE)
@@ -82,6 +87,9 @@ def uncertainty(
             jackknife = np.sqrt((count - 1) / count * np.sum(away**2, axis=0))
             std = np.maximum(std, jackknife)
     identifiable = _identifiable(solution, scale, std)
+    std = std * widened(
+        solution.beta * covariance, solution.theta, solution.prior, prior_of(model)[1]
+    )
     return Uncertainty(
         np.where(identifiable, std, np.inf),
         formal,

@@ -243,7 +243,7 @@ def regressor(fit: Fit, suspect: Suspect) -> Regressor | None:
     the c spread most. Where the suspect is right the points lie on the line of slope 1.
     """
     p = projection(fit)
-    effect = next((e for e in candidates(p) if e.name == suspect.effect), None)
+    effect = next((e for e in candidates(p.fit) if e.name == suspect.effect), None)
     if effect is None or not len(suspect.score.step):
         return None
     w, s = fit.whitening, fit.solution

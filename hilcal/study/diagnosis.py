@@ -82,8 +82,9 @@ class Sample:
 Simulate = Callable[[Asked], Sample]
 """Simulate a campaign; equal questions give equal campaigns."""
 
-More = Callable[[Asked, Diagnosis], Readings]
-"""Measure what separates the suspects of a diagnosis: all readings, the earlier ones first."""
+More = Callable[[Asked, Diagnosis], Readings | None]
+"""Measure what separates the suspects of a diagnosis: all readings, the earlier ones first; None
+where nothing is in doubt or to be had."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,9 +226,11 @@ def _run(asked: Asked, sample: Sample, more: More | None, refined: bool) -> Outc
         diagnosis, result = diagnose(fit(model, sample.readings, asked.mode)), None
     again = None
     if more is not None and asked.again:
-        readings = more(asked, diagnosis)
-        later = baseline(sample.cell, readings, asked.mode)
-        again = judgement(diagnose(fit(later, readings, asked.mode)))
+        readings, later = more(asked, diagnosis), diagnosis
+        if readings is not None:
+            known = baseline(sample.cell, readings, asked.mode)
+            later = diagnose(fit(known, readings, asked.mode))
+        again = judgement(later)
     return Outcome(asked, judgement(diagnosis), result, again, sample.variables)
 
 
