@@ -52,7 +52,6 @@ class Program:
         n, size, p = self.rows.shape
         flat = self.rows.reshape(-1, p)
         out = np.zeros((n, n))
-        plain = [(c, x, y) for c, x, y in smooth.products if x.ndim == 2]
         thin = [(c, x, y) for c, x, y in smooth.products if x.ndim == 1]
         if thin:  # tr(x xᵀ H_k Y H_l) = (H_k x)ᵀ Y H_l x
             seen = (flat @ np.stack([x for _, x, _ in thin], axis=1)).reshape(n, size, -1)
@@ -60,19 +59,50 @@ class Program:
             for k, (c, _, y) in enumerate(thin):
                 v = moved[:, k]
                 out -= c * (v @ y @ v.T)
-        if size * size <= p:  # by the rows
-            for c, x, y in plain:
-                left = flat @ x @ flat.T
-                left *= left if y is x else flat @ y @ flat.T
-                out -= c * left.reshape(n, size, n, size).sum(axis=3).sum(axis=1)
-        elif plain:  # by the matrices
-            h = np.matmul(self.rows.transpose(0, 2, 1), self.rows)
-            for c, x, y in plain:
-                out -= c * (h.reshape(n, -1) @ (x @ h @ y).reshape(n, -1).T)
+        for c, x, y in smooth.products:
+            if x.ndim == 2:
+                out -= c * _product(self.rows, x, y)
         for c, v in smooth.squares:
             price = prices(self.rows, v)
             out -= c * np.outer(price, price)
         return np.asarray(0.5 * (out + out.T))
+
+
+def _product(rows: Floats, x: Floats, y: Floats) -> Floats:
+    """Return (n, n) tr(X H_k Y H_l) of (n, R, P) rows, for semidefinite X and Y (P, P)."""
+    n, size = rows.shape[:2]
+    flat = rows.reshape(n * size, -1)
+    left = flat @ _root(x)
+    right = left if y is x else flat @ _root(y)
+    if 2 * size * size <= min(left.shape[1], right.shape[1]):  # by the rows
+        seen = left @ left.T
+        seen *= seen if y is x else right @ right.T
+        return np.asarray(seen.reshape(n, size, n, size).sum(axis=3).sum(axis=1))
+    # By the matrices T_k = L_xᵀ H_k L_y: the sum of T_k ∘ T_l.
+    t = np.matmul(left.reshape(n, size, -1).transpose(0, 2, 1), right.reshape(n, size, -1))
+    if y is x:  # symmetric: half of each does
+        up, across = np.triu_indices(t.shape[1])
+        half = t[:, up, across] * np.where(up == across, 1.0, np.sqrt(2.0))
+        return _gram(half)
+    return _gram(t.reshape(n, -1))
+
+
+def _gram(t: Floats) -> Floats:
+    """Return T Tᵀ (n, n)."""
+    upper = np.asarray(sl.blas.dsyrk(1.0, t.T, trans=1))
+    return upper + np.triu(upper, 1).T
+
+
+def _root(x: Floats) -> Floats:
+    """Return L (P, r) of a semidefinite X = L Lᵀ."""
+    size = np.sqrt(np.diag(x))
+    there = np.flatnonzero(size > 0.0)
+    unit = x[np.ix_(there, there)] / np.outer(size[there], size[there])
+    values, vectors = np.linalg.eigh(unit)
+    kept = values > 1e-15 * float(values.max(initial=0.0))
+    root = np.zeros((len(x), int(kept.sum())))
+    root[there] = size[there, None] * vectors[:, kept] * np.sqrt(values[kept])
+    return root
 
 
 @dataclass(frozen=True, slots=True, eq=False)
