@@ -11,10 +11,10 @@ from scipy.stats import ncf
 from drivers.simulated.hidden import hide
 from hilcal.diagnose.needless import CHANCE, needless
 from hilcal.diagnose.projection import projection
-from hilcal.diagnose.revise import add, remove
-from hilcal.diagnose.rivals import Rivals
+from hilcal.diagnose.revise import add, exchange, remove
+from hilcal.diagnose.rivals import PRICE, Alternative, Rivals
 from hilcal.diagnose.sensitivity import POWER, least_strength, noncentrality
-from hilcal.diagnose.suspects import candidates, family
+from hilcal.diagnose.suspects import candidates, family, rank_suspects
 from hilcal.diagnose.verdict import diagnose
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
@@ -99,14 +99,19 @@ def test_a_wrong_choice_is_exchanged_for_the_right_one():
     assert last.diagnosis.verdict == "adequate"
 
 
-def test_a_large_family_that_took_the_part_of_two_effects_is_exchanged_for_them():
+def _two_in_the_guise_of_one() -> _Work:
+    """Two hidden effects, and the large family that stands for both of them."""
     c = campaign("encoder_offset", "absolute", 2, poses=30)
     cell, p = c.cell, plan(30, 1002)
     rng = np.random.default_rng(2)
     world = world_of(cell, rng)
     for effect in ("encoder_offset", "tracker_drift"):
         world = hide(effect, cell, p.states, 3.0, "absolute", rng, world=world)
-    w = work(replace(c, world=world, readings=measured(world, p, rng)), "link_geometry")
+    return work(replace(c, world=world, readings=measured(world, p, rng)), "link_geometry")
+
+
+def test_a_large_family_that_took_the_part_of_two_effects_is_exchanged_for_them():
+    w = _two_in_the_guise_of_one()
     w.extend()
     while w.reconsider([]):
         w.extend()
@@ -128,6 +133,61 @@ def test_an_effect_that_is_not_there_cannot_be_removed():
     c = campaign(NOTHING, "absolute", 1)
     with pytest.raises(InputError, match="hysteresis is not in the model"):
         remove(fitted(c), "hysteresis")
+
+
+@pytest.mark.parametrize("mode", ["absolute", "deflection"])
+def test_algebra_tells_what_a_refit_would_of_an_effect_and_of_others_in_its_place(mode):
+    c = campaign("hysteresis", mode, 4, poses=20, registration_known=True)
+    full = fitted(c, "hysteresis")
+    without = remove(full, "hysteresis")
+    p = projection(without)
+    scores = {s.effect: s.score for s in rank_suspects(p, candidates(without))}
+    other = Rivals(full).of("hysteresis")
+    own = scores.pop("hysteresis").log_evidence
+    assert own > 30.0
+    assert other.own == pytest.approx(own, rel=0.03)
+    assert own > max(found.log_evidence for found in scores.values()) + 30.0
+    assert not other.better
+    assert not other.as_good
+
+
+def test_effects_added_by_algebra_explain_what_they_do_in_a_fit():
+    """Evidence of a chain against that of adding its effects one by one, each refitted."""
+    full = _two_in_the_guise_of_one().steps[-1].fit
+    other = Rivals(full).of("link_geometry")
+    assert {*other.others} == {"encoder_offset", "tracker_drift"}
+    assert other.better
+    current, total = remove(full, "link_geometry"), 0.0
+    for name in other.others:
+        p = projection(current)
+        (found,) = (s for s in rank_suspects(p, candidates(current)) if s.effect == name)
+        total += found.score.log_evidence
+        current = add(current, name)
+    total -= PRICE * (len(other.others) - 1)
+    assert other.log_evidence == pytest.approx(total, rel=0.05)
+
+
+def test_while_something_is_unknown_others_must_be_far_better():
+    c = campaign(NOTHING, "deflection", 1)
+    w = work(c)
+    last = w.steps[-1]
+    assert last.diagnosis.verdict == "adequate"
+    close = Alternative("hysteresis", 200.0, (), ("backlash",), 210.0)
+    far = replace(close, log_evidence=230.0)
+    assert w._better(last, close)
+    assert w._better(last, far)
+    unknown = replace(last, diagnosis=replace(last.diagnosis, verdict="unknown_effect"))
+    assert not w._better(unknown, close)
+    assert w._better(unknown, far)
+    assert not w._better(last, replace(close, log_evidence=201.0))
+
+
+def test_an_exchange_needs_an_effect_that_is_there_and_one_that_is_not():
+    found = fitted(campaign(NOTHING, "deflection", 1), "backlash")
+    with pytest.raises(InputError, match="hysteresis is not in the model"):
+        exchange(found, "hysteresis", "base_compliance")
+    with pytest.raises(InputError, match="joint_compliance is in the model already"):
+        exchange(found, "backlash", "joint_compliance")
 
 
 # --- what could have been seen --------------------------------------------------------------

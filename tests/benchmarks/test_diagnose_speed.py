@@ -47,7 +47,7 @@ def fitted(readings: int, mode: Mode) -> Fit:
 
 def largest(found: Fit) -> Model:
     """The baseline and the suspect with most parameters."""
-    names = {e.name: len(e.parameters) for e in candidates(projection(found))}
+    names = {e.name: len(e.parameters) for e in candidates(found)}
     name = max(names, key=lambda n: names[n])
     states = found.readings.states
     options = reading_options(name, found.readings.m)
@@ -57,7 +57,7 @@ def largest(found: Fit) -> Model:
 def score(found: Fit) -> tuple[Suspect, ...]:
     """Score every suspect of the catalogue."""
     p = projection(found)
-    return rank_suspects(p, candidates(p))
+    return rank_suspects(p, candidates(found))
 
 
 @pytest.mark.parametrize("mode", ["absolute", "deflection"])
