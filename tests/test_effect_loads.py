@@ -131,7 +131,7 @@ def test_a_gain_that_no_sensor_has_is_said_in_words():
     cell = CELLS["ur10e"]
     states = some_states(cell)
     model = soft(cell, states, "wrench_gain")
-    with pytest.raises(CannotAnswerError, match=r"wrench_gain: a gain error of -120%") as caught:
+    with pytest.raises(CannotAnswerError, match=r"wrench_gain: a gain error of -120 %") as caught:
         position(model, states, joints(cell), np.array([0, 0, -1.2, 0, 0, 0]))
     assert "\n" not in str(caught.value)
 

@@ -257,11 +257,11 @@ def test_a_load_is_right_within_newtons_or_its_share(size, share, off):
         (WEIGHT, 0.01 * WEIGHT, "asked for 10 kg (98.1 N), felt 1.0 N: that is about nothing"),
         (0 * WEIGHT, WEIGHT / 2, "asked for nothing, felt 49.0 N: about 5.0 kg still hangs"),
         (0 * WEIGHT, PULL, "asked for nothing, felt 50.0 N: something still pulls"),
-        (PULL, 0.8 * PULL, "asked for 50.0 N, felt 40.0 N: that is 80% of it, 0° off its"),
+        (PULL, 0.8 * PULL, "asked for 50.0 N, felt 40.0 N: that is 80 % of it, 0° off its"),
         (
             PULL,
             np.array([0.0, 50.0, 0.0, 0.0, 0.0, 0.0]),
-            "asked for 50.0 N, felt 50.0 N: that is 100% of it, 90° off its direction",
+            "asked for 50.0 N, felt 50.0 N: that is 100 % of it, 90° off its direction",
         ),
         (WEIGHT, np.full(6, np.nan), "asked for 10 kg (98.1 N), felt nan N: the sensor gives no"),
     ],
@@ -291,4 +291,4 @@ def test_a_pure_moment_is_judged_by_its_moment():
     assert compare(expected, expected, STD / 10, 3.0, 0.05)[0]
     right, text = compare(expected, 0.5 * expected, STD / 10, 3.0, 0.05)
     assert not right
-    assert text == "asked for 10.0 N·m, felt 5.0 N·m: that is 50% of it, 0° off its direction"
+    assert text == "asked for 10.0 N·m, felt 5.0 N·m: that is 50 % of it, 0° off its direction"

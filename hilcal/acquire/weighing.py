@@ -76,7 +76,7 @@ def _found(e: Floats, f: Floats, limit: float, unit: str, gravity: Floats) -> st
     if weighed and _mass(e, gravity) is not None:
         return f"that is {kilograms}"
     angle = np.degrees(np.arccos(np.clip(e @ f / (asked * felt), -1.0, 1.0)))
-    return f"that is {felt / asked:.0%} of it, {angle:.0f}° off its direction"
+    return f"that is {100 * felt / asked:.0f} % of it, {angle:.0f}° off its direction"
 
 
 def _mass(force: Floats, gravity: Floats) -> float | None:

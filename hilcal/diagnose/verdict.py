@@ -106,8 +106,8 @@ def diagnose(fit: Fit) -> Diagnosis:
 def _named(lead: Suspect, rivals: tuple[Apart, ...]) -> tuple[Verdict, str]:
     """Return the verdict where an effect of the catalogue is missing."""
     explains = (
-        f"explains {lead.share:.0%} of the misfit, {max(lead.holdout_share, 0):.0%} on poses "
-        f"left out (p = {lead.score.p_value:.1g})"
+        f"explains {100 * lead.share:.0f} % of the misfit, "
+        f"{100 * max(lead.holdout_share, 0):.0f} % on poses left out (p = {lead.score.p_value:.1g})"
     )
     if not rivals:
         return "missing_effect", f"{lead.effect} is missing: it {explains}"
@@ -144,14 +144,14 @@ def _judge(
     carry = [v.variable for v in told.carriers if v.share >= LEAST_SHARE]
     named = (carry or [v.variable for v in follow if v.share >= LEAST_SHARE])[:2]
     follows = f"; it follows {' and '.join(named)}" if named else ""
-    none = f"no effect of the catalogue explains {LEAST_SHARE:.0%} of it or more"
+    none = f"no effect of the catalogue explains {100 * LEAST_SHARE:.0f} % of it or more"
     if unsure:
         best = unsure[0]
         none = (
-            f"the best effect of the catalogue, {best.effect}, explains {best.share:.0%} of it, "
-            "but does not surely lower the error on poses left out"
+            f"the best effect of the catalogue, {best.effect}, explains {100 * best.share:.0f} % "
+            "of it, but does not surely lower the error on poses left out"
         )
     return "unknown_effect", (
-        f"Residuals are {spread}, a generic learner predicts {told.share:.0%} of the misfit, and "
-        f"{none}{follows}{noise.message}"
+        f"Residuals are {spread}, a generic learner predicts {100 * told.share:.0f} % of the "
+        f"misfit, and {none}{follows}{noise.message}"
     )

@@ -96,7 +96,7 @@ def _elastic_problem(effect: Effect, theta: Floats, s: Situation) -> str | None:
         if off > AGREES:
             return (
                 f"response is not the derivative of columns by the wrenches: {key} is off by "
-                f"{off:.1%} of its largest value"
+                f"{100 * off:.1f} % of its largest value"
             )
     return None
 
@@ -112,7 +112,7 @@ def _load_problem(effect: Effect, theta: Floats, s: Situation) -> str | None:
     if off > AGREES:
         return (
             "wrench_columns is not the derivative of the wrenches by the parameters: off by "
-            f"{off:.1%} of its largest value"
+            f"{100 * off:.1f} % of its largest value"
         )
     return None
 

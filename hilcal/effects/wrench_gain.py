@@ -39,8 +39,8 @@ class WrenchGain(ForceSensorEffect):
         """
         if np.any(theta <= -1):
             raise CannotAnswerError(
-                f"{self.name}: a gain error of {theta.min():.0%} turns the wrench round; measure "
-                "loads in more directions, or leave the effect out"
+                f"{self.name}: a gain error of {100 * theta.min():.0f} % turns the wrench round; "
+                "measure loads in more directions, or leave the effect out"
             )
         return np.asarray(said * (theta / (1 + theta)))
 

@@ -80,7 +80,7 @@ def story(
 def remarks(made: Planned) -> tuple[str, ...]:
     """Return what people should know of a plan."""
     left = tuple(
-        f'load "{name}" is not hung: the same time tells {gain:.0%} more without it'
+        f'load "{name}" is not hung: the same time tells {100 * gain:.0f} % more without it'
         for name, gain in made.loads.left_out
     )
     return tuple(dict.fromkeys((*made.drawn.remarks, *made.problem.notes, *left)))

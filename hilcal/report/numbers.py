@@ -59,7 +59,7 @@ def with_std(value: float, std: float) -> tuple[str, str]:
 
 def percent(share: float) -> str:
     """Write a share in percent."""
-    return f"{share:.0%}"
+    return f"{100 * share:.0f} %"
 
 
 def chance(p: float) -> str:

@@ -103,7 +103,7 @@ def _readings(study: PlansStudy) -> Table:
 
 def _needed(study: PlansStudy, needs: int | None) -> tuple[str, str]:
     """Readings of random plans, and the plan's share of them."""
-    return ("-", "-") if needs is None else (f"{needs}", f"{study.readings / needs:.0%}")
+    return ("-", "-") if needs is None else (f"{needs}", f"{100 * study.readings / needs:.0f} %")
 
 
 def as_predicted(ratio: Measured) -> str:
