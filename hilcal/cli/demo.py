@@ -11,7 +11,7 @@ from drivers.simulated.rehearsal import NOTHING, RANDOM, Rehearsal, check_choice
 from hilcal.cli.doubting import FIRST, STRENGTH, Doubted, doubted, in_doubt
 from hilcal.cli.effects_from import EffectsFrom
 from hilcal.cli.files import check_record, record_of, record_story
-from hilcal.cli.planning import POSES
+from hilcal.cli.plan_output import POSES
 from hilcal.cli.refining import Row, revisions_json
 from hilcal.cli.rehearsing import Told, first_plan, in_process, on_devices
 from hilcal.cli.terminal import Json, Record, Terminal, terminal

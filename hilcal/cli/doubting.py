@@ -7,7 +7,7 @@ import numpy as np
 from drivers.simulated.rehearsal import Rehearsal
 from hilcal.acquire.dry_run import dry_run
 from hilcal.cli.next import MOST, plan_of, separates
-from hilcal.cli.planning import refuse
+from hilcal.cli.plan_output import refuse
 from hilcal.cli.terminal import Terminal
 from hilcal.data.plan import REFERENCE, Plan
 from hilcal.data.records import content_hash

@@ -4,16 +4,24 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 
-from hilcal.acquire.dry_run import dry_run
 from hilcal.cli.effects_from import EffectsFrom
 from hilcal.cli.files import Opened, check_record, effect_names, open_run
-from hilcal.cli.planning import POSES, plan_json, read_cell, refuse
+from hilcal.cli.plan_output import (
+    POSES,
+    Csv,
+    Output,
+    Poses,
+    Quick,
+    Seed,
+    checked,
+    generator,
+    write,
+)
+from hilcal.cli.planning import plan_json, read_cell
 from hilcal.cli.terminal import Json, Record, Run, Terminal, terminal
 from hilcal.data.plan import REFERENCE, Plan, read_plan
-from hilcal.data.plan_csv import plan_csv
 from hilcal.data.run_log import PLAN
 from hilcal.diagnose.revise import remove
 from hilcal.diagnose.verdict import diagnose
@@ -42,13 +50,8 @@ class Doubt:
 
 def next_(
     run: Run,
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="PLAN", help="The plan file to make.")
-    ],
-    poses: Annotated[
-        int,
-        typer.Option("--poses", help="As many readings as so many poses take under every load."),
-    ] = POSES,
+    output: Output,
+    poses: Poses = POSES,
     suspects: Annotated[
         str | None,
         typer.Option("--suspects", metavar="A,B", help="Tell these apart, whatever is diagnosed."),
@@ -57,13 +60,9 @@ def next_(
         Path | None,
         typer.Option("--cell", metavar="CELL.toml", help="The cell, where it has other loads now."),
     ] = None,
-    seed: Annotated[int, typer.Option("--seed", help="Of the random candidates.")] = 0,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Without comparing criteria and numbers of poses.")
-    ] = False,
-    csv: Annotated[
-        Path | None, typer.Option("--csv", metavar="F.csv", help="The plan as a table, too.")
-    ] = None,
+    seed: Seed = 0,
+    quick: Quick = False,
+    csv: Csv = None,
     record: Record = None,
     effects_from: EffectsFrom = None,
     as_json: Json = False,
@@ -71,11 +70,9 @@ def next_(
     """Plan the measurements that separate the leading suspects; exit 4 where there is no doubt."""
     t = terminal(as_json)
     check_record(record)
-    if seed < 0:
-        raise InputError(f"--seed {seed}; valid: a whole number, 0 or more")
+    rng = generator(seed)
     if poses < 1:
         raise InputError(f"--poses {poses}; valid: a whole number from 1")
-    rng = np.random.default_rng(seed)
     with open_run(run) as o, working(t.progress) as say:
         config, numbers = (o.config, o.cell) if cell is None else read_cell(cell)
         doubt = doubt_of(t, o, _named(suspects), say)
@@ -84,29 +81,17 @@ def next_(
             numbers, config, doubt.fit, doubt.suspects, Request(poses), rng, say, place
         )
         told = story(found.planned, config, rng, say, compare=not quick)
-        made = plan_of(found, doubt.suspects)
         say("going through it in thought")
-        dry = dry_run(numbers, config, made)
-    refuse(dry, "the plan")
-    told = replace(told, remarks=tuple(dict.fromkeys((*dry.remarks, *told.remarks))))
-    _write(output, made.to_json() + "\n")
-    if csv is not None:
-        pulls = {load.name: load.wrench(numbers.gravity) for load in config.loads}
-        _write(csv, plan_csv(made, pulls))
-    if record is not None:
-        from hilcal.report.viewer.plan_stream import record_plan  # loads the viewer, which lasts
-
-        with working(t.progress) as say:
-            say(f"recording {record}")
-            record_plan(numbers, config, made, told, record)
+        made = checked(numbers, config, plan_of(found, doubt.suspects), told)
+    write(t, numbers, config, made, output, csv, record)
     t.show(f"In doubt: {words_of.names(doubt.suspects, 'or')}.\n")
-    t.show(next_report(found, told.poses, told.readings))
-    t.show(story_report(told))
+    t.show(next_report(found, made.told.poses, made.told.readings))
+    t.show(story_report(made.told))
     t.show(f"The plan is in {output}. Measure it into the same campaign with:")
     t.show(f"  hilcal run {cell or 'CELL.toml'} -o {run} --append --plan {output}")
     t.document(
         {
-            **plan_json(made, dry, told),
+            **plan_json(made),
             "plan": str(output),
             "suspects": list(doubt.suspects),
             **separates(found),
@@ -213,10 +198,3 @@ def _named(text: str | None) -> tuple[str, ...] | None:
     if not 2 <= len(names) <= MOST:
         raise InputError(f"--suspects has {len(names)} names; valid: 2 to {MOST}")
     return names
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror})") from None

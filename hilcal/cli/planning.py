@@ -4,29 +4,37 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
-import numpy as np
 import typer
 
 from hilcal.acquire.connect import Answer, connect
-from hilcal.acquire.dry_run import DryRun, dry_run
+from hilcal.acquire.dry_run import dry_run
 from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.effects_from import EffectsFrom
 from hilcal.cli.files import check_record, open_run
+from hilcal.cli.plan_output import (
+    POSES,
+    Csv,
+    Made,
+    Output,
+    Poses,
+    Quick,
+    Seed,
+    checked,
+    generator,
+    refuse,
+    write,
+)
 from hilcal.cli.terminal import Json, Record, Terminal, terminal
 from hilcal.config import CellConfig, load_config
 from hilcal.data.plan import Plan, load_plan
-from hilcal.data.plan_csv import plan_csv
 from hilcal.errors import DeviceError, InputError
 from hilcal.identify.fit import Fit
 from hilcal.plan.choice import CRITERIA
 from hilcal.plan.planner import Request, make
-from hilcal.plan.story import PlanStory
 from hilcal.plan.tell import about, remarks, story
 from hilcal.report import text_run
 from hilcal.report.progress import Say, working
 from hilcal.report.text_plan import story_report
-
-POSES = 20
 
 CellFile = Annotated[Path, typer.Argument(metavar="CELL.toml", help="The cell.")]
 PlanFile = Annotated[
@@ -36,13 +44,8 @@ PlanFile = Annotated[
 
 def plan(
     cell: CellFile,
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="PLAN", help="The plan file to make.")
-    ],
-    poses: Annotated[
-        int,
-        typer.Option("--poses", help="As many readings as so many poses take under every load."),
-    ] = POSES,
+    output: Output,
+    poses: Poses = POSES,
     readings: Annotated[
         int | None, typer.Option("--readings", help="Or so many readings, repeats not counted.")
     ] = None,
@@ -54,7 +57,7 @@ def plan(
         Path | None,
         typer.Option("--after", metavar="RUN.hilcal", help="Plan on from what it knows already."),
     ] = None,
-    seed: Annotated[int, typer.Option("--seed", help="Of the random candidates.")] = 0,
+    seed: Seed = 0,
     unloaded_first: Annotated[
         bool,
         typer.Option(
@@ -62,12 +65,8 @@ def plan(
             help="All unloaded readings before the loads: for run --until; a drift costs more.",
         ),
     ] = False,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Without comparing criteria and numbers of poses.")
-    ] = False,
-    csv: Annotated[
-        Path | None, typer.Option("--csv", metavar="F.csv", help="The plan as a table, too.")
-    ] = None,
+    quick: Quick = False,
+    csv: Csv = None,
     record: Record = None,
     effects_from: EffectsFrom = None,
     as_json: Json = False,
@@ -80,27 +79,16 @@ def plan(
     wanted = Request(poses, readings, _criterion(criterion), unloaded=unloaded)
     with working(t.progress) as say:
         known = None if after is None else _known(t, after, say)
-        rng = _generator(seed)
+        rng = generator(seed)
         chosen = make(numbers, config, wanted, rng, known, say)
-        made = replace(chosen.ordered.plan, about=about(chosen))
+        plan_ = replace(chosen.ordered.plan, about=about(chosen))
         told = story(chosen, config, rng, say, compare=not quick)
         say("going through it in thought")
-        dry = dry_run(numbers, config, made)
-    refuse(dry, "the plan")
-    told = replace(told, remarks=tuple(dict.fromkeys((*dry.remarks, *told.remarks))))
-    _write(output, made.to_json() + "\n")
-    if csv is not None:
-        pulls = {load.name: load.wrench(numbers.gravity) for load in config.loads}
-        _write(csv, plan_csv(made, pulls))
-    if record is not None:
-        from hilcal.report.viewer.plan_stream import record_plan  # loads the viewer, which lasts
-
-        with working(t.progress) as say:
-            say(f"recording {record}")
-            record_plan(numbers, config, made, told, record)
-    t.show(story_report(told))
+        made = checked(numbers, config, plan_, told)
+    write(t, numbers, config, made, output, csv, record)
+    t.show(story_report(made.told))
     t.show(f"The plan is in {output}: a file that you may edit. Every limit was checked.")
-    t.document({**plan_json(made, dry, told), "plan": str(output)})
+    t.document({**plan_json(made), "plan": str(output)})
 
 
 def _criterion(name: str | None) -> str | None:
@@ -118,13 +106,6 @@ def _known(t: Terminal, path: Path, say: Say) -> Fit:
     """Return the newest fit of a campaign."""
     with open_run(path) as run:
         return run.latest_fit(t, say)[1]
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
 
 
 def check(cell: CellFile, plan: PlanFile = None, as_json: Json = False) -> None:
@@ -164,30 +145,13 @@ def make_plan(
     cell: Cell, config: CellConfig, poses: int, seed: int, say: Say = lambda words: None
 ) -> Plan:
     """Return a plan of as many readings as so many poses take under every load of the cell."""
-    chosen = make(cell, config, Request(poses), _generator(seed), None, say)
+    chosen = make(cell, config, Request(poses), generator(seed), None, say)
     return replace(chosen.ordered.plan, about={**about(chosen), "remarks": list(remarks(chosen))})
 
 
-def _generator(seed: int) -> np.random.Generator:
-    if seed < 0:
-        raise InputError(f"--seed {seed}; valid: a whole number, 0 or more")
-    return np.random.default_rng(seed)
-
-
-def refuse(dry: DryRun, what: str) -> None:
-    """Refuse a plan that did not pass.
-
-    Raises:
-        InputError: says the first problem, and how many more there are.
-    """
-    if dry.problems:
-        more = len(dry.problems) - 1
-        others = f" (and {more} more: hilcal check --plan shows all)" if more else ""
-        raise InputError(f"{what} cannot be run: {dry.problems[0]}{others}")
-
-
-def plan_json(made: Plan, dry: DryRun, told: PlanStory) -> dict[str, object]:
+def plan_json(made: Made) -> dict[str, object]:
     """Return what the JSON document says of a plan."""
+    told, dry = made.told, made.dry
     known = asdict(told)
     return {
         "poses": told.poses,
@@ -196,7 +160,7 @@ def plan_json(made: Plan, dry: DryRun, told: PlanStory) -> dict[str, object]:
         "efficiency": told.efficiency,
         "predicted_std": {p.name: p.std for p in told.predicted},
         "position_std_m": told.position_std_m,
-        "loads": list(made.loads),
+        "loads": list(made.plan.loads),
         "readings_by_load": told.loads,
         "load_changes": dry.load_changes,
         "motions": dry.motions,

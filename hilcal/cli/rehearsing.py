@@ -13,7 +13,8 @@ from drivers.simulated.rehearsal import Rehearsal, Secret, as_told
 from hilcal.acquire.dry_run import dry_run
 from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.files import COVARIANCE, INSTRUMENT
-from hilcal.cli.planning import make_plan, refuse
+from hilcal.cli.plan_output import refuse
+from hilcal.cli.planning import make_plan
 from hilcal.cli.running import create, measure
 from hilcal.cli.terminal import Terminal
 from hilcal.config import CellConfig

@@ -22,14 +22,13 @@ from hilcal.cell import Cell
 from hilcal.cli.effects_from import EffectsFrom
 from hilcal.cli.files import COVARIANCE, INSTRUMENT
 from hilcal.cli.live import LiveModel
+from hilcal.cli.plan_output import POSES, refuse
 from hilcal.cli.planning import (
-    POSES,
     CellFile,
     PlanFile,
     answer_json,
     make_plan,
     read_cell,
-    refuse,
     refuse_unready,
 )
 from hilcal.cli.terminal import Json, Terminal, terminal

@@ -11,7 +11,8 @@ import typer
 from drivers.simulated.on_the_wire import secret_of, simulated_cell
 from drivers.simulated.rehearsal import NOTHING
 from hilcal.cli.effects_from import EffectsFrom
-from hilcal.cli.planning import POSES, CellFile, PlanFile, make_plan, read_cell
+from hilcal.cli.plan_output import POSES
+from hilcal.cli.planning import CellFile, PlanFile, make_plan, read_cell
 from hilcal.cli.terminal import terminal
 from hilcal.config import CellConfig
 from hilcal.config.write import to_toml
