@@ -15,14 +15,8 @@ Capsys = pytest.CaptureFixture[str]
 FAST = "--without-devices"
 
 
-@pytest.mark.parametrize(
-    "effect",
-    [
-        "hysteresis",
-        pytest.param("encoder_offset", marks=pytest.mark.slow),
-        pytest.param("base_frame", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("effect", ["hysteresis", "encoder_offset", "base_frame"])
 def test_the_hidden_effect_is_found(effect: str, tmp_path: Path, capsys: Capsys) -> None:
     path = tmp_path / "demo.hilcal"
     result = ok(capsys, "demo", FAST, "--hide", effect, "--seed", "1", "-o", path, "--json")

@@ -44,7 +44,7 @@ def work(c: Campaign, *effects: str) -> _Work:
 @pytest.mark.parametrize(
     ("mode", "effects"),
     [
-        ("deflection", ("backlash", "joint_tilt_compliance")),
+        pytest.param("deflection", ("backlash", "joint_tilt_compliance"), marks=pytest.mark.slow),
         ("absolute", ("hysteresis", "encoder_offset")),
     ],
 )

@@ -24,6 +24,7 @@ from hilcal.cli.terminal import Json, Record, Run, Terminal, terminal
 from hilcal.data.plan import REFERENCE, Plan, read_plan
 from hilcal.data.run_log import PLAN
 from hilcal.diagnose.revise import remove
+from hilcal.diagnose.rivals import Rivals
 from hilcal.diagnose.verdict import diagnose
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.fit import Fit
@@ -150,13 +151,13 @@ def doubt_of(t: Terminal, o: Opened, named: tuple[str, ...] | None, say: Say) ->
             f"hilcal add {o.path} {leading[0].effect}"
         )
     added = {r.added for r in chain(o.campaign.revisions())}
-    for name in newest.model.names:
-        if name in added:
-            say(f"reconsidering {name}")
-            without = remove(newest, name)
-            own = next(s for s in diagnose(without).suspects if s.effect == name)
-            if own.same_as:
-                return Doubt(without, (name, *own.same_as)[:MOST])
+    if doubtful := [name for name in newest.model.names if name in added]:
+        say(f"reconsidering {', '.join(doubtful)}")
+        others = Rivals(newest)
+        for name in doubtful:
+            if same := others.of(name).same_as:
+                say(f"fitting without {name}")
+                return Doubt(remove(newest, name), (name, *same)[:MOST])
     raise CannotAnswerError(_settled(o, d.verdict))
 
 
