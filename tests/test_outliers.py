@@ -7,12 +7,15 @@ import pytest
 from campaigns import Campaign, campaign, noiseless, plan, with_noise
 from scipy.stats import poisson
 
+from drivers.simulated.study_cases import study_case
+from hilcal.config import load_config
 from hilcal.data.readings import Readings
 from hilcal.diagnose.verdict import diagnose
 from hilcal.identify.baseline import baseline
 from hilcal.identify.document import outliers
 from hilcal.identify.fit import fit
-from hilcal.identify.outliers import FALSE_ALARMS, find_outliers
+from hilcal.identify.outliers import FALSE_ALARMS, find_outliers, limit
+from hilcal.robot.catalogue import configs_dir
 
 MODES = ("absolute", "deflection")
 
@@ -116,6 +119,24 @@ def test_a_true_effect_is_not_mistaken_for_gross_errors():
 
 
 # --- as campaigns spoil their readings ------------------------------------------------------
+
+
+def test_an_effect_of_the_unloaded_readings_is_no_heap_of_gross_errors():
+    """A bias of the force sensor looks like bad unloaded readings, pose after pose."""
+    for robot, seed in (("ur3e", 11), ("ur10e", 12)):
+        config = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
+        c = study_case(config, robot, "deflection", ("wrench_bias",), 3.0, seed)
+        found = fit(baseline(c.cell, c.readings, "deflection"), c.readings, "deflection")
+        assert not found.outlier.any()
+
+
+def test_the_limit_moves_away_gradually_as_the_bulk_grows_beyond_chance():
+    far = [limit(3, 150, scale) for scale in (1.0, 1.2, 1.31, 1.4, 1.5, 2.0)]
+    assert far == sorted(far)
+    assert far[1] == pytest.approx(1.2 * far[0])
+    assert far[2] < 2.1 * far[0]
+    assert far[4] == pytest.approx(1.5 * 2.5**2 * far[0])
+    assert far[5] == pytest.approx(2.0 * 2.5**2 * far[0])
 
 
 def gross(

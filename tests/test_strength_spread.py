@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hilcal.identify.strength_spread import widened
+from hilcal.identify.strength_spread import HIDDEN, widened, with_dropped
 
 LEARNT = 0.7
 
@@ -69,3 +69,31 @@ def test_groups_are_taken_one_by_one():
     np.testing.assert_allclose(together[:2], first)
     dropped = widened(covariance, theta, np.where([1, 1, 0, 0], prior, 0.0), np.array([0, 0, 1, 1]))
     np.testing.assert_allclose(dropped[2:], 1.0)
+
+
+def test_what_a_dropped_group_could_do_widens_what_it_is_confused_with():
+    rng = np.random.default_rng(2)
+    kept = rng.normal(size=(200, 3))
+    like_first = 0.9 * kept[:, [0]] + 0.3 * rng.normal(size=(200, 1))
+    apart = rng.normal(size=(200, 1))
+    apart -= kept @ np.linalg.lstsq(kept, apart, rcond=None)[0]
+    dropped, groups = np.hstack([like_first, apart]), np.array([0, 1])
+    h = kept.T @ kept
+    factor = with_dropped(np.eye(3), h, kept, dropped, groups, 1.0)
+    assert factor[0] > 1.5
+    assert np.all(factor[1:] < 1.1)
+    # As if the dropped ones were in the model, with a prior of their size.
+    inverse = np.linalg.inv(h)
+    free = dropped - kept @ inverse @ kept.T @ dropped
+    prior = np.sum(free**2, axis=0) / HIDDEN
+    full = np.hstack([kept, dropped])
+    joint = np.linalg.inv(full.T @ full + np.diag([0.0, 0.0, 0.0, *prior]))
+    np.testing.assert_allclose(factor, np.sqrt(np.diag(joint)[:3] / np.diag(inverse)), rtol=1e-6)
+
+
+def test_a_dropped_column_that_others_stand_for_altogether_changes_nothing():
+    kept = np.random.default_rng(3).normal(size=(50, 2))
+    factor = with_dropped(
+        np.eye(2), kept.T @ kept, kept, kept @ np.array([[1.0], [2.0]]), np.array([0]), 1.0
+    )
+    np.testing.assert_allclose(factor, 1.0)

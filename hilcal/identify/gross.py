@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg as sl
+from scipy.stats import binom
 
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Whitening
@@ -28,6 +29,8 @@ SMALLEST = 3e-3
 LEVERAGE = 1e-6
 """A reading of which less than this share is left after the fit cannot be judged."""
 
+ACCIDENT = 1e-3
+"""Gross errors that fall on unloaded readings more often than chance would have it are none."""
 PATIENCE = 10
 """So many readings, and half of what may be set aside, are taken out in vain before it ends."""
 
@@ -50,13 +53,15 @@ def find_gross(
 ) -> Suspected:
     """Search a gc-scaled solution for at most `most` gross errors.
 
-    Where there are more than twice as many, they are no accident, and none is returned.
+    Where there are more than twice as many, or too many of them are shared unloaded readings,
+    they are no accident, and none is returned.
     """
     e, q = _free(model, solution, readings, w)
     c = _candidates(w)
     g, a = c.gradients(e[:, None])[:, :, 0], c.information(q)
     whole = np.trace(a, axis1=1, axis2=2)
     drop: list[Ints] = []
+    taken: list[int] = []
     largest, found, open_ = 0.0, 0, np.ones(len(c.row), dtype=bool)
     t2 = _t2(g, a, whole)
     least, patience = limit(w.m, len(c.row)), most // 2 + PATIENCE
@@ -68,6 +73,7 @@ def find_gross(
         if top <= max(least, SMALLEST * largest):
             break
         drop.append(c.drops[k])
+        taken.append(k)
         open_ &= ~np.isin(c.row, c.drops[k])
         # P becomes P − P S (Sᵀ P S)⁻¹ Sᵀ P; it is no projection where parts have a prior.
         shift = c.column(k, len(e))
@@ -83,7 +89,9 @@ def find_gross(
         # The bulk is judged without the suspects: they are in everyone's residual.
         if top > limit(w.m, len(c.row), bulk(t2[c.loaded & open_], w.m)):
             found = len(drop)
-    if found > 2 * most:
+    shared = int(np.count_nonzero(~c.loaded[taken[:found]]))
+    chance = float(binom.sf(shared - 1, found, np.mean(~c.loaded))) if shared else 1.0
+    if found > 2 * most or chance < ACCIDENT:
         found = 0
     found = min(found, most)
     rows = np.unique(np.concatenate(drop[:found])) if found else np.zeros(0, dtype=np.int64)

@@ -8,8 +8,9 @@ from hilcal.types import Bools, Floats
 FALSE_ALARMS = 1e-3
 """Expected number of good readings set aside in a whole campaign, when the model is right."""
 MISFIT_FACTOR = 6.25
-"""While the model is wrong, the limit is 2.5 times as far: a misfit has heavier tails."""
-MISFIT = 1.3
+"""While the model is wrong, the limit is 2.5 times as far: a misfit has heavier tails ..."""
+MISFIT = (1.25, 1.5)
+"""... gradually so from the scale that chance allows to one that it does not."""
 
 
 def bulk(distance2: Floats, m: int) -> float:
@@ -24,7 +25,8 @@ def limit(m: int, count: int, scale: float = 1.0) -> float:
     campaigns, times the scale of the bulk where that is wider than the stated noise.
     """
     far = float(chi2.isf(FALSE_ALARMS / count, m)) * max(1.0, scale)
-    return far * MISFIT_FACTOR if scale > MISFIT else far
+    chance, sure = MISFIT
+    return far * float(MISFIT_FACTOR ** np.clip((scale - chance) / (sure - chance), 0.0, 1.0))
 
 
 def find_outliers(distance2: Floats, m: int) -> Bools:

@@ -10,17 +10,31 @@ with L and b the precision and the right-hand side of the group alone, V_τ = (L
 m_τ = V_τ b. p(τ) is half-Cauchy; its scale is the spread at which noise alone is as large as the
 group, so that "nothing there" and "something there" have equal chances. Other groups are kept.
 
+Groups that were dropped may be there all the same, as strong as the noise hides. They take their
+part of the uncertainty with a prior of that size:
+
+    Cov(z) = (H − C (G + β Λ)⁻¹ Cᵀ)⁻¹
+
+with H the normal equations of what is left, G = DᵀD and C = AᵀD of the dropped columns D.
+
 Sources: Kass and Steffey, *Approximate Bayesian inference in conditionally independent
 hierarchical models*, J. Am. Stat. Assoc. 84 (1989) 717-726; Polson and Scott, *On the half-Cauchy
 prior for a global scale parameter*, Bayesian Analysis 7 (2012) 887-902.
 """
 
 import numpy as np
+import scipy.linalg as sl
 
 from hilcal.types import Floats, Ints
 
 GRID = np.logspace(-2.0, 3.0, 101)
 """Values of τ in units of the half-Cauchy's scale."""
+
+
+ROUNDING = 1e-9
+HIDDEN = 2.0
+"""Variance that a dropped group may have, in units of what noise alone makes of its parameters:
+the mean over τ of a group at the limit of being dropped."""
 
 
 def widened(covariance: Floats, theta: Floats, prior: Floats, groups: Ints) -> Floats:
@@ -60,3 +74,35 @@ def _of_group(covariance: Floats, theta: Floats, prior: float) -> Floats:
     shift = np.einsum("t,ti,tj->ij", weight, away, away)
     mixed += np.einsum("pi,ij,pj->p", axes, shift, axes)
     return np.asarray(np.sqrt(np.maximum(mixed / np.diag(covariance), 1.0)))
+
+
+def with_dropped(
+    transform: Floats, h: Floats, rows: Floats, columns: Floats, groups: Ints, beta: float
+) -> Floats:
+    """Return the factors (P,), at least 1, by which groups that were dropped widen all others.
+
+    Args:
+        transform: (P, K) parameters per coordinate z.
+        h: (K, K) normal equations of z.
+        rows: (R, K) whitened derivatives A by z.
+        columns: (R, Q) whitened derivatives D by the dropped parameters.
+        groups: (Q,) their groups.
+        beta: noise factor that priors are weighed against.
+    """
+    cross = rows.T @ columns
+    inverse = np.linalg.inv(h)
+    gram = columns.T @ columns
+    free = np.maximum(np.diag(gram) - np.einsum("kq,kl,lq->q", cross, inverse, cross), 0.0)
+    count = np.bincount(groups)
+    reach = np.bincount(groups, weights=free) / np.maximum(count, 1)
+    # Columns that the others stand for altogether tell nothing of themselves: left out.
+    seen = reach[groups] > ROUNDING * np.maximum(np.diag(gram), 1e-300)
+    if not seen.any():
+        return np.ones(len(transform))
+    inner = gram[np.ix_(seen, seen)] + np.diag(beta * reach[groups][seen] / HIDDEN)
+    part = sl.solve_triangular(np.linalg.cholesky(inner), cross[:, seen].T, lower=True)
+    wide = np.linalg.inv(h - part.T @ part)
+    before = np.einsum("pk,kl,pl->p", transform, inverse, transform)
+    after = np.einsum("pk,kl,pl->p", transform, wide, transform)
+    there = before > 0
+    return np.sqrt(np.where(there, np.maximum(after / np.where(there, before, 1.0), 1.0), 1.0))

@@ -21,10 +21,10 @@ from scipy.stats import chi2
 
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Whitening
-from hilcal.identify.gauss_newton import Solution, prior_of, scales_of
+from hilcal.identify.gauss_newton import Solution, prior_of, scales_of, whitened_jacobian
 from hilcal.identify.holdout import leave_out
 from hilcal.identify.poses import block_folds, region_folds
-from hilcal.identify.strength_spread import widened
+from hilcal.identify.strength_spread import widened, with_dropped
 from hilcal.model import Model
 from hilcal.types import Bools, Floats, Ints
 
@@ -87,9 +87,7 @@ def uncertainty(
             jackknife = np.sqrt((count - 1) / count * np.sum(away**2, axis=0))
             std = np.maximum(std, jackknife)
     identifiable = _identifiable(solution, scale, std)
-    std = std * widened(
-        solution.beta * covariance, solution.theta, solution.prior, prior_of(model)[1]
-    )
+    std = std * _of_strength(model, w, solution, covariance)
     return Uncertainty(
         np.where(identifiable, std, np.inf),
         formal,
@@ -97,6 +95,20 @@ def uncertainty(
         misfit,
         name_directions(model, basis.null),
     )
+
+
+def _of_strength(model: Model, w: Whitening, solution: Solution, covariance: Floats) -> Floats:
+    """Factors (P,) by which not knowing the strength of shrunk families widens."""
+    groups, beta = prior_of(model)[1], solution.beta
+    factor = widened(beta * covariance, solution.theta, solution.prior, groups)
+    dropped = np.flatnonzero((groups >= 0) & (solution.prior == 0))
+    if w.scaling == "none" or not len(dropped) or not solution.rows.shape[1]:
+        return factor
+    columns = whitened_jacobian(model, solution.prediction, solution.theta, w, dropped)
+    basis, equations = solution.equations.basis, solution.equations
+    h = equations.gram + np.diag(beta * basis.prior_precision)
+    more = with_dropped(basis.transform, h, solution.rows, columns, groups[dropped], beta)
+    return factor * more
 
 
 def _identifiable(solution: Solution, scale: Floats, std: Floats) -> Bools:
