@@ -48,6 +48,7 @@ CRITERIA: dict[str, Callable[[], Criterion]] = {
     "test": lambda: Linear(few_poses()),
     "E": E,
     "K": K,
+    "E of some": lambda: E(np.array([0, 2, 5])),
     "separate": lambda: Separate(pairs()),
     "compromise": compromise,
     "volumes": lambda: Volumes(4),

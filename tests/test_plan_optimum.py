@@ -36,6 +36,7 @@ CRITERIA: dict[str, Callable[[], Criterion]] = {
     "volumes": lambda: Volumes(2),
     "E": E,
     "K": K,
+    "E of some": lambda: E(np.array([0, 1])),
     "separate": lambda: Separate(
         (
             Pair(np.array([0]), np.ones(1), np.array([1])),

@@ -73,11 +73,13 @@ def question(problem: Problem, name: str, work: WorkPoses | None) -> Question:
     if name == "separate":
         apart = rivals(problem)
         return replace(whole, criterion=Separate(apart.pairs), prior=apart.prior)
-    if name in ("E", "K"):
+    if name == "E":
+        return replace(whole, criterion=E(unknown(problem)))
+    if name == "K":  # of the model alone: more information, also of the others, may make it worse
         free = unknown(problem)
         own = Units(np.ascontiguousarray(problem.units.rows[:, :, free]), problem.units.cost)
         known = problem.measured[np.ix_(free, free)]
-        return Question(E() if name == "E" else K(), own, known, tuple(names[k] for k in free))
+        return Question(K(), own, known, tuple(names[k] for k in free))
     raise InputError(f"criterion {name!r}; valid: {', '.join(CRITERIA)}")
 
 

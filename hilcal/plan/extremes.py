@@ -6,41 +6,48 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilcal.plan.criterion import Smooth, require_determined, soft_least
-from hilcal.types import Floats
+from hilcal.plan.left import Left, left_for, values_left
+from hilcal.types import Floats, Ints
 
 _FLOOR = 1e-14
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class E:
-    """φ(M) = λ_min(M): the worst determined direction.
+    """φ(M) = λ_min(S): the worst determined direction of the parameters of interest.
 
-    O3 of Nahvi & Hollerbach (1996), IEEE ICRA. The surrogate is the barrier of the semidefinite
-    program max t, M ⪰ t 1: F = max over t of t + μ log det(M − t 1), whose gradient
-    Z = μ (M − t 1)⁻¹ has trace 1: λ_min(N) ≤ tr(Z N).
+    O3 of Nahvi & Hollerbach (1996), IEEE ICRA; S is M, or what is left of it where other
+    parameters are unknown as well. The surrogate is the barrier of the semidefinite program
+    max t, S ⪰ t 1: F = max over t of t + μ log det(S − t 1), whose gradient Z = μ (S − t 1)⁻¹ has
+    trace 1: λ_min(N) ≤ tr(Z N).
+
+    Attributes:
+        interest: indices of the parameters of interest; all by default.
     """
 
+    interest: Ints | None = None
     name = "E"
     monotone = True
     kinked = True
 
     def value(self, m: Floats) -> Floats:
         """Return φ of (..., P, P) matrices."""
-        return np.asarray(np.maximum(np.linalg.eigvalsh(m)[..., 0], 0.0))
+        s = values_left(m, self.interest)
+        return np.asarray(np.maximum(np.linalg.eigvalsh(s)[..., 0], 0.0))
 
     def gradient(self, m: Floats) -> Floats:
-        """Return (P, P) v vᵀ, v the eigenvector of the least eigenvalue."""
-        v = np.linalg.eigh(m)[1][:, 0]
-        return np.outer(v, v)
+        """Return (P, P) U v vᵀ Uᵀ, v the eigenvector of the least eigenvalue."""
+        left = left_for(m, self.interest)
+        v = np.linalg.eigh(left.s)[1][:, 0]
+        return left.whole(np.outer(v, v))
 
     def surrogate(self, m: Floats, order: float) -> Callable[[Floats], Smooth | None]:
         """Return f = F / λ_min(m) with μ = order · λ_min(m)."""
-        values = np.linalg.eigvalsh(m)
+        values = np.linalg.eigvalsh(left_for(m, self.interest).s)
         scale = max(float(values[0]), _FLOOR * float(values[-1]))
 
         def smooth(m: Floats) -> Smooth | None:
-            values, vectors = np.linalg.eigh(m)
-            part = _part(values, vectors, order * scale)
+            part = _least(left_for(m, self.interest), order * scale)
             return Smooth(
                 part.value / scale,
                 part.gradient / scale,
@@ -114,6 +121,17 @@ class K:
     def sure(self, m: Floats, names: Sequence[str] | None) -> None:
         """Refuse a singular M."""
         require_determined(m, names)
+
+
+def _least(left: Left, width: float) -> Smooth:
+    """Return the smooth least eigenvalue of S as a function of M."""
+    part = _part(*np.linalg.eigh(left.s), width)
+    gradient = left.whole(part.gradient)
+    products = tuple((c, left.whole(x), left.whole(y)) for c, x, y in part.products)
+    if left.others is not None:
+        products = (*products, (-2.0, gradient, left.others))
+    squares = tuple((c, left.whole(v)) for c, v in part.squares)
+    return Smooth(part.value, gradient, products, squares, gradient)
 
 
 def _part(values: Floats, vectors: Floats, width: float) -> Smooth:

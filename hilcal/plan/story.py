@@ -33,8 +33,9 @@ class Bought:
         position_open_m: the same where every effect that the plan is made against may be there.
         joint_share: largest standard uncertainty of a joint's parameter by its magnitude; None
             where no parameter belongs to a joint.
-        o1: (Π σ)^(1/P) / √N, what D makes large.
-        o2: σ_min / σ_max, what K makes large.
+        o1: (Π σ)^(1/P) / √N, what D makes large; σ² the eigenvalues of the information on the
+            model's parameters that have no prior, all others unknown as well.
+        o2: σ_min / σ_max, what K makes large; of the model alone.
         o3: σ_min, what E makes large.
         efficiency: certified share of the best possible by its own criterion; None without.
     """

@@ -11,6 +11,7 @@ from hilcal.plan.candidates import sense
 from hilcal.plan.choice import choose, only, unknown
 from hilcal.plan.compromise import robust_question
 from hilcal.plan.confounding import Confounding
+from hilcal.plan.left import left_for
 from hilcal.plan.planner import Planned, Say
 from hilcal.plan.predicted import Predicted, predicted
 from hilcal.plan.relaxation import relax
@@ -132,8 +133,10 @@ def _row(made: Planned, name: str, counts: Floats, efficiency: float) -> Bought:
     of, free = made.problem, unknown(made.problem)
     knows = predicted(of, counts, work=made.work)
     taken = np.flatnonzero(counts)
-    own = of.units.information(counts[taken], taken)[np.ix_(free, free)]
-    sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(own), 0.0))
+    known = of.units.information(counts[taken], taken)
+    left = left_for(of.prior + known, free).s
+    sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(left), 0.0))
+    alone = np.sqrt(np.maximum(np.linalg.eigvalsh(known[np.ix_(free, free)]), 0.0))
     readings = float(counts @ of.units.cost)
     volume = float(np.exp(np.mean(np.log(np.maximum(sigma, 1e-300)))))
     return Bought(
@@ -142,7 +145,7 @@ def _row(made: Planned, name: str, counts: Floats, efficiency: float) -> Bought:
         position_open_m=_finite(knows.position_open),
         joint_share=_joint_share(knows),
         o1=volume / np.sqrt(readings),
-        o2=float(sigma[0] / sigma[-1]),
+        o2=float(alone[0] / alone[-1]),
         o3=float(sigma[0]),
         efficiency=efficiency,
     )

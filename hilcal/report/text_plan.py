@@ -153,7 +153,8 @@ def _bought(rows: Sequence[Bought], own: str) -> Iterator[RenderableType]:
     yield Text(
         "position: where the robot will work; open: the same where the effects below may be there "
         "and are fitted too. joint: the worst joint's compliance. O1 to O3: observability indices, "
-        "larger is better. certified: share of the best possible by its own criterion.\n",
+        "larger is better; O1 and O3 with these effects unknown as well. certified: share of the "
+        "best possible by its own criterion.\n",
         style="dim",
     )
 

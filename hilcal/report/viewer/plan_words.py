@@ -151,7 +151,8 @@ def bought(s: PlanStory) -> str:
         "",
         "Position: where the robot will work; open: the same where any effect that the plan is "
         "made against may be there. Joint: the worst known of the joints' parameters, by its "
-        "size. O1 to O3: observability indices, larger is better. "
+        "size. O1 to O3: observability indices, larger is better; O1 and O3 with these effects "
+        "unknown as well. "
         "Certified: share of the best possible by its own criterion.",
     ]
     return "\n".join(lines)
