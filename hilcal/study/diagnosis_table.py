@@ -176,5 +176,7 @@ def _size(value: float) -> str:
 def _table(*columns: str) -> Table:
     out = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
     for k, name in enumerate(columns):
-        out.add_column(name, justify="right" if k else "left", overflow="fold")
+        # Names of effects stay whole; the words of the last table do not fit on a line.
+        whole = k == 0 and bool(name)
+        out.add_column(name, justify="right" if k else "left", overflow="fold", no_wrap=whole)
     return out
