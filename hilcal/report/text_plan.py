@@ -17,7 +17,7 @@ CRITERIA = {
     "D": "all parameters together (the volume of their confidence region)",
     "A": "the mean variance of the parameters",
     "E": "the combination of parameters that is known worst",
-    "K": "the condition number",
+    "K": "the condition number of the model alone, without power against what is missing",
     "test": "the position where the robot will work",
     "separate": "telling the leading suspects apart",
 }
