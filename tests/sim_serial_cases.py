@@ -118,6 +118,9 @@ def force_sensor(
 ) -> Iterator[Instrument]:
     """Run a force sensor ("ft300", "bota", "hex") that feels `wrench` (its axes, N and N·m)."""
     with tempfile.TemporaryDirectory() as directory:
+        world = Blackboard.create(Path(directory) / "world.bin", scale)
+        # Before the sensor starts: no frame of an empty world is on its way then.
+        world.write("truth", time=world.time, sensor_wrench=np.array(wrench))
         instrument = start(
             "force_server",
             "force",
@@ -130,7 +133,6 @@ def force_sensor(
             *options,
         )
         try:
-            instrument.truth(sensor_wrench=np.array(wrench))
             yield instrument
         finally:
             instrument.close()

@@ -14,6 +14,7 @@ from typing import Annotated
 import typer
 
 from hilcal.cli.effects_from import EffectsFrom
+from hilcal.cli.ending import told_to_end
 from hilcal.cli.files import (
     check_options,
     check_record,
@@ -277,25 +278,22 @@ def view(
         return
     from hilcal.report.viewer import serve  # loads the viewer's library, which takes a while
 
-    stop = threading.Event()
     # Ending the server can wait for a viewer that does not answer; the campaign is closed.
     guard = threading.Timer(ENDING, os._exit, (0,))
     guard.daemon = True
-    caught = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(s, lambda *_: stop.set()) for s in caught]
     try:
-        with serve(build_story(chapters), port=port) as served:
+        with (
+            told_to_end(signal.SIGINT, signal.SIGTERM) as wait,
+            serve(build_story(chapters), port=port) as served,
+        ):
             t.show(f"Open the viewer with:\n  {viewer_command()} {served.url}")
             t.document({"url": served.url, "revisions": [c.number for c in chapters]})
             sys.stdout.flush()
             t.notice("Serving until Ctrl-C.")
-            while not stop.wait(0.5):
-                pass
+            wait()
             guard.start()
     finally:
         guard.cancel()
-        for s, handler in zip(caught, before, strict=True):
-            signal.signal(s, handler)
 
 
 def viewer_command() -> str:

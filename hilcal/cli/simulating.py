@@ -1,7 +1,6 @@
 """`simulate`: the devices of a simulated cell, on real wires, until they are stopped."""
 
 import signal
-import threading
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated
@@ -11,6 +10,7 @@ import typer
 from drivers.simulated.on_the_wire import secret_of, simulated_cell
 from drivers.simulated.rehearsal import NOTHING
 from hilcal.cli.effects_from import EffectsFrom
+from hilcal.cli.ending import told_to_end
 from hilcal.cli.plan_output import POSES
 from hilcal.cli.planning import CellFile, PlanFile, make_plan, read_cell
 from hilcal.cli.terminal import terminal
@@ -45,10 +45,7 @@ def simulate(
     made = make_plan(numbers, config, POSES, number) if plan is None else load_plan(plan)
     base_dir = cell.absolute().parent
     secret = secret_of(config, made, hide or config.simulation.hide or NOTHING, number)
-    over = threading.Event()
-    for kind in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-        signal.signal(kind, lambda *_: over.set())
-    with ExitStack() as stack:
+    with told_to_end(signal.SIGTERM, signal.SIGINT, signal.SIGHUP) as wait, ExitStack() as stack:
         with working(t.progress) as say:
             say("starting the devices")
             there = stack.enter_context(simulated_cell(secret, number, base_dir, output))
@@ -57,8 +54,7 @@ def simulate(
         t.show(f"The devices run. Their cell is {target}; go on in another terminal with:")
         t.show(f"  hilcal check {target}\n  hilcal run {target} -o run.hilcal")
         t.show("Ctrl-C ends them.")
-        while not over.wait(1.0):
-            pass
+        wait()
     t.show("The devices have ended.")
 
 
