@@ -14,6 +14,7 @@ from hilcal.data.readings import Readings
 from hilcal.data.records import content_hash
 from hilcal.data.revision import RevisionRecord
 from hilcal.data.whitening import MODES, SCALINGS, Mode, Scaling
+from hilcal.diagnose.ahead import look_ahead
 from hilcal.diagnose.verdict import Diagnosis, diagnose
 from hilcal.effects.catalogue import make
 from hilcal.effects.options import Options
@@ -115,13 +116,16 @@ class Opened:
         if self.latest() is None:
             self.latest_fit(t, say)
         out = []
-        for record in chain(self.campaign.revisions()):
+        records = chain(self.campaign.revisions())
+        for record in records:
             say(f"restoring revision {record.number}")
             found = self.restore(record)
             judged = None
             if found.scaling == "gc":
                 say(f"diagnosing revision {record.number}")
                 judged = diagnose(found)
+                if record is records[-1]:  # to the others, something was added
+                    judged = look_ahead(judged, say)
             out.append(Chapter(record.number, record.added, found, judged, record.removed))
         return out
 

@@ -25,6 +25,7 @@ from hilcal.cli.files import (
 from hilcal.cli.fitting import Readings, options_json, options_line
 from hilcal.cli.terminal import Json, Record, Run, terminal
 from hilcal.data.revision import change
+from hilcal.diagnose.ahead import look_ahead
 from hilcal.diagnose.document import to_json
 from hilcal.diagnose.verdict import diagnose as judge
 from hilcal.effects.catalogue import effect_class
@@ -67,7 +68,7 @@ def diagnose(run: Run, effects_from: EffectsFrom = None, as_json: Json = False) 
     with open_run(run) as o, working(t.progress) as say:
         number, found = o.latest_fit(t, say)
         say(f"diagnosing revision {number}")
-        d = judge(found)
+        d = look_ahead(judge(found), say)
     t.show(text_refine.diagnosis_report(d))
     t.document({"revision": number, **to_json(d)})
 
@@ -123,7 +124,7 @@ def _change(
             say(f"{'adding' if adds else 'removing'} {named}")
             after = make(before, effect)
             say("diagnosing")
-            d = judge(after)
+            d = look_ahead(judge(after), say)
             added, removed = (effect, None) if adds else (None, effect)
             number = o.store(after, d, added, removed)
         stored = o.campaign.revision(before_number)

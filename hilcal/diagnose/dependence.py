@@ -232,7 +232,7 @@ def _best(p: Projection, laws: _Laws, mine: list[int]) -> int:
     x = laws.x[:, mine].reshape(len(p.fit.white), -1)
     blocks = p.free(x).reshape(len(x), -1, WIDTH).transpose(1, 2, 0)
     plain = x.reshape(len(x), -1, WIDTH).transpose(1, 0, 2)
-    found = _evidence(blocks @ plain, blocks @ p.fit.white, p.yy, int(p.fit.dof))
+    found = _evidence(blocks @ plain, blocks @ p.white, p.yy, int(p.fit.dof))
     return mine[int(np.argmax(found))]
 
 
@@ -270,6 +270,6 @@ def _least(p: Projection, x: Floats) -> tuple[Floats, Floats]:
     free = p.free(x)
     gram = (free.T @ x + x.T @ free) / 2
     inverse = np.linalg.pinv(gram, rcond=1e-9, hermitian=True)
-    y = inverse @ (free.T @ p.fit.white)
+    y = inverse @ (free.T @ p.white)
     left = max(p.yy - float(y @ gram @ y), 0.0) / max(p.fit.dof - len(y), 1.0)
     return y, np.asarray(inverse * max(left, 1e-300))

@@ -38,6 +38,13 @@ def to_json(d: Diagnosis) -> dict[str, object]:
             {"effect": a.effect, "unlike": a.unlike, "times": a.times if a.possible else None}
             for a in d.apart
         ],
+        "beyond": None
+        if d.beyond is None
+        else {
+            "effects": list(d.beyond.effects),
+            "share": d.beyond.share,
+            "variance_factor": d.beyond.variance_factor,
+        },
         "needless": list(d.needless),
         "carriers": carriers(d.carriers),
         "pure_error": None if d.pure_error is None else repeats(d.pure_error),

@@ -52,6 +52,7 @@ class Projection:
         fit: the fit.
         rows: (R, K) whitened Jacobian of the model, identifiable coordinates.
         factor: Cholesky factor of H.
+        white: (R,) whitened residual r, free of what the model itself could still explain.
         yy: ‖r‖².
         left_out: (poses,) the same of each pose, predicted without itself.
         folds: the model without each fold of poses.
@@ -60,6 +61,7 @@ class Projection:
     fit: Fit
     rows: Floats
     factor: tuple[Floats, bool]
+    white: Floats
     yy: float
     left_out: Floats
     folds: tuple[Fold, ...]
@@ -76,7 +78,7 @@ class Projection:
 
     def score_of(self, s: Floats, x: Floats) -> Score:
         """Score whitened columns X (R, P) whose S = Xᵀ M X (P, P) is known."""
-        return score(s, x.T @ self.fit.white, self.yy, self.fit.dof)
+        return score(s, x.T @ self.white, self.yy, self.fit.dof)
 
     def misfit(self) -> float:
         """‖r‖² − dof, the part that noise does not explain, at least three of its σ."""
@@ -128,11 +130,13 @@ class Projection:
 def projection(fit: Fit) -> Projection:
     """Prepare the scoring of families against a gc-scaled fit."""
     s = fit.solution
+    white = s.rest()
     return Projection(
         fit,
         s.rows,
         s.equations.factor(s.beta),
-        float(fit.white @ fit.white),
+        white,
+        float(white @ white),
         left_out_by_pose(fit),
         tuple(_folds(fit)),
     )

@@ -56,6 +56,17 @@ class Alternative:
         return self.log_evidence > self.own - SAME_EVIDENCE
 
 
+def outside(fit: Fit) -> tuple[Floats, dict[str, slice]]:
+    """Return the columns (R, P) of all effects that are not in the model, and whose they are."""
+    families = [family(fit, e) for e in candidates(fit)]
+    ends = np.cumsum([0] + [f.white.shape[1] for f in families])
+    columns = np.hstack([np.zeros((len(fit.white), 0)), *(f.white for f in families)])
+    return columns, {
+        f.effect.name: slice(int(a), int(b))
+        for f, a, b in zip(families, ends[:-1], ends[1:], strict=True)
+    }
+
+
 class Rivals:
     """The columns of a fitted model and of all effects outside of it."""
 
@@ -63,13 +74,7 @@ class Rivals:
         """Compute them."""
         self._fit = fit
         self._model = whitened_columns(fit)
-        families = [family(fit, e) for e in candidates(fit)]
-        ends = np.cumsum([0] + [f.white.shape[1] for f in families])
-        self._outside = np.hstack([np.zeros((len(fit.white), 0)), *(f.white for f in families)])
-        self._slices = {
-            f.effect.name: slice(int(a), int(b))
-            for f, a, b in zip(families, ends[:-1], ends[1:], strict=True)
-        }
+        self._outside, self._slices = outside(fit)
         self._gram = self._outside.T @ self._outside
 
     def of(self, effect: str, never: Collection[str] = ()) -> Alternative:
@@ -102,7 +107,7 @@ class Rivals:
             others.append(best)
             if total > own + SAME_EVIDENCE:
                 break
-            s, g, yy = _add(s, g, yy, w.dof, left.pop(best), scores[best])
+            s, g, yy = with_family(s, g, yy, w.dof, left.pop(best), scores[best])
         return Alternative(effect, own, same, tuple(others), total)
 
 
@@ -110,10 +115,19 @@ def _same(one: float, other: float) -> bool:
     return min(one, other) > SAME_EVIDENCE and abs(one - other) < SAME_EVIDENCE
 
 
-def _add(
+def with_family(
     s: Floats, g: Floats, yy: float, dof: float, mine: slice, found: Score
 ) -> tuple[Floats, Floats, float]:
-    """Add a family by algebra; returns S, g and ‖r‖² of the model with it."""
+    """Add a family by algebra; returns S, g and ‖r‖² of the model with it.
+
+    Args:
+        s: (P, P) S of all families.
+        g: (P,) of them.
+        yy: ‖r‖².
+        dof: degrees of freedom of r.
+        mine: the family's columns.
+        found: its score.
+    """
     precision = yy / (dof * found.strength**2)
     inner = s[mine, mine] + precision * np.eye(mine.stop - mine.start)
     step = np.linalg.solve(inner, np.column_stack([s[mine], g[mine]]))

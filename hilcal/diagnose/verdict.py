@@ -25,6 +25,21 @@ LEAST_SHARE = 0.01
 """An effect that explains less of the misfit on poses left out is not worth adding."""
 
 
+@dataclass(frozen=True, slots=True)
+class Beyond:
+    """What is left of a misfit with all effects of the catalogue that the readings ask for.
+
+    Attributes:
+        effects: these effects, the best first.
+        share: of the misfit, that they leave.
+        variance_factor: of the residual with them.
+    """
+
+    effects: tuple[str, ...]
+    share: float
+    variance_factor: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Diagnosis:
     """What is wrong with a fitted model.
@@ -42,6 +57,8 @@ class Diagnosis:
         needless: effects of the model that these readings do not ask for.
         carriers: variables that carry what is predictable, with the dependence on each.
         apart: how the leading suspect differs from those that it is not told from.
+        beyond: what the whole catalogue leaves; None where it leaves noise, or nobody asked
+            (see `look_ahead`). Where it is given, the carriers are those of what is left.
     """
 
     fit: Fit
@@ -55,6 +72,7 @@ class Diagnosis:
     needless: tuple[str, ...] = ()
     carriers: tuple[Dependence, ...] = ()
     apart: tuple[Apart, ...] = ()
+    beyond: Beyond | None = None
 
 
 def diagnose(fit: Fit) -> Diagnosis:

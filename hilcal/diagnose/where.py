@@ -129,7 +129,7 @@ def _poses(p: Projection, axes: Floats) -> list[Where]:
     u, s, _ = np.linalg.svd(free, full_matrices=False)
     u = u[:, s > 1e-6 * s.max(initial=0.0)]
     rank = u.shape[1]
-    gain = float(np.sum((u.T @ fit.white) ** 2))
+    gain = float(np.sum((u.T @ p.white) ** 2))
     within = (p.yy - gain) / (fit.dof - rank)
     p_value = float(f_distribution.sf(gain / rank / within, rank, fit.dof - rank))
     return [Where("pose", p.share(gain - rank * within), p_value)]

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.linalg as sl
 
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Whitening
@@ -58,6 +59,20 @@ class Solution:
     effective: float
     iterations: int
     converged: bool
+
+    def rest(self) -> Floats:
+        """(R,) whitened residual after the step that is left: `white` to within that step.
+
+        What is added to the model beside its own parameters is scored by this one. A column that
+        the model nearly explains would else be credited with the step that the model itself could
+        still take, divided by the little of it that the model does not explain.
+        """
+        basis = self.equations.basis
+        z = np.zeros(len(self.equations.rhs))
+        z[len(basis.singular) :] = self.theta[basis.held] / self.prior[basis.held]
+        downhill = self.rows.T @ self.white - self.beta * basis.prior_precision * z
+        step = sl.cho_solve(self.equations.factor(self.beta), downhill, check_finite=False)
+        return np.asarray(self.white - self.rows @ step)
 
 
 def prior_of(model: Model) -> tuple[Floats, Ints]:

@@ -69,7 +69,7 @@ def estimate(fit: Fit, effect: Effect) -> Estimate | None:
         free = x - solution.rows @ sl.cho_solve(factor, solution.rows.T @ x)
     s = x.T @ free
     values, vectors = np.linalg.eigh((s + s.T) / 2)
-    values, c = np.maximum(values, 0.0), vectors.T @ (x.T @ fit.white)
+    values, c = np.maximum(values, 0.0), vectors.T @ (x.T @ solution.rest())
     tau2 = STRENGTHS[:, None] ** 2
     evidence = 0.5 * np.sum(tau2 * c**2 / (1 + tau2 * values) - np.log1p(tau2 * values), axis=1)
     best = int(np.argmax(evidence))

@@ -167,7 +167,8 @@ def _told(d: Diagnosis) -> tuple[Suspect, ...]:
 def _curves(d: Diagnosis) -> tuple[StoryCurve, ...]:
     """Variables that carry the misfit, where the lead explains little of what is predictable."""
     known = next((s.holdout_share for s in d.suspects if s.effect in d.significant), 0.0)
-    if d.verdict == "adequate" or known >= LITTLE * d.predictable_share:
+    explained = d.beyond is None and known >= LITTLE * d.predictable_share
+    if d.verdict == "adequate" or explained:
         return ()
     return tuple(curve(v) for v in d.carriers if v.share >= LEAST_CARRIED)
 

@@ -76,7 +76,15 @@ def diagnosis_report(d: Diagnosis) -> Iterator[RenderableType]:
             f"A generic learner that knows nothing of robots predicts "
             f"{numbers.percent(d.predictable_share)} of the misfit."
         )
+        if d.beyond is not None:
+            yield f"What is left with {numbers.names(d.beyond.effects)}:"
         yield from curves(d.carriers)
+    if d.verdict == "unknown_effect":
+        yield Text(
+            "An effect of your own: hilcal effects new NAME writes one to begin with, and "
+            "--effects-from FILE.py tries it.",
+            style="dim",
+        )
     if d.pure_error is not None:
         yield from repeats(d.pure_error)
     yield from needless_line(d)

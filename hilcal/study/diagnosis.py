@@ -14,6 +14,7 @@ import numpy as np
 from hilcal.cell import Cell
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode
+from hilcal.diagnose.ahead import look_ahead
 from hilcal.diagnose.verdict import Diagnosis, diagnose
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
@@ -231,7 +232,7 @@ def _run(asked: Asked, sample: Sample, more: More | None, refined: bool) -> Outc
             known = baseline(sample.cell, readings, asked.mode)
             later = diagnose(fit(known, readings, asked.mode))
         again = judgement(later)
-    return Outcome(asked, judgement(diagnosis), result, again, sample.variables)
+    return Outcome(asked, judgement(look_ahead(diagnosis)), result, again, sample.variables)
 
 
 def judgement(d: Diagnosis, verdict: str | None = None, message: str | None = None) -> Judgement:

@@ -110,6 +110,6 @@ def _pairs(cases: Sequence[Outcome]) -> Iterable[Claim]:
 def _outside(cases: Sequence[Outcome]) -> Iterable[Claim]:
     what = "an effect outside of the catalogue"
     yield Claim("outside", f"{what}: unknown_effect, in the end", rate(cases, unknown), 0.9)
-    yield Claim("outside", f"{what}: unknown_effect, at once", rate(cases, unknown_at_once))
+    yield Claim("outside", f"{what}: unknown_effect, at once", rate(cases, unknown_at_once), 0.9)
     words = "its variable among the first two"
     yield Claim("outside", words, rate(cases, followed), 0.9)
