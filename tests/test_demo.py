@@ -37,6 +37,7 @@ def test_the_hidden_effect_is_found(effect: str, tmp_path: Path, capsys: Capsys)
         assert [r.added for r in stored.revisions()] == [r["added"] for r in d["revisions"]]
 
 
+@pytest.mark.slow
 def test_nothing_hidden_is_nothing_found(tmp_path: Path, capsys: Capsys) -> None:
     path = tmp_path / "demo.hilcal"
     d = ok(capsys, "demo", FAST, "--hide", "nothing", "--seed", "2", "-o", path, "--json").document

@@ -72,7 +72,8 @@ def check_uniform(found: dict[str, np.ndarray], chance: float) -> None:
     assert {n: w for n, w in worst.items() if w < chance / len(worst)} == {}
 
 
-@pytest.mark.parametrize("mode", [pytest.param("absolute", marks=pytest.mark.slow), "deflection"])
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", MODES)
 def test_p_values_are_uniform_where_nothing_is_missing(mode):
     found = null_p_values(mode, 100, 8, places=False)
     assert {"base_compliance", "hysteresis", "load_point", "joint_stiffening"} <= set(found)

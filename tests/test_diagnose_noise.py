@@ -60,7 +60,7 @@ def null_p_values(mode, m, seeds):
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("m", [3, 6])
+@pytest.mark.parametrize("m", [3, pytest.param(6, marks=pytest.mark.slow)])
 def test_the_factor_is_chi_square_and_so_is_what_is_left(mode, m):
     for p in null_p_values(mode, m, 40):
         assert kstest(p, "uniform").pvalue > 1e-3 / 8

@@ -41,10 +41,11 @@ def work(c: Campaign, *effects: str) -> _Work:
 # --- needless -------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mode", "effects"),
     [
-        pytest.param("deflection", ("backlash", "joint_tilt_compliance"), marks=pytest.mark.slow),
+        ("deflection", ("backlash", "joint_tilt_compliance")),
         ("absolute", ("hysteresis", "encoder_offset")),
     ],
 )

@@ -217,6 +217,7 @@ def test_too_few_readings_are_refused(deflection: Scene) -> None:
         run_campaign(deflection, plan, told, np.random.default_rng(0))
 
 
+@pytest.mark.slow
 def test_the_study_depends_on_its_seed_alone(small: PlansStudy) -> None:
     config = configured()
     cell = cell_from_config(config)
