@@ -9,7 +9,7 @@ import scipy.linalg as sl
 from hilcal.diagnose.gain import improves
 from hilcal.diagnose.score import Score, score
 from hilcal.identify.fit import Fit
-from hilcal.identify.holdout import fold_ridge
+from hilcal.identify.holdout import fold_equations
 from hilcal.identify.poses import random_folds
 from hilcal.types import Bools, Floats
 
@@ -155,11 +155,7 @@ def left_out_by_pose(fit: Fit) -> Floats:
 
 def _folds(fit: Fit) -> Iterator[Fold]:
     s = fit.solution
-    equations = s.equations
-    full = equations.gram + np.diag(fold_ridge(equations, s.beta))
-    # Steps start from the fit, where its priors pull already.
-    pull = s.beta * equations.basis.prior_precision * equations.solve(s.beta)
-    rhs = s.rows.T @ fit.white - pull
+    full, rhs = fold_equations(fit.model, s)
     of_row = fit.whitening.rows_of(random_folds(fit.pose))
     for f in range(int(of_row.max()) + 1):
         mine = of_row == f

@@ -186,7 +186,7 @@ def _assemble(
     w = fitted if scaling == "gc" else whitening(kept, mode, "gc")
     white = w.whiten(raw).reshape(-1)
     pose = distinct_poses(kept)[w.reading]
-    folds = leave_out(solution, random_folds(pose), fitted)
+    folds = leave_out(model, solution, random_folds(pose), fitted)
     total = float(white @ white)
     dof = max(w.rank - solution.effective, 1.0)
     # Readings that were set aside count in the errors: they are data, predicted unseen.

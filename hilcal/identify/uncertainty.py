@@ -81,7 +81,7 @@ def uncertainty(
         std = formal * np.sqrt(total / dof)
         angle = readings.states.q[w.reading]
         for fold in (block_folds(pose), region_folds(angle, pose)):
-            folds = leave_out(solution, fold, w)
+            folds = leave_out(model, solution, fold, w)
             count = len(folds.change)
             away = folds.change - folds.change.mean(axis=0)
             jackknife = np.sqrt((count - 1) / count * np.sum(away**2, axis=0))
