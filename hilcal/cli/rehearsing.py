@@ -91,7 +91,11 @@ def on_devices(t: Terminal, told: Told, plan: Plan) -> Iterator[tuple[Rehearsal,
         campaign = stack.enter_context(made)
 
         def measured() -> Rehearsal:
-            _to_the_end(t, lambda: measure(t, there.config, secret.cell, campaign))
+            to_the_end(
+                t,
+                lambda: measure(t, there.config, secret.cell, campaign),
+                lambda: campaign.n_readings,
+            )
             readings = _whole(secret.cell, there.config, campaign)
             return _rehearsal(secret, there.config, readings)
 
@@ -128,20 +132,28 @@ def in_process(t: Terminal, told: Told, plan: Plan) -> Iterator[tuple[Rehearsal,
         yield measured(plan, 1, 0.0), further
 
 
-def _to_the_end(t: Terminal, work: Callable[[], object]) -> None:
+def to_the_end(t: Terminal, work: Callable[[], object], done: Callable[[], int]) -> None:
     """Measure, and go on after a failure as `run --resume` does.
 
     A busy computer gives a simulated device no turn for a while, which is the same to the driver
     as a device that fails.
 
+    Args:
+        t: where failures are told.
+        work: measures what is missing.
+        done: how many readings there are.
+
     Raises:
-        DeviceError: it failed `TRIES` times.
+        DeviceError: it failed `TRIES` times on end without a further reading.
     """
-    for left in reversed(range(TRIES)):
+    left, before = TRIES, done()
+    while True:
         try:
             work()
         except DeviceError as error:
-            if not left:
+            now = done()
+            left, before = (TRIES if now > before else left) - 1, now
+            if left <= 0:
                 raise
             t.notice(f"note: {error}")
             t.notice("going on with what is missing")
