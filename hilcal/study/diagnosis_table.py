@@ -6,7 +6,6 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from hilcal.data.whitening import Mode
 from hilcal.study.diagnosis import Outcome
 from hilcal.study.diagnosis_claims import Claim, claims
 from hilcal.study.diagnosis_rates import (
@@ -25,7 +24,7 @@ from hilcal.study.diagnosis_rates import (
 CAPTION = (
     "found: the hidden effect is first, or one of at most three that the program says it cannot "
     "tell apart and that are first; named: and the verdict names it. set: mean number of effects "
-    "in that set. first instead: what led where it was not found, with the number of cases. Each "
+    "in that set. first instead: what led where it was not found. Each "
     "of two effects, and one outside of the catalogue, act with 3 σ."
 )
 _NAMES = 3  # effects that a row lists
@@ -37,8 +36,13 @@ def report(outcomes: Sequence[Outcome]) -> Iterator[Table | Text | str]:
     effects = by_effect(hidden)
     for mode in dict.fromkeys(f.mode for f in effects):
         yield _title(f"effects hidden in {mode} readings: found")
-        yield _effects(mode, [f for f in effects if f.mode == mode])
+        mine = [f for f in effects if f.mode == mode]
+        yield _effects(mine)
         yield ""
+        if any(f.instead for f in mine):
+            yield _title("first instead")
+            yield _others(mine)
+            yield ""
     if len({o.asked.robot for o in hidden}) > 1:
         yield _title("found, by arm")
         yield _robots(hidden)
@@ -82,12 +86,11 @@ def _title(words: str) -> Text:
     return Text(words, style="bold")
 
 
-def _effects(mode: Mode, rows: Sequence[Found]) -> Table:
+def _effects(rows: Sequence[Found]) -> Table:
     strengths = sorted({f.strength for f in rows}, reverse=True)
     again = any(f.again.cases for f in rows)
     names = [name for s in strengths for name in (f"{s:g} σ", "named", "set")]
-    out = _table("hidden", "n", *names, *(["next", "set"] if again else []), "first instead")
-    out.columns[-1].justify = "left"
+    out = _table("hidden", "n", *names, *(["next", "set"] if again else []))
     cell = {(f.effect, f.strength): f for f in rows}
     for effect in dict.fromkeys(f.effect for f in rows):
         mine = [cell[effect, s] for s in strengths if (effect, s) in cell]
@@ -96,7 +99,17 @@ def _effects(mode: Mode, rows: Sequence[Found]) -> Table:
         if again:
             last = next((f for f in mine if f.again.cases), None)
             values += ["", ""] if last is None else [_share(last.again), _size(last.size_again)]
-        out.add_row(effect, str(max(f.found.cases for f in mine)), *values, _instead(mine))
+        out.add_row(effect, str(max(f.found.cases for f in mine)), *values)
+    return out
+
+
+def _others(rows: Sequence[Found]) -> Table:
+    out = _table("hidden", "what led, and how often")
+    out.columns[-1].justify = "left"
+    for effect in dict.fromkeys(f.effect for f in rows):
+        others = _instead([f for f in rows if f.effect == effect])
+        if others:
+            out.add_row(effect, others)
     return out
 
 
