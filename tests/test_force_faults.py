@@ -2,6 +2,7 @@
 
 import binascii
 import os
+import signal
 import struct
 import threading
 import time
@@ -71,6 +72,21 @@ def test_a_stream_that_stops_is_stale_and_comes_back(kind, simulated, fault):
         time.sleep(0.1)
         time.sleep(0.2)
         assert sensor.losses().lost > 0.9 * missing
+
+
+@BOTH
+def test_frames_that_come_late_are_waited_for(kind, simulated):
+    """As on a busy computer: nothing comes during the whole window, all of it soon after."""
+    with opened(kind, simulated.port) as sensor:
+        time.sleep(0.2)
+        os.kill(simulated.process.pid, signal.SIGSTOP)
+        timer = threading.Timer(0.25, os.kill, (simulated.process.pid, signal.SIGCONT))
+        timer.start()
+        began = time.monotonic()
+        mean = sensor.average(0.1)
+        timer.join()
+        assert time.monotonic() - began > 0.2
+        assert mean.frames >= 5  # half of what 100 Hz, the slowest, gives in the window
 
 
 @BOTH

@@ -57,8 +57,10 @@ def check_beyond(d: Diagnosis) -> None:
     assert d.significant[0] in d.message
     assert 0.02 < d.beyond.share < 1.0
     assert d.beyond.variance_factor > 1.0
+    assert 0 <= d.beyond.refitted <= len(d.beyond.effects)
     assert to_json(d)["beyond"] == {
         "effects": list(d.beyond.effects),
+        "refitted": d.beyond.refitted,
         "share": d.beyond.share,
         "variance_factor": d.beyond.variance_factor,
     }

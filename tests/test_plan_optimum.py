@@ -21,8 +21,7 @@ from hilcal.types import Floats, Ints
 
 def compromise() -> Compromise:
     """Of two parameters, with a third that may be there."""
-    c = np.zeros((3, 3))
-    c[:2, :2] = [[2.0, 0.5], [0.5, 1.0]]
+    c = np.array([[2.0, 0.5, 0.0], [0.5, 1.0, 0.0], [0.0, 0.0, 0.0]])
     return Compromise(Linear(c), Linear(c[:2, :2]), 1.0, 2.0)
 
 

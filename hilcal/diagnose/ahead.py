@@ -82,7 +82,8 @@ def look_ahead(d: Diagnosis, say: Callable[[str], None] = lambda text: None) -> 
     """
     if not d.significant:
         return d
-    current, names = d.fit, list[str]()
+    current = d.fit
+    names: list[str] = []
     misfit = d.fit.chi2 - d.fit.dof
     while True:
         left = rest(current)
@@ -98,7 +99,10 @@ def look_ahead(d: Diagnosis, say: Callable[[str], None] = lambda text: None) -> 
     if noise.misjudged or not noise.off:
         return d
     beyond = Beyond(
-        (*names, *left.effects), (left.square - left.dof) / misfit, left.square / left.dof
+        (*names, *left.effects),
+        len(names),
+        (left.square - left.dof) / misfit,
+        left.square / left.dof,
     )
     message = _doubted(d, beyond, told) + noise.message
     return replace(

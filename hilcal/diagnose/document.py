@@ -42,6 +42,7 @@ def to_json(d: Diagnosis) -> dict[str, object]:
         if d.beyond is None
         else {
             "effects": list(d.beyond.effects),
+            "refitted": d.beyond.refitted,
             "share": d.beyond.share,
             "variance_factor": d.beyond.variance_factor,
         },

@@ -31,11 +31,13 @@ class Beyond:
 
     Attributes:
         effects: these effects, the best first.
+        refitted: how many of them were added by a refit; the carriers are of what these leave.
         share: of the misfit, that they leave.
         variance_factor: of the residual with them.
     """
 
     effects: tuple[str, ...]
+    refitted: int
     share: float
     variance_factor: float
 
@@ -58,7 +60,7 @@ class Diagnosis:
         carriers: variables that carry what is predictable, with the dependence on each.
         apart: how the leading suspect differs from those that it is not told from.
         beyond: what the whole catalogue leaves; None where it leaves noise, or nobody asked
-            (see `look_ahead`). Where it is given, the carriers are those of what is left.
+            (see `look_ahead`). Where it is given, the carriers are those of what the refit leaves.
     """
 
     fit: Fit

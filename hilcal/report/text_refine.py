@@ -77,7 +77,8 @@ def diagnosis_report(d: Diagnosis) -> Iterator[RenderableType]:
             f"{numbers.percent(d.predictable_share)} of the misfit."
         )
         if d.beyond is not None:
-            yield f"What is left with {numbers.names(d.beyond.effects)}:"
+            with_them = numbers.names(d.beyond.effects[: d.beyond.refitted])
+            yield f"What is left{' with ' * bool(with_them)}{with_them}:"
         yield from curves(d.carriers)
     if d.verdict == "unknown_effect":
         yield Text(
