@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode
-from hilcal.diagnose.revise import add, exchange, predicts_better, remove
 from hilcal.diagnose.rivals import Alternative, Rivals
+from hilcal.diagnose.stepwise import add, exchange, predicts_better, remove
 from hilcal.diagnose.verdict import Diagnosis, Verdict, diagnose
 from hilcal.identify.fit import Fit, fit
 from hilcal.model import Model

@@ -12,11 +12,11 @@ from hilcal.data.readings import Readings
 from hilcal.data.records import content_hash
 from hilcal.data.revision import RevisionRecord
 from hilcal.data.whitening import MODES, SCALINGS, Mode, Scaling
-from hilcal.diagnose import document as diagnosis_document
+from hilcal.diagnose import diagnosis_document
 from hilcal.diagnose.verdict import Diagnosis
 from hilcal.effects.catalogue import make
 from hilcal.errors import InputError
-from hilcal.identify import document as fit_document
+from hilcal.identify import fit_document
 from hilcal.identify.fit import Fit, fit
 from hilcal.model import Model
 from hilcal.types import Floats

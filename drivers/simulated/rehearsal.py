@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drivers.simulated.campaign import rehearsal_states, simulate
-from drivers.simulated.hidden import DEFLECTION_EFFECTS, EFFECTS, hide, nothing_hidden
+from drivers.simulated.injected_effects import DEFLECTION_EFFECTS, EFFECTS, hide, nothing_hidden
 from drivers.simulated.tracker import TrackerNoise
 from drivers.simulated.world import World
 from hilcal.cell import Cell, cell_from_config

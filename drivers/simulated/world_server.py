@@ -22,9 +22,9 @@ from typing import Any
 
 from drivers.simulated import admin
 from drivers.simulated.blackboard import Blackboard
-from drivers.simulated.living_world import LivingWorld
 from drivers.simulated.parent import end_with_parent
 from drivers.simulated.world_file import read_world
+from drivers.simulated.world_state import LivingWorld
 from hilcal.errors import HilcalError
 
 OPS = ("hang", "mistake", "push", "swing", "state", "log", "die")

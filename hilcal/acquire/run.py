@@ -12,8 +12,8 @@ from hilcal.acquire.progress import Phase, Remark, Watcher
 from hilcal.acquire.rig import Rig
 from hilcal.acquire.route import route
 from hilcal.acquire.session import Judge, Session
+from hilcal.acquire.stopping_rule import Rule
 from hilcal.acquire.store import Store
-from hilcal.acquire.until import Rule
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.data.plan import Plan

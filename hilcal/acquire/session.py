@@ -11,20 +11,20 @@ import numpy as np
 from hilcal.acquire.clock import Clock
 from hilcal.acquire.drift import Shift
 from hilcal.acquire.dry_run import route_problems
+from hilcal.acquire.eta import Pace
 from hilcal.acquire.force import Feeling, ForceMeter
 from hilcal.acquire.guard import Guard
 from hilcal.acquire.loads import Hook, payload
-from hilcal.acquire.memory import Memory
+from hilcal.acquire.measure import Measured, Taker
 from hilcal.acquire.motion import Mover
-from hilcal.acquire.pace import Pace
 from hilcal.acquire.progress import Judged, Phase, Remark, Taken, Watcher
 from hilcal.acquire.raw import plain
+from hilcal.acquire.reading_record import detail, feeling_of, row
 from hilcal.acquire.rig import Rig
 from hilcal.acquire.route import Stop
-from hilcal.acquire.row import detail, feeling_of, row
+from hilcal.acquire.session_state import Memory
+from hilcal.acquire.stopping_rule import Aim, Rule, ending
 from hilcal.acquire.store import Store
-from hilcal.acquire.take import Measured, Taker
-from hilcal.acquire.until import Aim, Rule, ending
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.data.plan import UNLOADED, Plan, Step

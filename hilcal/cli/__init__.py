@@ -19,8 +19,6 @@ from hilcal.cli.planning import check, plan
 from hilcal.cli.refining import add, diagnose, refine, remove, view
 from hilcal.cli.running import run
 from hilcal.cli.simulating import simulate
-from hilcal.cli.study_diagnosis import diagnosis
-from hilcal.cli.study_plans import plans
 from hilcal.cli.study_scaling import scaling
 from hilcal.cli.tables import export, import_
 from hilcal.effects.added import scope
@@ -32,18 +30,25 @@ _INTERRUPTED = 130
 _USAGE = 2
 
 
-def _application() -> typer.Typer:
-    def make(help_text: str, *, alone: bool = False) -> typer.Typer:
-        return typer.Typer(
-            add_completion=False,
-            pretty_exceptions_enable=False,
-            no_args_is_help=not alone,
-            invoke_without_command=alone,
-            rich_markup_mode=None,
-            help=help_text,
-        )
+def application(help_text: str, *, alone: bool = False) -> typer.Typer:
+    """Return an empty application.
 
-    app = make(
+    Args:
+        help_text: what it is for.
+        alone: whether it does something without a command.
+    """
+    return typer.Typer(
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        no_args_is_help=not alone,
+        invoke_without_command=alone,
+        rich_markup_mode=None,
+        help=help_text,
+    )
+
+
+def _hilcal() -> typer.Typer:
+    app = application(
         "Calibrate a robot arm: fit, see where the model fails, name and add what is missing."
     )
     commands: dict[str, Callable[..., None]] = {
@@ -66,14 +71,14 @@ def _application() -> typer.Typer:
     }
     for name, command in commands.items():
         app.command(name)(command)
-    known = make("List the effects that a model can have; new: begin one of your own.", alone=True)
+    known = application(
+        "List the effects that a model can have; new: begin one of your own.", alone=True
+    )
     known.command("new")(new)
     known.callback()(effects)
     app.add_typer(known, name="effects")
-    study = make("Studies of the program's own mathematics.")
+    study = application("Studies of the program's own mathematics.")
     study.command("scaling")(scaling)
-    study.command("plans")(plans)
-    study.command("diagnosis")(diagnosis)
     study.callback()(_group)
     app.add_typer(study, name="study")
     app.callback()(_top)
@@ -100,9 +105,19 @@ def _top(
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
+    """Run a command of `hilcal` and exit; see `execute`."""
+    execute(_hilcal(), "hilcal", arguments)
+
+
+def execute(app: typer.Typer, name: str, arguments: Sequence[str] | None = None) -> None:
     """Run a command and exit: 0 done, 2 wrong input, 3 a device failed, 4 cannot be answered.
 
     Wrong input and failures are one line on stderr; HILCAL_DEBUG=1 shows where they came from.
+
+    Args:
+        app: the commands.
+        name: of the program.
+        arguments: of the command line; those of the process where None.
     """
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
@@ -113,12 +128,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with warnings.catch_warnings(), threads, scope():
         if not debug:
             warnings.simplefilter("ignore")
-        sys.exit(_run(sys.argv[1:] if arguments is None else list(arguments), debug))
+        given = sys.argv[1:] if arguments is None else list(arguments)
+        sys.exit(_run(app, name, given, debug))
 
 
-def _run(arguments: list[str], debug: bool) -> int:
+def _run(app: typer.Typer, name: str, arguments: list[str], debug: bool) -> int:
     try:
-        result = _application()(arguments, prog_name="hilcal", standalone_mode=False)
+        result = app(arguments, prog_name=name, standalone_mode=False)
         sys.stdout.flush()
     except HilcalError as error:
         return _fail(error, str(error), error.exit_code, debug)

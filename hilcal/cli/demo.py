@@ -19,7 +19,7 @@ from hilcal.config import load_config
 from hilcal.data.campaign import Campaign, may_write
 from hilcal.data.plan import Plan
 from hilcal.data.records import content_hash
-from hilcal.diagnose.document import to_json
+from hilcal.diagnose.diagnosis_document import to_json
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.refine import Refinement

@@ -20,7 +20,7 @@ from hilcal.effects.option_help import option_defaults, option_help
 from hilcal.effects.protocol import Effect
 from hilcal.effects.written import written
 from hilcal.errors import InputError
-from hilcal.identify.document import plain
+from hilcal.identify.fit_document import plain
 from hilcal.report import text
 
 OPTIONS_NOTE = (

@@ -14,7 +14,7 @@ from hilcal.data.readings import Readings
 from hilcal.data.records import content_hash
 from hilcal.data.revision import RevisionRecord
 from hilcal.data.whitening import MODES, SCALINGS, Mode, Scaling
-from hilcal.diagnose.ahead import look_ahead
+from hilcal.diagnose.catalogue_sufficiency import look_ahead
 from hilcal.diagnose.verdict import Diagnosis, diagnose
 from hilcal.effects.catalogue import make
 from hilcal.effects.options import Options

@@ -17,14 +17,14 @@ from hilcal.cli.files import (
 )
 from hilcal.cli.terminal import Json, Run, terminal
 from hilcal.data.whitening import Scaling
+from hilcal.diagnose.misfit_breakdown import where
 from hilcal.diagnose.projection import projection
-from hilcal.diagnose.where import where
 from hilcal.effects.written import write_effect
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline, with_effects
-from hilcal.identify.document import to_json
-from hilcal.identify.everything import everything
 from hilcal.identify.fit import Fit, fit
+from hilcal.identify.fit_document import to_json
+from hilcal.identify.full_prediction import everything
 from hilcal.identify.validation import validate as predict_other
 from hilcal.report import numbers, text
 from hilcal.report.progress import working

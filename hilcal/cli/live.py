@@ -12,8 +12,8 @@ from hilcal.data.whitening import whitening
 from hilcal.errors import HilcalError
 from hilcal.identify.baseline import with_effects
 from hilcal.identify.fit import mahalanobis2
+from hilcal.identify.folds import distinct_poses
 from hilcal.identify.gauss_newton import Solution, scales_of, solve
-from hilcal.identify.poses import distinct_poses
 from hilcal.identify.repeatability import with_repeatability
 from hilcal.identify.residual import residual
 from hilcal.model import Model

@@ -23,14 +23,14 @@ from hilcal.cli.planning import plan_json, read_cell
 from hilcal.cli.terminal import Json, Record, Run, Terminal, terminal
 from hilcal.data.plan import REFERENCE, Plan, read_plan
 from hilcal.data.run_log import PLAN
-from hilcal.diagnose.revise import remove
 from hilcal.diagnose.rivals import Rivals
+from hilcal.diagnose.stepwise import remove
 from hilcal.diagnose.verdict import diagnose
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.fit import Fit
 from hilcal.plan.next import Next, measure_next
 from hilcal.plan.planner import Request
-from hilcal.plan.tell import about, story
+from hilcal.plan.summary import about, story
 from hilcal.report import numbers as words_of
 from hilcal.report.progress import Say, working
 from hilcal.report.text_next import next_report

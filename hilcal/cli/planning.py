@@ -31,7 +31,7 @@ from hilcal.errors import DeviceError, InputError
 from hilcal.identify.fit import Fit
 from hilcal.plan.choice import CRITERIA
 from hilcal.plan.planner import Request, make
-from hilcal.plan.tell import about, remarks, story
+from hilcal.plan.summary import about, remarks, story
 from hilcal.report import text_run
 from hilcal.report.progress import Say, working
 from hilcal.report.text_plan import story_report

@@ -25,8 +25,8 @@ from hilcal.cli.files import (
 from hilcal.cli.fitting import Readings, options_json, options_line
 from hilcal.cli.terminal import Json, Record, Run, terminal
 from hilcal.data.revision import change
-from hilcal.diagnose.ahead import look_ahead
-from hilcal.diagnose.document import to_json
+from hilcal.diagnose.catalogue_sufficiency import look_ahead
+from hilcal.diagnose.diagnosis_document import to_json
 from hilcal.diagnose.verdict import diagnose as judge
 from hilcal.effects.catalogue import effect_class
 from hilcal.effects.options import Options

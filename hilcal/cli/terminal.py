@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 from rich.console import Console, RenderableType
 
-from hilcal.identify.document import plain
+from hilcal.identify.fit_document import plain
 
 WIDTH = 100
 

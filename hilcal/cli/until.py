@@ -6,22 +6,22 @@ from collections.abc import Callable
 
 import numpy as np
 
-from hilcal.acquire.until import Standing
+from hilcal.acquire.stopping_rule import Standing
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode
 from hilcal.errors import HilcalError
 from hilcal.identify.baseline import with_effects
-from hilcal.identify.document import finite
 from hilcal.identify.fit import Fit, fit
+from hilcal.identify.fit_document import finite
 from hilcal.identify.gauss_newton import scales_of
 from hilcal.identify.repeatability import with_repeatability
-from hilcal.plan.assumed import after, assumed
 from hilcal.plan.feasible import Space
 from hilcal.plan.goal import JOINTS, Goal, Verdict, figures, parse_goal
+from hilcal.plan.nominal_model import after, assumed
 from hilcal.plan.predicted import positions_of, rms
-from hilcal.plan.work import work_poses
+from hilcal.plan.prediction_poses import work_poses
 from hilcal.report import numbers
 from hilcal.revisions import usual_mode
 from hilcal.types import Floats

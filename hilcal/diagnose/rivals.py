@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg as sl
 
-from hilcal.diagnose.needless import own_score
+from hilcal.diagnose.backward_elimination import own_score
+from hilcal.diagnose.effect_ranking import SAME_EVIDENCE, candidates, family
 from hilcal.diagnose.score import Score, score
-from hilcal.diagnose.suspects import SAME_EVIDENCE, candidates, family
 from hilcal.diagnose.without import leave_out_effect, whitened_columns
 from hilcal.identify.fit import Fit
 from hilcal.types import Floats

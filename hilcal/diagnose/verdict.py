@@ -6,15 +6,15 @@ from typing import Literal
 
 from scipy.stats import chi2
 
-from hilcal.diagnose.apart import Apart, apart
-from hilcal.diagnose.dependence import Dependence, Predicted
-from hilcal.diagnose.learner import predictable, predictable_share
-from hilcal.diagnose.needless import needless
+from hilcal.diagnose.backward_elimination import needless
+from hilcal.diagnose.effect_ranking import Suspect, candidates, rank_suspects
+from hilcal.diagnose.misfit_breakdown import Where, where
 from hilcal.diagnose.noise import PureError, pure_error
 from hilcal.diagnose.noise_verdict import MISFIT_ALARM, PREDICTABLE, judge_noise
 from hilcal.diagnose.projection import Projection, projection
-from hilcal.diagnose.suspects import Suspect, candidates, rank_suspects
-from hilcal.diagnose.where import Where, where
+from hilcal.diagnose.residual_curves import Dependence, Predicted
+from hilcal.diagnose.residual_regression import predictable, predictable_share
+from hilcal.diagnose.separability import Apart, apart
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit
 

@@ -8,12 +8,12 @@ from scipy.stats import chi2
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode, Scaling, Whitening, inverse_root, whitening
 from hilcal.errors import CannotAnswerError
+from hilcal.identify.data_snooping import find_gross
 from hilcal.identify.errors import ErrorBlock, error_block
+from hilcal.identify.folds import distinct_poses, random_folds
 from hilcal.identify.gauss_newton import Solution, solve
-from hilcal.identify.gross import find_gross
 from hilcal.identify.holdout import leave_out
 from hilcal.identify.outliers import limit
-from hilcal.identify.poses import distinct_poses, random_folds
 from hilcal.identify.residual import residual
 from hilcal.identify.uncertainty import Uncertainty, uncertainty
 from hilcal.model import Model

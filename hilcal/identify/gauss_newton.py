@@ -8,9 +8,9 @@ import scipy.linalg as sl
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Whitening
 from hilcal.errors import CannotAnswerError
+from hilcal.identify.empirical_bayes import shrink
 from hilcal.identify.linear import Basis, NormalEquations, find_basis, normal_equations
 from hilcal.identify.residual import residual
-from hilcal.identify.shrinkage import shrink
 from hilcal.model import Model, Prediction
 from hilcal.types import Floats, Ints
 

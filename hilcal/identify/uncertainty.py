@@ -21,10 +21,10 @@ from scipy.stats import chi2
 
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Whitening
+from hilcal.identify.folds import block_folds, region_folds
 from hilcal.identify.gauss_newton import Solution, prior_of, scales_of, whitened_jacobian
 from hilcal.identify.holdout import leave_out
-from hilcal.identify.poses import block_folds, region_folds
-from hilcal.identify.strength_spread import widened, with_dropped
+from hilcal.identify.hyperparameter_uncertainty import widened, with_dropped
 from hilcal.model import Model
 from hilcal.types import Bools, Floats, Ints
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from hilcal.plan.candidate_set import Units
 from hilcal.plan.criterion import Smooth
-from hilcal.plan.units import Units
 from hilcal.types import Floats, Ints
 
 _CHUNK = 2048

@@ -9,8 +9,8 @@ from hilcal.config import CellConfig
 from hilcal.data.plan import UNLOADED
 from hilcal.data.readings import States
 from hilcal.effects.protocol import Effect
-from hilcal.plan.assumed import Assumed, nominal_states
 from hilcal.plan.noise_model import reading_covariance
+from hilcal.plan.nominal_model import Assumed, nominal_states
 from hilcal.types import Bools, Floats, Ints
 
 CHUNK = 4096

@@ -6,16 +6,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilcal.errors import CannotAnswerError, InputError
+from hilcal.plan.approximate_design import relax
+from hilcal.plan.candidate_set import Units
 from hilcal.plan.criteria import A, D, Linear
 from hilcal.plan.criterion import Criterion
-from hilcal.plan.extremes import E, K
+from hilcal.plan.eigenvalue_criteria import E, K
 from hilcal.plan.information import Problem
 from hilcal.plan.optimum import Curve, Design, best, curve
-from hilcal.plan.relaxation import relax
+from hilcal.plan.prediction_poses import WorkPoses
 from hilcal.plan.rivals import rivals
-from hilcal.plan.separation import Separate
-from hilcal.plan.units import Units
-from hilcal.plan.work import WorkPoses
+from hilcal.plan.t_optimality import Separate
 from hilcal.types import Bools, Floats, Ints
 
 CRITERIA = ("D", "A", "E", "K", "test", "separate")

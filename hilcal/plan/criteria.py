@@ -14,8 +14,8 @@ from hilcal.plan.criterion import (
     require_determined,
     square,
 )
-from hilcal.plan.extremes import E, K
-from hilcal.plan.separation import Pair, Separate
+from hilcal.plan.eigenvalue_criteria import E, K
+from hilcal.plan.t_optimality import Pair, Separate
 from hilcal.types import Bools, Floats, Ints
 
 __all__ = ["A", "Criterion", "D", "E", "K", "Linear", "Pair", "Separate", "Smooth"]

@@ -11,7 +11,7 @@ from hilcal.data.plan import UNLOADED
 from hilcal.data.whitening import Mode
 from hilcal.effects.protocol import Effect
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.plan.assumed import Assumed
+from hilcal.plan.candidate_set import Units
 from hilcal.plan.candidates import (
     Candidates,
     Sensed,
@@ -20,9 +20,9 @@ from hilcal.plan.candidates import (
     deflection_rows,
     sense,
 )
-from hilcal.plan.known import information_of
+from hilcal.plan.nominal_model import Assumed
 from hilcal.plan.potential import Potential, potential
-from hilcal.plan.units import Units
+from hilcal.plan.prior_information import information_of
 from hilcal.types import Bools, Floats, Ints
 
 PAIRS_UP_TO = 4

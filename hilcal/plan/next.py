@@ -15,7 +15,7 @@ from hilcal.plan.information import Problem, readings_of
 from hilcal.plan.order import Chosen, Ordering, order_plan
 from hilcal.plan.planner import Planned, Request, Say, make
 from hilcal.plan.rivals import LEVEL, Rivals, estimated, never, power, rivals
-from hilcal.plan.separation import Pair
+from hilcal.plan.t_optimality import Pair
 from hilcal.robot.chain import evaluate
 from hilcal.types import Floats
 

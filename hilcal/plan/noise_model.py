@@ -5,7 +5,7 @@ import numpy as np
 from hilcal.config import CellConfig
 from hilcal.data.noise import TrackerNoise, tracker_covariance, tracker_pose_covariance
 from hilcal.model import Prediction
-from hilcal.plan.assumed import Assumed
+from hilcal.plan.nominal_model import Assumed
 from hilcal.robot import se3
 from hilcal.robot.chain import joint_jacobian
 from hilcal.types import Floats

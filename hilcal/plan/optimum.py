@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilcal.errors import CannotAnswerError
+from hilcal.plan.approximate_design import Relaxed, checked, relax
+from hilcal.plan.candidate_set import Units
 from hilcal.plan.criterion import Criterion
-from hilcal.plan.exchange import exact, rounded
-from hilcal.plan.relaxation import Relaxed, checked, relax
-from hilcal.plan.units import Units
+from hilcal.plan.exact_design import exact, rounded
 from hilcal.types import Floats, Ints
 
 

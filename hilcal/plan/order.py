@@ -10,9 +10,9 @@ from hilcal.config import CellConfig
 from hilcal.data.plan import REFERENCE, UNLOADED, Plan
 from hilcal.errors import InputError
 from hilcal.plan.confounding import Confounding
-from hilcal.plan.maker import Maker
 from hilcal.plan.ordering import Chosen, Ordering, stops_of
 from hilcal.plan.passages import Passable
+from hilcal.plan.run_order import Maker
 from hilcal.plan.timing import Duration
 from hilcal.types import Floats
 

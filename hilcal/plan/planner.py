@@ -12,7 +12,6 @@ from hilcal.data.plan import UNLOADED
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.fit import Fit
 from hilcal.identify.registration import MIN_POSES
-from hilcal.plan.assumed import after, assumed
 from hilcal.plan.choice import (
     EFFORT,
     Loads,
@@ -23,15 +22,16 @@ from hilcal.plan.choice import (
     within,
     worthwhile,
 )
-from hilcal.plan.compromise import robust_question
+from hilcal.plan.compound_criteria import robust_question
 from hilcal.plan.draw import Drawn, draw
 from hilcal.plan.feasible import Space
 from hilcal.plan.information import Problem, problem, readings_of
 from hilcal.plan.noise_model import reading_covariance
+from hilcal.plan.nominal_model import after, assumed
 from hilcal.plan.optimum import Design
 from hilcal.plan.order import Chosen, Ordered, Ordering, order_plan
+from hilcal.plan.prediction_poses import WorkPoses, work_poses
 from hilcal.plan.timing import pace
-from hilcal.plan.work import WorkPoses, work_poses
 from hilcal.types import Bools, Floats, Ints
 
 HOMES = 4

@@ -14,7 +14,6 @@ import numpy as np
 
 from hilcal.config import CellConfig
 from hilcal.effects.protocol import Effect
-from hilcal.plan.assumed import Assumed, build, potential_names, random_columns
 from hilcal.plan.candidates import (
     Candidates,
     absolute_rows,
@@ -22,6 +21,7 @@ from hilcal.plan.candidates import (
     sense,
     sizes,
 )
+from hilcal.plan.nominal_model import Assumed, build, potential_names, random_columns
 from hilcal.types import Floats
 
 MOST_PARAMETERS = 200

@@ -7,7 +7,7 @@ import numpy as np
 from hilcal.identify.linear import INFORMATION, ROUNDING
 from hilcal.identify.uncertainty import LEARNT, MEANINGLESS, NULL_SHARE
 from hilcal.plan.information import Problem
-from hilcal.plan.work import WorkPoses
+from hilcal.plan.prediction_poses import WorkPoses
 from hilcal.types import Bools, Floats
 
 

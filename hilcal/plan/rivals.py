@@ -17,10 +17,10 @@ from scipy import stats
 
 from hilcal.data.plan import UNLOADED
 from hilcal.errors import CannotAnswerError, InputError
+from hilcal.plan.approximate_design import relax
 from hilcal.plan.information import Problem
-from hilcal.plan.relaxation import relax
-from hilcal.plan.separation import Pair, Separate
 from hilcal.plan.suspects import estimate
+from hilcal.plan.t_optimality import Pair, Separate
 from hilcal.types import Floats
 
 LEVEL = 0.01

@@ -10,14 +10,14 @@ import scipy.linalg as sl
 from hilcal.cell import Cell
 from hilcal.data.revision import change
 from hilcal.data.whitening import Mode
-from hilcal.diagnose.dependence import Dependence
+from hilcal.diagnose.effect_ranking import Suspect, candidates
 from hilcal.diagnose.projection import projection
-from hilcal.diagnose.suspects import Suspect, candidates
+from hilcal.diagnose.residual_curves import Dependence
 from hilcal.diagnose.verdict import Diagnosis
 from hilcal.errors import InputError
-from hilcal.identify.document import finite
-from hilcal.identify.everything import Everything, everything
 from hilcal.identify.fit import Fit, mahalanobis2
+from hilcal.identify.fit_document import finite
+from hilcal.identify.full_prediction import Everything, everything
 from hilcal.model import Model
 from hilcal.report import numbers
 from hilcal.report.story import (

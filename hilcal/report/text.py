@@ -9,12 +9,12 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from hilcal.diagnose.where import Where
+from hilcal.diagnose.misfit_breakdown import Where
 from hilcal.effects.protocol import Effect
-from hilcal.identify.document import notes, registration
-from hilcal.identify.everything import Everything, everything
+from hilcal.identify.data_snooping_reason import gross_errors
 from hilcal.identify.fit import Fit
-from hilcal.identify.gross_reason import gross_errors
+from hilcal.identify.fit_document import notes, registration
+from hilcal.identify.full_prediction import Everything, everything
 from hilcal.report import numbers
 from hilcal.robot import se3
 from hilcal.types import Ints

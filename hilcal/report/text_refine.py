@@ -7,8 +7,8 @@ from rich.text import Text
 
 from hilcal.diagnose.verdict import Diagnosis
 from hilcal.effects.catalogue import catalogue
-from hilcal.identify.everything import everything
 from hilcal.identify.fit import Fit
+from hilcal.identify.full_prediction import everything
 from hilcal.report import numbers, text
 from hilcal.report.text_seen import could_have_been_seen, needless_line
 from hilcal.report.text_unknown import curves, repeats

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from rich.console import RenderableType
 from rich.text import Text
 
-from hilcal.diagnose.sensitivity import Strength
+from hilcal.diagnose.minimum_detectable_effect import Strength
 from hilcal.diagnose.verdict import Diagnosis
 from hilcal.report import numbers, text
 

@@ -5,8 +5,8 @@ from collections.abc import Iterator, Sequence
 from rich.console import RenderableType
 from rich.text import Text
 
-from hilcal.diagnose.dependence import Dependence
 from hilcal.diagnose.noise import PureError
+from hilcal.diagnose.residual_curves import Dependence
 from hilcal.report import numbers, text
 
 BARS = "▁▂▃▄▅▆▇█"

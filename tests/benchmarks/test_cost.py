@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.linalg as sl
-from arm_cases import arm_of, cell_of
 
 from hilcal.data.readings import Readings, States
 from hilcal.data.whitening import Whitening, whitening
@@ -29,6 +28,7 @@ from hilcal.identify.linear import find_basis, normal_equations
 from hilcal.identify.residual import residual
 from hilcal.model import Model, Prediction
 from hilcal.types import Floats
+from tests.support.arm_cases import arm_of, cell_of
 
 pytestmark = pytest.mark.slow
 

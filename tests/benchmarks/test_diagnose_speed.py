@@ -10,17 +10,17 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from campaigns import campaign
 
 from hilcal.data.whitening import Mode
+from hilcal.diagnose.effect_ranking import Suspect, candidates, rank_suspects
 from hilcal.diagnose.projection import projection
-from hilcal.diagnose.suspects import Suspect, candidates, rank_suspects
 from hilcal.diagnose.verdict import diagnose
 from hilcal.effects.catalogue import make
 from hilcal.effects.options import reading_options
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
 from hilcal.model import Model
+from tests.support.campaigns import campaign
 
 pytestmark = pytest.mark.slow
 

@@ -11,7 +11,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from sim_serial_cases import force_sensor
+
+from tests.support.sim_serial_cases import force_sensor
 
 ROOT = Path(__file__).resolve().parents[2]
 

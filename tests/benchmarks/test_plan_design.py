@@ -11,18 +11,18 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.linalg as sl
-from arm_cases import arm_of, cell_of
 
 from hilcal.data.readings import States
 from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.effects.link_geometry import LinkGeometry
 from hilcal.identify.gauss_newton import scales_of
 from hilcal.model import Model
+from hilcal.plan.approximate_design import relax
+from hilcal.plan.candidate_set import Units
 from hilcal.plan.criteria import D
 from hilcal.plan.optimum import best
-from hilcal.plan.relaxation import relax
-from hilcal.plan.units import Units
 from hilcal.types import Floats
+from tests.support.arm_cases import arm_of, cell_of
 
 pytestmark = pytest.mark.slow
 

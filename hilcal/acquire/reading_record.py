@@ -1,0 +1,106 @@
+"""One reading as a row of the campaign, and everything raw behind it as JSON."""
+
+from typing import Any
+
+import numpy as np
+
+from hilcal.acquire.force import Feeling
+from hilcal.acquire.measure import Measured
+from hilcal.acquire.raw import plain
+from hilcal.data.plan import Step
+from hilcal.data.readings import Readings, States
+from hilcal.types import Floats
+
+
+def row(
+    step: Step,
+    q: Floats,
+    measured: Measured,
+    wrench: Floats,
+    time: float,
+    load_time: float,
+    side: Floats,
+    joint_temperature: Floats | None,
+) -> Readings:
+    """Return one reading; its covariance is the instrument's alone.
+
+    Args:
+        step: which one.
+        q: (n,) commanded joint angles, rad.
+        measured: what was measured.
+        wrench: (6,) of the load at the load point, base axes, N and N·m.
+        time: since the campaign's start, cell s.
+        load_time: since the load's last change, cell s.
+        side: (n,) from which each joint arrived, -1 or +1.
+        joint_temperature: (n,) °C; None in a campaign without.
+    """
+    states = States(
+        q=q[None].copy(),
+        wrench=wrench[None].copy(),
+        time=np.array([time]),
+        load_time=np.array([load_time]),
+        joint_temperature=None if joint_temperature is None else joint_temperature[None].copy(),
+        approach=side[None].copy(),
+        q_actual=measured.q[None].copy(),
+    )
+    return Readings(
+        states=states,
+        pose=np.zeros(1, dtype=np.int64),
+        load=np.zeros(1, dtype=np.int64),
+        cycle=np.array([step.cycle], dtype=np.int64),
+        value=measured.mean.value[None].copy(),
+        covariance=measured.mean.covariance[None].copy(),
+        load_names=(step.load,),
+        pose_names=(step.pose,),
+    )
+
+
+def detail(
+    step: Step,
+    measured: Measured,
+    feeling: Feeling | None,
+    zero: Floats | None,
+    session: dict[str, Any],
+) -> dict[str, Any]:
+    """Return everything raw behind a reading.
+
+    Args:
+        step: which one.
+        measured: what was measured.
+        feeling: the mean wrench against the session's zero; None without a force sensor.
+        zero: (6,) that zero.
+        session: further keys of the session: times, losses, sides.
+    """
+    out: dict[str, Any] = {
+        "pose": step.pose,
+        "load": step.load,
+        "cycle": step.cycle,
+        "value": measured.mean.value.tolist(),
+        "tracker_covariance": measured.mean.covariance.tolist(),
+        "scatter": measured.mean.scatter,
+        "left_out": list(measured.mean.left_out),
+        "q_actual": measured.q.tolist(),
+        "settling_s": measured.settling,
+        "remarks": list(measured.remarks),
+        "arm_before": plain(measured.before),
+        "arm_after": plain(measured.after),
+        "tracker": [plain(sample) for sample in measured.tracker],
+        "force": plain(measured.force),
+    }
+    if feeling is not None and zero is not None:
+        out["felt"] = {
+            "wrench": feeling.wrench.tolist(),
+            "covariance": feeling.covariance.tolist(),
+            "zero": zero.tolist(),
+        }
+    return out | session
+
+
+def feeling_of(stored: dict[str, Any]) -> Feeling | None:
+    """Return the mean wrench in a stored detail; None without one."""
+    felt = stored.get("felt")
+    if felt is None:
+        return None
+    return Feeling(
+        np.array(felt["wrench"]), np.array(felt["covariance"]), np.array(stored["q_actual"])
+    )

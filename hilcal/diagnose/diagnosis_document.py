@@ -1,0 +1,101 @@
+"""The JSON of a diagnosis."""
+
+from collections.abc import Sequence
+
+from hilcal.diagnose.minimum_detectable_effect import Strength
+from hilcal.diagnose.noise import PureError
+from hilcal.diagnose.residual_curves import Dependence
+from hilcal.diagnose.verdict import Diagnosis
+
+
+def to_json(d: Diagnosis) -> dict[str, object]:
+    """Keys of the contract, and what repeats say of the noise."""
+    return {
+        "model": list(d.fit.model.names),
+        "verdict": d.verdict,
+        "message": d.message,
+        "variance_factor": d.fit.variance_factor,
+        "variance_factor_interval": list(d.fit.variance_factor_interval),
+        "predictable_share": d.predictable_share,
+        "where": [
+            {"variable": v.variable, "share": v.share, "p_value": v.p_value} for v in d.where
+        ],
+        "suspects": [
+            {
+                "effect": s.effect,
+                "p_value": s.score.p_value,
+                "share": s.share,
+                "holdout_share": s.holdout_share,
+                "delta_bic": s.score.delta_bic,
+                "log_evidence": s.score.log_evidence,
+                "significant": s.effect in d.significant,
+                "same_as": list(s.same_as),
+                "least": least(s.least),
+            }
+            for s in d.suspects
+        ],
+        "apart": [
+            {"effect": a.effect, "unlike": a.unlike, "times": a.times if a.possible else None}
+            for a in d.apart
+        ],
+        "beyond": None
+        if d.beyond is None
+        else {
+            "effects": list(d.beyond.effects),
+            "refitted": d.beyond.refitted,
+            "share": d.beyond.share,
+            "variance_factor": d.beyond.variance_factor,
+        },
+        "needless": list(d.needless),
+        "carriers": carriers(d.carriers),
+        "pure_error": None if d.pure_error is None else repeats(d.pure_error),
+    }
+
+
+def least(s: Strength) -> dict[str, object] | None:
+    """Smallest strength that would have been revealed, SI; null where none would."""
+    if not s.visible:
+        return None
+    return {
+        "displacement_m": s.displacement_m,
+        "parameters": [{"unit": unit, "rms": rms} for unit, rms in s.parameters],
+    }
+
+
+def repeats(e: PureError) -> dict[str, object]:
+    """What repeats say of the noise; `where` is null where it is everywhere the same."""
+    w = e.where
+    return {
+        "variance_factor": e.factor,
+        "interval": list(e.interval),
+        "dof": e.dof,
+        "lack_of_fit_p": e.lack_of_fit_p,
+        "where": None
+        if w is None
+        else {
+            "kind": w.kind,
+            "name": w.name,
+            "variance_factor": w.factor,
+            "interval": list(w.interval),
+            "p_value": w.p_value,
+        },
+    }
+
+
+def carriers(found: Sequence[Dependence]) -> list[dict[str, object]]:
+    """Variables that carry what is predictable, with their curves, SI units."""
+    return [
+        {
+            "variable": v.variable,
+            "unit": v.unit,
+            "share": v.share,
+            "moves": v.moves,
+            "direction": v.direction.tolist(),
+            "labels": list(v.labels),
+            "x": v.x.tolist(),
+            "y": v.y.tolist(),
+            "error": v.error.tolist(),
+            "y_unit": v.y_unit,
+        }
+        for v in found
+    ]

@@ -1,0 +1,126 @@
+"""Which effects of the catalogue could be missing, best first."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hilcal.diagnose.minimum_detectable_effect import Strength, least_strength
+from hilcal.diagnose.projection import Projection
+from hilcal.diagnose.score import Score
+from hilcal.effects.catalogue import catalogue, make
+from hilcal.effects.options import reading_options
+from hilcal.effects.protocol import Effect
+from hilcal.identify.fit import Fit
+from hilcal.types import Floats
+
+SAME_EVIDENCE = 3.0
+"""Two suspects whose evidence differs by less than e³ = 20 : 1 are not told apart."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Suspect:
+    """An effect that is not in the model, and what it would explain.
+
+    Attributes:
+        effect: canonical name.
+        score: the joint test of the whole family.
+        share: share of the misfit it explains.
+        holdout_share: the same on poses left out.
+        sure: whether the error there falls by more than it scatters from pose to pose.
+        least: the smallest strength of it that these readings would reveal.
+        same_as: other suspects that these data cannot tell from it.
+    """
+
+    effect: str
+    score: Score
+    share: float
+    holdout_share: float
+    sure: bool
+    least: Strength
+    same_as: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Family:
+    """The columns of an effect in ordinary magnitudes of its parameters.
+
+    Attributes:
+        effect: the effect.
+        scale: (P,) ordinary magnitudes, SI.
+        white: (R, P) whitened columns.
+        motion: (D, 3, P) displacement of each measured position, m.
+    """
+
+    effect: Effect
+    scale: Floats
+    white: Floats
+    motion: Floats
+
+
+def candidates(fit: Fit) -> tuple[Effect, ...]:
+    """Effects that are not in the model and can be computed from these readings."""
+    states = fit.readings[~fit.outlier].states
+    out = []
+    for name, kind in catalogue().items():
+        if name not in fit.model.names and kind.computable(states):
+            effect = make(name, fit.model.cell, states, reading_options(name, fit.whitening.m))
+            out.append(effect.for_scoring(states))
+    return tuple(out)
+
+
+def family(fit: Fit, effect: Effect) -> Family:
+    """Return the columns of an effect, at the parameters of the fit."""
+    s, w = fit.solution, fit.whitening
+    jacobian = fit.model.jacobian_of((effect,), s.prediction, s.theta, w.m)
+    scale = np.array([q.scale for q in effect.parameters])
+    raw = w.raw(jacobian * scale)
+    return Family(effect, scale, w.whiten(raw).reshape(-1, len(scale)), raw[:, :3])
+
+
+def rank_suspects(
+    p: Projection, effects: tuple[Effect, ...], level: float = 0.001
+) -> tuple[Suspect, ...]:
+    """Score all effects; best first by evidence, with those that cannot be told apart named.
+
+    Args:
+        p: the fitted model's part.
+        effects: that are not in the model.
+        level: of the test over all of them together.
+    """
+    found = [_suspect(p, family(p.fit, e), level / len(effects)) for e in effects]
+    found.sort(key=lambda s: (-s.score.log_evidence, s.score.p_value))
+    return tuple(
+        replace(
+            s,
+            same_as=tuple(
+                o.effect
+                for o in found
+                if o is not s
+                and min(o.score.log_evidence, s.score.log_evidence) > SAME_EVIDENCE
+                and abs(o.score.log_evidence - s.score.log_evidence) < SAME_EVIDENCE
+            ),
+        )
+        for s in found
+    )
+
+
+def _suspect(p: Projection, of: Family, level: float) -> Suspect:
+    s = of.white.T @ p.free(of.white)
+    result = p.score_of(s, of.white)
+    held = p.held_out(of.white, result)
+    return Suspect(
+        effect=of.effect.name,
+        score=result,
+        share=p.share(result.gain),
+        holdout_share=held.share,
+        sure=held.sure,
+        least=least_strength(
+            s,
+            of.motion,
+            of.scale,
+            tuple(q.unit for q in of.effect.parameters),
+            p.fit.dof,
+            max(p.fit.variance_factor, 1.0),
+            level,
+        ),
+    )

@@ -1,0 +1,275 @@
+"""What a misfit that no effect explains depends on, and how: variables, shares, curves.
+
+A catalogue of smooth laws asks, for every recorded variable x and every way the arm can move,
+whether one joint errs, or the target along one base axis, as a smooth function of x:
+
+    r = J_j f(x) + noise,    f(x) = Σ_k c_k φ_k(x)
+
+with few functions φ_k: a constant, harmonics of an angle, powers of everything else, membership
+for loads; and products: of an angle's with the size of the load, and of two angles'.
+Laws are chosen one after the other by their evidence, on the poses that are not left out; what
+the chosen laws predict of the poses left out is the predictable share. A variable carries what
+the prediction loses when its values are exchanged at random between poses and loads.
+Source of the latter: Breiman, *Random forests*, Machine Learning 45 (2001) 5-32, section 10.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg as sl
+
+from hilcal.diagnose.projection import Projection
+from hilcal.diagnose.recorded import (
+    PER_MOTION,
+    WIDTH,
+    Variable,
+    bins_of,
+    law_columns,
+    motions,
+    recorded,
+)
+from hilcal.identify.folds import random_folds
+from hilcal.types import Bools, Floats
+
+FOLDS = 5
+MOST_ROWS = 3000
+MOST_LAWS = 3
+SHUFFLES = 4
+LEAST_EVIDENCE = 8.0
+"""Gain in log evidence that a law needs, for the many that are tried."""
+STRENGTHS = np.logspace(-2, 3, 21)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Dependence:
+    """How the misfit depends on one variable.
+
+    Attributes:
+        variable: e.g. "joint 4 angle", "load", "time".
+        unit: of x; empty where x counts the loads of `labels`.
+        share: share of the misfit on poses left out that is lost without the variable.
+        moves: what errs: "joint 2", or "target" along `direction`.
+        direction: (3,) base axes; zero for a joint.
+        x: (K,) centres of the bins.
+        y: (K,) mean error in each bin, rad of the joint or m of the target.
+        error: (K,) its standard error.
+        y_unit: "rad" or "m".
+        labels: names of the loads that x counts.
+    """
+
+    variable: str
+    unit: str
+    share: float
+    moves: str
+    direction: Floats
+    x: Floats
+    y: Floats
+    error: Floats
+    y_unit: str
+    labels: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Predicted:
+    """What smooth laws predict of the misfit on poses left out.
+
+    Attributes:
+        share: of the misfit, within [0, 1].
+        carriers: variables that carry it, largest share first.
+    """
+
+    share: float
+    carriers: tuple[Dependence, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Laws:
+    """All laws: columns (R, L, WIDTH) whitened, variable and way (L,) of each."""
+
+    x: Floats
+    variable: tuple[int, ...]
+    way: tuple[int, ...]
+
+
+def dependence(p: Projection) -> Predicted:
+    """Find the laws that predict the misfit of poses left out, and what they depend on."""
+    variables, ways = recorded(p), motions(p)
+    laws = _laws(p, variables, ways)
+    white, w = p.fit.white, p.fit.whitening
+    of_row = w.rows_of(random_folds(p.fit.pose, FOLDS))
+    rng = np.random.default_rng(20250302)
+    without = with_ = 0.0
+    lost: dict[str, float] = {}
+    for f in range(int(of_row.max()) + 1):
+        mine = of_row == f
+        chosen = _choose(p, laws, ~mine)
+        model, plain = _refit(p, laws, chosen, ~mine), _refit(p, laws, [], ~mine)
+        bare = white[mine] - p.rows[mine] @ plain[0]
+        base = white[mine] - p.rows[mine] @ model[0]
+        told = base - sum((laws.x[mine, k] @ c for k, c in zip(chosen, model[1], strict=True)), 0.0)
+        without += float(bare @ bare)
+        with_ += float(told @ told)
+        for name in {n for k in chosen for n in variables[laws.variable[k]].names}:
+            for _ in range(SHUFFLES):
+                order = rng.permutation(len(variables[0].values))
+                other = base.copy()
+                for k, c in zip(chosen, model[1], strict=True):
+                    v, x = variables[laws.variable[k]], laws.x[mine, k]
+                    if name in v.names:
+                        x = law_columns(p, v.exchanged(name, order), ways[laws.way[k]])[mine]
+                    other -= x @ c
+                more = float(other @ other) - float(told @ told)
+                lost[name] = lost.get(name, 0.0) + more / SHUFFLES
+    rank = w.rank
+    misfit = max(without - rank, 3 * np.sqrt(2 * rank))
+    share = float(np.clip((without - with_) / misfit, 0.0, 1.0))
+    return Predicted(share, _carriers(p, variables, ways, laws, lost, share))
+
+
+def _choose(p: Projection, laws: _Laws, rows: Bools) -> list[int]:
+    """Laws chosen one after the other by their evidence on some of the rows."""
+    rows = _thinned(rows, p.fit.whitening.m)
+    white, own = p.fit.white[rows], p.rows[rows]
+    x = laws.x[rows].reshape(len(white), -1)
+    factor = _factor(p, own)
+    fixed = sl.solve_triangular(factor, own.T, lower=True).T
+    x, r = x - fixed @ (fixed.T @ x), white - fixed @ (fixed.T @ white)
+    dof = max(len(r) - own.shape[1], 1)
+    chosen: list[int] = []
+    for _ in range(MOST_LAWS):
+        blocks = x.reshape(len(r), -1, WIDTH).transpose(1, 2, 0)
+        evidence = _evidence(blocks @ blocks.transpose(0, 2, 1), blocks @ r, float(r @ r), dof)
+        best = int(np.argmax(evidence))
+        if evidence[best] < LEAST_EVIDENCE:
+            break
+        chosen.append(best)
+        u, s, _ = np.linalg.svd(blocks[best].T, full_matrices=False)
+        u = u[:, s > 1e-3 * s.max(initial=1e-300)]
+        x, r = x - u @ (u.T @ x), r - u @ (u.T @ r)
+        dof = max(dof - u.shape[1], 1)
+    return chosen
+
+
+def _thinned(rows: Bools, m: int) -> Bools:
+    """At most about `MOST_ROWS` of the rows, whole measurements: more make it slower, not wiser."""
+    every = -(-int(rows.sum()) // MOST_ROWS)
+    return np.asarray(rows & (np.arange(len(rows)) // m % every == 0))
+
+
+def _evidence(gram: Floats, g: Floats, yy: float, dof: int) -> Floats:
+    """(L,) gain in log evidence of laws with a common prior N(0, τ²), τ at its best."""
+    lam, u = np.linalg.eigh(gram)
+    lam = np.maximum(lam, 0.0)
+    c = np.einsum("lij,li->lj", u, g)
+    explained = np.where(lam > 1e-4, c**2 / np.maximum(lam, 1e-4), 0.0)
+    t2 = (STRENGTHS**2 * dof / yy)[:, None, None]
+    shrunk = t2 * lam / (1 + t2 * lam)
+    left = np.maximum(1 - np.sum(shrunk * explained, axis=2) / yy, 1e-12)
+    value = -0.5 * np.sum(np.log1p(t2 * lam), axis=2) - 0.5 * dof * np.log(left)
+    return np.asarray(value.max(axis=0))
+
+
+def _factor(p: Projection, own: Floats) -> Floats:
+    """Cholesky factor of the model's normal equations from some rows."""
+    precision = p.fit.solution.equations.basis.prior_precision
+    h = own.T @ own + np.diag(np.maximum(p.fit.solution.beta * precision, 1e-6))
+    return np.asarray(np.linalg.cholesky(h))
+
+
+def _refit(
+    p: Projection, laws: _Laws, chosen: list[int], rows: Bools
+) -> tuple[Floats, list[Floats]]:
+    """Model step (K,) and coefficients of the chosen laws, from some rows."""
+    own, white = p.rows[rows], p.fit.white[rows]
+    x = np.concatenate([own, *(laws.x[rows, k] for k in chosen)], axis=1)
+    h = x.T @ x
+    size = own.shape[1]
+    precision = p.fit.solution.beta * p.fit.solution.equations.basis.prior_precision
+    ridge = np.full(len(h), 1e-3)
+    ridge[:size] = np.maximum(precision, 1e-6)
+    step = sl.solve(h + np.diag(ridge), x.T @ white, assume_a="pos", check_finite=False)
+    return step[:size], [
+        step[size + i * WIDTH : size + (i + 1) * WIDTH] for i in range(len(chosen))
+    ]
+
+
+def _laws(p: Projection, variables: list[Variable], ways: list[Floats]) -> _Laws:
+    columns, of, by = [], [], []
+    for i, v in enumerate(variables):
+        for k, way in enumerate(ways):
+            columns.append(law_columns(p, v, way))
+            of.append(i)
+            by.append(k)
+    return _Laws(np.stack(columns, axis=1), tuple(of), tuple(by))
+
+
+def _carriers(
+    p: Projection,
+    variables: list[Variable],
+    ways: list[Floats],
+    laws: _Laws,
+    lost: dict[str, float],
+    share: float,
+) -> tuple[Dependence, ...]:
+    """Variables that lose something when exchanged, with their curves."""
+    names = {name: value for name, value in lost.items() if value > 0}
+    total = sum(names.values())
+    if total <= 0 or share <= 0:
+        return ()
+    out = []
+    for name, value in sorted(names.items(), key=lambda item: -item[1]):
+        mine = [k for k, of in enumerate(laws.variable) if name in variables[of].names]
+        v = next((v for v in variables if v.names == (name,)), None)
+        if value < 0.02 * total or v is None:
+            continue
+        way = laws.way[_best(p, laws, mine)]
+        out.append(_curve(p, v, way, ways[way], share * value / total))
+    return tuple(out)
+
+
+def _best(p: Projection, laws: _Laws, mine: list[int]) -> int:
+    """The law of one variable with the largest evidence on all rows."""
+    x = laws.x[:, mine].reshape(len(p.fit.white), -1)
+    blocks = p.free(x).reshape(len(x), -1, WIDTH).transpose(1, 2, 0)
+    plain = x.reshape(len(x), -1, WIDTH).transpose(1, 0, 2)
+    found = _evidence(blocks @ plain, blocks @ p.white, p.yy, int(p.fit.dof))
+    return mine[int(np.argmax(found))]
+
+
+def _curve(p: Projection, v: Variable, number: int, way: Floats, share: float) -> Dependence:
+    """Mean error by bins of the variable, along what errs most."""
+    bins, x = bins_of(v)
+    member = (bins[:, None] == np.arange(len(x))).astype(float)
+    w = p.fit.whitening
+    raw = (way[:, :, :, None] * member[:, None, None, :]).reshape(*way.shape[:2], -1)
+    direction = np.zeros(3)
+    if way.shape[2] == 3:
+        solved, _ = _least(p, w.whiten(w.raw(raw)).reshape(len(p.fit.white), -1))
+        direction = np.linalg.svd(solved.reshape(3, -1), full_matrices=False)[0][:, 0]
+        direction = direction * np.sign(direction[np.argmax(np.abs(direction))])
+        raw = np.einsum("nik,k->ni", way, direction)[:, :, None] * member[:, None, :]
+    y, covariance = _least(p, w.whiten(w.raw(raw)).reshape(len(p.fit.white), -1))
+    error = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    joint = way.shape[2] == 1
+    return Dependence(
+        variable=v.name,
+        unit=v.unit,
+        share=share,
+        moves=f"joint {number + 1}" if joint else "target",
+        direction=direction,
+        x=x,
+        y=PER_MOTION * (y - y.mean()),
+        error=PER_MOTION * error,
+        y_unit="rad" if joint else "m",
+        labels=v.labels,
+    )
+
+
+def _least(p: Projection, x: Floats) -> tuple[Floats, Floats]:
+    """Coefficients and covariance of columns (R, K) beside the model."""
+    free = p.free(x)
+    gram = (free.T @ x + x.T @ free) / 2
+    inverse = np.linalg.pinv(gram, rcond=1e-9, hermitian=True)
+    y = inverse @ (free.T @ p.white)
+    left = max(p.yy - float(y @ gram @ y), 0.0) / max(p.fit.dof - len(y), 1.0)
+    return y, np.asarray(inverse * max(left, 1e-300))

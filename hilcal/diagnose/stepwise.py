@@ -1,0 +1,77 @@
+"""Changes of a model: an effect more, one less, one in place of another."""
+
+import numpy as np
+
+from hilcal.diagnose.paired_test import LEAST_GAIN, improves
+from hilcal.diagnose.projection import left_out_by_pose
+from hilcal.effects.catalogue import make
+from hilcal.effects.options import Options, reading_options
+from hilcal.errors import InputError
+from hilcal.identify.fit import Fit, fit
+from hilcal.model import Model
+from hilcal.types import Floats
+
+
+def add(before: Fit, effect: str, options: Options | None = None) -> Fit:
+    """Refit with one more effect, from where the fit stands.
+
+    Args:
+        before: the fit.
+        effect: its name.
+        options: of the effect, where they are not the usual ones.
+
+    Raises:
+        InputError: unknown effect, one that is there already, or one that these readings
+            cannot show; an unknown option, or a bad value.
+    """
+    readings = before.readings
+    if effect in before.model.names:
+        raise InputError(
+            f"effect {effect} is in the model already: {', '.join(before.model.names)}"
+        )
+    all_options = {**reading_options(effect, readings.m), **(options or {})}
+    model = before.model + make(effect, before.model.cell, readings.states, all_options)
+    start = np.concatenate([before.theta, np.zeros(model.size - before.model.size)])
+    return fit(model, readings, before.mode, before.scaling, start)
+
+
+def remove(before: Fit, effect: str) -> Fit:
+    """Refit without an effect, from where the fit stands.
+
+    Raises:
+        InputError: an effect that is not there.
+    """
+    model, start = _rest(before, effect)
+    return fit(model, before.readings, before.mode, before.scaling, start)
+
+
+def _rest(before: Fit, effect: str) -> tuple[Model, Floats]:
+    """Return the model without an effect, and its parameters in the fit."""
+    model = before.model
+    if effect not in model.names:
+        raise InputError(f"effect {effect} is not in the model: {', '.join(model.names)}")
+    place = model.names.index(effect)
+    rest = tuple(e for e in model.effects if e.name != effect)
+    return Model(model.cell, rest), np.delete(before.theta, model.slices()[place])
+
+
+def exchange(before: Fit, effect: str, other: str) -> Fit:
+    """Refit with another effect in the place of one, from where the fit stands.
+
+    Raises:
+        InputError: an effect that is not there, or another that is.
+    """
+    rest, start = _rest(before, effect)
+    if other in before.model.names:
+        raise InputError(f"effect {other} is in the model already: {', '.join(before.model.names)}")
+    readings = before.readings
+    model = rest + make(other, rest.cell, readings.states, reading_options(other, readings.m))
+    start = np.concatenate([start, np.zeros(model.size - rest.size)])
+    return fit(model, readings, before.mode, before.scaling, start)
+
+
+def predicts_better(before: Fit, after: Fit) -> bool:
+    """Whether the error on poses left out falls, by more than it scatters from pose to pose."""
+    if np.any(before.outlier != after.outlier):
+        return after.holdout.rms_sigma < (1 - LEAST_GAIN) * before.holdout.rms_sigma
+    return improves(left_out_by_pose(before), left_out_by_pose(after))

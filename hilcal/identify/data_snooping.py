@@ -1,0 +1,206 @@
+"""The search for gross errors: which readings, shifted, explain what nothing smooth does.
+
+With P the projection that frees whitened rows of the model and of generic smooth columns (its
+parts with a prior included as their marginal covariance), and S_k (R, m) the whitened effect of
+a shift of reading k, of a loaded one or of the unloaded one that deflections share,
+
+    t²_k = (S_kᵀ P r)ᵀ (S_kᵀ P S_k)⁻¹ (S_kᵀ P r)
+
+is χ²_m for a good reading, whatever its leverage. The reading with the largest t² is taken out,
+its columns join P, and so on: a gross error cannot hide others, nor make good readings look bad.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg as sl
+from scipy.stats import binom
+
+from hilcal.data.readings import Readings
+from hilcal.data.whitening import Whitening
+from hilcal.identify.gauss_newton import Solution
+from hilcal.identify.outliers import bulk, limit
+from hilcal.identify.smooth_nuisance import generic_columns
+from hilcal.model import Model
+from hilcal.types import Bools, Floats, Ints
+
+SMALLEST = 3e-3
+"""Errors with less than this share of the largest t² wait until the model is fitted again."""
+LEVERAGE = 1e-6
+"""A reading of which less than this share is left after the fit cannot be judged."""
+
+ACCIDENT = 1e-3
+"""Gross errors that fall on unloaded readings more often than chance would have it are none."""
+PATIENCE = 10
+"""So many readings, and half of what may be set aside, are taken out in vain before it ends."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Suspected:
+    """Gross errors that were found.
+
+    Attributes:
+        drop: rows of the readings to set aside.
+        count: number of gross errors; one in a shared unloaded reading drops several rows.
+    """
+
+    drop: Ints
+    count: int
+
+
+def find_gross(
+    model: Model, solution: Solution, readings: Readings, w: Whitening, most: int
+) -> Suspected:
+    """Search a gc-scaled solution for at most `most` gross errors.
+
+    Where there are more than twice as many, or too many of them are shared unloaded readings,
+    they are no accident, and none is returned.
+    """
+    e, q = _free(model, solution, readings, w)
+    c = _candidates(w)
+    g, a = c.gradients(e[:, None])[:, :, 0], c.information(q)
+    whole = np.trace(a, axis1=1, axis2=2)
+    drop: list[Ints] = []
+    taken: list[int] = []
+    largest, found, open_ = 0.0, 0, np.ones(len(c.row), dtype=bool)
+    t2 = _t2(g, a, whole)
+    least, patience = limit(w.m, len(c.row)), most // 2 + PATIENCE
+    added = np.empty((len(e), 0))
+    while len(drop) <= min(2 * most, found + patience) and (open_ & c.loaded).any():
+        k = int(np.argmax(np.where(open_, t2, 0.0)))
+        top = float(t2[k])
+        largest = max(largest, top)
+        if top <= max(least, SMALLEST * largest):
+            break
+        drop.append(c.drops[k])
+        taken.append(k)
+        open_ &= ~np.isin(c.row, c.drops[k])
+        # P becomes P − P S (Sᵀ P S)⁻¹ Sᵀ P; it is no projection where parts have a prior.
+        shift = c.column(k, len(e))
+        inverse_root = _inverse_root(a[k], float(whole[k]))
+        freed = shift - q @ (q.T @ shift) - added @ (added.T @ shift)
+        new = freed @ inverse_root
+        slope = c.gradients(new)
+        size = inverse_root.T @ g[k]
+        added = np.concatenate([added, new], axis=1)
+        g = g - slope @ size
+        a = a - slope @ np.swapaxes(slope, 1, 2)
+        t2 = _t2(g, a, whole)
+        # The bulk is judged without the suspects: they are in everyone's residual.
+        if top > limit(w.m, len(c.row), bulk(t2[c.loaded & open_], w.m)):
+            found = len(drop)
+    shared = int(np.count_nonzero(~c.loaded[taken[:found]]))
+    chance = float(binom.sf(shared - 1, found, np.mean(~c.loaded))) if shared else 1.0
+    if found > 2 * most or chance < ACCIDENT:
+        found = 0
+    found = min(found, most)
+    rows = np.unique(np.concatenate(drop[:found])) if found else np.zeros(0, dtype=np.int64)
+    return Suspected(rows, found)
+
+
+def _free(
+    model: Model, solution: Solution, readings: Readings, w: Whitening
+) -> tuple[Floats, Floats]:
+    """Residual (R,) and Q (R, K) with P = I − Q Qᵀ."""
+    factor, _ = sl.cho_factor(
+        solution.equations.gram + np.diag(solution.beta * solution.equations.basis.prior_precision),
+        lower=True,
+    )
+    own = sl.solve_triangular(factor, solution.rows.T, lower=True).T
+    x = generic_columns(model, solution.prediction, readings, w)
+    free = x - own @ (own.T @ x)
+    # P − P X (I + Xᵀ P X)⁻¹ Xᵀ P, and the residual is P of the data already.
+    root = np.linalg.cholesky(np.eye(x.shape[1]) + x.T @ free)
+    more = sl.solve_triangular(root, free.T, lower=True).T
+    e = solution.white - more @ sl.solve_triangular(root, x.T @ solution.white, lower=True)
+    return e, np.concatenate([own, more], axis=1)
+
+
+def _inverse_root(a: Floats, whole: float) -> Floats:
+    """Root (m, r) of the inverse of (m, m), of the part that is left to judge a reading by."""
+    values, vectors = np.linalg.eigh(a)
+    seen = values > LEVERAGE * max(whole, 1e-300)
+    return np.asarray(vectors[:, seen] / np.sqrt(values[seen]))
+
+
+def _t2(g: Floats, a: Floats, whole: Floats) -> Floats:
+    """(N,) squared distances; zero where nothing of a reading is left to judge it by."""
+    values, vectors = np.linalg.eigh(a)
+    c = np.einsum("kij,ki->kj", vectors, g)
+    seen = values > LEVERAGE * np.maximum(whole, 1e-300)[:, None]
+    return np.asarray(np.sum(np.where(seen, c**2 / np.where(seen, values, 1.0), 0.0), axis=1))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Shifts:
+    """Effects of shifts of all readings that can be judged.
+
+    Attributes:
+        row: (N,) the reading.
+        loaded: (N,) whether it is a measurement by itself.
+        drops: rows to set aside with it.
+        blocks: per shape: whitened rows (G, r) and shifts (G, r, c·m) of c readings each.
+        m: elements.
+    """
+
+    row: Ints
+    loaded: Bools
+    drops: list[Ints]
+    blocks: list[tuple[Ints, Floats]]
+    m: int
+
+    def gradients(self, x: Floats) -> Floats:
+        """(N, m, P) Sᵀ x of whitened columns (R, P)."""
+        out = [
+            (np.swapaxes(s, 1, 2) @ x[rows]).reshape(-1, self.m, x.shape[1])
+            for rows, s in self.blocks
+        ]
+        return np.concatenate(out)
+
+    def information(self, q: Floats) -> Floats:
+        """(N, m, m) Sᵀ P S."""
+        slope = self.gradients(q)
+        own = []
+        for _, s in self.blocks:
+            parts = s.reshape(*s.shape[:2], -1, self.m)
+            own.append(np.einsum("grci,grcj->gcij", parts, parts).reshape(-1, self.m, self.m))
+        return np.asarray(np.concatenate(own) - slope @ np.swapaxes(slope, 1, 2))
+
+    def column(self, k: int, size: int) -> Floats:
+        """(R, m) effect of the shift of candidate k."""
+        out = np.zeros((size, self.m))
+        for rows, s in self.blocks:
+            each = s.shape[2] // self.m
+            if k < len(rows) * each:
+                g, i = divmod(k, each)
+                out[rows[g]] = s[g][:, i * self.m : (i + 1) * self.m]
+                break
+            k -= len(rows) * each
+        return out
+
+
+def _candidates(w: Whitening) -> _Shifts:
+    m = w.m
+    row, loaded, drops, blocks = [], [], [], []
+    first = 0
+    for b in w.buckets:
+        groups, size = b.loaded.shape
+        refs = b.reference.shape[1]
+        rows = first + np.arange(groups * size * m).reshape(groups, -1)
+        shifts, cells = [b.factor], [b.loaded]
+        # With one loaded reading only, a shift of either is the same.
+        shared = refs if size > 1 or refs > 1 else 0
+        total = b.factor.reshape(groups, size * m, size, m).sum(axis=2)
+        shifts += [-total / max(refs, 1)] * shared
+        cells += [b.reference[:, [u]] for u in range(shared)]
+        blocks.append((rows, np.concatenate(shifts, axis=2)))
+        of = np.concatenate(cells, axis=1)
+        row.append(of.reshape(-1))
+        loaded.append(np.tile(np.arange(of.shape[1]) < size, groups))
+        for g in range(groups):
+            drops += [np.array([r]) for r in b.loaded[g]]
+            for u in range(shared):
+                alone = b.reference[g, [u]]
+                drops.append(alone if refs > 1 else np.concatenate([alone, b.loaded[g]]))
+        first += groups * size * m
+    return _Shifts(np.concatenate(row), np.concatenate(loaded), drops, blocks, m)

@@ -1,0 +1,123 @@
+"""Readings that were set aside as gross errors, and what they look like."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from hilcal.data.readings import Readings
+from hilcal.identify.fit import Fit
+from hilcal.identify.full_prediction import Everything, everything, names
+from hilcal.types import Floats
+
+ALIKE = 1e-3
+"""Two readings are alike where noise differs by more once in a thousand times."""
+SAME = 1e-3
+"""A reading that repeats another to this share of σ was not taken anew."""
+MOSTLY = 0.8
+"""Share of the error that an axis must have to be named."""
+AXES = ("x", "y", "z", "rotation about x", "rotation about y", "rotation about z")
+
+
+@dataclass(frozen=True, slots=True)
+class GrossError:
+    """A reading that was set aside.
+
+    Attributes:
+        row: of the readings.
+        pose: its name.
+        load: its name.
+        sigma: Mahalanobis distance from what the fit predicts.
+        reason: what it looks like, in a phrase.
+    """
+
+    row: int
+    pose: str
+    load: str
+    sigma: float
+    reason: str
+
+
+def gross_errors(fit: Fit) -> tuple[GrossError, ...]:
+    """List what was set aside, in order; of deflections that share a bad unloaded reading, that."""
+    if not fit.outlier.any():
+        return ()
+    e = everything(fit)
+    found: dict[int, GrossError] = {}
+    first = 0
+    for b in e.whitening.buckets:
+        size = b.loaded.shape[1]
+        for g in range(len(b.loaded)):
+            at = first + g * size + np.arange(size)
+            shared = [int(r) for r in b.reference[g] if fit.outlier[r]]
+            for row in shared:
+                found[row] = _shared(e, row, at, len(b.reference[g]) == 1)
+            if len(shared) == len(b.reference[g]) and shared:
+                continue
+            for k, r in zip(at, b.loaded[g], strict=True):
+                if fit.outlier[r]:
+                    found[int(r)] = _one(e, int(r), e.raw[k], e.whitening.covariance[k])
+        first += b.loaded.size
+    return tuple(found[row] for row in sorted(found))
+
+
+def _shared(e: Everything, row: int, measurements: Floats, alone: bool) -> GrossError:
+    """Judge an unloaded reading by the deflections that are taken from it."""
+    rows = e.whitening.reading[measurements]
+    v = e.readings.covariance
+    off = -np.median(e.raw[measurements], axis=0)
+    spread = v[row] + v[rows].sum(axis=0) / len(rows) ** 2
+    one = _one(e, row, off, spread)
+    if not alone:
+        return one
+    many = len(rows)
+    told = f"{one.reason}; its {many} deflections" if many > 1 else f"{one.reason}; its deflection"
+    return GrossError(row, one.pose, one.load, one.sigma, f"{told} set aside with it")
+
+
+def _one(e: Everything, row: int, off: Floats, covariance: Floats) -> GrossError:
+    sigma = _distance(off, covariance)
+    reason = _stale(e.readings, row) or _like_another(e.readings, row) or _off(off, covariance)
+    return GrossError(row, *names(e.readings, row), sigma, reason)
+
+
+def _stale(r: Readings, row: int) -> str:
+    if row == 0:
+        return ""
+    std = np.sqrt(np.maximum(np.diagonal(r.covariance[row]), 1e-300))
+    if np.all(np.abs(r.value[row] - r.value[row - 1]) <= SAME * std):
+        return "equal to the reading before: not taken anew (stale)?"
+    return ""
+
+
+def _like_another(r: Readings, row: int) -> str:
+    """Whether it reads as under another load at the same pose."""
+    best, found = float(chi2.isf(ALIKE, r.m)), -1
+    for other in np.flatnonzero((r.pose == r.pose[row]) & (r.load != r.load[row])):
+        away = _distance(r.value[row] - r.value[other], r.covariance[row] + r.covariance[other])
+        if away**2 < best:
+            best, found = away**2, int(other)
+    if found < 0:
+        return ""
+    load = r.load_names[r.load[found]]
+    if load == "none":
+        return "like the unloaded reading: was the load hung?"
+    if r.unloaded[row]:
+        return f'like the reading under "{load}": was the load still hung?'
+    return f'like the reading under "{load}": was that load hung?'
+
+
+def _off(off: Floats, covariance: Floats) -> str:
+    std = np.sqrt(np.maximum(np.diagonal(covariance), 1e-300))
+    white = np.abs(off) / std
+    axis = int(np.argmax(white))
+    sigma = _distance(off, covariance)
+    if white[axis] < MOSTLY * float(np.linalg.norm(white)):
+        return f"{sigma:.0f} σ off"
+    return f"{sigma:.0f} σ off in {AXES[axis]}"
+
+
+def _distance(off: Floats, covariance: Floats) -> float:
+    """Mahalanobis distance, of the part that has noise."""
+    square = float(off @ np.linalg.pinv(covariance, hermitian=True) @ off)
+    return float(np.sqrt(max(square, 0.0)))

@@ -1,0 +1,119 @@
+"""The JSON of a fit."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from hilcal.identify.data_snooping_reason import gross_errors
+from hilcal.identify.fit import Fit
+from hilcal.identify.full_prediction import everything
+from hilcal.robot import se3
+from hilcal.types import Floats
+
+
+def to_json(fit: Fit) -> dict[str, object]:
+    """Keys of the contract, and what else a script may want to know of a fit.
+
+    `value` and `std` are null where the data do not determine a parameter, conditions where
+    there is nothing to condition.
+    """
+    basis = fit.solution.equations.basis
+    return {
+        "model": list(fit.model.names),
+        "readings": fit.mode,
+        "scaling": fit.scaling,
+        "n_readings": len(fit.readings),
+        "n_measurements": len(fit.raw),
+        "dof": fit.dof,
+        "rank": fit.rank,
+        "converged": fit.solution.converged,
+        "iterations": fit.solution.iterations,
+        "condition": {
+            "unscaled": finite(basis.condition_unscaled),
+            "scaled": finite(basis.condition_scaled),
+        },
+        "parameters": parameters(fit),
+        "unidentifiable": list(fit.uncertainty.null),
+        "inflated": fit.uncertainty.inflated,
+        "variance_factor": fit.variance_factor,
+        "variance_factor_interval": list(fit.variance_factor_interval),
+        "error": {"fit": fit.error.to_json(), "holdout": fit.holdout.to_json()},
+        "noise_floor_m": everything(fit).noise_floor,
+        "outliers": outliers(fit),
+        "registration": registration(fit).tolist(),
+        "notes": list(notes(fit)),
+    }
+
+
+def parameters(fit: Fit) -> list[dict[str, object]]:
+    """Name, value, standard uncertainty and unit of each parameter that is not held at zero."""
+    out: list[dict[str, object]] = []
+    u, prior = fit.uncertainty, fit.solution.prior
+    for effect, rows in zip(fit.model.effects, fit.model.slices(), strict=True):
+        for p, k in zip(effect.parameters, range(rows.start, rows.stop), strict=True):
+            if prior[k] == 0:
+                continue  # a shrunk family dropped it
+            seen = bool(u.identifiable[k])
+            out.append(
+                {
+                    "name": f"{effect.name}.{p.name}",
+                    "value": float(fit.theta[k]) if seen else None,
+                    "std": finite(u.std[k]) if seen else None,
+                    "unit": p.unit,
+                    "identifiable": seen,
+                }
+            )
+    return out
+
+
+def outliers(fit: Fit) -> list[dict[str, object]]:
+    """Readings that were set aside, with their Mahalanobis distance and what they look like."""
+    return [
+        {"pose": g.pose, "load": g.load, "sigma": g.sigma, "reason": g.reason}
+        for g in gross_errors(fit)
+    ]
+
+
+def registration(fit: Fit) -> Floats:
+    """T_sensor_base (4, 4) as fitted: the cell's, moved by `base_frame` where that is fitted."""
+    start = fit.model.cell.registration
+    for effect, rows in zip(fit.model.effects, fit.model.slices(), strict=True):
+        if effect.name == "base_frame":
+            return np.asarray(start @ se3.matrix(*se3.exp(fit.theta[rows])))
+    return start
+
+
+def notes(fit: Fit) -> tuple[str, ...]:
+    """What a reader of the numbers has to know, a sentence each."""
+    out = []
+    if not fit.solution.converged:
+        out.append(
+            f"not converged after {fit.solution.iterations} steps: do not trust the parameters"
+        )
+    if fit.uncertainty.inflated:
+        out.append(
+            "the residuals are larger than the noise, so the errors are not independent: the "
+            "standard uncertainties were widened to what leaving out groups of poses shows"
+        )
+    if fit.mode == "deflection" and "base_frame" in fit.model.names:
+        out.append(
+            "deflections do not see where the base is, only how it is turned: base_frame holds "
+            "what the closed-form registration and the turning of deflections tell"
+        )
+    return tuple(out)
+
+
+def finite(value: float) -> float | None:
+    """Return a JSON number, null where there is none."""
+    return float(value) if np.isfinite(value) else None
+
+
+def plain(content: object) -> object:
+    """Return JSON content in which every number that is not finite is null."""
+    if isinstance(content, float | np.floating):
+        return finite(float(content))
+    if isinstance(content, Mapping):
+        return {str(k): plain(v) for k, v in content.items()}
+    if isinstance(content, list | tuple):
+        return [plain(v) for v in content]
+    return content

@@ -1,0 +1,1 @@
+"""Studies of the program itself: how often the diagnosis is right, and what planning buys."""

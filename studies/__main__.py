@@ -1,0 +1,26 @@
+"""`python -m studies`: evaluations of the program itself, which are not part of the wheel."""
+
+from collections.abc import Sequence
+
+import typer
+
+from hilcal.cli import application, execute
+from studies.diagnosis_command import diagnosis
+from studies.plans_command import plans
+
+
+def _group() -> None:
+    """Evaluate the program itself on simulated campaigns."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run a study; exit codes and messages as those of `hilcal`."""
+    app: typer.Typer = application("Evaluate the program itself on simulated campaigns.")
+    app.command("diagnosis")(diagnosis)
+    app.command("plans")(plans)
+    app.callback()(_group)
+    execute(app, "studies", arguments)
+
+
+if __name__ == "__main__":
+    main()

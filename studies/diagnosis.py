@@ -1,0 +1,299 @@
+"""One case of the study of the diagnosis: a simulated campaign, its diagnosis and refinement.
+
+Campaigns come from outside (`Simulate`), from mechanics that the program does not know. Only the
+public results of diagnosis and refinement are read. A case in which the program fails is an
+outcome, too: it counts as a miss, and says why.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from hilcal.cell import Cell
+from hilcal.data.readings import Readings
+from hilcal.data.whitening import Mode
+from hilcal.diagnose.catalogue_sufficiency import look_ahead
+from hilcal.diagnose.verdict import Diagnosis, diagnose
+from hilcal.errors import InputError
+from hilcal.identify.baseline import baseline
+from hilcal.identify.fit import Fit, fit
+from hilcal.identify.full_prediction import everything
+from hilcal.refine import Refinement, refine
+from hilcal.types import Floats
+
+Kind = Literal["hidden", "nothing", "noise", "pairs", "outside"]
+KINDS: tuple[Kind, ...] = ("hidden", "nothing", "noise", "pairs", "outside")
+MOST = 3
+"""A set of effects that cannot be told apart counts as an answer up to this size."""
+NAMING = ("missing_effect", "ambiguous")
+LEADING = 2
+"""Variables of each list that count."""
+INTERVAL = 1.959964
+"""Half of a 95 % interval, standard uncertainties."""
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What a campaign hides, and how it is measured.
+
+    Attributes:
+        kind: what is asked of it.
+        robot: name of the arm.
+        mode: readings.
+        hidden: effects, or the law outside of the catalogue; empty for nothing.
+        strength: of each, rms in units of the noise.
+        seed: of the simulation.
+        stated: stated over true standard deviation of the noise.
+        cycles: how often all is measured.
+        again: measure once more what separates the suspects.
+    """
+
+    kind: Kind
+    robot: str
+    mode: Mode
+    hidden: tuple[str, ...]
+    strength: float
+    seed: int
+    stated: float = 1.0
+    cycles: int = 1
+    again: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sample:
+    """A simulated campaign.
+
+    Attributes:
+        cell: as the program is told.
+        readings: what was measured.
+        noise: (N, m) what noise did to each reading.
+        truth: true parameters that are not zero, by the program's names of them.
+        variables: what a law outside of the catalogue depends on.
+    """
+
+    cell: Cell
+    readings: Readings
+    noise: Floats
+    truth: Mapping[str, float]
+    variables: tuple[str, ...] = ()
+
+
+Simulate = Callable[[Asked], Sample]
+"""Simulate a campaign; equal questions give equal campaigns."""
+
+More = Callable[[Asked, Diagnosis], Readings | None]
+"""Measure what separates the suspects of a diagnosis: all readings, the earlier ones first; None
+where nothing is in doubt or to be had."""
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """What the program says of a model.
+
+    Attributes:
+        verdict: in a word.
+        lead: the first effect that is named; the first suspect where none is.
+        same_as: what it is not told from.
+        variables: those that the residual follows most.
+        carriers: those that carry what can be predicted of it.
+        message: the verdict in a sentence.
+        variance_factor: of the fit.
+    """
+
+    verdict: str
+    lead: str
+    same_as: tuple[str, ...]
+    variables: tuple[str, ...]
+    carriers: tuple[str, ...]
+    message: str
+    variance_factor: float
+
+    @property
+    def named(self) -> bool:
+        """Whether the verdict names an effect."""
+        return self.verdict in NAMING
+
+    def finds(self, effect: str) -> bool:
+        """Whether an effect is first, or one of at most three that cannot be told apart."""
+        return effect == self.lead or (effect in self.same_as and len(self.same_as) < MOST)
+
+    def follows(self, variables: tuple[str, ...]) -> bool:
+        """Whether one of the variables is among the first two of either list."""
+        return not {*self.variables, *self.carriers}.isdisjoint(variables)
+
+
+@dataclass(frozen=True, slots=True)
+class Added:
+    """An effect that a refinement added, and what it could as well have been."""
+
+    effect: str
+    same_as: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Inside:
+    """How many identifiable true parameters of an effect lie in their 95 % intervals."""
+
+    effect: str
+    inside: int
+    parameters: int
+
+
+@dataclass(frozen=True, slots=True)
+class Refined:
+    """What a refinement came to.
+
+    Attributes:
+        judgement: on the last model.
+        added: effects, in order.
+        model: effects of the last model.
+        holdout: error on poses left out over the stated noise floor.
+        holdout_real: the same over what the noise was in these readings.
+        intervals: of the parameters of the last model's effects that are in the truth.
+    """
+
+    judgement: Judgement
+    added: tuple[Added, ...]
+    model: tuple[str, ...]
+    holdout: float
+    holdout_real: float
+    intervals: tuple[Inside, ...]
+
+    def finds(self, effect: str) -> bool:
+        """Whether an effect is in the model, or cannot be told from one that was added."""
+        return effect in self.model or any(
+            effect in a.same_as and len(a.same_as) < MOST for a in self.added
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """A case.
+
+    Attributes:
+        asked: the question.
+        first: judgement on the baseline; None where the case failed.
+        refined: None where it was not asked for.
+        again: judgement on the baseline after a round of further measurements.
+        variables: what a law outside of the catalogue depends on.
+        failure: why there is no answer; empty where there is one.
+        impossible: why there is no such campaign; it does not count.
+    """
+
+    asked: Asked
+    first: Judgement | None = None
+    refined: Refined | None = None
+    again: Judgement | None = None
+    variables: tuple[str, ...] = ()
+    failure: str = ""
+    impossible: str = ""
+
+
+def run_case(
+    asked: Asked, simulate: Simulate, more: More | None = None, refined: bool = True
+) -> Outcome:
+    """Simulate, fit the baseline, diagnose as `diagnose` does, and refine as `refine` does.
+
+    Args:
+        asked: the question.
+        simulate: makes its campaign.
+        more: measures once more, where that is asked.
+        refined: whether hidden effects are added as well.
+    """
+    try:
+        sample = simulate(asked)
+    except InputError as error:  # e.g. a gear that would have to stiffen to nothing
+        return Outcome(asked, impossible=_line(error))
+    except Exception as error:
+        return Outcome(asked, failure=f"{type(error).__name__}: {_line(error)}")
+    try:
+        return _run(asked, sample, more, refined)
+    except Exception as error:
+        return Outcome(asked, failure=f"{type(error).__name__}: {_line(error)}")
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split())
+
+
+def _run(asked: Asked, sample: Sample, more: More | None, refined: bool) -> Outcome:
+    model = baseline(sample.cell, sample.readings, asked.mode)
+    if refined and asked.kind not in ("nothing", "noise"):
+        r = refine(model, sample.readings, asked.mode)
+        diagnosis, result = r.steps[0].diagnosis, _refined(r, sample)
+    else:
+        diagnosis, result = diagnose(fit(model, sample.readings, asked.mode)), None
+    again = None
+    if more is not None and asked.again:
+        readings, later = more(asked, diagnosis), diagnosis
+        if readings is not None:
+            known = baseline(sample.cell, readings, asked.mode)
+            later = diagnose(fit(known, readings, asked.mode))
+        again = judgement(later)
+    return Outcome(asked, judgement(look_ahead(diagnosis)), result, again, sample.variables)
+
+
+def judgement(d: Diagnosis, verdict: str | None = None, message: str | None = None) -> Judgement:
+    """Return what a diagnosis says; verdict and message of a refinement where given."""
+    lead = d.suspects[0] if d.suspects else None
+    if d.significant:
+        lead = next(s for s in d.suspects if s.effect == d.significant[0])
+    kinds = [v.variable for v in d.where if v.variable.split()[0] not in ("pose", "direction")]
+    return Judgement(
+        verdict=verdict or d.verdict,
+        lead="" if lead is None else lead.effect,
+        same_as=() if lead is None else lead.same_as,
+        variables=tuple(kinds[:LEADING]),
+        carriers=tuple(c.variable for c in d.carriers[:LEADING]),
+        message=message or d.message,
+        variance_factor=d.fit.variance_factor,
+    )
+
+
+def _refined(r: Refinement, sample: Sample) -> Refined:
+    last = r.steps[-1]
+    floor, real = _floors(last.fit, sample)
+    return Refined(
+        judgement=judgement(last.diagnosis, r.verdict, r.message),
+        added=tuple(
+            Added(after.added, _same_as(before.diagnosis, after.added))
+            for before, after in zip(r.steps, r.steps[1:], strict=False)
+            if after.added is not None
+        ),
+        model=last.fit.model.names,
+        holdout=last.fit.holdout.rms_m / floor,
+        holdout_real=last.fit.holdout.rms_m / real,
+        intervals=intervals(last.fit, sample.truth),
+    )
+
+
+def _same_as(d: Diagnosis, effect: str) -> tuple[str, ...]:
+    return next((s.same_as for s in d.suspects if s.effect == effect), ())
+
+
+def _floors(f: Fit, sample: Sample) -> tuple[float, float]:
+    """Root mean square position error of the stated noise, and of what the noise was, m."""
+    e = everything(f)
+    noise = e.whitening.raw(sample.noise)[:, :3]
+    return e.noise_floor, float(np.sqrt(np.mean(np.sum(noise**2, axis=1))))
+
+
+def intervals(f: Fit, truth: Mapping[str, float]) -> tuple[Inside, ...]:
+    """Count true parameters in their 95 % intervals, of effects that are in the truth.
+
+    Those that are not identifiable have no interval. Frames that are registered anew have no
+    true value.
+    """
+    there = {name.split(".")[0] for name in truth}
+    out = []
+    for effect, rows in zip(f.model.effects, f.model.slices(), strict=True):
+        if effect.name not in there:
+            continue
+        true = np.array([truth.get(f"{effect.name}.{p.name}", 0.0) for p in effect.parameters])
+        seen = f.uncertainty.identifiable[rows]
+        off = np.abs(f.theta[rows] - true)[seen]
+        inside = off <= INTERVAL * f.uncertainty.std[rows][seen]
+        out.append(Inside(effect.name, int(inside.sum()), int(seen.sum())))
+    return tuple(out)

@@ -1,0 +1,102 @@
+"""The questions of the study of the diagnosis: what to hide, on which arm, how often."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations, product
+
+import numpy as np
+
+from hilcal.data.whitening import Mode
+from studies.diagnosis import Asked, Kind
+
+MANY = 3.0
+"""Strength of two effects at once, and of one outside of the catalogue, σ."""
+MISJUDGED = (0.5, 2.0)
+"""Stated over true σ."""
+AGAIN = 0.5
+"""Strength at which a further round is measured, σ."""
+
+
+@dataclass(frozen=True, slots=True)
+class Extent:
+    """How much is asked.
+
+    Attributes:
+        kinds: what is asked.
+        robots: arms.
+        modes: readings.
+        effects: by readings, what can be hidden.
+        laws: by readings, effects outside of the catalogue.
+        strengths: of one hidden effect, σ.
+        seeds: campaigns per effect, strength, arm and readings; of laws as well.
+        nothing: campaigns that hide nothing, per readings.
+        noise: campaigns of each misjudged noise, per readings.
+        pairs: campaigns with two effects, per readings.
+        first_seed: of the simulation.
+        again: measure a further round at 0.5 σ.
+    """
+
+    kinds: tuple[Kind, ...]
+    robots: tuple[str, ...]
+    modes: tuple[Mode, ...]
+    effects: Mapping[Mode, tuple[str, ...]]
+    laws: Mapping[Mode, tuple[str, ...]]
+    strengths: tuple[float, ...] = (2.0, 1.0, 0.5)
+    seeds: int = 20
+    nothing: int = 500
+    noise: int = 100
+    pairs: int = 100
+    first_seed: int = 0
+    again: bool = False
+
+
+def questions(extent: Extent) -> tuple[Asked, ...]:
+    """Return all questions, kind by kind; arms take turns where the number is a total."""
+    asked = {
+        "hidden": _hidden,
+        "nothing": _nothing,
+        "noise": _noise,
+        "pairs": _pairs,
+        "outside": _outside,
+    }
+    return tuple(q for kind in extent.kinds for q in asked[kind](extent))
+
+
+def _hidden(e: Extent) -> Iterator[Asked]:
+    # Seeds come first, so that a study that is stopped has asked of everything.
+    for seed, mode in product(_seeds(e, e.seeds), e.modes):
+        for effect, robot, strength in product(e.effects[mode], e.robots, e.strengths):
+            again = e.again and strength == AGAIN
+            yield Asked("hidden", robot, mode, (effect,), strength, seed, again=again)
+
+
+def _nothing(e: Extent) -> Iterator[Asked]:
+    for seed, mode in product(_seeds(e, e.nothing), e.modes):
+        yield Asked("nothing", _turn(e.robots, seed), mode, (), 0.0, seed)
+
+
+def _noise(e: Extent) -> Iterator[Asked]:
+    for seed, mode, stated in product(_seeds(e, e.noise), e.modes, MISJUDGED):
+        yield Asked("noise", _turn(e.robots, seed), mode, (), 0.0, seed, stated, cycles=2)
+
+
+def _pairs(e: Extent) -> Iterator[Asked]:
+    for seed, mode in product(_seeds(e, e.pairs), e.modes):
+        pairs = list(combinations(e.effects[mode], 2))
+        if pairs:
+            pick = np.random.default_rng([seed, len(pairs)]).integers(len(pairs))
+            yield Asked("pairs", _turn(e.robots, seed), mode, pairs[pick], MANY, seed)
+
+
+def _outside(e: Extent) -> Iterator[Asked]:
+    for seed, mode in product(_seeds(e, e.seeds), e.modes):
+        for law, robot in product(e.laws[mode], e.robots):
+            yield Asked("outside", robot, mode, (law,), MANY, seed)
+
+
+def _seeds(e: Extent, count: int) -> range:
+    return range(e.first_seed, e.first_seed + count)
+
+
+def _turn(robots: Sequence[str], seed: int) -> str:
+    return robots[seed % len(robots)]

@@ -1,0 +1,228 @@
+"""What planning buys: real errors of planned, random and hand-made campaigns.
+
+Plans of the same number of readings are carried out on simulated arms that hide nothing beyond
+the model, and each campaign is identified. Two claims are tested: the real errors of parameters
+and positions are those that were predicted, so that they shrink as predicted from plan to plan;
+and the planner needs at most half of the readings of a random plan for the same accuracy at the
+test poses. The arms come from outside, so that the plan is tested against mechanics that it
+does not know.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilcal.cell import Cell
+from hilcal.config import CellConfig
+from studies.plans_errors import Arm, Errors, run_campaign, subject
+from studies.plans_kinds import Chosen, Scene, at_random, grid, matching, optimal, scene
+from studies.plans_statistics import Measured, Summary, summary
+
+TEST, PARAMETERS = "test", "D"
+RANDOM, GRID = "random", "grid"
+DOUBLE = "random, twice"
+ROBUST = ", robust"
+TOLERANCE = 0.1
+"""How far real errors may be from predicted ones."""
+
+MakeArm = Callable[[Cell, CellConfig, int], Arm]
+"""Make a simulated arm by its number: equal numbers give equal arms."""
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """One kind of plan on one robot.
+
+    Attributes:
+        kind: "test" and "D" by these criteria; the same ", robust" where power is kept against
+            the effects of `[planning] against`; "random", "grid".
+        efficiency: certified, of the planner's; None for others.
+        position_open: predicted RMS error at the test poses where the potential terms have to
+            be estimated too, m; None of random plans and grids.
+        random_readings: readings that random plans need for the position that is predicted of
+            it; None where that is not asked, or not reached.
+        random_readings_open: the same for `position_open`.
+        result: of the campaigns.
+    """
+
+    kind: str
+    efficiency: float | None
+    position_open: float | None
+    random_readings: int | None
+    random_readings_open: int | None
+    result: Summary
+
+
+@dataclass(frozen=True, slots=True)
+class Shrinkage:
+    """How the errors shrink from the random plan to another of as many readings.
+
+    Attributes:
+        kind: the other plan.
+        parameter: predicted ratio of the random plan's parameter error to its own.
+        parameter_real: ratio of the true errors.
+        position: predicted ratio of the errors at the test poses.
+        position_real: ratio of the true errors.
+        twice: true error at the test poses of random plans with twice the readings, over its
+            own: at least 1 where it needs at most half of the readings.
+    """
+
+    kind: str
+    parameter: float
+    parameter_real: Measured
+    position: float
+    position_real: Measured
+    twice: Measured
+
+    @property
+    def agreement(self) -> Measured:
+        """True over predicted shrinkage of the parameter error."""
+        real = self.parameter_real
+        return Measured(real.value / self.parameter, real.std / self.parameter)
+
+    @property
+    def position_agreement(self) -> Measured:
+        """True over predicted shrinkage of the error at the test poses."""
+        real = self.position_real
+        return Measured(real.value / self.position, real.std / self.position)
+
+
+@dataclass(frozen=True, slots=True)
+class PlansStudy:
+    """One robot.
+
+    Attributes:
+        robot: its model.
+        mode: readings, "deflection" or "absolute".
+        readings: of each plan, the unloaded ones included.
+        campaigns: of each kind of plan.
+        where: what is predicted at the test poses, in words.
+        lines: the kinds of plans.
+    """
+
+    robot: str
+    mode: str
+    readings: int
+    campaigns: int
+    where: str
+    lines: tuple[Line, ...]
+
+    def of(self, kind: str) -> Line:
+        """Return the line of a kind."""
+        return next(line for line in self.lines if line.kind == kind)
+
+    @property
+    def planned(self) -> tuple[Line, ...]:
+        """Those of the planner."""
+        return tuple(line for line in self.lines if line.efficiency is not None)
+
+    def shrinkage(self) -> tuple[Shrinkage, ...]:
+        """Return by how much each of the planner's plans is better than random ones."""
+        base, twice = self.of(RANDOM).result, self.of(DOUBLE).result
+        return tuple(
+            Shrinkage(
+                kind=line.kind,
+                parameter=base.parameter / line.result.parameter,
+                parameter_real=_ratio(base.parameter_real, line.result.parameter_real),
+                position=base.position / line.result.position,
+                position_real=_ratio(base.position_real, line.result.position_real),
+                twice=_ratio(twice.position_real, line.result.position_real),
+            )
+            for line in self.planned
+        )
+
+
+def plans_study(
+    cell: Cell,
+    config: CellConfig,
+    make_arm: MakeArm,
+    *,
+    readings: int = 100,
+    campaigns: int = 50,
+    candidates: int | None = None,
+    seed: int = 0,
+    advance: Callable[[int], None] = lambda step: None,
+) -> PlansStudy:
+    """Compare plans on one robot.
+
+    Every campaign has an arm of its own, the same for all kinds of plans; random plans are
+    drawn anew for each.
+
+    Args:
+        cell: the cell.
+        config: its configuration.
+        make_arm: makes simulated arms.
+        readings: of each plan, the unloaded ones included.
+        campaigns: of each kind of plan.
+        candidates: poses that plans choose from; as configured by default.
+        seed: of everything.
+        advance: told of each campaign that is done.
+
+    Raises:
+        CannotAnswerError: from the cell, where it leaves no pose, or from a fit.
+        InputError: from the configuration.
+    """
+    rng = np.random.default_rng(seed)
+    of = scene(cell, config, candidates or config.planning.candidates, rng)
+    fixed: dict[str, Chosen] = {GRID: grid(of, readings)}
+    for robust in (False, True)[: 1 if of.robust is None else 2]:
+        for criterion in (TEST, PARAMETERS):
+            name = criterion + (ROBUST if robust else "")
+            fixed[name] = optimal(of, criterion, readings, rng, robust=robust)
+    many = {RANDOM: readings, DOUBLE: 2 * readings}
+    kinds = kinds_of(config)
+    errors: dict[str, list[Errors]] = {kind: [] for kind in kinds}
+    for number in range(campaigns):
+        arm = subject(of, make_arm(cell, config, number))
+        for index, kind in enumerate(kinds):
+            noise = np.random.default_rng([seed, number, index])
+            chosen = fixed[kind] if kind in fixed else at_random(of, many[kind], noise)
+            errors[kind].append(run_campaign(of, chosen, arm, noise))
+            advance(1)
+    opened = {k: of.with_others(fixed[k]) if k in fixed else None for k in kinds}
+    lines = tuple(
+        Line(
+            kind=kind,
+            efficiency=fixed[kind].efficiency if kind in fixed else None,
+            position_open=opened[kind],
+            random_readings=_needs(of, kind, fixed, readings, seed),
+            random_readings_open=_needs(of, kind, fixed, readings, seed, others=opened[kind]),
+            result=summary(errors[kind]),
+        )
+        for kind in kinds
+    )
+    return PlansStudy(config.robot.model, of.exact.mode, readings, campaigns, of.work.what, lines)
+
+
+def kinds_of(config: CellConfig) -> tuple[str, ...]:
+    """Kinds of plans that are compared."""
+    own = (TEST, PARAMETERS)
+    robust = tuple(kind + ROBUST for kind in own) if config.planning.against else ()
+    return (*own, *robust, RANDOM, GRID, DOUBLE)
+
+
+def _needs(
+    of: Scene,
+    kind: str,
+    fixed: Mapping[str, Chosen],
+    readings: int,
+    seed: int,
+    *,
+    others: float | None = 0.0,
+) -> int | None:
+    """Readings that random plans need for the accuracy that is predicted of a planner's plan.
+
+    With `others` for that accuracy, where the potential terms have to be estimated too.
+    """
+    if kind not in fixed or fixed[kind].efficiency is None or others is None:
+        return None
+    position = others or fixed[kind].predicted.position
+    rng = np.random.default_rng([seed, 1])
+    return None if position is None else matching(of, position, readings, rng, others=others > 0)
+
+
+def _ratio(a: Measured, b: Measured) -> Measured:
+    """Divide figures, with the uncertainty of independent figures."""
+    value = a.value / b.value
+    return Measured(value, value * float(np.hypot(a.std / a.value, b.std / b.value)))

@@ -1,0 +1,176 @@
+"""`python -m studies plans`: planned, random and hand-made campaigns on simulated arms."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from drivers.simulated.campaign import simulate
+from drivers.simulated.injected_effects import nothing_hidden
+from drivers.simulated.tracker import TrackerNoise
+from drivers.simulated.world import World
+from hilcal.cell import Cell, cell_from_config
+from hilcal.cli.demo import CELL
+from hilcal.cli.terminal import Json, terminal
+from hilcal.config import CellConfig, load_config
+from hilcal.data.readings import Readings, States
+from hilcal.errors import InputError
+from hilcal.plan.nominal_model import tracker_place
+from hilcal.report.progress import counting
+from hilcal.robot import se3
+from hilcal.robot.catalogue import configs_dir, load_arm
+from hilcal.types import Floats
+from studies.plans import MakeArm, PlansStudy, kinds_of, plans_study
+from studies.plans_errors import Asked
+from studies.plans_table import CAPTION, as_predicted, halved, report
+
+ROBOTS = ("ur10e", "ur5e")
+FRAMES = ("base_frame", "target_offset")
+"""Their true values are relative to a registration that identification makes anew."""
+
+
+def plans(
+    cell: Annotated[
+        Path | None,
+        typer.Argument(metavar="CELL.toml", help="The cell; that of the demo by default."),
+    ] = None,
+    robot: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--robot", help="Another robot in this cell, loads by its payload; repeatable."
+        ),
+    ] = None,
+    readings: Annotated[int, typer.Option("--readings", help="Of each plan.")] = 100,
+    campaigns: Annotated[int, typer.Option("--campaigns", help="Of each kind of plan.")] = 50,
+    candidates: Annotated[
+        int | None, typer.Option("--candidates", help="Poses to choose from; as configured.")
+    ] = None,
+    seed: Annotated[int, typer.Option("--seed", help="Of everything that is random.")] = 0,
+    as_json: Json = False,
+) -> None:
+    """Carry out planned, random and grid plans on simulated arms and compare their true errors."""
+    t = terminal(as_json)
+    if readings < 1 or campaigns < 2 or seed < 0 or (candidates is not None and candidates < 1):
+        given = "" if candidates is None else f"--candidates {candidates}, "
+        raise InputError(
+            f"{given}--readings {readings}, --campaigns {campaigns}, --seed {seed}; valid: whole "
+            "numbers from 1, at least 2 campaigns, a seed from 0"
+        )
+    path = configs_dir() / "cells" / CELL if cell is None else cell
+    here = load_config(path)
+    models = robot or (list(ROBOTS) if cell is None else [here.robot.model])
+    base = path.absolute().parent
+    settings = [with_robot(here, model, base) for model in models]
+    total = sum(campaigns * len(kinds_of(config)) for config in settings)
+    studies = []
+    with counting(t.progress, "campaigns", total) as advance:
+        for config in settings:
+            studies.append(
+                plans_study(
+                    cell_from_config(config, base), config, arms(seed),
+                    readings=readings, campaigns=campaigns, candidates=candidates,
+                    seed=seed, advance=advance,
+                )
+            )  # fmt: skip
+    for study in studies:
+        t.show(report(study))
+        t.show("")
+    t.show(CAPTION)
+    t.document({"robots": [document(study) for study in studies]})
+
+
+def document(study: PlansStudy) -> dict[str, object]:
+    """Return a study as a JSON document says it."""
+    shrinkage = [
+        {**asdict(s), "as_predicted": as_predicted(s.agreement), "half": halved(study, s)}
+        for s in study.shrinkage()
+    ]
+    return {**asdict(study), "shrinkage": shrinkage}
+
+
+def with_robot(config: CellConfig, model: str, base_dir: Path | None = None) -> CellConfig:
+    """Return the cell with another robot; its loads scaled by the payload."""
+    own = config.robot
+    if model == own.model:
+        return config
+    new = own.model_copy(update={"model": model, "base_link": None, "tip_link": None})
+    old_arm = load_arm(own.model, base_dir, base_link=own.base_link, tip_link=own.tip_link)
+    share = load_arm(model, base_dir).payload / old_arm.payload
+    if not np.isfinite(share) or share <= 0.0:
+        raise InputError(f"--robot {model}: loads cannot be scaled, a payload is not known")
+    loads = tuple(
+        load.model_copy(
+            update={
+                "name": load.name if load.mass_kg == 0.0 else f"{share * load.mass_kg:.3g}kg",
+                "mass_kg": share * load.mass_kg,
+                "force_N": tuple(share * f for f in load.force_N),
+                "moment_Nm": tuple(share * m for m in load.moment_Nm),
+            }
+        )
+        for load in config.loads
+    )
+    names = {old.name: scaled.name for old, scaled in zip(config.loads, loads, strict=True)}
+    work_load = names.get(config.planning.work_load, config.planning.work_load)
+    planning = config.planning.model_copy(update={"work_load": work_load})
+    return config.model_copy(update={"robot": new, "loads": loads, "planning": planning})
+
+
+def arms(seed: int) -> MakeArm:
+    """Return what makes arms by number."""
+
+    def make(cell: Cell, config: CellConfig, number: int) -> SimulatedArm:
+        return SimulatedArm(world(cell, config, np.random.default_rng([seed, number, 99])))
+
+    return make
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SimulatedArm:
+    """A simulated arm as the study asks it."""
+
+    world: World
+
+    @property
+    def parameters(self) -> Mapping[str, Floats]:
+        """True parameters by effect, SI."""
+        physics = self.world.physics
+        names = (f.name for f in fields(physics) if f.name not in FRAMES)
+        return {name: np.asarray(getattr(physics, name)).reshape(-1) for name in names}
+
+    def measure(self, asked: Asked, rng: np.random.Generator) -> Readings:
+        """Return what the tracker reads of it."""
+        return simulate(
+            self.world, asked.states, asked.pose, asked.load, asked.cycle, asked.load_names, rng
+        )
+
+    def position(self, states: States) -> Floats:
+        """Return (N, 3) true positions of the target, sensor axes, m."""
+        return self.world.sight(states).position
+
+
+def world(cell: Cell, config: CellConfig, rng: np.random.Generator) -> World:
+    """Return an arm that hides nothing, measured as configured.
+
+    The tracker stands where the plan takes it to be, turned about the vertical at random; a
+    reading is the mean of so many samples, with the noise that a plan assumes of it.
+    """
+    t, a = config.tracker, config.acquire
+    share = float(np.sqrt(a.systematic_share + (1.0 - a.systematic_share) / a.samples))
+    noise = TrackerNoise(
+        (share * t.range_std_m, share * t.range_std_per_m),
+        (share * t.transverse_std_m, share * t.transverse_std_per_m),
+        share * t.orientation_std_rad,
+    )
+    drawn = nothing_hidden(
+        cell, rng, noise=noise, joint_std=config.repeatability.per_joint(cell.arm.n)
+    )
+    place, _ = tracker_place(cell, config)
+    turn = se3.rotation(np.array([0.0, 0.0, rng.uniform(0.0, 2.0 * np.pi)]))
+    frame = se3.matrix(turn, -turn @ place)
+    if not cell.registration_known:
+        return replace(drawn, registration=frame, station=np.eye(4))
+    station = frame if t.frame == "base" else np.eye(4)
+    return replace(drawn, registration=cell.registration, station=station)

@@ -1,0 +1,184 @@
+"""Simulated campaigns of a plan, and how far what is identified lies from the truth."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from hilcal.data.plan import UNLOADED
+from hilcal.data.readings import Readings, States
+from hilcal.data.whitening import Mode
+from hilcal.errors import CannotAnswerError
+from hilcal.identify.baseline import with_effects
+from hilcal.identify.fit import fit
+from hilcal.plan.information import Problem, readings_of
+from hilcal.plan.nominal_model import nominal_states
+from hilcal.plan.predicted import rms
+from hilcal.types import Floats, Ints
+from studies.plans_kinds import Chosen, Scene
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Asked:
+    """N readings that a plan takes, as `Readings` describes them.
+
+    Attributes:
+        states: the N states.
+        pose: (N,) index of the pose.
+        load: (N,) index into `load_names`.
+        cycle: (N,) readings of one pose and one cycle share their unloaded reading.
+        load_names: names of the loads.
+    """
+
+    states: States
+    pose: Ints
+    load: Ints
+    cycle: Ints
+    load_names: tuple[str, ...]
+
+
+class Arm(Protocol):
+    """A simulated arm, whose truth is known."""
+
+    @property
+    def parameters(self) -> Mapping[str, Floats]:
+        """True parameters by effect, SI."""
+
+    def measure(self, asked: Asked, rng: np.random.Generator) -> Readings:
+        """Return what the tracker reads of it."""
+
+    def position(self, states: States) -> Floats:
+        """Return (N, 3) true positions of the target, sensor axes, m."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Errors:
+    """One campaign: true errors, and what was predicted of them.
+
+    Attributes:
+        parameter: (P,) estimate minus truth, SI.
+        std: (P,) predicted standard uncertainty, SI.
+        ordinary: (P,) ordinary magnitudes of the parameters, SI.
+        position: RMS over the test poses of the 3-D error, m.
+        position_std: predicted, m.
+        readings: number of readings.
+        poses: number of different poses.
+    """
+
+    parameter: Floats
+    std: Floats
+    ordinary: Floats
+    position: float
+    position_std: float
+    readings: int
+    poses: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Subject:
+    """An arm, and how its target truly moves at the test poses.
+
+    Attributes:
+        arm: the arm.
+        test: the test states; for deflections the loaded ones, then the unloaded ones.
+        unloaded: (T,) rows of the unloaded state of each test pose; empty for positions.
+        truth: (T, 3) true positions or deflections, sensor axes, m.
+    """
+
+    arm: Arm
+    test: States
+    unloaded: Ints
+    truth: Floats
+
+
+def subject(of: Scene, arm: Arm) -> Subject:
+    """Ask for the truth once, for all plans."""
+    candidates, work_load = of.exact.candidates, of.config.planning.work_load
+    deflection = of.exact.mode == "deflection"
+    if deflection and work_load == UNLOADED:
+        loads = np.arange(1, len(candidates.loads))
+    else:
+        loads = np.array([candidates.loads.index(work_load)])
+    q, count = of.work.q, len(of.work.q) // len(loads)
+    wrench = np.repeat(candidates.wrench[loads], count, axis=0)
+    unloaded = np.zeros(0, dtype=np.int64)
+    if deflection:
+        unloaded = len(q) + np.tile(np.arange(count), len(loads))
+        q = np.vstack([q, q[:count]])
+        wrench = np.vstack([wrench, np.zeros((count, 6))])
+    test = nominal_states(q, wrench)
+    return Subject(arm, test, unloaded, _of_interest(arm.position(test), unloaded))
+
+
+def _of_interest(position: Floats, unloaded: Ints) -> Floats:
+    """Positions, or deflections where there are unloaded states."""
+    if not len(unloaded):
+        return position
+    return np.asarray(position[: len(unloaded)] - position[unloaded])
+
+
+def run_campaign(of: Scene, chosen: Chosen, subject: Subject, rng: np.random.Generator) -> Errors:
+    """Simulate a campaign of a plan, identify, and compare with the truth.
+
+    Compared are the parameters of the planned effects; those of the frames show in the
+    positions.
+
+    Raises:
+        CannotAnswerError: the readings do not determine the parameters.
+    """
+    mode, names = of.config.planning.readings, of.config.planning.model
+    readings = subject.arm.measure(readings_asked(chosen), rng)
+    found = fit(with_effects(of.cell, readings, mode, names), readings, mode)
+    at_test = found.model.predict(subject.test, found.theta).observation.position
+    error = _of_interest(at_test, subject.unloaded) - subject.truth
+    told, true = chosen.predicted, subject.arm.parameters
+    off: dict[str, float] = {}
+    for e, s in zip(found.model.effects, found.model.slices(), strict=True):
+        if e.name in names and len(true.get(e.name, ())) == len(e.parameters):
+            own = (f"{e.name}.{p.name}" for p in e.parameters)
+            off |= dict(zip(own, found.theta[s] - true[e.name], strict=True))
+    if not off:
+        raise CannotAnswerError(f"of {', '.join(names)} the simulated arm knows no true parameters")
+    std = told.by_name()
+    ordinary = {t.name: t.scale for t in chosen.problem.terms if not t.potential}
+    if unknown := [name for name in off if not np.isfinite(std.get(name, np.inf))]:
+        raise CannotAnswerError(
+            f"{chosen.readings} readings of a plan do not determine {', '.join(unknown)}; "
+            "compare plans of more readings"
+        )
+    assert told.position is not None  # noqa: S101 - every scene has test poses
+    return Errors(
+        parameter=np.array([off[k] for k in off]),
+        std=np.array([std[k] for k in off]),
+        ordinary=np.array([ordinary[k] for k in off]),
+        position=rms(np.linalg.norm(error, axis=1)),
+        position_std=told.position,
+        readings=chosen.readings,
+        poses=chosen.poses,
+    )
+
+
+def readings_asked(chosen: Chosen) -> Asked:
+    """Return the readings that a plan takes; a unit that is taken again is a cycle of its own."""
+    source: Problem = chosen.problem
+    mode: Mode = "deflection" if source.mode == "deflection" else "absolute"
+    names = source.candidates.loads
+    pose: list[int] = []
+    load: list[int] = []
+    cycle: list[int] = []
+    seen: dict[object, int] = {}
+    for k in np.flatnonzero(chosen.counts):
+        at, _ = source.what[k]
+        loads = readings_of(source.what[k], mode)
+        for _ in range(int(chosen.counts[k])):
+            # Absolute readings of one cycle are of different loads.
+            key = at if mode == "deflection" else (at, loads)
+            number = seen[key] = seen.get(key, -1) + 1
+            pose += [at] * len(loads)
+            load += [names.index(name) for name in loads]
+            cycle += [number] * len(loads)
+    used, index = np.unique(pose, return_inverse=True)
+    of = source.candidates
+    states = nominal_states(of.q[used][index], of.wrench[np.array(load)])
+    return Asked(states, index, np.array(load), np.array(cycle), names)

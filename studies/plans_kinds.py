@@ -1,0 +1,230 @@
+"""The plans that are compared: of the planner, at random, and a grid as made by hand."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import cycle
+
+import numpy as np
+
+from hilcal.cell import Cell
+from hilcal.config import CellConfig
+from hilcal.errors import CannotAnswerError
+from hilcal.plan.choice import choose
+from hilcal.plan.compound_criteria import robust_question
+from hilcal.plan.draw import draw
+from hilcal.plan.feasible import Space
+from hilcal.plan.information import Problem, problem
+from hilcal.plan.nominal_model import Assumed, assumed
+from hilcal.plan.predicted import Predicted, predicted, rms
+from hilcal.plan.prediction_poses import WorkPoses, work_poses
+from hilcal.types import Floats, Ints
+
+LEVELS = (3, 4, 5, 6)
+"""Levels per joint of a grid: the coarsest that has enough feasible poses."""
+TEST_POSES = 50
+"""Test poses that are drawn where the configuration names none."""
+MATCHED = 20
+"""Random plans by which the readings are found that equal a planned accuracy."""
+MOST = 20
+"""Readings are looked for up to so many times those of the plan."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """A cell that is planned for.
+
+    Attributes:
+        cell: the cell.
+        config: its configuration.
+        space: its feasible states.
+        assumed: the model.
+        exact: the design problem of the model alone.
+        robust: the same with the potential terms of the configuration; None without any.
+        work: test poses; drawn apart from the candidates where the configuration names none.
+    """
+
+    cell: Cell
+    config: CellConfig
+    space: Space
+    assumed: Assumed
+    exact: Problem
+    robust: Problem | None
+    work: WorkPoses
+
+    def with_others(self, chosen: "Chosen") -> float | None:
+        """RMS position, m, where potential terms are estimated too; of the candidates' units."""
+        if self.robust is None or chosen.problem not in (self.exact, self.robust):
+            return None
+        if self.robust.what != self.exact.what:
+            return None
+        return predicted(self.robust, chosen.counts, work=self.work).position_open
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chosen:
+    """A plan.
+
+    Attributes:
+        problem: whose units it takes.
+        counts: (K,) how often it takes each.
+        predicted: what it will know.
+        efficiency: certified by the planner; None for a plan of another make.
+    """
+
+    problem: Problem
+    counts: Floats
+    predicted: Predicted
+    efficiency: float | None = None
+
+    @property
+    def readings(self) -> int:
+        """Number of readings, the unloaded ones included."""
+        return round(float(self.counts @ self.problem.units.cost))
+
+    @property
+    def poses(self) -> int:
+        """Number of different poses."""
+        return len({self.problem.what[k][0] for k in np.flatnonzero(self.counts)})
+
+
+def scene(cell: Cell, config: CellConfig, candidates: int, rng: np.random.Generator) -> Scene:
+    """Draw candidates and test poses of a cell and set up its design problems.
+
+    Raises:
+        CannotAnswerError: no feasible pose, or no load that any of them bears.
+        InputError: from the configuration's `[planning]`.
+    """
+    space = Space(cell, config)
+    drawn = draw(space, candidates, rng)
+    apart = draw(space, TEST_POSES, rng).q
+    model = assumed(cell, config)
+    alone = without_potential(config)
+    exact = problem(model, alone, drawn.q, drawn.allowed)
+    robust = problem(model, config, drawn.q, drawn.allowed) if config.planning.against else None
+    work = work_poses(model, config, apart, space.allowed)
+    return Scene(cell, config, space, model, exact, robust, work)
+
+
+def without_potential(config: CellConfig) -> CellConfig:
+    """Return the configuration of a plan for the model alone."""
+    planning = config.planning.model_copy(update={"against": ()})
+    return config.model_copy(update={"planning": planning})
+
+
+def optimal(
+    of: Scene, criterion: str, budget: int, rng: np.random.Generator, *, robust: bool = False
+) -> Chosen:
+    """Return the planner's plan of so many readings.
+
+    Args:
+        of: the cell.
+        criterion: "D", "test", ...
+        budget: readings, the unloaded ones included.
+        rng: generator.
+        robust: whether it keeps power against the potential terms.
+    """
+    of_plan = of.robust if robust and of.robust is not None else of.exact
+    asked = robust_question(of_plan, criterion, of.work, float(budget), rng)
+    design = choose(asked, float(budget), rng)
+    counts = np.asarray(design.counts, dtype=float)
+    told = predicted(of_plan, counts, work=of.work)
+    return Chosen(of_plan, counts, told, design.efficiency)
+
+
+def at_random(of: Scene, budget: int, rng: np.random.Generator) -> Chosen:
+    """Return random feasible poses, each under every load that it bears."""
+    order = rng.permutation(len(of.exact.candidates))
+    return _of_poses(of.exact, cycle(order.tolist()), budget, of.work)
+
+
+def grid(of: Scene, budget: int) -> Chosen:
+    """Return a plan as made by hand: a regular grid in joint space, its feasible poses kept.
+
+    The coarsest grid with enough poses, evenly thinned to the readings wanted; each pose under
+    every load that it bears.
+
+    Raises:
+        CannotAnswerError: no pose of the finest grid is feasible.
+    """
+    space = of.space
+    for levels in LEVELS:
+        share = (np.arange(levels) + 0.5) / levels
+        unit = np.stack(np.meshgrid(*[share] * len(space.low), indexing="ij"), axis=-1)
+        q = space.low + unit.reshape(-1, len(space.low)) * (space.high - space.low)
+        q = q[space.allowed(q)]
+        allowed = np.ones((len(q), len(space.loads)), dtype=np.bool_)
+        for k, load in enumerate(space.loads[1:], start=1):
+            allowed[:, k] = space.allowed(q, load)
+        some = allowed[:, 1:].any(axis=1) | (of.exact.mode == "absolute")
+        q, allowed = q[some], allowed[some]
+        if allowed.sum() >= budget:
+            break
+    if not len(q):
+        raise CannotAnswerError("no pose of a regular grid in joint space is feasible")
+    of_grid = problem(of.assumed, without_potential(of.config), q, allowed)
+    poses = next((n for n in range(1, len(q)) if allowed[_even(len(q), n)].sum() >= budget), len(q))
+    order = _even(len(q), poses)
+    return _of_poses(of_grid, cycle(order.tolist()), budget, of.work)
+
+
+def _even(count: int, wanted: int) -> Ints:
+    """Indices (wanted,) spread evenly over so many."""
+    return np.asarray(np.floor((np.arange(wanted) + 0.5) * count / wanted), dtype=np.int64)
+
+
+def matching(
+    of: Scene, position: float, budget: int, rng: np.random.Generator, *, others: bool = False
+) -> int | None:
+    """Return how many readings random plans need for an accuracy at the test poses.
+
+    The least number whose predicted mean square over random plans, each extended reading by
+    reading, is as small; None where `most` times the budget does not do.
+
+    Args:
+        of: the cell.
+        position: RMS standard deviation wanted, m.
+        budget: readings to start from.
+        rng: generator.
+        others: whether the potential terms have to be estimated too.
+    """
+    orders = [rng.permutation(len(of.exact.candidates)).tolist() for _ in range(MATCHED)]
+
+    judge = of.robust if others and of.robust is not None else of.exact
+
+    def reached(readings: int) -> bool:
+        got = []
+        for order in orders:
+            counts = _of_poses(of.exact, cycle(order), readings, of.work).counts
+            told = predicted(judge, counts, work=of.work)
+            got.append(told.position_open if others else told.position)
+        return rms(np.array(got, dtype=float)) <= position
+
+    low, high = 1, budget
+    while not reached(high):
+        if high >= MOST * budget:
+            return None
+        low, high = high, min(2 * high, MOST * budget)
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if reached(middle) else (middle, high)
+    return high
+
+
+def _of_poses(of: Problem, order: Iterable[int], budget: int, work: WorkPoses) -> Chosen:
+    """Take poses in order, each with as many loads as it bears, until the readings are used."""
+    counts, left = np.zeros(len(of.units)), float(budget)
+    pose = np.array([p for p, _ in of.what])
+    cost, least = of.units.cost, float(of.units.cost.min())
+    for p in order:
+        if left < least:
+            break
+        first, last = np.searchsorted(pose, [p, p + 1])
+        mine = np.arange(first, last)
+        if of.mode == "deflection" and len(mine):
+            mine = mine[cost[mine] <= left]
+            mine = mine[[int(np.argmax(cost[mine]))]] if len(mine) else mine
+        for k in mine:
+            if cost[k] <= left:
+                counts[k] += 1.0
+                left -= float(cost[k])
+    return Chosen(of, counts, predicted(of, counts, work=work))

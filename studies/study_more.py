@@ -1,0 +1,114 @@
+"""A further round in the study of the diagnosis: what `next` plans, measured in the same world."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+
+from drivers.simulated.campaign import simulate
+from drivers.simulated.planned import planned_states
+from drivers.simulated.temperatures import air, joints
+from hilcal.config import CellConfig
+from hilcal.config.loads import Load
+from hilcal.data.readings import Readings, States
+from hilcal.diagnose.verdict import Diagnosis
+from hilcal.errors import CannotAnswerError
+from hilcal.plan.next import measure_next
+from hilcal.plan.planner import Request
+from hilcal.types import Floats
+from studies.study_cases import StudyCase, with_study_loads
+
+POSES = 20
+MOST = 3
+"""Suspects that are told apart."""
+CANDIDATES = 120
+"""Poses that the plan chooses from: hundreds of plans are made."""
+_PAUSE = 600.0  # s between the rounds
+
+
+def measure_more(
+    config: CellConfig,
+    robot: str,
+    case: StudyCase,
+    diagnosis: Diagnosis,
+    seed: int,
+    poses: int = POSES,
+) -> Readings | None:
+    """Plan what separates the leading suspects, and measure it.
+
+    Where no effect is significant, it is the suspects of most evidence.
+
+    Args:
+        config: the cell; robot and loads are replaced.
+        robot: name of the arm.
+        case: the campaign so far.
+        diagnosis: of it, on the baseline.
+        seed: of everything random.
+        poses: as many readings as so many poses take under every load.
+
+    Returns:
+        All readings, the earlier ones first; None where nothing is in doubt, and where no
+        measurement separates the suspects.
+    """
+    names = suspects(diagnosis)
+    if len(names) < 2:
+        return None
+    rng = np.random.default_rng([seed, len(case.readings)])
+    own, pulls = with_study_loads(config, robot)
+    loads = tuple(
+        Load(name=name, force_N=tuple(map(float, w[:3])), moment_Nm=tuple(map(float, w[3:])))
+        for name, w in pulls
+    )
+    planning = own.planning.model_copy(update={"candidates": CANDIDATES})
+    own = own.model_copy(update={"loads": list(loads), "planning": planning})
+    # Instead of leaving out loads, one after the other, which takes long.
+    asked = Request(poses, readings=poses * (1 + len(loads)))
+    try:
+        found = measure_next(case.cell, own, diagnosis.fit, names, asked, rng)
+    except CannotAnswerError:
+        return None
+    before = case.readings
+    begun = float(np.asarray(before.states.time).max()) + _PAUSE
+    visit = planned_states(case.cell, own, found.planned.ordered.plan, begun)
+    since = np.asarray(visit.states.time) - begun
+    states = replace(
+        visit.states,
+        air_temperature=air(since, rng),
+        joint_temperature=joints(since, case.cell.arm.n, rng),
+    )
+    hung = ("none", *(load.name for load in loads))
+    number = visit.pose + len(before.pose_names)
+    after = simulate(case.world, states, number, visit.load, visit.cycle, hung, rng)
+    plan = found.planned.ordered.plan
+    return _joined(before, after, tuple(f"next {name}" for name in plan.pose_names))
+
+
+def suspects(d: Diagnosis) -> tuple[str, ...]:
+    """Return the effects in doubt: the leading one and its rivals, or the best where none leads."""
+    lead = next((s for s in d.suspects if s.effect in d.significant), None)
+    if lead is not None:
+        return (lead.effect, *lead.same_as)[:MOST]
+    return tuple(s.effect for s in d.suspects)[:MOST]
+
+
+def _joined(a: Readings, b: Readings, poses: tuple[str, ...]) -> Readings:
+    """One after the other; what only one of them has is left out."""
+
+    def both(name: str) -> Floats | None:
+        parts = [getattr(r.states, name) for r in (a, b)]
+        return None if any(part is None for part in parts) else np.concatenate(parts)
+
+    optional = {f.name: both(f.name) for f in fields(States) if f.name not in ("q", "wrench")}
+    return Readings(
+        states=States(
+            q=np.concatenate([a.states.q, b.states.q]),
+            wrench=np.concatenate([a.states.wrench, b.states.wrench]),
+            **optional,
+        ),
+        pose=np.concatenate([a.pose, b.pose]),
+        load=np.concatenate([a.load, b.load]),
+        cycle=np.concatenate([a.cycle, b.cycle]),
+        value=np.concatenate([a.value, b.value]),
+        covariance=np.concatenate([a.covariance, b.covariance]),
+        load_names=a.load_names,
+        pose_names=(*a.pose_names, *poses),
+    )

@@ -1,0 +1,307 @@
+"""The commands from import to view: exit codes, the documents of the contract, words for people."""
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.simulated.campaign import simulate
+from hilcal import __version__
+from hilcal.data.campaign import Campaign
+from hilcal.data.table import read_table
+from hilcal.effects.catalogue import catalogue
+from tests.support.cli_cases import CELL, ok, refused, rehearsal, run, table
+
+Capsys = pytest.CaptureFixture[str]
+ERROR = {"rms_m", "mean_m", "max_m", "rms_sigma"}
+VERDICTS = {"adequate", "missing_effect", "ambiguous", "unknown_effect", "noise_misjudged"}
+
+
+@pytest.fixture(scope="module")
+def hysteresis_table(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return table(tmp_path_factory.mktemp("tables") / "hysteresis.csv", "hysteresis")
+
+
+@pytest.fixture
+def campaign(hysteresis_table: Path, tmp_path: Path, capsys: Capsys) -> Path:
+    path = tmp_path / "run.hilcal"
+    ok(capsys, "import", hysteresis_table, "--config", CELL, "-o", path)
+    return path
+
+
+def test_import_says_what_was_read(hysteresis_table: Path, tmp_path: Path, capsys: Capsys) -> None:
+    path = tmp_path / "new.hilcal"
+    words = ok(capsys, "import", hysteresis_table, "--config", CELL, "-o", path).out
+    for part in ("70 readings of 14 poses", "ur10e", "10kg", "covariance: from the table"):
+        assert part in words
+    refused(capsys, 2, "import", hysteresis_table, "--config", CELL, "-o", path)
+    document = ok(
+        capsys, "import", hysteresis_table, "--config", CELL, "-o", path, "--force", "--json"
+    ).document
+    assert (document["n_readings"], document["n_poses"]) == (70, 14)
+    assert document["loads"][0] == "none"
+
+
+def test_identify_reports_what_the_contract_asks_for(campaign: Path, capsys: Capsys) -> None:
+    d = ok(capsys, "identify", campaign, "--json").document
+    assert d["model"] == ["base_frame", "joint_compliance"]
+    assert d["readings"] == "deflection"
+    assert d["scaling"] == "gc"
+    assert d["n_readings"] == 70
+    assert d["rank"] + d["dof"] == pytest.approx(3 * 56, abs=6)
+    assert set(d["condition"]) == {"unscaled", "scaled"}
+    assert d["condition"]["scaled"] < d["condition"]["unscaled"]
+    low, high = d["variance_factor_interval"]
+    assert low < d["variance_factor"] < high
+    assert set(d["error"]) == {"fit", "holdout"}
+    assert all(set(block) == ERROR for block in d["error"].values())
+    by_name = {p["name"]: p for p in d["parameters"]}
+    j2 = by_name["joint_compliance.j2"]
+    assert set(j2) == {"name", "value", "std", "unit", "identifiable"}
+    assert j2["identifiable"]
+    assert 1e-6 < j2["value"] < 1e-4
+    assert 0 < j2["std"] < j2["value"]
+    assert j2["unit"] == "rad/(N·m)"
+    unseen = by_name["base_frame.x"]  # cancels in deflections
+    assert (unseen["identifiable"], unseen["value"], unseen["std"]) == (False, None, None)
+    assert d["inflated"] is True
+    assert d["outliers"] == []
+    assert len(d["registration"]) == 4
+
+
+def test_identify_in_words(campaign: Path, capsys: Capsys) -> None:
+    words = ok(capsys, "identify", campaign).out
+    for part in ("µrad/(N·m)", "Condition number", "widened", "Not determined", "noise alone"):
+        assert part in words
+    assert max(map(len, words.splitlines())) <= 100
+
+
+def test_identify_names_directions_that_cannot_be_seen(campaign: Path, capsys: Capsys) -> None:
+    arguments = ("identify", campaign, "--effects", "link_geometry,joint_compliance")
+    d = ok(capsys, *arguments, "--readings", "absolute", "--json").document
+    assert d["model"] == ["base_frame", "link_geometry", "joint_compliance"]
+    assert d["unidentifiable"]
+    assert any("link_geometry" in direction for direction in d["unidentifiable"])
+    unseen = [p for p in d["parameters"] if not p["identifiable"]]
+    assert unseen
+    assert all(p["value"] is None and p["std"] is None for p in unseen)
+
+
+def test_all_scalings_stand_side_by_side(campaign: Path, capsys: Capsys) -> None:
+    d = ok(capsys, "identify", campaign, "--scaling", "all", "--json").document
+    assert d["scaling"] == "gc"
+    assert set(d["scalings"]) == {"none", "gu", "gc"}
+    assert all(found["scaling"] == name for name, found in d["scalings"].items())
+    assert d["scalings"]["gc"]["parameters"] == d["parameters"]
+    assert d["scalings"]["none"]["parameters"] != d["parameters"]
+    with Campaign.open(campaign) as stored:
+        assert [r.options["scaling"] for r in stored.revisions()] == ["gc"]
+    words = ok(capsys, "identify", campaign, "--scaling", "all").out
+    assert "The same readings with every scaling" in words
+
+
+def test_the_baseline_is_made_and_stored_where_there_is_no_revision(
+    campaign: Path, capsys: Capsys
+) -> None:
+    result = ok(capsys, "compare", campaign, "--json")
+    assert "made the baseline" in result.err
+    d = result.document
+    assert {"fit", "holdout"} == set(d["error"])
+    assert all(set(w) == {"variable", "share", "p_value"} for w in d["where"])
+    assert d["where"][0]["share"] > 0.3
+    strongest = next(w for w in d["where"] if not w["variable"].startswith("direction"))
+    assert "approach" in strongest["variable"]  # what hysteresis depends on
+    assert d["worst"][0]["sigma"] > d["worst"][-1]["sigma"] > 3
+    with Campaign.open(campaign) as stored:
+        assert len(stored.revisions()) == 1
+    again = ok(capsys, "compare", campaign, "--json")
+    assert again.document["error"]["fit"] == pytest.approx(d["error"]["fit"])
+    assert "made the baseline" not in again.err
+
+
+def test_diagnose_names_the_missing_effect(campaign: Path, capsys: Capsys) -> None:
+    d = ok(capsys, "diagnose", campaign, "--json").document
+    assert d["verdict"] == "missing_effect"
+    assert "hysteresis" in d["message"]
+    first = d["suspects"][0]
+    keys = {"effect", "p_value", "share", "holdout_share", "delta_bic", "same_as"}
+    assert keys <= set(first)
+    assert first["effect"] == "hysteresis"
+    assert {"model", "variance_factor", "predictable_share", "where"} <= set(d)
+    words = ok(capsys, "diagnose", campaign).out
+    assert "an effect is missing" in words
+    assert "hysteresis is missing" in words
+
+
+def test_add_shows_the_error_before_and_after(campaign: Path, capsys: Capsys) -> None:
+    d = ok(capsys, "add", campaign, "hysteresis", "--json").document
+    before, after = d["revisions"]
+    assert (before["revision"], before["added"]) == (1, None)
+    assert (after["revision"], after["added"]) == (2, "hysteresis")
+    assert set(after["error"]) == {"fit", "holdout"}
+    assert after["error"]["holdout"]["rms_sigma"] < 0.6 * before["error"]["holdout"]["rms_sigma"]
+    assert after["variance_factor"] < before["variance_factor"]
+    assert d["verdict"] == "adequate"
+    assert "already" in refused(capsys, 2, "add", campaign, "hysteresis")
+    words = ok(capsys, "add", campaign, "base_compliance").out
+    assert "base_compliance" in words
+    assert "does not fall" in words or "falls" in words
+
+
+def test_remove_takes_out_what_is_needless_and_says_what_is_not(
+    campaign: Path, capsys: Capsys
+) -> None:
+    ok(capsys, "add", campaign, "hysteresis")
+    ok(capsys, "add", campaign, "tracker_scale")
+    d = ok(capsys, "diagnose", campaign, "--json").document
+    assert d["needless"] == ["tracker_scale"]
+    assert "do not ask for tracker_scale" in ok(capsys, "diagnose", campaign).out
+    d = ok(capsys, "remove", campaign, "tracker_scale", "--json").document
+    assert (d["revisions"][-1]["added"], d["revisions"][-1]["removed"]) == (None, "tracker_scale")
+    assert d["revisions"][-1]["model"] == ["base_frame", "joint_compliance", "hysteresis"]
+    assert d["verdict"] == "adequate"
+    result = ok(capsys, "remove", campaign, "hysteresis")
+    assert "− hysteresis" in result.out
+    assert "it belongs there" in result.out
+    assert "not in the model" in refused(capsys, 2, "remove", campaign, "hysteresis")
+    assert "unknown effect" in refused(capsys, 2, "remove", campaign, "friction")
+
+
+def test_refine_ends_adequate_and_keeps_every_revision(campaign: Path, capsys: Capsys) -> None:
+    result = ok(capsys, "refine", campaign, "--json")
+    d = result.document
+    assert d["verdict"] == "adequate"
+    errors = [r["error"]["holdout"]["rms_sigma"] for r in d["revisions"]]
+    assert errors == sorted(errors, reverse=True)
+    assert errors[-1] < 1.3 < 2 < errors[0]
+    assert d["revisions"][-1]["model"] == ["base_frame", "joint_compliance", "hysteresis"]
+    low, high = d["revisions"][-1]["variance_factor_interval"]
+    assert low < 1 < high
+    assert "adding hysteresis" in result.err  # progress
+    with Campaign.open(campaign) as stored:
+        records = stored.revisions()
+    assert [r.added for r in records] == [None, "hysteresis"]
+    assert records[-1].result_json["diagnose"]["verdict"] == "adequate"
+
+
+def test_refine_can_start_elsewhere(campaign: Path, capsys: Capsys) -> None:
+    refused(capsys, 2, "refine", campaign, "--from-latest")
+    ok(capsys, "add", campaign, "hysteresis")
+    d = ok(capsys, "refine", campaign, "--from-latest", "--json").document
+    assert [r["revision"] for r in d["revisions"]] == [2]  # adequate already: nothing is stored
+    with Campaign.open(campaign) as stored:
+        assert len(stored.revisions()) == 2
+    refused(capsys, 2, "refine", campaign, "--from-latest", "--effects", "hysteresis")
+    chosen = ("--effects", "hysteresis,joint_compliance", "--readings", "absolute")
+    d = ok(capsys, "refine", campaign, *chosen, "--json").document
+    assert d["revisions"][0]["model"] == ["base_frame", "hysteresis", "joint_compliance"]
+    assert {r["readings"] for r in d["revisions"]} == {"absolute"}
+    with Campaign.open(campaign) as stored:  # what was fitted last is what is gone on with
+        assert stored.revisions()[-1].options["readings"] == "absolute"
+    assert ok(capsys, "identify", campaign, "--json").document["readings"] == "absolute"
+
+
+def test_validate_predicts_what_was_never_fitted(
+    campaign: Path, tmp_path: Path, capsys: Capsys
+) -> None:
+    ok(capsys, "refine", campaign)
+    r = rehearsal("hysteresis")
+    half = r.readings.pose < 7  # the other readings: the same cell and tracker, half of the poses
+    other = tmp_path / "other.hilcal"
+    with Campaign.create(other, r.config.to_json(), str(tmp_path), "test") as file:
+        file.append_readings(r.readings[half])
+    d = ok(capsys, "validate", campaign, other, "--json").document
+    assert d["n_readings"] == int(half.sum())
+    assert set(d["error"]) == ERROR
+    assert d["error"]["rms_sigma"] < 1.3
+    assert d["registered"] is False
+    # The same arm, but the tracker stands elsewhere.
+    moved = np.eye(4)
+    moved[:3, :3] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    moved[:3, 3] = 2.0, 1.5, -0.4
+    seen, rng = r.readings, np.random.default_rng(3)
+    there = replace(r.world, registration=moved)
+    readings = simulate(there, seen.states, seen.pose, seen.load, seen.cycle, seen.load_names, rng)
+    far = tmp_path / "far.hilcal"
+    with Campaign.create(far, r.config.to_json(), str(tmp_path), "test") as file:
+        file.append_readings(readings)
+    wrong = ok(capsys, "validate", campaign, far)
+    assert "--register" in wrong.out
+    again = ok(capsys, "validate", campaign, far, "--register", "--json").document
+    assert again["registered"] is True
+    assert again["error"]["rms_sigma"] < 1.3
+
+
+def test_view_writes_a_recording_that_can_be_read(
+    campaign: Path, tmp_path: Path, capsys: Capsys
+) -> None:
+    from rerun.chunk import RrdReader
+
+    path = tmp_path / "story.rrd"
+    ok(capsys, "add", campaign, "hysteresis", "--record", path)
+    first = path.read_bytes()
+    ok(capsys, "view", campaign, "--record", path)
+    assert path.read_bytes()[:4] == first[:4] == b"RRF2"
+    reader = RrdReader(str(path))
+    assert reader.recordings()
+    missing = tmp_path / "nowhere" / "story.rrd"
+    assert "no folder" in refused(capsys, 2, "view", campaign, "--record", missing)
+
+
+def test_export_writes_tables_that_go_in_again(
+    campaign: Path, tmp_path: Path, capsys: Capsys
+) -> None:
+    readings, parameters = tmp_path / "readings.csv", tmp_path / "parameters.csv"
+    assert "revision" in refused(capsys, 2, "export", campaign, "--parameters", parameters)
+    assert "--table" in refused(capsys, 2, "export", campaign)
+    ok(capsys, "refine", campaign)
+    ok(capsys, "export", campaign, "--table", readings, "--parameters", parameters)
+    refused(capsys, 2, "export", campaign, "--table", readings)
+    with Campaign.open(campaign) as stored:
+        again = read_table(readings, rehearsal("nothing").cell.arm, None)
+        assert (again.value == stored.readings().value).all()
+    with parameters.open(encoding="utf-8", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    j2 = next(row for row in rows if row["name"] == "hysteresis.j2")
+    assert float(j2["value"]) > 0
+    assert j2["unit"] == "rad"
+
+
+def test_effects_lists_the_catalogue(capsys: Capsys) -> None:
+    d = ok(capsys, "effects", "--json").document
+    assert [e["name"] for e in d["effects"]] == list(catalogue())
+    assert all(e["law"] and e["parameters"] for e in d["effects"])
+    assert {e["source"] for e in d["effects"]} == {"built in"}
+    words = ok(capsys, "effects").out
+    assert all(name in words for name in catalogue())
+
+
+def test_study_scaling(tmp_path: Path, capsys: Capsys) -> None:
+    picture = tmp_path / "study.svg"
+    d = ok(capsys, "study", "scaling", "--runs", "20", "--picture", picture, "--json").document
+    assert d["runs"] == 20
+    assert set(d["summary"]) == {"none", "gu", "gc"}
+    assert picture.read_text(encoding="utf-8").startswith("<svg")
+    assert "2 or more" in refused(capsys, 2, "study", "scaling", "--runs", "1")
+    assert ".svg" in refused(capsys, 2, "study", "scaling", "--picture", tmp_path / "study.png")
+
+
+def test_json_leaves_words_to_stderr(campaign: Path, capsys: Capsys) -> None:
+    for command in (["identify"], ["compare"], ["diagnose"], ["refine"]):
+        result = ok(capsys, *command, campaign, "--json")
+        json.loads(result.out)
+        assert "noise alone" in result.err
+
+
+def test_version(capsys: Capsys) -> None:
+    assert ok(capsys, "--version").out == f"hilcal {__version__}\n"
+
+
+def test_without_a_command_help_is_shown(capsys: Capsys) -> None:
+    result = run(capsys)
+    assert result.code == 2
+    assert "refine" in result.out + result.err
+    assert "Traceback" not in result.err

@@ -1,0 +1,141 @@
+"""Options of effects on the command line: given, refused, stored, shown."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from hilcal.data.campaign import Campaign
+from tests.support.cli_cases import CELL, Outcome, ok, refused, table
+
+Capsys = pytest.CaptureFixture[str]
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return table(tmp_path_factory.mktemp("tables") / "hysteresis.csv", "hysteresis")
+
+
+@pytest.fixture
+def campaign(measured: Path, tmp_path: Path, capsys: Capsys) -> Path:
+    path = tmp_path / "run.hilcal"
+    ok(capsys, "import", measured, "--config", CELL, "-o", path)
+    return path
+
+
+def names_of(result: Outcome, effect: str) -> list[str]:
+    named = [p["name"] for p in result.document["parameters"]]
+    return [n.partition(".")[2] for n in named if n.startswith(f"{effect}.")]
+
+
+def revisions(path: Path) -> list[tuple[tuple[str, ...], str | None, dict[str, object]]]:
+    with Campaign.open(path) as stored:
+        return [(r.effects, r.added, r.options["effects"]) for r in stored.revisions()]
+
+
+def test_identify_takes_options_and_keeps_them(
+    campaign: Path, tmp_path: Path, capsys: Capsys
+) -> None:
+    text = "joint_compliance(joints=1/2/3/4-6), hysteresis(joints=1-3), transmission_error(harmonics=5; joints='2/3')"  # noqa: E501
+    found = ok(capsys, "identify", campaign, "--effects", text, "--json")
+    d = found.document
+    assert d["model"] == ["base_frame", "joint_compliance", "hysteresis", "transmission_error"]
+    assert d["options"]["joint_compliance"] == {"joints": "1/2/3/4-6"}
+    assert d["options"]["hysteresis"] == {"joints": "1-3"}
+    assert d["options"]["transmission_error"] == {"harmonics": 5, "joints": "2/3"}
+    assert names_of(found, "joint_compliance") == ["j1", "j2", "j3", "j4-6"]
+    assert names_of(found, "hysteresis") == ["j1-3"]
+    said = "hysteresis(joints=1-3), transmission_error(harmonics=5, joints=2/3)."
+    assert said in " ".join(found.err.split())
+    ((effects, added, options),) = revisions(campaign)
+    assert added is None
+    assert {e: options[e] for e in effects} == d["options"]
+
+    # The stored revision is the same model in the commands that go on with it.
+    shown = " ".join(ok(capsys, "compare", campaign).out.split())
+    assert "+ hysteresis(joints=1-3) + transmission_error(harmonics=5, joints=2/3)" in shown
+    other = tmp_path / "other.hilcal"
+    shutil.copyfile(campaign, other)
+    shown = " ".join(ok(capsys, "validate", campaign, other).out.split())
+    assert "joint_compliance(joints=1/2/3/4-6) + hysteresis(joints=1-3)" in shown
+    parameters = tmp_path / "parameters.csv"
+    ok(capsys, "export", campaign, "--parameters", parameters)
+    assert "hysteresis.j1-3" in parameters.read_text(encoding="utf-8")
+    ok(capsys, "view", campaign, "--record", tmp_path / "story.rrd")
+
+
+def test_usual_options_are_not_shown(campaign: Path, capsys: Capsys) -> None:
+    result = ok(capsys, "identify", campaign, "--effects", "joint_compliance(joints=each)")
+    assert "Options" not in result.out
+    assert "joints=" not in ok(capsys, "compare", campaign).out
+
+
+def test_add_takes_options(campaign: Path, capsys: Capsys) -> None:
+    ok(capsys, "identify", campaign)
+    result = ok(capsys, "add", campaign, "hysteresis(joints=2/3+4)", "--json")
+    last = result.document["revisions"][-1]
+    assert last["added"] == "hysteresis"
+    assert last["options"]["hysteresis"] == {"joints": "2/3-4"}
+    assert "hysteresis(joints=2/3+4)" in result.err
+    effects, added, options = revisions(campaign)[-1]
+    assert (effects[-1], added) == ("hysteresis", "hysteresis")
+    assert options["hysteresis"] == {"joints": "2/3-4"}
+    again = ok(capsys, "refine", campaign, "--from-latest", "--json").document
+    assert again["revisions"][0]["options"]["hysteresis"] == {"joints": "2/3-4"}
+    line = refused(capsys, 2, "add", campaign, "hysteresis(joints=common)")
+    assert "in the model already" in line
+    ok(capsys, "remove", campaign, "hysteresis")
+    assert "hysteresis" not in revisions(campaign)[-1][2]
+
+
+def test_refine_starts_from_options(campaign: Path, capsys: Capsys) -> None:
+    chosen = "joint_compliance(joints=1/2/3/4-6)"
+    d = ok(capsys, "refine", campaign, "--effects", chosen, "--json").document
+    assert all(r["options"]["joint_compliance"] == {"joints": "1/2/3/4-6"} for r in d["revisions"])
+    assert d["revisions"][1]["added"] == "hysteresis"
+
+
+@pytest.mark.parametrize(
+    ("text", "wrong"),
+    [
+        ("hysteresis(colour=1)", "effect hysteresis: unknown option 'colour'; valid: joints"),
+        ("hysteresis(joints=7)", "effect hysteresis: joints = 7, there is no joint 7; valid: each"),
+        ("backlash(crossing=wide)", "effect backlash: crossing = 'wide'; valid: a finite number"),
+        ("base_frame(prior_m=-1; prior_rad=1)", "prior_m and prior_rad must be positive"),
+        ("hysteresis(joints=1", "hysteresis(joints=1': ) is missing at the end; valid: NAME or"),
+        ("hysteresis(joints)", "hysteresis: 'joints' is not an option with a value; valid: NAME"),
+        ("histeresis(joints=1)", "unknown effect 'histeresis'"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line_and_nothing_is_stored(
+    campaign: Path, capsys: Capsys, text: str, wrong: str
+) -> None:
+    for command in (("identify", campaign, "--effects", f"joint_compliance,{text}"),
+                    ("refine", campaign, "--effects", text),
+                    ("add", campaign, text)):  # fmt: skip
+        assert wrong in refused(capsys, 2, *command)
+    assert revisions(campaign) == []
+
+
+def test_other_refusals(campaign: Path, capsys: Capsys) -> None:
+    assert "creep is there twice" in refused(
+        capsys, 2, "identify", campaign, "--effects", "creep,creep(joints=1)"
+    )
+    assert "has 2 effects; valid: one" in refused(capsys, 2, "add", campaign, "creep,hysteresis")
+    assert "has 0 effects; valid: one" in refused(capsys, 2, "add", campaign, "")
+    assert "--effects is empty" in refused(capsys, 2, "identify", campaign, "--effects", " , ")
+    assert "unknown effect" in refused(capsys, 2, "remove", campaign, "creep(joints=1)")
+
+
+def test_effects_shows_options_and_defaults(capsys: Capsys) -> None:
+    d = {e["name"]: e for e in ok(capsys, "effects", "--json").document["effects"]}
+    assert d["backlash"]["options"] == ["joints", "crossing"]
+    assert d["backlash"]["defaults"] == {"joints": "each", "crossing": 0.01}
+    assert d["creep"]["defaults"] == {"joints": "common"}
+    assert d["transmission_error"]["defaults"] == {"joints": "each", "harmonics": None}
+    assert d["joint_compliance"]["option_help"]["joints"].startswith("which joints have a")
+    assert d["link_geometry"]["options"] == []
+    assert d["link_geometry"]["defaults"] == {}
+    words = " ".join(ok(capsys, "effects").out.split())
+    for part in ("periodic_joint_compliance orders [2]", "creep joints common", "(joints=1-3)"):
+        assert part in words

@@ -1,0 +1,285 @@
+"""Bad input on the command line: one clear line, the exit code of the contract, no traceback."""
+
+import signal
+import socket
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from hilcal.data.campaign import Campaign
+from hilcal.data.readings import Readings
+from tests.support.cli_cases import CELL, ok, refused, rehearsal, run, start, table
+
+Capsys = pytest.CaptureFixture[str]
+Rows = list[list[str]]
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return table(tmp_path_factory.mktemp("tables") / "good.csv", "nothing", poses=6)
+
+
+@pytest.fixture
+def campaign(good: Path, tmp_path: Path, capsys: Capsys) -> Path:
+    path = tmp_path / "run.hilcal"
+    ok(capsys, "import", good, "--config", CELL, "-o", path)
+    return path
+
+
+def rows_of(path: Path) -> Rows:
+    return [line.split(",") for line in path.read_text(encoding="utf-8").splitlines()]
+
+
+def rename(old: str, new: str) -> Callable[[Rows], Rows]:
+    return lambda rows: [[new if c == old else c for c in rows[0]], *rows[1:]]
+
+
+def cell(column: str, row: int, value: str) -> Callable[[Rows], Rows]:
+    def change(rows: Rows) -> Rows:
+        k = rows[0].index(column)
+        return [
+            [*r[:k], value, *r[k + 1 :]] if number == row else r
+            for number, r in enumerate(rows, start=1)
+        ]
+
+    return change
+
+
+def drop(column: str) -> Callable[[Rows], Rows]:
+    def change(rows: Rows) -> Rows:
+        k = rows[0].index(column)
+        return [[*r[:k], *r[k + 1 :]] for r in rows]
+
+    return change
+
+
+BAD_TABLES: dict[str, tuple[Callable[[Rows], Rows], tuple[str, ...]]] = {
+    "missing column": (drop("y_m"), ("y_m",)),
+    "misspelled column": (rename("x_m", "x_mm"), ("x_mm",)),
+    "duplicated column": (rename("y_m", "x_m"), ("x_m", "2 times")),
+    "not a number": (cell("z_m", 3, "nan"), ("row 3", "z_m")),
+    "millimetres": (cell("x_m", 4, "1400"), ("row 4", "x_m")),
+    "negative variance": (cell("cov_y_y", 2, "-1e-9"), ("row 2", "variance")),
+    "covariance not positive": (cell("cov_x_y", 2, "1e-3"), ("row 2", "cov")),
+    "joints beyond limits": (cell("q2_rad", 5, "7.1"), ("row 5", "q2_rad")),
+    "joints in degrees": (cell("q3_rad", 5, "120"), ("row 5", "q3_rad")),
+    "no rows": (lambda rows: rows[:1], ()),
+    "empty": (lambda rows: [], ()),
+}
+
+
+@pytest.mark.parametrize("case", BAD_TABLES)
+def test_a_bad_table_is_one_clear_line(
+    case: str, good: Path, tmp_path: Path, capsys: Capsys
+) -> None:
+    change, named = BAD_TABLES[case]
+    bad, output = tmp_path / "bad.csv", tmp_path / "bad.hilcal"
+    bad.write_text("".join(",".join(r) + "\n" for r in change(rows_of(good))), encoding="utf-8")
+    line = refused(capsys, 2, "import", bad, "--config", CELL, "-o", output)
+    assert "bad.csv" in line
+    assert all(part in line for part in named), line
+    assert not output.exists()
+
+
+def test_a_pose_without_an_unloaded_reading(good: Path, tmp_path: Path, capsys: Capsys) -> None:
+    rows = rows_of(good)
+    lacking = tmp_path / "lacking.csv"
+    kept = [r for r in rows if r[:2] != ["p2", "none"]]
+    lacking.write_text("".join(",".join(r) + "\n" for r in kept), encoding="utf-8")
+    path = tmp_path / "lacking.hilcal"
+    ok(capsys, "import", lacking, "--config", CELL, "-o", path)
+    line = refused(capsys, 2, "identify", path, "--readings", "deflection")
+    assert "p2" in line
+    assert "absolute" in line
+    d = ok(capsys, "identify", path, "--json").document
+    assert d["readings"] == "absolute"  # deflections are not possible, so they are not the default
+
+
+def test_files_that_are_no_campaigns(
+    good: Path, campaign: Path, tmp_path: Path, capsys: Capsys
+) -> None:
+    assert "not a hilcal campaign" in refused(capsys, 2, "compare", good)
+    assert "no such" in refused(capsys, 2, "compare", tmp_path / "none.hilcal")
+    cut = tmp_path / "cut.hilcal"
+    cut.write_bytes(campaign.read_bytes()[:9000])
+    assert "truncated" in refused(capsys, 2, "diagnose", cut)
+    line = refused(capsys, 2, "import", campaign, "--config", CELL, "-o", tmp_path / "x.hilcal")
+    assert "run.hilcal" in line
+    refused(capsys, 2, "import", good, "--config", CELL, "-o", good, "--force")
+    assert rows_of(good)  # a file of another kind is never overwritten
+
+
+def test_unknown_names_list_the_valid_ones(
+    campaign: Path, good: Path, tmp_path: Path, capsys: Capsys
+) -> None:
+    line = refused(capsys, 2, "add", campaign, "histeresis")
+    assert "hysteresis" in line
+    assert "base_frame" in line
+    assert "hysteresis" in refused(capsys, 2, "identify", campaign, "--effects", "histeresis")
+    assert "twice" in refused(capsys, 2, "refine", campaign, "--effects", "hysteresis,hysteresis")
+    assert "gc" in refused(capsys, 2, "identify", campaign, "--scaling", "full")
+    assert "absolute" in refused(capsys, 2, "identify", campaign, "--readings", "relative")
+    bad = tmp_path / "cell.toml"
+    bad.write_text('[robot]\nmodel = "ur10f"\n', encoding="utf-8")
+    assert "ur10e" in refused(capsys, 2, "import", good, "--config", bad, "-o", tmp_path / "x")
+    bad.write_text('[robot]\nmodel = "ur10e"\ncolour = 1\n', encoding="utf-8")
+    assert "colour" in refused(capsys, 2, "import", good, "--config", bad, "-o", tmp_path / "x")
+    line = refused(
+        capsys, 2, "import", good, "--config", CELL, "-o", tmp_path / "x", "--format", "xls"
+    )
+    assert "ipa-ur10" in line
+
+
+def test_usage_errors_are_one_line(campaign: Path, capsys: Capsys) -> None:
+    assert "nonsense" in refused(capsys, 2, "nonsense")
+    assert "EFFECT" in refused(capsys, 2, "add", campaign)
+    assert "--frobnicate" in refused(capsys, 2, "refine", campaign, "--frobnicate")
+
+
+def test_diagnosis_needs_the_full_scaling(campaign: Path, capsys: Capsys) -> None:
+    ok(capsys, "identify", campaign, "--scaling", "gu")
+    assert "gc" in refused(capsys, 2, "diagnose", campaign)
+    assert "gc" in refused(capsys, 2, "compare", campaign)
+
+
+def test_fewer_readings_than_parameters(tmp_path: Path, capsys: Capsys) -> None:
+    r = rehearsal("nothing", poses=4)
+    path = tmp_path / "few.hilcal"
+    unloaded = r.readings.unloaded
+    with Campaign.create(path, r.config.to_json(), str(tmp_path), "test") as file:
+        file.append_readings(r.readings[unloaded])
+    line = refused(
+        capsys, 4, "identify", path, "--effects", "encoder_offset,link_geometry", "--readings",
+        "absolute",
+    )  # fmt: skip
+    assert "measure" in line
+    two = tmp_path / "two.hilcal"
+    with Campaign.create(two, r.config.to_json(), str(tmp_path), "test") as file:
+        file.append_readings(r.readings[r.readings.pose < 2])
+    assert "poses" in refused(capsys, 4, "identify", two)
+
+
+def test_readings_appended_after_a_fit(campaign: Path, capsys: Capsys) -> None:
+    ok(capsys, "identify", campaign)
+    more: Readings = rehearsal("nothing", seed=2, poses=2).readings
+    with Campaign.open(campaign) as file:
+        names = tuple(f"new{k}" for k in range(2))
+        file.append_readings(type(more)(**{**_fields(more), "pose_names": names}))
+    line = refused(capsys, 2, "compare", campaign)
+    assert "identify again" in line
+
+
+def _fields(readings: Readings) -> dict[str, object]:
+    return {name: getattr(readings, name) for name in readings.__dataclass_fields__}
+
+
+def test_a_busy_port_is_refused(campaign: Path, capsys: Capsys) -> None:
+    ok(capsys, "identify", campaign)
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        line = refused(capsys, 2, "view", campaign, "--port", str(taken.getsockname()[1]))
+    assert "port" in line
+
+
+def test_an_unexpected_error_names_itself(
+    monkeypatch: pytest.MonkeyPatch, campaign: Path, capsys: Capsys
+) -> None:
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError("by\nzero")
+
+    monkeypatch.setattr("hilcal.cli.fitting.where", broken)
+    monkeypatch.delenv("HILCAL_DEBUG", raising=False)
+    line = refused_with_notice(capsys, campaign)
+    assert "ZeroDivisionError: by zero" in line
+    assert "report" in line
+    monkeypatch.setenv("HILCAL_DEBUG", "1")
+    result = run(capsys, "compare", campaign)
+    assert result.code == 1
+    assert "Traceback" in result.err
+
+
+def refused_with_notice(capsys: Capsys, campaign: Path) -> str:
+    result = run(capsys, "compare", campaign)
+    assert result.code == 1
+    assert "Traceback" not in result.err
+    return result.err.splitlines()[-1]
+
+
+def test_an_interrupt_ends_quietly(
+    monkeypatch: pytest.MonkeyPatch, campaign: Path, capsys: Capsys
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("hilcal.cli.fitting.where", interrupted)
+    result = run(capsys, "compare", campaign)
+    assert result.code == 130
+    assert result.err.splitlines()[-1] == "error: interrupted"
+
+
+def test_numerical_warnings_do_not_reach_the_user(
+    monkeypatch: pytest.MonkeyPatch, campaign: Path, capsys: Capsys
+) -> None:
+    import warnings
+
+    from hilcal.diagnose.misfit_breakdown import where
+
+    def noisy(p: object) -> object:
+        warnings.warn("divide by zero", RuntimeWarning, stacklevel=1)
+        return where(p)  # type: ignore[arg-type]
+
+    monkeypatch.setattr("hilcal.cli.fitting.where", noisy)
+    assert "divide" not in ok(capsys, "compare", campaign).err
+
+
+def test_a_reader_that_leaves_early_is_no_error(campaign: Path) -> None:
+    process = start("effects")
+    assert process.stdout is not None
+    assert process.stderr is not None
+    process.stdout.close()
+    with process.stderr:
+        assert process.stderr.read() == ""
+    process.wait(60)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_view_serves_until_it_is_told_to_stop(campaign: Path, number: int, capsys: Capsys) -> None:
+    ok(capsys, "identify", campaign)
+    with start("view", campaign, "--port", str(free_port())) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline().startswith("Open the viewer with")
+            assert "rerun+http://127.0.0.1:" in process.stdout.readline()
+            process.send_signal(number)
+            out, err = process.communicate(timeout=60)
+        finally:
+            process.kill()
+    assert process.returncode == 0, err
+    assert "Traceback" not in out + err
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def test_a_kill_leaves_every_committed_revision(campaign: Path, capsys: Capsys) -> None:
+    ok(capsys, "identify", campaign)
+    process = start("refine", campaign)
+    time.sleep(0.3)  # anywhere: whatever it is doing, the file stays whole
+    process.kill()
+    process.communicate()
+    with Campaign.open(campaign) as stored:
+        assert len(stored.revisions()) >= 1
+    assert ok(capsys, "refine", campaign, "--json").document["verdict"] == "adequate"
+
+
+def test_a_program_without_a_place_to_write(good: Path, tmp_path: Path, capsys: Capsys) -> None:
+    line = refused(capsys, 2, "import", good, "--config", CELL, "-o", tmp_path / "no" / "x.hilcal")
+    assert "written" in line

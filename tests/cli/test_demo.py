@@ -1,0 +1,105 @@
+"""The demo: it hides an effect, finds it, and says whether it did."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.simulated.rehearsal import choices, rehearse
+from hilcal.config import load_config
+from hilcal.data.campaign import Campaign
+from hilcal.errors import InputError
+from tests.support.cli_cases import CELL, ok, refused, rehearsal
+
+Capsys = pytest.CaptureFixture[str]
+FAST = "--without-devices"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("effect", ["hysteresis", "encoder_offset", "base_frame"])
+def test_the_hidden_effect_is_found(effect: str, tmp_path: Path, capsys: Capsys) -> None:
+    path = tmp_path / "demo.hilcal"
+    result = ok(capsys, "demo", FAST, "--hide", effect, "--seed", "1", "-o", path, "--json")
+    d = result.document
+    assert d["hidden"] == effect
+    assert d["found"] is True
+    assert d["verdict"] == "adequate"
+    assert d["revisions"][1]["added"] == effect
+    first, last = d["revisions"][0], d["revisions"][-1]
+    assert first["error"]["holdout"]["rms_sigma"] > 2
+    assert last["error"]["holdout"]["rms_sigma"] < 1.2
+    assert any(name.startswith(effect) for name in d["truth"])
+    assert "true" in result.err  # people's text is on stderr
+    off = [abs(p["value"] - p["true"]) / p["std"] for p in d["parameters"]]
+    assert np.sqrt(np.mean(np.square(off))) < 2
+    with Campaign.open(path) as stored:
+        assert 80 < stored.n_readings < 150
+        assert [r.added for r in stored.revisions()] == [r["added"] for r in d["revisions"]]
+
+
+@pytest.mark.slow
+def test_nothing_hidden_is_nothing_found(tmp_path: Path, capsys: Capsys) -> None:
+    path = tmp_path / "demo.hilcal"
+    d = ok(capsys, "demo", FAST, "--hide", "nothing", "--seed", "2", "-o", path, "--json").document
+    assert (d["hidden"], d["found"], d["verdict"]) == ("nothing", True, "adequate")
+    assert [r["added"] for r in d["revisions"]] == [None]
+
+
+def test_the_demo_in_words(tmp_path: Path, capsys: Capsys) -> None:
+    path, recording = tmp_path / "demo.hilcal", tmp_path / "demo.rrd"
+    arguments = ("demo", FAST, "--hide", "hysteresis", "--seed", "1", "-o", path)
+    words = ok(capsys, *arguments, "--record", recording).out
+    for part in (
+        " readings.",
+        "The misfit follows joint",
+        "hysteresis is missing",
+        "noise alone",
+        "poses",
+        "adequate",
+        "Hidden was hysteresis",
+        "It was found and added",
+    ):
+        assert part in words
+    assert max(map(len, words.splitlines())) <= 100
+    assert recording.read_bytes()[:4] == b"RRF2"
+    again = ok(capsys, *arguments)
+    assert again.out == words  # the same seed, the same story
+    assert "is replaced" in again.err
+
+
+def test_the_demo_does_not_replace_another_file(tmp_path: Path, capsys: Capsys) -> None:
+    path = tmp_path / "notes.txt"
+    path.write_text("mine", encoding="utf-8")
+    line = refused(capsys, 2, "demo", FAST, "--hide", "nothing", "-o", path, "--json")
+    assert "notes.txt" in line
+    assert path.read_text(encoding="utf-8") == "mine"
+
+
+def test_what_cannot_be_hidden(tmp_path: Path, capsys: Capsys) -> None:
+    line = refused(capsys, 2, "demo", "--hide", "gremlins", "-o", tmp_path / "x.hilcal")
+    assert all(name in line for name in (*choices(), "random", "nothing"))
+    line = refused(capsys, 2, "demo", "--seed", "-1", "-o", tmp_path / "x.hilcal")
+    assert "--seed" in line
+
+
+def test_a_rehearsal_repeats_itself_and_loads_every_joint() -> None:
+    one, two, other = rehearsal("hysteresis"), rehearsal("hysteresis"), rehearsal("hysteresis", 2)
+    np.testing.assert_array_equal(one.readings.value, two.readings.value)
+    assert not np.array_equal(one.readings.value, other.readings.value)
+    torque = one.world.drive_torque(one.readings.states)
+    unloaded = np.repeat(torque[one.readings.unloaded], 5, axis=0)
+    assert (np.abs(torque - unloaded).max(axis=0) > 5.0).all()  # N·m
+
+
+def test_a_random_choice_gives_nothing_away() -> None:
+    config = load_config(CELL)
+    drawn = [rehearse(config, "random", seed, 3) for seed in range(6)]
+    assert len({r.hidden for r in drawn}) > 2
+    assert {r.mode for r in drawn} == {"absolute"}
+    assert {r.cell.registration_known for r in drawn} == {False}
+
+
+def test_a_cell_without_loads_is_refused() -> None:
+    config = load_config(CELL).model_copy(update={"loads": ()})
+    with pytest.raises(InputError, match="loads"):
+        rehearse(config, "nothing", 1)

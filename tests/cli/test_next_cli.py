@@ -1,0 +1,176 @@
+"""`hilcal next` and `hilcal demo --ambiguous`: what they say, write and refuse."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from hilcal.cli.doubting import CHOICE, in_doubt
+from hilcal.data.campaign import Campaign
+from hilcal.data.plan import load_plan
+from hilcal.robot.catalogue import configs_dir
+from tests.support.cli_cases import ok, refused
+from tests.support.next_cases import SMALL, doubtful
+
+Capsys = pytest.CaptureFixture[str]
+TILT, LINK, BASE = "joint_tilt_compliance", "link_compliance", "base_compliance"
+CELLS = str(configs_dir() / "cells")
+
+
+def stored(path: Path, effect: str, seed: int) -> Path:
+    """Write a small campaign, as `hilcal import` would."""
+    with Campaign.create(path, SMALL.to_json(), CELLS, "a test", overwrite=True) as campaign:
+        campaign.append_readings(doubtful(effect, seed).rehearsal.readings)
+    return path
+
+
+@pytest.fixture
+def ambiguous(tmp_path: Path) -> Path:
+    assert doubtful(BASE, 2).suspects == (BASE, TILT)
+    return stored(tmp_path / "run.hilcal", BASE, 2)
+
+
+def test_next_in_json(ambiguous: Path, tmp_path: Path, capsys: Capsys) -> None:
+    ok(capsys, "identify", ambiguous)
+    plan, table = tmp_path / "next.json", tmp_path / "next.csv"
+    arguments = ("--quick", "--poses", "8", "--csv", table, "--json")
+    result = ok(capsys, "next", ambiguous, "-o", plan, *arguments)
+    d = result.document
+    assert d["suspects"] == [BASE, TILT]
+    assert d["criterion"] == "separate"
+    assert {(e, f) for e, f, _ in d["separates"]} == {(BASE, TILT), (TILT, BASE)}
+    now = {(e, f): p for e, f, p in d["separates_now"]}
+    assert all(0 <= now[e, f] < p <= 1 for e, f, p in d["separates"])
+    assert 0.9 < d["efficiency"] <= 1
+    made = load_plan(plan)
+    assert d["readings"] == len(made.steps)
+    assert made.about["suspects"] == [BASE, TILT]
+    assert d["poses"] > 0
+    assert set(d["predicted_std"]) > {"joint_compliance.j1"}
+    assert len(table.read_text(encoding="utf-8").splitlines()) == 1 + d["readings"]
+    again = ok(capsys, "next", ambiguous, "-o", tmp_path / "b.json", *arguments)
+    assert (tmp_path / "b.json").read_bytes() == plan.read_bytes()
+    assert again.document["separates"] == d["separates"]
+    assert "ruled out" in result.err  # words are on stderr
+
+
+def test_next_in_words(ambiguous: Path, tmp_path: Path, capsys: Capsys) -> None:
+    plan = tmp_path / "next.json"
+    words = ok(capsys, "next", ambiguous, "-o", plan, "--quick", "--poses", "8").out
+    for part in (
+        f"In doubt: {BASE} or {TILT}.",
+        "this is ruled out",
+        "What separates the weakest pair comes from ",
+        "telling the leading suspects apart",
+        f"--append --plan {plan}",
+    ):
+        assert part in " ".join(words.split())
+    assert max(map(len, words.splitlines())) <= 100
+
+
+def test_an_effect_that_was_added_in_doubt_is_in_doubt_still(
+    ambiguous: Path, tmp_path: Path, capsys: Capsys
+) -> None:
+    """`refine` has added the leading suspect: the newest model is adequate, and may be wrong."""
+    refined = ok(capsys, "refine", ambiguous, "--json").document
+    assert refined["verdict"] == "ambiguous"
+    added = refined["revisions"][-1]["added"]
+    arguments = ("--quick", "--poses", "4", "--json")
+    d = ok(capsys, "next", ambiguous, "-o", tmp_path / "n.json", *arguments).document
+    assert d["suspects"][0] == added
+    assert len(d["suspects"]) > 1
+
+
+def test_named_suspects_need_no_diagnosis(tmp_path: Path, capsys: Capsys) -> None:
+    path = stored(tmp_path / "run.hilcal", "nothing", 1)
+    arguments = ("--suspects", f"{TILT},load_point", "--quick", "--poses", "3", "--json")
+    d = ok(capsys, "next", path, "-o", tmp_path / "n.json", *arguments).document
+    assert d["suspects"] == [TILT, "load_point"]
+    assert all(p > 0.5 for _, _, p in d["separates"])
+
+
+def test_nothing_in_doubt_is_said_so(tmp_path: Path, capsys: Capsys) -> None:
+    plan = tmp_path / "next.json"
+    path = stored(tmp_path / "run.hilcal", "nothing", 1)
+    line = refused_after(capsys, "next", path, "-o", plan)
+    assert "the model is adequate" in line
+    assert "--after" in line
+    assert doubtful("sensor_misalignment", 1).suspects == ("sensor_misalignment",)
+    path = stored(tmp_path / "one.hilcal", "sensor_misalignment", 1)
+    line = refused_after(capsys, "next", path, "-o", plan)
+    assert "hilcal add" in line
+    assert not plan.exists()
+
+
+def refused_after(capsys: Capsys, *arguments: str | Path) -> str:
+    """The line of a refusal with exit 4; the first use of a campaign makes its baseline."""
+    ok(capsys, "diagnose", arguments[1])
+    return refused(capsys, 4, *arguments)
+
+
+def test_pairs_that_nothing_separates_are_refused(tmp_path: Path, capsys: Capsys) -> None:
+    path = stored(tmp_path / "run.hilcal", "nothing", 1)
+    ok(capsys, "identify", path)
+    suspects = ("--suspects", "tracker_scale,hysteresis")
+    line = refused(capsys, 4, "next", path, "-o", tmp_path / "n.json", *suspects)
+    assert "no measurement separates them" in line
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--suspects", "gremlins,hysteresis"), ("gremlins", "valid")),
+        (("--suspects", "hysteresis"), ("--suspects", "2 to 4")),
+        (("--suspects", "hysteresis,hysteresis"), ("--suspects", "twice")),
+        (("--poses", "0"), ("--poses", "from 1")),
+        (("--seed", "-1"), ("--seed",)),
+        (("--record", "no/where.rrd"), ("no folder",)),
+        (("--cell", "nothing.toml"), ("nothing.toml",)),
+    ],
+)
+def test_wrong_options(
+    arguments: tuple[str, ...], words: tuple[str, ...], tmp_path: Path, capsys: Capsys
+) -> None:
+    path = stored(tmp_path / "run.hilcal", "nothing", 1)
+    line = refused(capsys, 2, "next", path, "-o", tmp_path / "n.json", *arguments)
+    assert all(word in line for word in words)
+
+
+# the demo
+
+
+@pytest.mark.slow
+def test_the_demo_settles_a_doubt(tmp_path: Path, capsys: Capsys) -> None:
+    path = tmp_path / "demo.hilcal"
+    arguments = ("demo", "--without-devices", "--ambiguous", "--hide", LINK, "--seed", "2")
+    result = ok(capsys, *arguments, "-o", path, "--json")
+    d = result.document
+    assert d["hidden"] == LINK
+    assert d["doubt"]["verdict"] == "ambiguous"
+    assert {TILT, LINK} <= set(d["doubt"]["suspects"])
+    assert all(p > 0.5 for _, _, p in d["doubt"]["separates"])
+    assert (d["found"], d["verdict"]) == (True, "adequate")
+    assert d["diagnoses"][0]["suspects"][0]["effect"] == LINK
+    assert d["diagnoses"][0]["suspects"][0]["same_as"] == []
+    assert "readings were added" in result.err
+    with Campaign.open(path) as campaign:
+        records, readings = campaign.revisions(), campaign.readings()
+    assert [r.added for r in records] == [None, None, LINK]
+    assert records[0].data_hash != records[1].data_hash
+    assert d["doubt"]["verdict"] == records[0].result_json["diagnose"]["verdict"]
+    assert len(readings) > 100
+    viewed = ok(capsys, "view", path, "--record", tmp_path / "demo.rrd", "--json").document
+    assert viewed["revisions"] == [2, 3]
+
+
+@pytest.mark.slow
+def test_a_demo_without_devices_can_be_viewed(tmp_path: Path, capsys: Capsys) -> None:
+    path = tmp_path / "demo.hilcal"
+    ok(capsys, "demo", "--without-devices", "--hide", "nothing", "--poses", "6", "-o", path)
+    ok(capsys, "view", path, "--record", tmp_path / "demo.rrd", "--json")
+
+
+def test_the_effect_of_an_ambiguous_demo_is_drawn_from_the_seed() -> None:
+    assert {in_doubt(seed) for seed in range(20)} == set(CHOICE)
+    assert in_doubt(3) == in_doubt(3)
+    assert json.dumps(in_doubt(1))

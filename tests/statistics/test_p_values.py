@@ -1,0 +1,89 @@
+"""Without a hidden effect p-values are uniform, in all that makes a real campaign irregular."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import kstest, wishart
+
+from hilcal.acquire.average import PRIOR_REPEATS
+from hilcal.data.readings import Readings
+from hilcal.data.whitening import MODES
+from hilcal.diagnose.effect_ranking import candidates, rank_suspects
+from hilcal.diagnose.projection import projection
+from hilcal.diagnose.stepwise import add
+from hilcal.effects.catalogue import catalogue
+from hilcal.identify.baseline import baseline
+from hilcal.identify.fit import fit
+from tests.support.campaigns import NOTHING, campaign
+
+SAMPLES = 5
+"""Readings of the tracker that are averaged, from whose scatter a covariance is estimated."""
+IN_THE_MODEL = {"absolute": ("hysteresis", "encoder_offset"), "deflection": ("backlash",)}
+
+
+def estimated(readings: Readings, rng: np.random.Generator) -> Readings:
+    """The covariances as a run estimates them: what is stated, and the scatter of few samples."""
+    m, repeats = readings.m, SAMPLES - 1
+    drawn = [wishart.rvs(repeats, v, random_state=rng) for v in readings.covariance]
+    shrunk = (PRIOR_REPEATS * readings.covariance + np.array(drawn)) / (PRIOR_REPEATS + repeats)
+    assert shrunk.shape[1:] == (m, m)
+    return replace(readings, covariance=shrunk)
+
+
+def unequal(readings: Readings, rng: np.random.Generator) -> Readings:
+    """Some loaded readings are missing, and others were taken twice (but not of one noise)."""
+    loaded = np.flatnonzero(~readings.unloaded)
+    drop = rng.choice(loaded, len(loaded) // 3, replace=False)
+    return readings[np.setdiff1d(np.arange(len(readings)), drop)]
+
+
+def p_values(kind: str, mode: str, seeds: range) -> dict[str, list[float]]:
+    out: dict[str, list[float]] = {}
+    for seed in seeds:
+        c = campaign(NOTHING, mode, seed, poses=14, plan_seed=3, registration_known=True)
+        rng = np.random.default_rng([seed, 77])
+        readings = c.readings
+        if kind == "estimated covariances":
+            readings = estimated(readings, rng)
+        elif kind == "unequal numbers":
+            readings = unequal(readings, rng)
+        found = fit(baseline(c.cell, readings, mode), readings, mode)
+        if kind == "several effects":
+            for name in IN_THE_MODEL[mode]:
+                found = add(found, name)
+        p = projection(found)
+        for s in rank_suspects(p, candidates(p.fit)):
+            if s.score.rank:
+                out.setdefault(s.effect, []).append(s.score.p_value)
+    return out
+
+
+def check(kind: str, mode: str, count: int) -> None:
+    found = p_values(kind, mode, range(count))
+    assert len(found) > len(catalogue()) // 2
+    for effect, p in found.items():
+        assert len(p) > 0.8 * count, effect
+        # Families are tested one by one, about fifty over all cases: one in 1e5 each.
+        assert kstest(p, "uniform").pvalue > 1e-5, (effect, np.round(sorted(p)[:5], 4))
+    every = np.concatenate([np.array(p) for p in found.values()])
+    # Of one campaign they depend on each other: as if there were five independent families.
+    for level in (0.05, 0.2, 0.5):
+        spread = np.sqrt(level * (1 - level) / (5 * count))
+        assert abs(np.mean(every < level) - level) < 4 * spread, level
+
+
+KINDS = ("estimated covariances", "unequal numbers", "several effects")
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("kind", KINDS)
+def test_p_values_are_uniform(kind, mode):
+    check(kind, mode, 12 if kind == "several effects" else 24)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("kind", KINDS)
+def test_p_values_are_uniform_over_many_campaigns(kind, mode):
+    check(kind, mode, 300)

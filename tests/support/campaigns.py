@@ -1,0 +1,143 @@
+"""Simulated campaigns with a known truth, for the tests of identification and diagnosis."""
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+
+from drivers.simulated.campaign import rehearsal_states, simulate
+from drivers.simulated.injected_effects import hide, nothing_hidden
+from drivers.simulated.tracker import TrackerNoise
+from drivers.simulated.world import World
+from hilcal.cell import Cell, cell_from_config
+from hilcal.config import CellConfig, load_config
+from hilcal.data.readings import Readings, States
+from hilcal.data.whitening import Mode
+from hilcal.robot import se3
+from hilcal.robot.catalogue import configs_dir
+from hilcal.types import Floats, Ints
+
+NOTHING = "none"
+
+
+def configuration() -> CellConfig:
+    """The cell of `hilcal demo`: a UR10e, two weights and two pulls."""
+    return load_config(configs_dir() / "cells" / "demo_ur10e.toml")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plan:
+    """States of a campaign: every pose unloaded and under each load."""
+
+    states: States
+    pose: Ints
+    load: Ints
+    cycle: Ints
+    load_names: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Campaign:
+    """A cell as the program believes it to be, the world as it is, and what was read."""
+
+    cell: Cell
+    world: World
+    readings: Readings
+    mode: Mode
+
+
+def cell_of(*, registration_known: bool = False, target_known: bool = True) -> Cell:
+    """The demo's cell; a known registration is some way off the origin and turned."""
+    cell = cell_from_config(configuration())
+    cell = replace(cell, registration_known=registration_known, target_known=target_known)
+    if registration_known:
+        turn = se3.rotation(np.array([0.02, -0.03, 2.1]))
+        cell = replace(cell, registration=se3.matrix(turn, np.array([2.4, -1.6, -0.5])))
+    return cell
+
+
+@cache
+def plan(poses: int = 12, seed: int = 0, cycles: int = 1) -> Plan:
+    """Feasible spread poses under all loads of the configuration; the same for equal arguments."""
+    config, cell = configuration(), cell_of()
+    pulls = [(load.name, load.wrench(cell.gravity)) for load in config.loads]
+    rng = np.random.default_rng(seed)
+    states, pose, load, cycle = rehearsal_states(cell, poses, pulls, rng, cycles=cycles)
+    return Plan(states, pose, load, cycle, ("none", *(name for name, _ in pulls)))
+
+
+def world_of(cell: Cell, rng: np.random.Generator) -> World:
+    """A world with joint compliance alone, tracker and repeatability as configured."""
+    config = configuration()
+    t = config.tracker
+    noise = TrackerNoise(
+        (t.range_std_m, t.range_std_per_m),
+        (t.transverse_std_m, t.transverse_std_per_m),
+        t.orientation_std_rad,
+    )
+    return nothing_hidden(
+        cell, rng, noise=noise, joint_std=config.repeatability.per_joint(cell.arm.n)
+    )
+
+
+def campaign(
+    effect: str = NOTHING,
+    mode: Mode = "absolute",
+    seed: int = 0,
+    *,
+    poses: int = 12,
+    strength: float = 3.0,
+    registration_known: bool = False,
+    target_known: bool = True,
+    m: int = 3,
+    cycles: int = 1,
+    plan_seed: int | None = None,
+    harmonics: int = 6,
+) -> Campaign:
+    """Measure a campaign in a world that hides one effect at `strength` σ.
+
+    With `plan_seed` equal plans share their states; otherwise poses are drawn for each seed.
+    """
+    cell = cell_of(registration_known=registration_known, target_known=target_known)
+    p = plan(poses, 1000 + seed if plan_seed is None else plan_seed, cycles)
+    rng = np.random.default_rng(seed)
+    world = world_of(cell, rng)
+    if effect == "joint_stiffening":  # a gear that stiffens starts softer than its mean
+        softer = 1.5 * world.physics.joint_compliance
+        world = replace(world, physics=world.physics.with_effect("joint_compliance", softer))
+    if effect != NOTHING:
+        world = hide(
+            effect, cell, p.states, strength, mode, rng,
+            world=world, m=m, pose=p.pose, cycle=p.cycle, harmonics=harmonics,
+        )  # fmt: skip
+    return Campaign(cell, world, measured(world, p, rng, m), mode)
+
+
+def measured(world: World, p: Plan, rng: np.random.Generator, m: int = 3) -> Readings:
+    """What the tracker reads of a plan."""
+    return simulate(world, p.states, p.pose, p.load, p.cycle, p.load_names, rng, m)
+
+
+def noiseless(world: World, p: Plan, m: int = 3) -> Readings:
+    """The same without any noise; the covariance stays."""
+    readings = measured(world, p, np.random.default_rng(0), m)
+    return replace(readings, value=world.sight(p.states).value(m))
+
+
+def with_noise(clean: Readings, rng: np.random.Generator, factor: float = 1.0) -> Readings:
+    """Readings about noiseless ones, normal with `factor`² times the stated covariance."""
+    root = factor * np.linalg.cholesky(clean.covariance)
+    error = np.einsum("nij,nj->ni", root, rng.standard_normal(clean.value.shape))
+    value = clean.value + error
+    if clean.m == 6:
+        turned = se3.rotation(error[:, 3:]) @ se3.rotation(clean.value[:, 3:])
+        value[:, 3:] = se3.rotation_vector(turned)
+    return replace(clean, value=value)
+
+
+def true_parameters(world: World, effect: str, *, m: int = 3) -> Floats:
+    """Parameters of one effect of the program that describe the world, in its order."""
+    truth = np.asarray(getattr(world.physics, effect)).reshape(-1)
+    if effect == "target_offset" and m == 6:
+        return np.concatenate([truth, np.zeros(3)])
+    return truth

@@ -1,0 +1,88 @@
+"""Campaigns for the tests of the command line, and a way to run it."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from drivers.simulated.rehearsal import Rehearsal, rehearse
+from hilcal.cli import main
+from hilcal.config import load_config
+from hilcal.data.table import write_table
+from hilcal.robot.catalogue import configs_dir
+from studies.__main__ import main as studies
+
+CELL = configs_dir() / "cells" / "demo_ur10e.toml"
+POSES = 14
+
+
+@dataclass(frozen=True)
+class Outcome:
+    code: int
+    out: str
+    err: str
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """What stdout holds: one JSON document and nothing else."""
+        return dict(json.loads(self.out))
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> Outcome:
+    """Run a command in this process; one of `python -m studies` where it begins with "studies"."""
+    capsys.readouterr()
+    command, given = (
+        (studies, arguments[1:]) if arguments[:1] == ("studies",) else (main, arguments)
+    )
+    with pytest.raises(SystemExit) as ended:
+        command([str(a) for a in given])
+    told = capsys.readouterr()
+    assert isinstance(ended.value.code, int)
+    return Outcome(ended.value.code, told.out, told.err)
+
+
+def ok(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> Outcome:
+    """Run a command that must succeed."""
+    result = run(capsys, *arguments)
+    assert result.code == 0, result.err
+    return result
+
+
+def refused(capsys: pytest.CaptureFixture[str], code: int, *arguments: str | Path) -> str:
+    """Run a command that must be refused; returns the one line on stderr that says why."""
+    result = run(capsys, *arguments)
+    assert result.code == code, result
+    assert result.out == ""
+    lines = [line for line in result.err.splitlines() if not line.startswith("[")]
+    assert len(lines) == 1, result.err
+    assert lines[0].startswith("error: ")
+    assert "Traceback" not in result.err
+    return lines[0]
+
+
+def start(*arguments: str | Path, **options: Any) -> "subprocess.Popen[str]":
+    """Start the program as a process of its own."""
+    root = str(Path(__file__).resolve().parents[2])
+    return subprocess.Popen(
+        [sys.executable, "-m", "hilcal", *map(str, arguments)],
+        env={**os.environ, "PYTHONPATH": root, "PYTHONUNBUFFERED": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        **options,
+    )
+
+
+def rehearsal(hidden: str, seed: int = 1, poses: int = POSES) -> Rehearsal:
+    return rehearse(load_config(CELL), hidden, seed, poses)
+
+
+def table(path: Path, hidden: str, seed: int = 1, poses: int = POSES) -> Path:
+    """Write the exchange table of a simulated campaign."""
+    write_table(rehearsal(hidden, seed, poses).readings, path)
+    return path

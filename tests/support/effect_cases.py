@@ -1,0 +1,156 @@
+"""States, situations and parameters that the tests of effects share."""
+
+import numpy as np
+
+from hilcal.cell import Cell
+from hilcal.data.readings import States
+from hilcal.effects.catalogue import BUILT_IN, make
+from hilcal.effects.options import typical_compliances
+from hilcal.effects.protocol import Situation
+from hilcal.model import Model
+from hilcal.robot import chain as chains
+from hilcal.robot.deviation import Deviation
+from hilcal.robot.statics import Load, slot_wrenches
+from hilcal.types import Floats
+from tests.support.arm_cases import arm_of
+from tests.support.arm_cases import cell_of as odd_cell
+from tests.support.campaigns import cell_of
+
+NAMES = tuple(e.name for e in BUILT_IN)
+ELASTIC = tuple(e.name for e in BUILT_IN if e.elastic)
+FIELDS = ("dq", "twist", "base", "station", "target", "scale")
+
+
+def some_states(cell: Cell, count: int = 9, seed: int = 1) -> States:
+    rng = np.random.default_rng(seed)
+    n = cell.arm.n
+    wrench = rng.normal(size=(count, 6)) * [40, 40, 40, 6, 6, 6]
+    wrench[::3] = 0.0
+    return States(
+        q=rng.uniform(-2.5, 2.5, (count, n)),
+        wrench=wrench,
+        time=np.sort(rng.uniform(0, 4e3, count)),
+        approach=rng.choice([-1.0, 1.0], (count, n)),
+        load_time=10 ** rng.uniform(0.5, 2.5, count),
+        air_temperature=rng.uniform(14.0, 29.0, count),
+        joint_temperature=rng.uniform(20.0, 45.0, (count, n)),
+    )
+
+
+def options_of(name: str, m: int = 3) -> dict[str, object]:
+    if name == "target_offset":
+        return {"rotation": m == 6}
+    known: dict[str, dict[str, object]] = {
+        "tracker_drift": {"reference_s": 0.0},
+        "transmission_error": {"harmonics": 3},
+        "thermal_joint_drift": {"reference_degC": 22.0},
+    }
+    return known.get(name, {})
+
+
+TURN = [0.3, -0.5, 1.1]
+VARIANTS: tuple[tuple[str, dict[str, object]], ...] = (
+    ("periodic_joint_compliance", {"orders": [1, 4, 2]}),
+    ("backlash", {"crossing": 0.3}),
+    ("creep", {"form": "each"}),
+    ("thermal_growth", {"links": "each", "temperature": "joints", "reference_degC": 5.0}),
+    ("thermal_joint_drift", {}),
+    ("wrench_bias", {"rotvec_rad": TURN}),
+    ("wrench_gain", {"rotvec_rad": TURN}),
+    ("sensor_misalignment", {"rotvec_rad": TURN}),
+)
+"""Effects with options other than the usual ones."""
+
+
+def situation(cell: Cell, seed: int = 2) -> Situation:
+    """A configuration that is visibly deflected, under wrenches and weight."""
+    states = some_states(cell, seed=seed)
+    rng = np.random.default_rng(seed)
+    shape = (len(states), cell.arm.n)
+    deviation = Deviation(
+        dq=1e-2 * rng.normal(size=shape),
+        twist=1e-2 * rng.normal(size=(shape[0], shape[1] + 1, 6)),
+    )
+    chain = chains.evaluate(cell.arm, states.q, deviation)
+    load = Load(states.wrench, cell.load_point, cell.tool_mass, cell.tool_com, cell.gravity)
+    wrench = slot_wrenches(cell.arm, chain, load)
+    return Situation(cell, states, states.q, chain, wrench, load, typical_compliances(cell))
+
+
+CELLS = {"ur10e": cell_of(), "odd": odd_cell(arm_of("odd"))}
+
+
+def random_theta(effects, rng, elastic=1.0):
+    return np.concatenate(
+        [
+            (elastic if e.elastic else 1.0)
+            * rng.normal(size=len(e.parameters))
+            * [p.scale for p in e.parameters]
+            for e in effects
+        ]
+    )
+
+
+def numeric_jacobian(model, states, theta, scale, m, live=None):
+    """Central differences of the readings by parameters; rotations as small rotations."""
+    live = range(len(theta)) if live is None else live
+    base = model.predict(states, theta).observation.rotation
+    out = np.empty((len(states), m, len(live)))
+    for column, p in enumerate(live):
+
+        def moved(h, p=p):
+            o = model.predict(states, theta + h * scale[p] * np.eye(len(theta))[p]).observation
+            turn = o.rotation @ np.swapaxes(base, 1, 2)
+            skew = 0.5 * (turn - np.swapaxes(turn, 1, 2))
+            w = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=1)
+            return np.concatenate([o.position, w], axis=1)[:, :m]
+
+        out[:, :, column] = (moved(1.0) - moved(-1.0)) / 2
+    return out
+
+
+def give(model: Model, prediction, theta) -> float:
+    """By how much more a unit motion of the arm deflects it: Σ compliance · (f·reach + m).
+
+    What an analytic derivative at fixed wrenches leaves out is a motion's own change of the
+    wrenches, so it is this share of the motion, at most. A motion by a unit turns forces f and
+    moments m by as much and shifts forces by the reach.
+    """
+    s = prediction.situation
+    reach = model.cell.arm.reach + np.linalg.norm(model.cell.load_point)
+    force = np.linalg.norm(s.wrench[:, :, :3], axis=2).max()
+    moment = np.linalg.norm(s.wrench[:, :, 3:], axis=2).max()
+    slots = s.wrench.shape[1]
+    size = np.array([force] * 3 + [force * reach + moment] * 3)
+    change = np.zeros((len(s.states), 6 * slots, slots, 6))
+    for slot in range(slots):
+        change[:, 6 * slot : 6 * slot + 6, slot] = np.diag(size)
+    total = 0.0
+    for effect, rows in zip(model.effects, model.slices(), strict=True):
+        if not effect.elastic:
+            continue
+        r = effect.response(theta[rows], s, change)
+        if r.dq is not None:
+            total += np.abs(r.dq).max(axis=0).sum()
+        if r.twist is not None:
+            weight = np.array([1 / reach] * 3 + [1.0] * 3)
+            total += (np.abs(r.twist) * weight).max(axis=0).sum()
+    return float(total)
+
+
+SOFT = 2e-5
+"""Compliance of every joint in what follows, rad/(N·m)."""
+
+
+def soft(cell: Cell, states: States, name: str, options=None) -> Model:
+    """Compliant joints and one more effect."""
+    names = ("joint_compliance", name)
+    return Model(cell, tuple(make(n, cell, states, options if n == name else {}) for n in names))
+
+
+def position(model: Model, states: States, *theta: Floats) -> Floats:
+    return model.predict(states, np.concatenate(theta)).observation.position
+
+
+def joints(cell: Cell) -> Floats:
+    return np.full(cell.arm.n, SOFT)

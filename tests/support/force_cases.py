@@ -1,0 +1,109 @@
+"""Simulated force sensors and the drivers that open them, for the tests of both."""
+
+import re
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack, contextmanager, suppress
+
+import numpy as np
+import pytest
+
+from drivers import bota, ft300, onrobot_hex
+from hilcal.config import CellConfig
+from hilcal.errors import DeviceError
+from tests.support.sim_serial_cases import force_sensor
+
+OPEN: dict[str, Callable] = {
+    "ft300": ft300.open_force_sensor,
+    "bota": bota.open_force_sensor,
+    "hex": onrobot_hex.open_force_sensor,
+}
+OPTIONS = {"hex": {"counts_per_N": 50.0, "counts_per_Nm": 2000.0}}
+ALL = pytest.mark.parametrize("kind", OPEN)
+BOTH = pytest.mark.parametrize("kind", ["ft300", "bota"])
+WRENCH = np.array([1.0, -2.0, 30.0, 0.1, 0.2, -0.3])
+WARM = ("--on", "1e6")  # its zero drifts no more
+DEADLINE_S = 2.0
+SLACK_S = 2.0  # a machine that does other work
+
+
+def config(kind, port, **keys):
+    section = {"driver": kind, "port": str(port), "options": OPTIONS.get(kind, {}), **keys}
+    return CellConfig.model_validate({"robot": {"model": "ur10e"}, "force_sensor": section})
+
+
+@contextmanager
+def opened(kind, port, **keys):
+    sensor = OPEN[kind](config(kind, port, **keys))
+    try:
+        yield sensor
+    finally:
+        sensor.close()
+
+
+def truth_of(simulated):
+    """(6,) what the (warm) sensor means, (6,) how one frame scatters, and what counts lose."""
+    state = simulated.admin("state")
+    return WRENCH + np.array(state["bias"]), np.array(state["noise"]), 0.01
+
+
+def fails(action, match, within=DEADLINE_S):
+    """Do it again and again until it fails, with one line, in time."""
+    start = time.monotonic()
+
+    def again() -> None:
+        while time.monotonic() < start + within + SLACK_S:
+            try:
+                action()
+            except DeviceError as error:
+                # a machine that does other work may starve the stream for a moment
+                if re.search(match, str(error)) or "nothing came for 0." not in str(error):
+                    raise
+            time.sleep(0.01)
+
+    with pytest.raises(DeviceError, match=match) as caught:
+        again()
+    assert time.monotonic() - start < within + SLACK_S
+    assert "\n" not in str(caught.value)
+    assert str(caught.value).startswith("force sensor: ")
+
+
+@pytest.fixture(scope="module")
+def instruments():
+    """Starts each simulated sensor once, for all tests of a file."""
+    with ExitStack() as stack:
+        running = {}
+
+        def start(kind):
+            if kind not in running:
+                running[kind] = stack.enter_context(force_sensor(kind, tuple(WRENCH), *WARM))
+            return running[kind]
+
+        yield start
+
+
+@pytest.fixture
+def simulated(kind, instruments):
+    """A simulated sensor without faults; it has none after the test either."""
+    instrument = instruments(kind)
+    baud = instrument.admin("state")["baud"]
+    yield instrument
+    for op, arguments in (
+        *(("mute", {"on": False}), ("stall", {"on": False}), ("overload", {"force": [0.0] * 6})),
+        *(("flip", {"probability": 0.0}), ("cut", {"probability": 0.0}), ("baud", {"baud": baud})),
+        ("replug", {}),
+    ):
+        instrument.admin(op, **arguments)
+
+
+def readers():
+    return [t for t in threading.enumerate() if t.name == "force sensor"]
+
+
+def steady(sensor, seconds):
+    """A mean, though the machine may do other work for longer than a frame stays fresh."""
+    for _ in range(20):
+        with suppress(DeviceError):
+            return sensor.average(seconds)
+    return sensor.average(seconds)

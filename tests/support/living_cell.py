@@ -1,0 +1,118 @@
+"""A small simulated cell for the tests of what lives in it."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivers.simulated.blackboard import Blackboard
+from drivers.simulated.injected_effects import nothing_hidden
+from drivers.simulated.truth import Truth
+from drivers.simulated.world import World
+from drivers.simulated.world_state import LivingWorld
+from hilcal.cell import cell_from_config
+from hilcal.config import CellConfig
+from hilcal.data.readings import States
+from hilcal.types import Floats
+from tests.support.arm_cases import arm_of
+
+Q = np.array([0.3, -1.1, 1.4, 0.5, -0.7, 0.2])
+SIDE = np.array([1.0, -1.0, 1.0, 1.0, -1.0, -1.0])
+CLOCK = 20.0
+
+
+def config(**sections: Any) -> CellConfig:
+    """A UR10e with two loads; further sections as given."""
+    content = {
+        "robot": {"model": "ur10e"},
+        "tool": {
+            "target_m": [0.06, 0.02, 0.12],
+            "load_point_m": [0.1, -0.03, 0.15],
+            "mass_kg": 0.8,
+            "com_m": [0.01, 0.02, 0.06],
+        },
+        "loads": [
+            {"name": "5kg", "mass_kg": 5.0},
+            {"name": "pull", "force_N": [80.0, 10.0, 0.0], "moment_Nm": [0.0, 6.0, -3.0]},
+        ],
+        "simulation": {"clock": CLOCK},
+    }
+    return CellConfig.model_validate({**content, **sections})
+
+
+def world_of(made: CellConfig, seed: int = 1, joint_std: float = 1e-5, **hidden: Any) -> World:
+    """The world of a configuration with the given parts of its truth."""
+    rng = np.random.default_rng(seed)
+    world = nothing_hidden(cell_from_config(made), rng, joint_std=joint_std)
+    return replace(world, physics=replace(world.physics, **hidden))
+
+
+class Life:
+    """A living world in this process, with a controller that does what the test says."""
+
+    def __init__(self, world: World, made: CellConfig, path: Path, seed: int = 5) -> None:
+        self.world = world
+        self.board = Blackboard.create(path / "world.bin", made.simulation.clock)
+        self.living = LivingWorld(world, made, self.board, seed)
+        self.arrivals = 0
+        self.now_ns = 0
+
+    def rest_at(self, q: Floats, side: Floats = SIDE) -> Any:
+        """Let the arm arrive, and return the truth."""
+        self.arrivals += 1
+        fields = {"q": q, "side": side, "arrivals": self.arrivals, "moving": 0.0, "alive": 1.0}
+        self.board.write("arm", **fields)
+        return self.look()
+
+    def look(self, seconds: float = 1.0) -> Any:
+        """Let the world look once, so many real seconds later, and return the truth."""
+        self.now_ns += round(seconds * 1e9)
+        self.living.step(self.now_ns)
+        return self.board.read("truth")
+
+
+def states(q: Floats, wrench: Sequence[float] | Floats, time: float) -> States:
+    """One state."""
+    return States(
+        q=np.asarray(q)[None],
+        wrench=np.asarray(wrench, dtype=float)[None],
+        time=np.array([time]),
+        load_time=np.zeros(1),
+        approach=SIDE[None],
+    )
+
+
+WEIGHT = np.array([0.0, 0.0, -5.0 * 9.80665, 0.0, 0.0, 0.0])
+PULL = np.array([80.0, 10.0, 0.0, 0.0, 6.0, -3.0])
+
+
+def everything(rng):
+    """A bit of every effect, all numbers odd."""
+    arm = arm_of("ur10e")
+    rigid = Truth.rigid(arm, harmonics=3)
+    size = {
+        "joint_compliance": 1e-5,
+        "joint_tilt_compliance": 4e-6,
+        "base_compliance": 2e-6,
+        "link_compliance": 8e-6,
+        "hysteresis": 5e-5,
+        "encoder_offset": 2e-4,
+        "transmission_error": 1e-4,
+        "link_geometry": 3e-4,
+        "load_point": 5e-3,
+        "target_offset": 5e-3,
+        "base_frame": 1e-3,
+        "tracker_drift": 1e-8,
+    }
+    return {n: s * rng.uniform(0.5, 1.0, getattr(rigid, n).shape) for n, s in size.items()}
+
+
+def life(tmp_path, joint_std=1e-5, sections=None, **hidden):
+    made = config(**(sections or {}))
+    return Life(world_of(made, joint_std=joint_std, **hidden), made, tmp_path)
+
+
+def same(a, b):
+    return np.asarray(a).tobytes() == np.asarray(b).tobytes()

@@ -1,0 +1,97 @@
+"""Small campaigns that leave a doubt, and the measurements that settle it."""
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from drivers.simulated.on_the_wire import read_plan, secret_of
+from drivers.simulated.rehearsal import Rehearsal, Secret
+from hilcal.cell import cell_from_config
+from hilcal.config import load_config
+from hilcal.data.appended import fitted_on
+from hilcal.data.plan import Plan
+from hilcal.data.readings import Readings, States
+from hilcal.diagnose.verdict import Diagnosis, diagnose
+from hilcal.identify.baseline import baseline
+from hilcal.identify.fit import Fit, fit
+from hilcal.plan.next import Next, measure_next
+from hilcal.plan.planner import Request, make
+from tests.support.cli_cases import CELL
+
+_CONFIG = load_config(CELL)
+STRENGTH = 2.0
+SMALL = _CONFIG.model_copy(
+    update={
+        "planning": _CONFIG.planning.model_copy(update={"candidates": 120, "against": ()}),
+        "simulation": _CONFIG.simulation.model_copy(update={"strength_sigma": STRENGTH}),
+    }
+)
+
+
+@dataclass(frozen=True)
+class Doubtful:
+    secret: Secret
+    plan: Plan
+    rehearsal: Rehearsal
+    fit: Fit
+    diagnosis: Diagnosis
+
+    @property
+    def suspects(self) -> tuple[str, ...]:
+        """The leading one that is significant, and what it is not told from."""
+        d = self.diagnosis
+        lead = next((s for s in d.suspects if s.effect in d.significant), None)
+        return () if lead is None else (lead.effect, *lead.same_as)[:4]
+
+
+@cache
+def first_plan() -> Plan:
+    """Six poses under two of the four loads."""
+    some = SMALL.model_copy(update={"loads": SMALL.loads[1::2]})
+    return make(cell_from_config(some), some, Request(6), np.random.default_rng(4)).ordered.plan
+
+
+@cache
+def doubtful(effect: str, seed: int) -> Doubtful:
+    """A small campaign with a weak hidden effect."""
+    secret = secret_of(SMALL, first_plan(), effect, seed)
+    r = read_plan(secret, first_plan(), [seed, 1])
+    found = fit(baseline(r.cell, r.readings, r.mode), r.readings, r.mode)
+    return Doubtful(secret, first_plan(), r, found, diagnose(found))
+
+
+def settled(first: Doubtful, poses: int = 20) -> tuple[Diagnosis, Next]:
+    """Plan what separates the suspects, measure it in the same world, and diagnose all."""
+    cell = first.rehearsal.cell
+    reference = first.plan.joints("reference")
+    found = measure_next(
+        cell, SMALL, first.fit, first.suspects, Request(poses), np.random.default_rng(1),
+        reference=reference,
+    )  # fmt: skip
+    further = fitted_on(found.planned.ordered.plan, first.plan, 2)
+    more = read_plan(first.secret, further, [9, 2], 3000.0).readings
+    readings = both(first.rehearsal.readings, more)
+    mode = first.rehearsal.mode
+    return diagnose(fit(baseline(cell, readings, mode), readings, mode)), found
+
+
+def both(a: Readings, b: Readings) -> Readings:
+    """All readings of two campaigns in one cell."""
+    names = tuple(dict.fromkeys((*a.pose_names, *b.pose_names)))
+    place = [np.array([names.index(n) for n in r.pose_names])[r.pose] for r in (a, b)]
+    states = {
+        name: np.concatenate([getattr(a.states, name), getattr(b.states, name)])
+        for name in States.__dataclass_fields__
+        if getattr(a.states, name) is not None
+    }
+    return Readings(
+        states=States(**states),
+        pose=np.concatenate(place),
+        load=np.concatenate([a.load, b.load]),
+        cycle=np.concatenate([a.cycle, b.cycle]),
+        value=np.concatenate([a.value, b.value]),
+        covariance=np.concatenate([a.covariance, b.covariance]),
+        load_names=a.load_names,
+        pose_names=names,
+    )

@@ -1,0 +1,221 @@
+"""A running simulated UR controller for tests, and the real client library in its own process."""
+
+import json
+import os
+import secrets
+import socket
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivers.simulated import admin
+from drivers.simulated.blackboard import Blackboard
+
+ROOT = Path(__file__).resolve().parents[2]
+PORTS = (29999, 30003, 30004)
+_READY = 20.0  # s
+
+
+def environment() -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+
+
+def free_host() -> str:
+    """A loopback address on which no controller listens."""
+    while True:
+        a, b, c = (secrets.randbelow(200) + 20 for _ in range(3))
+        host = f"127.{a}.{b}.{c}"
+        try:
+            with ExitStack() as stack:
+                for port in PORTS:
+                    stack.enter_context(socket.socket()).bind((host, port))
+        except OSError:
+            continue
+        return host
+
+
+@dataclass
+class SimulatedUr:
+    """A running controller."""
+
+    directory: Path
+    host: str
+    board: Blackboard
+    process: subprocess.Popen[bytes]
+
+    def admin(self, op: str = "state", **arguments: Any) -> Any:
+        return admin.ask(self.directory / "arm.sock", op, **arguments)
+
+    def wait(self, what: str, value: Any, timeout: float = 5.0) -> dict[str, Any]:
+        """Wait until a field of the state has a value; returns the state."""
+        deadline = time.monotonic() + timeout
+        while (state := self.admin())[what] != value:
+            assert time.monotonic() < deadline, f"{what} stays {state[what]!r}, not {value!r}"
+            time.sleep(0.005)
+        return state
+
+    def close(self) -> None:
+        self.process.stdin.close()
+        try:
+            self.process.wait(5)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+
+
+def command(directory: Path, host: str, *arguments: str) -> list[str]:
+    return [
+        *(sys.executable, "-m", "drivers.simulated.ur_server"),
+        *("--directory", str(directory), "--host", host, "--robot", "ur10e", *arguments),
+    ]
+
+
+def start(
+    directory: Path,
+    scale: float = 1.0,
+    truth: dict[str, Any] | None = None,
+    *arguments: str,
+    host: str | None = None,
+) -> SimulatedUr:
+    """Start a controller in a world of its own; `truth` are fields of the blackboard's section."""
+    board = Blackboard.create(directory / "world.bin", scale)
+    if truth is not None:
+        board.write("truth", **{"flange": np.eye(4), "time": 1e-6, **truth})
+    host = host or free_host()
+    process = subprocess.Popen(
+        command(directory, host, *arguments), stdin=subprocess.PIPE, env=environment()
+    )
+    running = SimulatedUr(directory, host, board, process)
+    deadline = time.monotonic() + _READY
+    while not (directory / "arm.sock").exists():
+        if process.poll() is not None or time.monotonic() > deadline:
+            running.close()
+            raise AssertionError(f"the controller is not ready, exit code {process.returncode}")
+        time.sleep(0.005)
+    return running
+
+
+class ClientError(Exception):
+    """What the client library raised."""
+
+
+class Client:
+    """The real client library in a process of its own: its constructors hold the GIL."""
+
+    def __init__(self) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, str(ROOT / "tests" / "support" / "sim_ur_client.py")],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env=environment(),
+        )
+
+    def __call__(self, part: str, call: str, *arguments: Any) -> Any:
+        """Call `part` ("control", "receive", "dashboard"); the call "open" constructs it."""
+        self.process.stdin.write(json.dumps([part, call, arguments]).encode() + b"\n")
+        self.process.stdin.flush()
+        answer = self.process.stdout.readline()
+        if not answer:
+            raise ClientError(f"died, exit code {self.process.wait()}")
+        result = json.loads(answer)
+        if "error" in result:
+            raise ClientError(result["error"])
+        return result["result"]
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+    def close(self) -> None:
+        self.kill()
+        self.process.stdin.close()
+        self.process.stdout.close()
+
+
+@contextmanager
+def client(host: str, *parts: str) -> Iterator[Client]:
+    """A client with these parts opened."""
+    made = Client()
+    try:
+        for part in parts:
+            made(part, "open", host)
+        yield made
+    finally:
+        made.close()
+
+
+class Wire:
+    """A plain socket that speaks RTDE frames."""
+
+    def __init__(self, host: str, port: int = 30004) -> None:
+        self.socket = socket.create_connection((host, port), timeout=5.0)
+
+    def __enter__(self) -> "Wire":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.socket.close()
+
+    def send(self, kind: str, payload: bytes = b"") -> None:
+        self.socket.sendall(struct.pack(">HB", 3 + len(payload), ord(kind)) + payload)
+
+    def receive(self) -> tuple[str, bytes]:
+        size, kind = struct.unpack(">HB", self.exactly(3))
+        return chr(kind), self.exactly(size - 3)
+
+    def ask(self, kind: str, payload: bytes = b"") -> bytes:
+        """Send a frame and return the payload of the next one, which has the same type."""
+        self.send(kind, payload)
+        came, body = self.receive()
+        assert came == kind
+        return body
+
+    def outputs(self, names: str, hz: float = 125.0) -> str:
+        """Agree on outputs; returns their types."""
+        assert self.ask("V", struct.pack(">H", 2)) == b"\x01"
+        return self.ask("O", struct.pack(">d", hz) + names.encode())[1:].decode()
+
+    def exactly(self, count: int) -> bytes:
+        data = b""
+        while len(data) < count:
+            more = self.socket.recv(count - len(data))
+            if not more:
+                raise ConnectionResetError("closed")
+            data += more
+        return data
+
+
+class Lines:
+    """A plain socket that speaks lines: the dashboard."""
+
+    def __init__(self, host: str, port: int = 29999) -> None:
+        self.socket = socket.create_connection((host, port), timeout=5.0)
+        self.stream = self.socket.makefile("rb")
+
+    def __enter__(self) -> "Lines":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.stream.close()
+        self.socket.close()
+
+    def read(self) -> str:
+        return self.stream.readline().decode().rstrip("\n")
+
+    def ask(self, words: str) -> str:
+        self.socket.sendall(words.encode() + b"\n")
+        return self.read()
+
+
+def send_script(host: str, text: str) -> None:
+    with socket.create_connection((host, 30003), timeout=5.0) as line:
+        line.sendall(text.encode())

@@ -1,0 +1,134 @@
+"""The UR driver on a simulated controller: how tests open it, move it, and put faults right."""
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+
+from drivers.ur import UrArm, open_arm
+from drivers.ur_link import dashboard
+from hilcal.config import CellConfig
+from hilcal.errors import DeviceError
+from tests.support import sim_ur_cases
+
+MASS, COM = 2.5, np.array([0.01, -0.02, 0.08])
+SPEED, ACCELERATION = 0.5, 4.0
+STOP_NS = 500_000_000
+"""In this time the arm has to stand after a fault (the requirement)."""
+
+Sim = sim_ur_cases.SimulatedUr
+
+
+def config(
+    host: str | None, model: str = "ur10e", clock: float = 1.0, **options: Any
+) -> CellConfig:
+    robot = {"model": model, "driver": "ur", "host": host, "options": options}
+    return CellConfig.model_validate({"robot": robot, "simulation": {"clock": clock}})
+
+
+def start(directory: Path, *arguments: str, scale: float = 1.0) -> Sim:
+    return sim_ur_cases.start(directory, scale, None, *arguments)
+
+
+def controlled(sim: Sim, clock: float = 1.0) -> UrArm:
+    arm = open_arm(config(sim.host, clock=clock))
+    try:
+        arm.take_control(MASS, COM)
+    except BaseException:
+        arm.close()
+        raise
+    return arm
+
+
+def away(arm: UrArm, by: float = 0.8) -> np.ndarray:
+    """A goal that takes a while, and stays within the joint limits."""
+    q = arm.sample().q.copy()
+    q[0] += by if q[0] < 0 else -by
+    return q
+
+
+def finish(arm: UrArm) -> None:
+    while arm.moving():
+        time.sleep(0.01)
+
+
+def under_way(arm: UrArm, sim: Sim) -> np.ndarray:
+    """Start a motion and watch it until it has its full speed; returns the goal."""
+    goal = away(arm)
+    arm.start_move(goal, SPEED, ACCELERATION)
+    while abs(sim.admin()["qd"][0]) < 0.99 * SPEED:
+        assert arm.moving()
+        time.sleep(0.01)
+    return goal
+
+
+def error_of(call: Callable[[], Any], seconds: float = 20.0) -> str:
+    """Call until a DeviceError comes; returns its text, which has to be one line."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        try:
+            call()
+        except DeviceError as error:
+            text = str(error)
+            break
+        time.sleep(0.01)
+    else:
+        raise AssertionError(f"no DeviceError within {seconds} s")
+    assert "\n" not in text
+    return text
+
+
+def children() -> list[psutil.Process]:
+    """Child processes of the driver (the simulated controllers are children, too)."""
+    mine = psutil.Process().children(recursive=True)
+    return [p for p in mine if "drivers.ur_link" in " ".join(_words(p))]
+
+
+def _words(process: psutil.Process) -> list[str]:
+    try:
+        return process.cmdline()
+    except psutil.NoSuchProcess:
+        return []
+
+
+def put_right(sim: Sim) -> None:
+    """Switch off every fault and bring the robot back to running (not a protective stop)."""
+    for op in ("rtde_stall", "rtde_mute", "dashboard_mute", "refuse", "refuse_motion"):
+        sim.admin(op, on=False)
+    sim.admin("set", slider=1.0, speed_scaling=1.0)
+    sim.admin("remote_mode")
+    sim.admin("release_emergency_stop")
+    if sim.admin()["robot_mode"] != 7:
+        dashboard.ask(sim.host, ("power on", "brake release"), 2.0)
+        sim.wait("robot_mode", 7)
+    sim.wait("moving", False)
+
+
+def check_resting(sim: Sim, since: int) -> None:
+    """The arm came to rest in time after a moment, and stays there."""
+    state = sim.wait("moving", False)
+    assert state["rest_ns"] - since < STOP_NS
+    time.sleep(0.05)
+    assert sim.admin()["q"] == state["q"]
+
+
+@pytest.fixture(scope="module")
+def sim(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Sim]:
+    """One controller for a file."""
+    running = start(tmp_path_factory.mktemp("ur"))
+    yield running
+    running.close()
+
+
+@pytest.fixture
+def arm(sim: Sim) -> Iterator[UrArm]:
+    """An arm under control; after the test there is no fault and no process."""
+    opened = controlled(sim)
+    yield opened
+    put_right(sim)
+    opened.close()
+    assert children() == []

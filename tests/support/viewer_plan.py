@@ -1,0 +1,135 @@
+"""A plan and its recording, for the tests of what the viewer gets."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rerun as rr
+from rerun.chunk import RrdReader
+
+from hilcal.cell import Cell, cell_from_config
+from hilcal.config import CellConfig, load_config
+from hilcal.data.plan import REFERENCE, UNLOADED, Plan, Step
+from hilcal.plan.story import Bought, Enough, OrderStory, PlanStory, Promised, Seen
+from hilcal.report.viewer.plan_stream import record_plan
+from hilcal.robot.chain import evaluate
+
+CELL = Path(__file__).parents[2] / "configs" / "cells" / "demo_ur10e.toml"
+TRACKER = np.array([-2.5, 1.0, 1.3])
+Q = np.array(
+    [
+        [-0.6, -1.6, 1.6, -1.6, -1.5, 0.0],
+        [0.4, -1.3, 1.2, -1.4, -1.4, 0.5],
+        [-1.5, -1.8, 1.9, -1.7, -1.3, -0.4],
+        [0.9, -2.0, 1.7, -1.2, -1.6, 0.9],
+    ]
+)
+PLAN = Plan(
+    (REFERENCE, "p1", "p2", "p3"),
+    Q,
+    (
+        Step(REFERENCE, UNLOADED),
+        Step("p1", UNLOADED),
+        Step("p2", UNLOADED),
+        Step("p3", UNLOADED),
+        Step(REFERENCE, UNLOADED, 1),
+        Step("p1", "10kg"),
+        Step("p2", "10kg"),
+        Step("p3", "pull x"),
+        Step("p1", "pull x"),
+        Step(REFERENCE, UNLOADED, 2),
+    ),
+)
+STORY = PlanStory(
+    poses=3,
+    readings=10,
+    loads={UNLOADED: 6, "10kg": 2, "pull x": 2},
+    load_changes=3,
+    motion_s=60.0,
+    readings_s=90.0,
+    load_changes_s=180.0,
+    criterion="D",
+    efficiency=0.98768,
+    predicted=(
+        Promised("joint_compliance.j1", 4e-8, 4e-6, "rad/(N·m)"),
+        Promised("joint_compliance.j2", 6e-7, 6e-6, "rad/(N·m)"),
+        Promised("target_offset.x", 2.2e-5, 0.0, "m"),
+        Promised("base_frame.x", 1.2e-5, None, "m"),
+    ),
+    position_std_m=12e-6,
+    bought=(
+        Bought("D", 12e-6, 24e-6, 0.038, 132.0, 0.02, 4.0, 0.98768),
+        Bought("test", 9e-6, 30e-6, None, 66.0, 0.01, 2.0, None),
+    ),
+    curve=(Enough(2, 24e-6), Enough(3, 12e-6), Enough(6, 8e-6)),
+    seen=(Seen("hysteresis", 6e-6), Seen("tracker_drift", None)),
+    order=OrderStory(0.03, 0.02, 0.4, 5e-9, 5e-6, 0.0, None),
+    remarks=("only 3 candidates are left of load 10kg.",),
+)
+BARE = PlanStory(3, 10, {UNLOADED: 10}, 0, 1.0, 2.0, 0.0, "made by hand", None, (), None)
+
+
+@pytest.fixture(autouse=True)
+def strict():
+    rr.set_strict_mode(True)
+    yield
+    rr.set_strict_mode(False)
+
+
+def configured(**sections: object) -> tuple[Cell, CellConfig]:
+    """Return the demo's cell with some sections of its own."""
+    told = load_config(CELL).model_dump(mode="json", exclude_none=True)
+    config = CellConfig.model_validate(told | sections)
+    return cell_from_config(config), config
+
+
+def target(cell: Cell, pose: int) -> np.ndarray:
+    return evaluate(cell.arm, Q[pose : pose + 1]).point(cell.target[:3, 3])[0]
+
+
+@pytest.fixture(scope="module")
+def shadowed() -> tuple[Cell, CellConfig]:
+    """A screen stands between the tracker and the target in pose p1; a pillar stands apart."""
+    cell, _ = configured()
+    middle = 0.45 * target(cell, 1) + 0.55 * TRACKER
+    return configured(
+        obstacles=[
+            {"name": "screen", "center_m": middle.tolist(), "size_m": [0.1, 0.1, 0.3]},
+            {"name": "pillar", "bottom_m": [1.2, 1.2, 0.0], "radius_m": 0.1, "height_m": 1.6},
+        ],
+        sight={"tracker_m": TRACKER.tolist()},
+    )
+
+
+@pytest.fixture(scope="module")
+def recording(shadowed, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("plan") / "plan.rrd"
+    record_plan(*shadowed, PLAN, STORY, path)
+    return path
+
+
+def rows(path: Path, entity: str, component: str) -> dict[int, list]:
+    """Return the values of a component by step, under 0 what is static."""
+    out: dict[int, list] = {}
+    for chunk in RrdReader(path).stream().filter(content=entity).to_chunks():
+        batch = chunk.to_record_batch()
+        if component not in batch.schema.names:
+            continue
+        values = batch.column(component).to_pylist()
+        steps = batch.column("step").to_pylist() if "step" in batch.schema.names else [0]
+        out |= {int(t): v for t, v in zip(steps, values, strict=True) if v is not None}
+    return out
+
+
+def entities(path: Path) -> set[str]:
+    return {str(c.entity_path) for c in RrdReader(path).stream().to_chunks()}
+
+
+def rgb(value: int) -> tuple[int, int, int]:
+    return value >> 24 & 255, value >> 16 & 255, value >> 8 & 255
+
+
+def turned(quaternion: np.ndarray) -> np.ndarray:
+    """(K, 3) where quaternions x y z w lead the z axis."""
+    x, y, z, w = np.asarray(quaternion).T
+    return np.stack([2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)], 1)

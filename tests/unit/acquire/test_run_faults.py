@@ -1,0 +1,202 @@
+"""A campaign under a fault at any call of any device: each reading exactly once, arm stopped."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from hilcal.acquire.run import HOW_ON, run
+from hilcal.config import Limits
+from hilcal.data.plan import Plan
+from hilcal.errors import DeviceError, InputError
+from tests.support.fake_bench import Bench, plan_of
+from tests.support.fake_world import Killed
+
+FAULTS = (
+    DeviceError("arm: the line is dead"),
+    KeyboardInterrupt(),
+    Killed(),
+    OSError(5, "Input/output error"),
+)
+
+
+def small_plan() -> Plan:
+    """Every kind of motion and change of load, in few calls."""
+    return plan_of(
+        ("reference", "none", 0),
+        ("p1", "none", 0),
+        ("p1", "none", 1),
+        ("p1", "3kg", 0),
+        ("reference", "none", 1),
+    )
+
+
+def bench() -> Bench:
+    made = Bench(limits=Limits())
+    made.world.hurry = 20.0  # fewer calls in the same motions
+    return made
+
+
+def measure(b: Bench, plan: Plan) -> None:
+    run(b.rig, b.cell, b.config, plan, b.store, b.clock, b.notes)
+
+
+def each_once(b: Bench, plan: Plan) -> bool:
+    return Counter(step for step, _, _ in b.store.rows) == Counter(plan.steps)
+
+
+def calls_of_a_whole_run() -> int:
+    b = bench()
+    measure(b, small_plan())
+    assert each_once(b, small_plan())
+    return len(b.world.calls)
+
+
+KINDS = pytest.mark.parametrize("kind", range(len(FAULTS)), ids=[type(f).__name__ for f in FAULTS])
+
+
+@KINDS
+def test_fault_at_some_calls(kind: int) -> None:
+    """Every 41st call, other ones for each kind of fault."""
+    for k in range(1 + 10 * kind, calls_of_a_whole_run() + 1, 41):
+        check_fault(FAULTS[kind], k)
+
+
+@pytest.mark.slow
+@KINDS
+def test_fault_at_every_call(kind: int) -> None:
+    for k in range(1, calls_of_a_whole_run() + 1):
+        check_fault(FAULTS[kind], k)
+
+
+def check_fault(fault: BaseException, k: int) -> None:
+    """Fail at the k-th call, look what was done about it, resume, and count."""
+    b, plan = bench(), small_plan()
+    if isinstance(fault, Killed):
+        b.world.kill_at = k
+    else:
+        b.world.fail[k] = fault
+    expected = DeviceError if isinstance(fault, OSError) else type(fault)
+    with pytest.raises(expected) as raised:
+        measure(b, plan)
+    if isinstance(raised.value, DeviceError):
+        said = str(raised.value)
+        assert said.endswith(HOW_ON), (k, said)
+        assert "\n" not in said
+    check_stopped(b, k)
+    before = [step for step, _, _ in b.store.rows]
+    b.world.again()
+    measure(b, plan)
+    assert [step for step, _, _ in b.store.rows][: len(before)] == before
+    assert each_once(b, plan), k
+    readings = b.store.readings()
+    assert readings is not None
+    assert readings.states.time is not None
+    assert np.all(np.diff(readings.states.time) > 0), k
+
+
+def check_stopped(b: Bench, k: int) -> None:
+    """Once the arm is ours, the call after the fault is its stop; then only an event is stored."""
+    world = b.world
+    after = world.calls[k:]
+    if world.killed:
+        assert after == []
+    elif "arm.take_control" in world.calls[:k]:
+        assert after == ["arm.stop", "store.event"], (k, after)
+        assert not world.is_moving
+    else:
+        assert after == ["store.event"], (k, after)
+
+
+def test_disk_full_stops_the_arm_and_says_what_to_do() -> None:
+    b, plan = bench(), small_plan()
+    b.store.full_at = 2
+    with pytest.raises(DeviceError, match=r"disk is full.*--resume$"):
+        measure(b, plan)
+    assert b.world.calls[-2:] == ["arm.stop", "store.event"]
+    assert len(b.store.rows) == 2
+    b.store.full_at = None
+    b.world.again()
+    measure(b, plan)
+    assert each_once(b, plan)
+
+
+def test_a_refused_row_keeps_its_kind_of_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the store refuses as wrong input stays that (exit code 2), and stops the arm."""
+    b = bench()
+
+    def refuse(*_: object) -> None:
+        raise InputError("run.hilcal: the readings differ from those before")
+
+    monkeypatch.setattr(b.store, "record", refuse)
+    with pytest.raises(InputError, match=r"differ from those before\. .*--resume$"):
+        measure(b, small_plan())
+    assert b.world.calls[-2] == "arm.stop"
+
+
+def test_an_arm_that_does_not_stop_is_told_loudly(monkeypatch: pytest.MonkeyPatch) -> None:
+    b = bench()
+
+    def stop() -> None:
+        raise DeviceError("arm: no answer to stop")
+
+    monkeypatch.setattr(b.rig.arm, "stop", stop)
+    b.world.fail[120] = KeyboardInterrupt()
+    with pytest.raises(DeviceError, match=r"THE ARM MAY STILL MOVE.*no answer.*emergency stop"):
+        measure(b, small_plan())
+    assert b.store.last("interrupted")["arm_not_stopped"] == "arm: no answer to stop"
+
+
+def test_an_error_that_asks_for_the_emergency_stop_asks_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    b = bench()
+
+    def stop() -> None:
+        raise DeviceError("arm: not sure that it stands: press the emergency stop if it moves")
+
+    monkeypatch.setattr(b.rig.arm, "stop", stop)
+    b.world.fail[120] = DeviceError("arm: its link broke; press the emergency stop. Unplugged?")
+    with pytest.raises(DeviceError) as raised:
+        measure(b, small_plan())
+    said = str(raised.value)
+    assert said.count("emergency stop") == 1
+    assert said.endswith(f"Unplugged? {HOW_ON}")
+
+
+def test_impatience_does_not_keep_the_arm_from_stopping(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C while the arm is being stopped: it is stopped again."""
+    b = bench()
+    stops = []
+    real = b.rig.arm.stop
+
+    def stop() -> None:
+        stops.append(1)
+        if len(stops) == 1:
+            raise KeyboardInterrupt
+        real()
+
+    monkeypatch.setattr(b.rig.arm, "stop", stop)
+    b.world.fail[120] = DeviceError("tracker: silent")
+    with pytest.raises(DeviceError, match=r"tracker: silent.*--resume$"):
+        measure(b, small_plan())
+    assert len(stops) == 2
+    assert not b.world.is_moving
+
+
+def test_unexpected_errors_are_one_line_and_their_trace_is_stored() -> None:
+    b = bench()
+    b.world.fail[150] = ZeroDivisionError("of a driver of somebody else's")
+    with pytest.raises(DeviceError, match=r"unexpected ZeroDivisionError: of a driver.*--resume"):
+        measure(b, small_plan())
+    assert "Traceback" in b.store.last("failed")["trace"]
+
+
+def test_nothing_is_stopped_before_the_arm_is_ours() -> None:
+    """A fault before `take_control`: somebody else's program may be running."""
+    b = bench()
+    b.world.fail[2] = DeviceError("force sensor: silent")
+    with pytest.raises(DeviceError, match="silent"):
+        measure(b, small_plan())
+    assert "arm.take_control" not in b.world.calls
+    assert "arm.stop" not in b.world.calls

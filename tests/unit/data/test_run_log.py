@@ -1,0 +1,211 @@
+"""What a run writes: readings with their details, steps exactly once, events, durable."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hilcal.data import schema
+from hilcal.data.campaign import Campaign
+from hilcal.data.plan import Plan, Step, load_plan, read_plan
+from hilcal.data.readings import Readings, States
+from hilcal.data.run_log import PLAN, RunLog
+from hilcal.errors import DeviceError, InputError
+
+STEPS = tuple(Step(pose, load, 0) for pose in ("p1", "p2", "p3") for load in ("none", "5kg"))
+MADE = Plan(("p1", "p2", "p3"), np.arange(18.0).reshape(3, 6) / 10, STEPS, {"seed": 3})
+
+
+def _reading(step: Step) -> Readings:
+    return Readings(
+        states=States(q=MADE.joints(step.pose)[None], wrench=np.zeros((1, 6))),
+        pose=np.zeros(1, dtype=np.int64),
+        load=np.zeros(1, dtype=np.int64),
+        cycle=np.array([step.cycle]),
+        value=np.ones((1, 3)),
+        covariance=1e-10 * np.eye(3)[None],
+        load_names=(step.load,),
+        pose_names=(step.pose,),
+    )
+
+
+def _campaign(path: Path) -> Campaign:
+    return Campaign.create(path, "{}", ".", "test", more={PLAN: MADE.to_json()})
+
+
+def test_what_was_recorded_comes_back_after_reopening(tmp_path: Path) -> None:
+    path = tmp_path / "run.hilcal"
+    with _campaign(path) as campaign:
+        log = RunLog(campaign)
+        assert log.readings() is None
+        for k, step in enumerate(STEPS[:3]):
+            log.record(_reading(step), step, {"k": k})
+        log.event("stopped", {"why": "test"})
+    with Campaign.open(path) as campaign:
+        log = RunLog(campaign)
+        assert log.done() == frozenset(STEPS[:3])
+        assert [d["k"] for d in log.details()] == [0, 1, 2]
+        assert log.details()[1]["step"] == {"pose": "p1", "load": "5kg", "cycle": 0}
+        assert [(e["kind"], e["why"]) for e in log.events()] == [("stopped", "test")]
+        assert log.plan.without(log.done()).steps == STEPS[3:]
+        readings = log.readings()
+        assert readings is not None
+        assert len(readings) == 3
+
+
+def test_a_step_is_never_there_twice_and_its_refusal_leaves_no_reading(tmp_path: Path) -> None:
+    with _campaign(tmp_path / "run.hilcal") as campaign:
+        log = RunLog(campaign)
+        log.record(_reading(STEPS[0]), STEPS[0], {})
+        with pytest.raises(InputError, match="p1, none, cycle 0 has been measured already"):
+            log.record(_reading(STEPS[0]), STEPS[0], {})
+        assert campaign.n_readings == 1
+
+
+def test_a_table_cannot_be_resumed(tmp_path: Path) -> None:
+    made = Campaign.create(tmp_path / "run.hilcal", "{}", ".", "a table")
+    with made as campaign, pytest.raises(InputError, match="cannot be resumed"):
+        RunLog(campaign)
+
+
+def test_a_full_database_stores_all_or_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "run.hilcal"
+    with _campaign(path) as campaign:
+        log = RunLog(campaign)
+        (pages,) = campaign.connection.execute("PRAGMA page_count").fetchone()
+        campaign.connection.execute(f"PRAGMA max_page_count = {pages + 2}")
+
+        def fill() -> None:
+            for step in (Step("p1", "none", k) for k in range(100)):
+                log.record(_reading(step), step, {"filler": "x" * 300})
+
+        with pytest.raises(DeviceError, match="make room on the disk"):
+            fill()
+        stored = campaign.n_readings
+    assert 0 < stored < 100
+    with Campaign.open(path) as campaign:
+        assert campaign.n_readings == len(RunLog(campaign).done()) == stored
+
+
+_FILL = """
+import resource, sys
+from pathlib import Path
+from tests.unit.data.test_run_log import _reading
+from hilcal.data.campaign import Campaign
+from hilcal.data.plan import Step
+from hilcal.data.run_log import RunLog
+from hilcal.errors import DeviceError
+path = Path(sys.argv[1])
+with Campaign.open(path) as campaign:
+    log = RunLog(campaign)
+    limit = path.stat().st_size + 8192
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+    try:
+        for k in range(100):
+            step = Step("p1", "none", k)
+            log.record(_reading(step), step, {"filler": "x" * 300})
+            print(k, flush=True)
+    except DeviceError as error:
+        print(error, file=sys.stderr)
+        sys.exit(error.exit_code)
+"""
+
+
+def test_a_write_that_the_system_refuses_loses_nothing(tmp_path: Path) -> None:
+    """A file-size limit of the process: writes fail in the system, as on a full disk."""
+    path = tmp_path / "run.hilcal"
+    _campaign(path).close()
+    root = Path(__file__).resolve().parents[3]
+    done = subprocess.run(
+        [sys.executable, "-c", _FILL, path],
+        cwd=root,
+        env={**os.environ, "PYTHONPATH": str(root)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 3
+    assert "make room on the disk" in done.stderr
+    stored = len(done.stdout.split())
+    assert stored > 0
+    with Campaign.open(path) as campaign:
+        assert campaign.n_readings == len(RunLog(campaign).done()) == stored
+
+
+def test_files_of_the_first_version_open(tmp_path: Path) -> None:
+    path = tmp_path / "old.hilcal"
+    with Campaign.create(path, "{}", ".", "a table") as campaign:
+        campaign.append_readings(_reading(STEPS[0]))
+        for table in ("details", "events"):
+            campaign.connection.execute(f"DROP TABLE {table}")
+        campaign.connection.execute("PRAGMA user_version = 1")
+    with Campaign.open(path) as campaign:
+        assert campaign.n_readings == 1
+    assert schema.VERSION > 1
+
+
+names = st.text(min_size=1, max_size=6)
+
+
+@given(
+    st.lists(names, min_size=1, max_size=4, unique=True),
+    st.lists(st.tuples(st.integers(0, 3), names, st.integers(0, 3)), min_size=1, max_size=8),
+    st.floats(-7, 7),
+)
+def test_a_plan_is_read_back_as_written(
+    poses: list[str], rows: list[tuple[int, str, int]], angle: float
+) -> None:
+    steps = tuple(dict.fromkeys(Step(poses[p % len(poses)], ld, c) for p, ld, c in rows))
+    q = angle * np.arange(1.0, 1 + 6 * len(poses)).reshape(-1, 6) / 7.0
+    again = read_plan(Plan(tuple(poses), q, steps, {"note": 1}).to_json(), "plan")
+    assert again.pose_names == tuple(poses)
+    assert np.array_equal(again.q, q)
+    assert again.steps == steps
+    assert again.about == {"note": 1}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "not JSON"),
+        ("[]", "not a plan"),
+        ('{"format": "hilcal-plan", "version": 9}', "version 9"),
+        ('{"format": "hilcal-plan", "version": 1, "poses": []}', '"poses" must be a list'),
+    ],
+)
+def test_what_is_not_a_plan_is_refused_in_one_line(text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message) as raised:
+        read_plan(text, "p.json")
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('"name": "p2"', '"name": "p1"', "two poses have the name 'p1'"),
+        ('"pose": "p3"', '"pose": "p9"', "there is no pose 'p9'"),
+        ('"load": "5kg"', '"load": 5', "load 5 must be a name"),
+        ('"cycle": 0', '"cycle": -1', "must be a whole number"),
+        ('"load": "5kg"', '"load": "none"', "are the same"),
+        ('"cycle": 0', '"cycel": 0', 'must have "pose" and "load"'),
+        ("0.1,", '"a",', "finite numbers"),
+    ],
+)
+def test_a_wrong_edit_of_a_plan_is_named(tmp_path: Path, old: str, new: str, message: str) -> None:
+    path = tmp_path / "plan.json"
+    path.write_text(MADE.to_json().replace(old, new, 1))
+    with pytest.raises(InputError, match=message) as raised:
+        load_plan(path)
+    assert "\n" not in str(raised.value)
+    assert "plan.json" in str(raised.value)
+
+
+def test_a_missing_plan_names_the_command(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="hilcal plan"):
+        load_plan(tmp_path / "no.json")

@@ -1,0 +1,129 @@
+"""The model's Jacobian with every effect, alone and all together, against differences."""
+
+import numpy as np
+import pytest
+
+from hilcal.effects.catalogue import make
+from hilcal.model import Model
+from tests.support.effect_cases import (
+    CELLS,
+    NAMES,
+    VARIANTS,
+    give,
+    numeric_jacobian,
+    options_of,
+    random_theta,
+    some_states,
+)
+
+SHORT = {"transmission_error": {"harmonics": 1}}
+STEP = 0.05
+
+
+def assert_slope(model, states, theta, m, live=None):
+    """The Jacobian is the slope of the prediction, but for what deflects the arm once more."""
+    live = np.arange(model.size) if live is None else live
+    scale = np.array([p.scale for e in model.effects for p in e.parameters])
+    prediction = model.predict(states, theta)
+    derived = model.jacobian(prediction, theta, m, live) * scale[live]
+    numeric = numeric_jacobian(model, states, theta, STEP * scale, m, live) / STEP
+    size = np.abs(numeric).max(axis=(0, 1))
+    off = np.abs(derived - numeric).max(axis=(0, 1))
+    # Beside it the equilibrium's own tolerance, the rounding of readings of some metres, and
+    # what a central difference over a milliradian leaves out (h²/6 of the motion).
+    slack = 2e-12 / STEP + 1e-6 * size
+    every = [f"{e.name}.{p.name}" for e in model.effects for p in e.parameters]
+    names = [every[p] for p in live]
+    limit = give(model, prediction, theta) * size + slack
+    assert {n: (o, b) for n, o, b in zip(names, off, limit, strict=True) if o > b} == {}
+
+
+@pytest.mark.parametrize(
+    ("arm", "m", "elastic"), [("ur10e", 6, 1.0), ("ur10e", 6, 1e-3), ("odd", 3, 1e-3)]
+)
+def test_model_jacobian_is_the_derivative_of_the_prediction(arm, m, elastic):
+    """All effects at once; what the derivative leaves out is of the order of the deflection.
+
+    The slopes are those of a third of all parameters; each effect has its own test.
+    """
+    cell = CELLS[arm]
+    states = some_states(cell, 4)
+    model = Model(cell, tuple(make(n, cell, states, SHORT.get(n, options_of(n, m))) for n in NAMES))
+    rng = np.random.default_rng(4)
+    theta = random_theta(model.effects, rng, elastic)
+    live = np.sort(rng.permutation(model.size)[: model.size // 3])
+    assert_slope(model, states, theta, m, live)
+
+
+USUAL = tuple((name, SHORT.get(name, options_of(name))) for name in NAMES)
+
+
+@pytest.mark.parametrize("elastic", [1.0, 1e-3])
+@pytest.mark.parametrize(("name", "options"), USUAL + VARIANTS)
+def test_each_effect_with_compliant_joints(name, options, elastic):
+    cell = CELLS["odd"]
+    states = some_states(cell, 4)
+    joints = () if name == "joint_compliance" else (make("joint_compliance", cell, states),)
+    model = Model(cell, (*joints, make(name, cell, states, options)))
+    theta = random_theta(model.effects, np.random.default_rng(6), elastic)
+    assert_slope(model, states, theta, 3)
+
+
+@pytest.mark.parametrize("name", [n for n in NAMES if n != "joint_compliance"])
+def test_each_effect_alone(name):
+    cell = CELLS["ur10e"]
+    states = some_states(cell, 4)
+    model = Model(cell, (make(name, cell, states, SHORT.get(name, options_of(name))),))
+    theta = random_theta(model.effects, np.random.default_rng(7))
+    assert_slope(model, states, theta, 6)
+
+
+@pytest.mark.parametrize("form", ["common", "each"])
+def test_a_joint_that_creeps_shows_more_of_its_compliance(form):
+    """With a creep of the size of the elastic twist, which no neglect could hide."""
+    cell = CELLS["odd"]
+    states = some_states(cell, 4)
+    joints, creep = (make("joint_compliance", cell, states),
+                     make("creep", cell, states, {"form": form}))  # fmt: skip
+    model = Model(cell, (creep, joints))
+    rng = np.random.default_rng(8)
+    k = rng.uniform(0.3, 1.0, len(creep.parameters))
+    c = 1e-4 * rng.uniform(0.5, 1.0, cell.arm.n) * [p.scale for p in joints.parameters]
+    assert_slope(model, states, np.concatenate([k, c]), 3)
+    plain = Model(cell, (joints,))
+    alone = plain.jacobian(plain.predict(states, c), c, 3)
+    whole = model.jacobian(model.predict(states, np.concatenate([k, c])), np.append(k, c), 3)
+    more = 1 + k * np.log10(1 + states.load_time)[:, None]  # (N, 1) or (N, n)
+    expected = alone * np.broadcast_to(more, (len(states), cell.arm.n))[:, None, :]
+    np.testing.assert_allclose(
+        whole[:, :, len(k) :], expected, rtol=0, atol=1e-3 * np.abs(expected).max()
+    )
+
+
+def test_jacobian_of_some_parameters_is_a_part_of_that_of_all():
+    cell = CELLS["odd"]
+    states = some_states(cell, 4)
+    model = Model(cell, tuple(make(n, cell, states, SHORT.get(n, options_of(n))) for n in NAMES))
+    theta = random_theta(model.effects, np.random.default_rng(9))
+    prediction = model.predict(states, theta)
+    whole = model.jacobian(prediction, theta, 6)
+    live = np.sort(np.random.default_rng(9).permutation(model.size)[: model.size // 2])
+    np.testing.assert_array_equal(model.jacobian(prediction, theta, 6, live), whole[:, :, live])
+
+
+def test_jacobian_of_an_effect_that_is_not_in_the_model_is_that_at_zero():
+    cell = CELLS["ur10e"]
+    states = some_states(cell)
+    model = Model(cell, (make("joint_compliance", cell, states),))
+    theta = random_theta(model.effects, np.random.default_rng(0))
+    prediction = model.predict(states, theta)
+    for name in NAMES[1:]:
+        if name in model.names:
+            continue
+        effect = make(name, cell, states, options_of(name))
+        outside = model.jacobian_of((effect,), prediction, theta, 3)
+        larger = model + effect
+        full = np.concatenate([theta, np.zeros(len(effect.parameters))])
+        inside = larger.jacobian(larger.predict(states, full), full, 3)[:, :, len(theta) :]
+        # The two equilibria may differ by their tolerance of 1e-13 m.
+        np.testing.assert_allclose(outside, inside, rtol=1e-11, atol=1e-11, err_msg=name)

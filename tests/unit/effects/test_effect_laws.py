@@ -1,0 +1,222 @@
+"""The laws of the effects, against the simulated world, which shares no code with them."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from drivers.simulated.tracker import TrackerNoise
+from drivers.simulated.truth import Truth
+from drivers.simulated.world import World
+from hilcal.cell import Cell
+from hilcal.data.readings import States
+from hilcal.effects.catalogue import make
+from hilcal.effects.protocol import Situation
+from hilcal.model import Model
+from tests.support.campaigns import true_parameters
+from tests.support.effect_cases import CELLS, NAMES, options_of, situation, some_states
+
+# --- laws, against the simulated world ------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Both:
+    """A world and a model of the same cell that hold the same parameters."""
+
+    world: World
+    model: Model
+    theta: np.ndarray
+
+
+def truth_of(name: str, cell: Cell, rng: np.random.Generator, scale: float) -> np.ndarray:
+    """Random parameters, shaped as in the world."""
+    zero = getattr(Truth.rigid(cell.arm, 3), name)
+    effect = make(name, cell, some_states(cell), options_of(name))
+    ordinary = np.array([p.scale for p in effect.parameters])
+    drawn = rng.normal(size=len(ordinary))
+    if name == "joint_compliance":  # an arm that gives way, also where it stiffens
+        drawn = 1 + np.abs(drawn)
+    return (scale * ordinary * drawn).reshape(zero.shape)
+
+
+def both(names: tuple[str, ...], cell: Cell, states: States, scale: float) -> Both:
+    rng = np.random.default_rng(11)
+    truth = Truth.rigid(cell.arm)
+    for name in names:
+        truth = truth.with_effect(name, truth_of(name, cell, rng, scale))
+    world = World(cell, truth, cell.registration, np.eye(4), TrackerNoise(), np.zeros(cell.arm.n))
+    model = Model(cell, tuple(make(n, cell, states, options_of(n)) for n in names))
+    theta = np.concatenate([true_parameters(world, n) for n in names])
+    return Both(world, model, theta)
+
+
+def apart(b: Both, states: States) -> tuple[float, float]:
+    """Largest distance, m, and angle, rad, of the model's readings from the world's."""
+    seen, told = b.model.predict(states, b.theta).observation, b.world.sight(states)
+    turn = np.abs(seen.rotation - told.rotation).max()
+    return float(np.linalg.norm(seen.position - told.position, axis=1).max()), float(turn)
+
+
+def order_of_turns(b: Both, states: States) -> float:
+    """Sum of the tilts times the sum of all small rotations, rad²: what their order can make out.
+
+    A tilt is one small rotation about the moment's axis in the program and two successive
+    rotations about x and y in the world; the tip of a beam likewise. A link that grows does so
+    before its twists in the world and along with them in the program.
+    """
+    p = b.model.predict(states, b.theta)
+    tilt = total = grown = 0.0
+    for effect, rows in zip(b.model.effects, b.model.slices(), strict=True):
+        d = effect.deviation(b.theta[rows], p.situation)
+        if d.twist is not None:
+            turn = np.linalg.norm(d.twist[:, :, 3:], axis=2).sum(axis=1).max()
+            total += turn
+            shift = np.linalg.norm(d.twist[:, :, :3], axis=2).sum(axis=1).max()
+            grown += shift / b.model.cell.arm.reach if effect.name == "thermal_growth" else 0.0
+            tilt += turn if effect.name in TILTING else 0.0
+        if d.dq is not None:
+            total += np.abs(d.dq).sum(axis=1).max()
+    return float((tilt + grown) * total)
+
+
+TILTING = ("joint_tilt_compliance", "base_compliance", "link_compliance", "tool_compliance")
+SENSOR = ("wrench_bias", "wrench_gain", "sensor_misalignment")
+ON_COMPLIANCE = ("joint_stiffening", "creep", "link_mass", "load_point", *SENSOR)
+ALONE = tuple((n,) for n in NAMES if n not in ON_COMPLIANCE)
+TOGETHER = tuple(("joint_compliance", n) for n in ON_COMPLIANCE)
+EVERYTHING = tuple(tuple(n for n in NAMES if n not in SENSOR or n == one) for one in SENSOR)
+"""All effects, but one error of the force sensor at a time: their products are left out."""
+
+
+@pytest.mark.parametrize("arm", CELLS)
+@pytest.mark.parametrize("names", [*ALONE, *TOGETHER, *EVERYTHING], ids="+".join)
+def test_prediction_is_what_the_world_shows(names, arm):
+    cell = CELLS[arm]
+    states = some_states(cell, 6)
+    for scale in (1.0, 1e-2):
+        b = both(names, cell, states, 0.3 * scale)
+        rigid = replace(b.world, physics=Truth.rigid(cell.arm))
+        change = b.world.sight(states).position - rigid.sight(states).position
+        moved = np.linalg.norm(change, axis=1).max()
+        distance, turn = apart(b, states)
+        reach = cell.arm.reach + np.linalg.norm(cell.registration[:3, 3])
+        limit = order_of_turns(b, states) * reach
+        # Equilibria to 1e-12 rad in the world and 1e-13 m here, of an arm of a metre or two.
+        assert distance <= limit + 1e-11
+        assert turn <= limit / reach + 1e-11
+        assert limit < 0.05 * moved
+        assert moved > 1e-9  # a hundred times the tolerance
+
+
+@pytest.mark.parametrize("arm", CELLS)
+def test_errors_of_the_force_sensor_add_but_for_their_products(arm):
+    """What two of them leave out is one as a share of what the other moves."""
+    cell = CELLS[arm]
+    states = some_states(cell, 6)
+    for scale in (1.0, 1e-2):
+        b = both(("joint_compliance", *SENSOR), cell, states, scale)
+        joints = Model(cell, b.model.effects[:1])
+        true = joints.predict(states, b.theta[: cell.arm.n]).observation.position
+        all_of_them = b.model.predict(states, b.theta).observation.position - true
+        bias, gain, turn = (b.theta[at] for at in b.model.slices()[1:])
+        loaded = states.wrench[np.any(states.wrench != 0, axis=1)]
+        least = [np.linalg.norm(loaded[:, part], axis=1).min() for part in (slice(3), slice(3, 6))]
+        share = np.linalg.norm(bias[:3]) / least[0] + np.linalg.norm(bias[3:]) / least[1]
+        share += np.abs(gain).max() + np.linalg.norm(turn)
+        moved = np.linalg.norm(all_of_them, axis=1).max()
+        # Every error alone moves at most what its share of the wrench does to soft joints.
+        soft = np.linalg.norm(true - rigid_position(cell, states), axis=1).max()
+        assert apart(b, states)[0] <= 3 * share**2 * soft + 1e-11
+        assert 3 * share**2 * soft < moved or scale == 1.0
+        assert moved > 1e-6 * scale**2
+
+
+def rigid_position(cell: Cell, states: States) -> np.ndarray:
+    return Model(cell, ()).predict(states, np.zeros(0)).observation.position
+
+
+def test_a_tilt_turns_across_the_joint_axis_by_the_moment_there():
+    cell = CELLS["odd"]
+    s = situation(cell)
+    effect = make("joint_tilt_compliance", cell, s.states)
+    k = 1e-6 * np.arange(1, cell.arm.n + 1)
+    twist = effect.deviation(k, s).twist
+    axis = np.swapaxes(s.chain.rotation[:-1, :, :, 2], 0, 1)
+    in_slots = np.moveaxis(s.chain.rotation[:-1], 0, 1)
+    turn = np.einsum("njab,njb->nja", in_slots, twist[:, :-1, 3:])
+    moment = np.einsum("njab,njb->nja", in_slots, s.wrench[:, :-1, 3:])
+    across = moment - axis * np.sum(axis * moment, axis=2, keepdims=True)
+    np.testing.assert_allclose(turn, k[:, None] * across, rtol=0, atol=1e-15)
+    assert np.all(twist[:, :, :3] == 0)
+    assert np.all(twist[:, -1] == 0)
+
+
+@pytest.mark.parametrize("arm", CELLS)
+def test_base_compliance_turns_the_arm_about_the_base_origin(arm):
+    """To first order the target moves by (B t_0) × x, with t_0 the moment about the origin."""
+    cell = CELLS[arm]
+    states = some_states(cell)
+    model = Model(cell, (make("base_compliance", cell, states),))
+    rigid = model.predict(states, np.zeros(3))
+    b = 1e-9 * np.array([3.0, 1.0, 2.0])
+    bent = model.predict(states, b)
+    chain, arm_ = rigid.situation.chain, cell.arm
+    weight = cell.gravity
+    moment = states.wrench[:, 3:] + np.cross(chain.point(cell.load_point), states.wrench[:, :3])
+    moment = moment + np.cross(chain.point(cell.tool_com), cell.tool_mass * weight)
+    for mass, com in zip(arm_.masses, chain.com, strict=True):
+        moment = moment + np.cross(com, mass * weight)
+    turn = b * moment
+    expected = np.cross(turn, rigid.observation.base_position)
+    moved = bent.observation.position - rigid.observation.position
+    reach = arm_.reach + 1.0
+    second_order = np.abs(turn).max() ** 2 * reach * 10
+    np.testing.assert_allclose(
+        moved @ cell.registration[:3, :3], expected, rtol=0, atol=second_order + 1e-14
+    )
+
+
+def test_a_zero_error_of_the_first_joint_is_a_turn_of_the_base_about_z():
+    cell = CELLS["ur10e"]
+    states = some_states(cell)
+    offset = Model(cell, (make("encoder_offset", cell, states),))
+    frame = Model(cell, (make("base_frame", cell, states),))
+    a = offset.predict(states, 0.01 * np.eye(6)[0]).observation
+    b = frame.predict(states, 0.01 * np.eye(6)[5]).observation
+    np.testing.assert_allclose(a.position, b.position, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(a.rotation, b.rotation, rtol=0, atol=1e-14)
+
+
+def test_harmonics_and_sides_are_what_they_say():
+    cell = CELLS["ur10e"]
+    s = situation(cell)
+    effect = make("transmission_error", cell, s.states, {"harmonics": 4})
+    theta = np.random.default_rng(0).normal(size=48)
+    by_name = {p.name: t for p, t in zip(effect.parameters, theta, strict=True)}
+    dq = effect.deviation(theta, s).dq
+    for j in range(6):
+        q = s.angle[:, j]
+        expected = sum(
+            by_name[f"j{j + 1}.cos{k}"] * np.cos(k * q)
+            + by_name[f"j{j + 1}.sin{k}"] * np.sin(k * q)
+            for k in range(1, 5)
+        )
+        np.testing.assert_allclose(dq[:, j], expected, rtol=0, atol=1e-13)
+    h = np.arange(1.0, 7.0)
+    dq = make("hysteresis", cell, s.states).deviation(h, s).dq
+    np.testing.assert_array_equal(dq, h * s.states.approach)
+
+
+def test_drift_starts_at_its_reference_time():
+    cell = CELLS["ur10e"]
+    states = some_states(cell)
+    rate = 1e-8 * np.arange(1.0, 7.0)
+    for reference, start in ((None, states.time.min()), (100.0, 100.0)):
+        given = {} if reference is None else {"reference_s": reference}
+        effect = make("tracker_drift", cell, states, given)
+        station = effect.deviation(rate, situation_of(cell, states)).station
+        np.testing.assert_allclose(station, (states.time - start)[:, None] * rate, rtol=1e-13)
+
+
+def situation_of(cell: Cell, states: States) -> Situation:
+    return Model(cell, ()).predict(states, np.zeros(0)).situation

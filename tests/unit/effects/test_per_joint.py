@@ -1,0 +1,316 @@
+"""Joints that share a parameter, joints that have none: what it means for each effect."""
+
+import numpy as np
+import pytest
+
+from hilcal.data.records import content_hash
+from hilcal.data.revision import from_text, to_text
+from hilcal.effects.catalogue import effect_class, make
+from hilcal.effects.per_joint import PerJoint, joint_groups
+from hilcal.effects.protocol import Columns, Effect, Parameter
+from hilcal.errors import InputError
+from hilcal.identify.baseline import with_effects
+from hilcal.identify.fit import fit
+from hilcal.model import Model
+from hilcal.revisions import restore_model, to_record
+from tests.support.campaigns import campaign
+from tests.support.effect_cases import CELLS, NAMES, options_of, random_theta, some_states
+from tests.unit.effects.test_effect_jacobian import assert_slope
+
+PER_JOINT = tuple(name for name in NAMES if issubclass(effect_class(name), PerJoint))
+CREEPS = ("common", "each", "2-3/5+6")
+GROUPS = ("common", "2/3/4-6", "1+4/2-3", "5")
+
+
+def membership(groups: str, count: int) -> np.ndarray:
+    """(n, G) 1 where a joint belongs to a group; written out by hand, not read."""
+    known = {
+        "common": [range(count)],
+        "each": [[j] for j in range(count)],
+        "2/3/4-6": [[1], [2], [3, 4, 5]],
+        "1+4/2-3": [[0, 3], [1, 2]],
+        "2-3/5+6": [[1, 2], [4, 5]],
+        "5": [[4]],
+        "1-3": [[0, 1, 2]],
+    }[groups]
+    out = np.zeros((count, len(known)))
+    for k, group in enumerate(known):
+        out[list(group), k] = 1.0
+    return out
+
+
+def options(name: str, groups: str) -> dict[str, object]:
+    few = {"harmonics": 2} if name == "transmission_error" else options_of(name)
+    return {**few, "joints": groups}
+
+
+def spread(effect: Effect, groups: str) -> np.ndarray:
+    """(P each, P groups) parameters of every joint by those of the groups."""
+    member = membership(groups, effect.cell.arm.n)
+    return np.kron(member, np.eye(len(effect.parameters) // member.shape[1]))
+
+
+# --- how it is written ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("given", "text", "labels", "joint", "group"),
+    [
+        ("each", "each", "1 2 3 4 5 6", [0, 1, 2, 3, 4, 5], [0, 1, 2, 3, 4, 5]),
+        ("common", "common", "1-6", [0, 1, 2, 3, 4, 5], [0] * 6),
+        ("2/3/4-6", "2/3/4-6", "2 3 4-6", [1, 2, 3, 4, 5], [0, 1, 2, 2, 2]),
+        ("4-6/3/2", "2/3/4-6", "2 3 4-6", [1, 2, 3, 4, 5], [0, 1, 2, 2, 2]),
+        ("1+4+5/ 2", "1+4-5/2", "1+4-5 2", [0, 1, 3, 4], [0, 1, 0, 0]),
+        ("1+2+3", "1-3", "1-3", [0, 1, 2], [0, 0, 0]),
+        (3, "3", "3", [2], [0]),
+        ("6/5/4/3/2/1", "each", "1 2 3 4 5 6", [0, 1, 2, 3, 4, 5], [0, 1, 2, 3, 4, 5]),
+        ("1-6", "common", "1-6", [0, 1, 2, 3, 4, 5], [0] * 6),
+        ("1-5/6", "1-5/6", "1-5 6", [0, 1, 2, 3, 4, 5], [0, 0, 0, 0, 0, 1]),
+    ],
+)
+def test_groups_are_read_and_written_in_one_way(given, text, labels, joint, group):
+    g = joint_groups("hysteresis", {"joints": given}, 6)
+    assert (g.text, " ".join(g.labels)) == (text, labels)
+    assert (g.joint.tolist(), g.group.tolist()) == (joint, group)
+    again = joint_groups("hysteresis", {"joints": g.text}, 6)
+    assert (again.text, again.labels) == (g.text, g.labels)
+    assert (again.joint.tolist(), again.group.tolist()) == (joint, group)
+
+
+@pytest.mark.parametrize(
+    ("given", "wrong"),
+    [
+        ("", "'' is no joint"),
+        ("all", "'all' is no joint"),
+        ("1/", "'' is no joint"),
+        ("1,2", "'1,2' is no joint"),
+        ("1--3", "'1--3' is no joint"),
+        ("²", "'²' is no joint"),
+        ("0", "there is no joint 0"),
+        ("5-8", "there is no joint 7"),
+        ("999", "there is no joint 999"),
+        ("3-1", "3-1 runs backwards"),
+        ("1-3/3", "joint 3 is there twice"),
+        ("2+2", "joint 2 is there twice"),
+        (2.5, "joints = 2.5; valid"),
+        (True, "joints = True; valid"),
+        (None, "joints = None; valid"),
+        ([1, 2], "joints = [1, 2]; valid"),
+    ],
+)
+def test_other_groups_are_refused_with_what_would_be_valid(given, wrong):
+    with pytest.raises(InputError) as caught:
+        joint_groups("hysteresis", {"joints": given}, 6)
+    line = str(caught.value)
+    assert line.startswith("effect hysteresis: joints = ")
+    assert wrong in line
+    assert "valid: each, common, or joints 1 to 6 in groups, as 2/3/4-6" in line
+    assert "\n" not in line
+
+
+# --- what it means --------------------------------------------------------------------------
+
+
+def test_every_effect_of_the_joints_can_be_grouped():
+    assert set(PER_JOINT) == {
+        "encoder_offset", "transmission_error", "hysteresis", "joint_compliance",
+        "joint_stiffening", "joint_tilt_compliance", "periodic_joint_compliance", "backlash",
+        "creep", "thermal_joint_drift",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("groups", GROUPS)
+@pytest.mark.parametrize("name", PER_JOINT)
+def test_a_shared_parameter_is_the_same_number_at_each_of_its_joints(name, groups):
+    """Same readings; and the derivative is the sum of theirs, also of another effect's by it."""
+    cell = CELLS["odd"]
+    states = some_states(cell, 5)
+    others = [n for n in ("load_point", "joint_compliance") if n != name]
+    rest = [make(n, cell, states) for n in others]
+    one = make(name, cell, states, options(name, groups))
+    every = make(name, cell, states, options(name, "each"))
+    m = spread(one, groups)
+    assert m.shape == (len(every.parameters), len(one.parameters))
+    rng = np.random.default_rng(1)
+    theta = random_theta((one,), rng)
+    fixed = random_theta(rest, rng)
+    a, b = Model(cell, (*rest, one)), Model(cell, (*rest, every))
+    at, bt = np.concatenate([fixed, theta]), np.concatenate([fixed, m @ theta])
+    pa, pb = a.predict(states, at), b.predict(states, bt)
+    np.testing.assert_allclose(pa.observation.position, pb.observation.position, rtol=0, atol=1e-12)
+    ja, jb = a.jacobian(pa, at, 6), b.jacobian(pb, bt, 6)
+    k = len(fixed)
+    expected = np.concatenate([jb[:, :, :k], jb[:, :, k:] @ m], axis=2)
+    size = np.abs(expected).max(axis=(0, 1)) + 1e-300
+    np.testing.assert_allclose(ja / size, expected / size, rtol=0, atol=1e-10)
+    assert np.all(np.abs(ja).max(axis=(0, 1)) > 0)
+
+
+@pytest.mark.parametrize("groups", ["common", "1+4/2-3"])
+@pytest.mark.parametrize("name", PER_JOINT)
+def test_derivatives_by_shared_parameters(name, groups):
+    cell = CELLS["odd"]
+    states = some_states(cell, 4)
+    joints = () if name == "joint_compliance" else (make("joint_compliance", cell, states),)
+    model = Model(cell, (*joints, make(name, cell, states, options(name, groups))))
+    theta = random_theta(model.effects, np.random.default_rng(6), 1e-2)
+    assert_slope(model, states, theta, 3)
+
+
+@pytest.mark.parametrize("creeps", CREEPS)
+@pytest.mark.parametrize("groups", ["common", "2/3/4-6", "1-3"])
+def test_a_shared_compliance_shows_more_where_the_joints_creep(groups, creeps):
+    """With a creep of the size of the elastic twist, which no neglect could hide."""
+    cell = CELLS["odd"]
+    states = some_states(cell, 4)
+    creep = make("creep", cell, states, {"joints": creeps})
+    some = make("joint_compliance", cell, states, {"joints": groups})
+    every = make("joint_compliance", cell, states)
+    rng = np.random.default_rng(8)
+    k = rng.uniform(0.3, 1.0, len(creep.parameters))
+    c = 1e-4 * rng.uniform(0.5, 1.0, len(some.parameters)) * [p.scale for p in some.parameters]
+    a, b = Model(cell, (creep, some)), Model(cell, (creep, every))
+    m = spread(some, groups)
+    at, bt = np.append(k, c), np.append(k, m @ c)
+    assert_slope(a, states, at, 3)
+    ja = a.jacobian(a.predict(states, at), at, 3)
+    jb = b.jacobian(b.predict(states, bt), bt, 3)
+    expected = np.concatenate([jb[:, :, : len(k)], jb[:, :, len(k) :] @ m], axis=2)
+    size = np.abs(expected).max(axis=(0, 1)) + 1e-300
+    np.testing.assert_allclose(ja / size, expected / size, rtol=0, atol=1e-10)
+    plain = Model(cell, (every,))
+    alone = plain.jacobian(plain.predict(states, m @ c), m @ c, 3)
+    crept = membership(creeps, cell.arm.n) @ k * np.log10(1 + states.load_time)[:, None]
+    law = (alone * (1 + crept)[:, None, :]) @ m
+    np.testing.assert_allclose(ja[:, :, len(k) :], law, rtol=0, atol=1e-3 * np.abs(law).max())
+
+
+@pytest.mark.parametrize("name", PER_JOINT)
+def test_names_and_magnitudes(name):
+    cell = CELLS["ur10e"]
+    states = some_states(cell)
+    every = make(name, cell, states, options(name, "each")).parameters
+    some = make(name, cell, states, options(name, "1+4-5/2/3")).parameters
+    kinds = len(every) // 6
+    assert len(some) == 3 * kinds
+    heads = [p.name.split(".")[0] for p in some[::kinds]]
+    assert heads == ["j1+4-5", "j2", "j3"]
+    tails = [p.name.partition(".")[2] for p in some]
+    assert tails == [p.name.partition(".")[2] for p in every][: len(some)]
+    first = [every[kinds * j].scale for j in (0, 3, 4)]
+    assert some[0].scale == pytest.approx(np.exp(np.mean(np.log(first))), rel=1e-12)
+    assert some[kinds].scale == every[kinds].scale
+    assert some[0].meaning == every[0].meaning.replace("joint 1", "joints 1+4-5")
+    assert {p.unit for p in some} == {p.unit for p in every}
+
+
+def test_compliance_of_joints_by_their_groups():
+    cell = CELLS["ur10e"]
+    effect = make("joint_compliance", cell, some_states(cell), {"joints": "2/4-5"})
+    found = effect.compliance(np.array([3.0, 7.0]))
+    assert found.tolist() == [0.0, 3.0, 0.0, 7.0, 7.0, 0.0]
+    assert type(2 * found) is type(found + found) is np.ndarray
+
+
+def test_harmonics_of_shared_joints_have_one_variance():
+    cell = CELLS["ur10e"]
+    effect = make("transmission_error", cell, some_states(cell), options(PER_JOINT[1], "1-3/5"))
+    assert effect.groups().tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
+    assert effect.for_scoring(some_states(cell)).options == effect.options
+
+
+def test_creep_takes_the_older_name_of_its_groups():
+    cell = CELLS["ur10e"]
+    states = some_states(cell)
+    for form in ("common", "each"):
+        old = make("creep", cell, states, {"form": form})
+        new = make("creep", cell, states, {"joints": form})
+        assert old.parameters == new.parameters
+        assert old.options == new.options == {"joints": form}
+    assert [p.name for p in make("creep", cell, states).parameters] == ["k"]
+    with pytest.raises(InputError, match="form and joints; valid: joints alone"):
+        make("creep", cell, states, {"form": "each", "joints": "each"})
+
+
+class Builds(Effect):
+    """Builds on every joint's compliance, and knows of no groups."""
+
+    name = "builds"
+    summary = "twice the compliance"
+    elastic = True
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return (Parameter("k", "1", 1.0),)
+
+    def columns(self, s):
+        joints = np.arange(s.angle.shape[1])
+        return (Columns("dq", 0 * joints, joints, s.compliance * s.torque),)
+
+    def compliance_columns(self, theta, s):
+        joints = np.arange(s.angle.shape[1])
+        return (Columns("dq", joints, joints, theta[0] * s.torque),)
+
+
+@pytest.mark.parametrize("joints", ["each", "common", "2/3/4-6"])
+@pytest.mark.parametrize("builder", ["creep", "a user's"])
+def test_what_builds_on_shared_compliances_has_the_right_derivative(joints, builder):
+    cell = CELLS["ur10e"]
+    states = some_states(cell)
+    shared = make("joint_compliance", cell, states, {"joints": joints})
+    other = make("creep", cell, states) if builder == "creep" else Builds(cell, states)
+    model = Model(cell, (shared, other))
+    theta = np.array([p.scale for p in shared.parameters] + [0.3])
+    assert_slope(model, states, theta, 3)
+
+
+# --- fits -----------------------------------------------------------------------------------
+
+CHOSEN = {
+    "joint_compliance": {"joints": "1/2/3/4-6"},
+    "hysteresis": {"joints": "1-3"},
+    "transmission_error": {"joints": "2/3", "harmonics": 2},
+}
+
+
+def test_shared_parameters_are_found_and_stored_with_their_groups():
+    c = campaign(plan_seed=0, registration_known=True)
+    model = with_effects(c.cell, c.readings, "absolute", CHOSEN, CHOSEN)
+    rng = np.random.default_rng(2)
+    truth = np.abs(random_theta(model.effects, rng))
+    value = model.predict(c.readings.states, truth).observation.position
+    noise = 2e-6 * rng.normal(size=value.shape)
+    readings = type(c.readings)(
+        **{f: getattr(c.readings, f) for f in c.readings.__dataclass_fields__ if f != "value"},
+        value=value + noise,
+    )
+    found = fit(model, readings, "absolute")
+    free = found.solution.prior > 0
+    assert free[:5].all()
+    names = [f"{e.name}.{p.name}" for e in model.effects for p in e.parameters]
+    assert names[:5] == [
+        "joint_compliance.j1", "joint_compliance.j2", "joint_compliance.j3",
+        "joint_compliance.j4-6", "hysteresis.j1-3",
+    ]  # fmt: skip
+    assert all(n.startswith(("transmission_error.j2.", "transmission_error.j3."))
+               for n in names[5:])  # fmt: skip
+    seen = found.uncertainty.identifiable[:5]
+    assert seen[1:].all()
+    off = np.abs(found.theta - truth)[:5][seen] / found.uncertainty.std[:5][seen]
+    assert off.max() < 5
+
+    record = from_text(to_text(to_record(found, None, None, content_hash(readings))), 1)
+    again, theta = restore_model(record, c.cell, readings)
+    assert [e.options for e in again.effects] == [e.options for e in model.effects]
+    assert again.effects[0].options == {"joints": "1/2/3/4-6"}
+    np.testing.assert_array_equal(theta, found.theta)
+
+
+def test_frames_take_options_too():
+    c = campaign(plan_seed=0)
+    usual = with_effects(c.cell, c.readings, "absolute", ("hysteresis",))
+    given = {"base_frame": {"prior_m": 2e-3, "prior_rad": 4e-3}}
+    known = with_effects(c.cell, c.readings, "absolute", ("base_frame", "hysteresis"), given)
+    assert known.names == usual.names == ("base_frame", "hysteresis")
+    assert usual.effects[0].prior_std() is None
+    assert known.effects[0].prior_std().tolist() == [2e-3] * 3 + [4e-3] * 3

@@ -1,0 +1,295 @@
+"""An effect of a user's own: from a file or an installed package it takes part in everything."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilcal.data.campaign import Campaign
+from hilcal.data.readings import Readings
+from hilcal.data.table import write_table
+from hilcal.effects.added import scope
+from hilcal.effects.catalogue import catalogue
+from hilcal.effects.from_file import read_effects
+from hilcal.model import Model
+from hilcal.types import Floats
+from tests.support.campaigns import campaign as simulated
+from tests.support.campaigns import plan
+from tests.support.cli_cases import CELL, ok, refused, start
+from tests.support.user_effect_cases import CLASS, COLUMNS
+
+Capsys = pytest.CaptureFixture[str]
+NAME = "soft_side"
+POSES = 20
+
+
+@dataclass(frozen=True)
+class Case:
+    """Tables of readings that a user's law is in, and its true parameters."""
+
+    fitted: Path
+    unseen: Path
+    truth: Floats
+
+
+def with_the_law(amplitude: Floats, plan_seed: int, noise_seed: int) -> Readings:
+    """Readings of a simulated arm with dq_j = a_j sin(q_j) τ_j beside its joint compliance."""
+    c = simulated(seed=noise_seed, plan_seed=plan_seed, poses=POSES)
+    p = plan(POSES, plan_seed)
+    q = p.states.q
+    torque = Model(c.cell, ()).predict(p.states, np.zeros(0)).situation.torque
+    # What the deflection adds to the torque is below a thousandth of it.
+    off = amplitude * np.sin(q) * torque
+    moved = c.world.sight(replace(p.states, q=q + off)).position - c.world.sight(p.states).position
+    return replace(c.readings, value=c.readings.value + moved)
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
+    folder = tmp_path_factory.mktemp("tables")
+    truth = 2e-6 * np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
+    for k, name in enumerate(("fitted", "unseen")):
+        write_table(with_the_law(truth, k, 0), folder / f"{name}.csv")
+    return Case(folder / "fitted.csv", folder / "unseen.csv", truth)
+
+
+@pytest.fixture
+def file(tmp_path: Path, capsys: Capsys) -> Path:
+    path = tmp_path / "effects" / "mine.py"
+    path.parent.mkdir()
+    ok(capsys, "effects", "new", NAME, "-o", path)
+    return path
+
+
+@pytest.fixture
+def run_file(case: Case, tmp_path: Path, capsys: Capsys) -> Path:
+    path = tmp_path / "run.hilcal"
+    ok(capsys, "import", case.fitted, "--config", CELL, "-o", path)
+    return path
+
+
+# --- it takes part --------------------------------------------------------------------------
+
+
+def test_a_missing_law_is_named_added_and_the_error_falls_to_the_noise(
+    case: Case, run_file: Path, file: Path, tmp_path: Path, capsys: Capsys
+) -> None:
+    mine = ("--effects-from", file)
+    without = ok(capsys, "refine", run_file, "--json").document
+    assert NAME not in json.dumps(without)
+    assert without["verdict"] != "adequate"
+
+    ok(capsys, "identify", run_file, "--json")
+    d = ok(capsys, "diagnose", run_file, *mine, "--json").document
+    assert d["verdict"] == "missing_effect"
+    assert d["suspects"][0]["effect"] == NAME
+    assert NAME in d["message"]
+    assert NAME in ok(capsys, "diagnose", run_file, *mine).out
+
+    recording = tmp_path / "story.rrd"
+    r = ok(capsys, "refine", run_file, *mine, "--json", "--record", recording).document
+    assert r["verdict"] == "adequate", r["message"]
+    assert r["revisions"][1]["added"] == NAME
+    before, after = r["revisions"][0], r["revisions"][-1]
+    low, high = after["variance_factor_interval"]
+    assert low < 1 < high < before["variance_factor"]
+    assert after["error"]["holdout"]["rms_sigma"] < 0.6 * before["error"]["holdout"]["rms_sigma"]
+    assert NAME.encode() in recording.read_bytes()
+
+    with Campaign.open(run_file) as stored:
+        parameters = stored.revisions()[-1].parameters_json
+    found = {
+        name: (value, std)
+        for name, value, std in zip(
+            parameters["names"], parameters["theta"], parameters["std"], strict=True
+        )
+    }
+    for j in (2, 3):  # those that weight and loads turn most
+        value, std = found[f"{NAME}.j{j}"]
+        assert abs(value - case.truth[j - 1]) < 4 * std
+        assert abs(value) > 10 * std
+
+    other = tmp_path / "other.hilcal"
+    ok(capsys, "import", case.unseen, "--config", CELL, "-o", other)
+    v = ok(capsys, "validate", run_file, other, "--register", *mine, "--json").document
+    assert NAME in v["model"]
+    assert v["error"]["rms_sigma"] < 1.2
+
+
+def test_it_can_be_fitted_and_added_by_name(run_file: Path, file: Path, capsys: Capsys) -> None:
+    mine = ("--effects-from", file)
+    chosen = f"joint_compliance,{NAME}"
+    d = ok(capsys, "identify", run_file, "--effects", chosen, *mine, "--json").document
+    assert d["model"][-1] == NAME
+    units = {p["unit"] for p in d["parameters"] if p["name"].startswith(NAME)}
+    assert units == {"rad/(N·m)"}
+    ok(capsys, "identify", run_file)
+    a = ok(capsys, "add", run_file, NAME, *mine, "--json").document
+    assert a["revisions"][1]["added"] == NAME
+    assert "unknown effect" in refused(capsys, 2, "add", run_file, NAME)
+    words = ok(capsys, "compare", run_file, *mine).out
+    assert NAME in words
+
+
+def test_a_process_of_its_own_and_an_installed_package(
+    run_file: Path, file: Path, tmp_path: Path
+) -> None:
+    shown = start("diagnose", run_file, "--effects-from", file, "--json")
+    out, err = shown.communicate(timeout=120)
+    assert shown.returncode == 0, err
+    assert json.loads(out)["suspects"][0]["effect"] == NAME
+
+    package = installed(tmp_path / "site", file.read_text(encoding="utf-8"), "mine:SoftSide")
+    code, out, err = hilcal(package, "diagnose", run_file, "--json")
+    assert code == 0, err
+    assert json.loads(out)["suspects"][0]["effect"] == NAME
+    code, out, err = hilcal(package, "effects", "--json")
+    assert code == 0, err
+    listed = {e["name"]: e["source"] for e in json.loads(out)["effects"]}
+    assert listed[NAME] == "installed"
+    assert listed["joint_compliance"] == "built in"
+    code, out, err = hilcal(package, "effects", "--effects-from", file)
+    assert (code, out) == (2, "")
+    assert f"{NAME} is in the catalogue already" in err
+
+
+@pytest.mark.parametrize(
+    ("point", "said"),
+    [
+        ("mine:Effect", "class Effect lacks columns and parameters"),
+        pytest.param("mine:np", "not an Effect class", marks=pytest.mark.slow),
+        pytest.param("mine:No", "cannot be loaded (AttributeError", marks=pytest.mark.slow),
+    ],
+)
+def test_a_broken_package_is_one_clear_line(
+    point: str, said: str, file: Path, tmp_path: Path
+) -> None:
+    package = installed(tmp_path / "site", file.read_text(encoding="utf-8"), point)
+    code, out, err = hilcal(package, "effects")
+    assert (code, out) == (2, "")
+    assert err.startswith(f"error: entry point {NAME} = {point}: ")
+    assert said in err
+    assert err.count("\n") == 1
+
+
+def installed(site: Path, content: str, point: str) -> Path:
+    """Install a module with an effect into a folder."""
+    about = site / "mine-1.0.dist-info"
+    about.mkdir(parents=True)
+    (site / "mine.py").write_text(content, encoding="utf-8")
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text(f"[hilcal.effects]\n{NAME} = {point}\n")
+    return site
+
+
+def hilcal(site: Path, *arguments: str | Path) -> tuple[int, str, str]:
+    """Run the program in a process that has the folder among its packages."""
+    root = Path(__file__).resolve().parents[3]
+    done = subprocess.run(
+        [sys.executable, "-m", "hilcal", *map(str, arguments)],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(site), str(root)])},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    return done.returncode, done.stdout, done.stderr
+
+
+def test_a_plan_is_made_against_it(file: Path, tmp_path: Path, capsys: Capsys) -> None:
+    cell = tmp_path / "cell.toml"
+    text = CELL.read_text(encoding="utf-8")
+    assert "[planning]" in text
+    cell.write_text(text.replace("[planning]", f'[planning]\nagainst = ["{NAME}"]'), "utf-8")
+    arguments = ("plan", cell, "-o", tmp_path / "plan.toml", "--poses", "6", "--quick")
+    assert f"unknown effect '{NAME}'" in refused(capsys, 2, *arguments)
+    d = ok(capsys, *arguments, "--effects-from", file, "--json").document
+    assert {seen["effect"] for seen in d["detectable"]} == {NAME}
+
+
+# --- a campaign remembers it ----------------------------------------------------------------
+
+
+def test_a_revision_says_which_file_it_needs(run_file: Path, file: Path, capsys: Capsys) -> None:
+    mine = ("--effects-from", file)
+    ok(capsys, "identify", run_file, "--effects", f"joint_compliance,{NAME}", *mine)
+    for command in (["diagnose"], ["compare"], ["refine", "--from-latest"], ["view"]):
+        said = refused(capsys, 2, *command, run_file)
+        assert f"revision 1 has the effect {NAME}, which is not in the catalogue" in said
+        assert said.endswith(f"--effects-from {file}")
+    said = refused(capsys, 2, "validate", run_file, run_file)
+    assert NAME in said
+    ok(capsys, "diagnose", run_file, *mine)
+    ok(capsys, "export", run_file, "--parameters", file.with_suffix(".csv"))
+
+    changed = file.read_text(encoding="utf-8").replace("np.sin(s.angle)", "np.cos(s.angle)")
+    file.write_text(changed, encoding="utf-8")
+    said = refused(capsys, 2, "diagnose", run_file, *mine)
+    assert f"was fitted with another {NAME}" in said
+    assert str(file) in said
+    ok(capsys, "identify", run_file, "--effects", f"joint_compliance,{NAME}", *mine)
+    ok(capsys, "diagnose", run_file, *mine)
+
+
+def test_nothing_of_it_outlives_a_command(file: Path, capsys: Capsys) -> None:
+    before = tuple(catalogue())
+    assert NAME in ok(capsys, "effects", "--effects-from", file).out
+    assert NAME not in ok(capsys, "effects").out
+    refused(capsys, 2, "effects", "--effects-from", file, "--no-such-option")
+    assert "Is a directory" in refused(capsys, 2, "effects", "--effects-from", file.parent)
+    assert tuple(catalogue()) == before
+    assert not [name for name in sys.modules if name.startswith("effects_from")]
+    assert not (file.parent / "__pycache__").exists()
+    with scope(read_effects(file)):
+        assert tuple(catalogue()) == (*before, NAME)
+    assert tuple(catalogue()) == before
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["identify", "r"],
+        ["compare", "r"],
+        ["diagnose", "r"],
+        ["add", "r", "e"],
+        ["refine", "r"],
+        ["validate", "r", "r"],
+        ["view", "r"],
+        ["plan", "c", "-o", "p"],
+        ["run", "c", "-o", "r"],
+        ["simulate", "c", "-o", "d"],
+        ["demo"],
+        ["effects"],
+    ],
+    ids=lambda command: command[0],
+)
+def test_every_command_with_models_reads_it_first(
+    command: list[str], tmp_path: Path, capsys: Capsys
+) -> None:
+    missing = tmp_path / "nothing.py"
+    said = refused(capsys, 2, *command, "--effects-from", missing)
+    assert said == f"error: {missing}: no such file; expected a Python file of effects"
+
+
+@pytest.mark.parametrize(
+    ("law", "said"),
+    [
+        ("[1.0][len(s.angle) > 40] * s.angle[:, :1]", ", line 13: effect mine: columns raises Ind"),
+        ("s.angle[:, :1] / (len(s.angle) <= 40)", ": effect mine: columns has dq values that are"),
+        ("s.angle[:40, :1]", ": effect mine: columns has dq values of shape (40, 1); expected (10"),
+    ],
+)
+def test_a_law_that_fails_on_the_readings_is_one_clear_line(
+    law: str, said: str, run_file: Path, tmp_path: Path, capsys: Capsys
+) -> None:
+    path = tmp_path / "mine.py"
+    path.write_text(CLASS.replace(COLUMNS, f"values = {law}"), encoding="utf-8")
+    ok(capsys, "effects", "--effects-from", path)  # 30 states
+    ok(capsys, "identify", run_file, "--effects-from", path)
+    line = refused(capsys, 2, "diagnose", run_file, "--effects-from", path)
+    assert line.startswith(f"error: {path}{said}")

@@ -1,0 +1,130 @@
+"""Families of parameters: the data decide how strong they are, and which are needless."""
+
+import numpy as np
+import pytest
+
+from hilcal.effects.catalogue import make
+from hilcal.identify.baseline import baseline, with_effects
+from hilcal.identify.empirical_bayes import Shrinkage, shrink
+from hilcal.identify.fit import Fit, fit
+from tests.support.campaigns import campaign, noiseless, plan
+
+
+def linear(strength, count, rows=1200, flat=3, noise=1.0, seed=0) -> tuple[Shrinkage, np.ndarray]:
+    """A random regression: flat columns, then groups of `count` of the given strengths."""
+    rng = np.random.default_rng(seed)
+    groups = np.repeat(np.arange(len(strength)), count)
+    theta = np.asarray(strength)[groups] * rng.normal(size=len(groups))
+    a = rng.normal(size=(rows, flat + len(groups)))
+    y = a @ np.concatenate([10 * rng.normal(size=flat), theta]) + noise * rng.normal(size=rows)
+    start = np.full(len(groups), 1.0)
+    found = shrink(a.T @ a, a.T @ y, float(y @ y), rows, flat, groups, start)
+    return found, groups
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_strengths_come_out_as_they_are(seed):
+    truth = np.array([3.0, 1.0, 0.3])
+    found, groups = linear(truth, 100, seed=seed)
+    told = np.array([found.std[groups == g][0] for g in range(3)])
+    # A standard deviation from 100 draws is known to 7 %; the iteration stops within 10 % of σ.
+    np.testing.assert_allclose(np.log(told / truth), 0, atol=4 * 0.071 + 0.1)
+    assert found.effective > 250
+
+
+def test_groups_that_the_data_do_not_ask_for_are_dropped():
+    kept, count = 0, 40
+    for seed in range(10):
+        found, groups = linear([2.0, 0.0, 2.0, 0.0], count, seed=seed)
+        present = np.isin(groups, [0, 2])
+        assert np.all(found.std[present] > 1.0)
+        # What is left of an absent group moves the data by far less than the noise does.
+        assert np.all(found.std[~present] < 0.3 / np.sqrt(count))
+        kept += len(np.unique(groups[~present & (found.std > 0)]))
+    assert kept < 20
+
+
+@pytest.mark.parametrize("noise", [1.0, 3.0, 10.0])
+def test_the_noise_factor_is_found_but_never_below_the_stated_one(noise):
+    found, _ = linear([5.0], 50, noise=noise)
+    assert found.beta == pytest.approx(noise**2, rel=4 * np.sqrt(2 / 1147))
+    quiet, _ = linear([5.0], 50, noise=0.1)
+    assert quiet.beta == 1.0
+
+
+def test_an_empty_family_leaves_the_rest():
+    rng = np.random.default_rng(0)
+    a = rng.normal(size=(50, 4))
+    y = rng.normal(size=50)
+    none = np.zeros(0)
+    found = shrink(a.T @ a, a.T @ y, float(y @ y), 50, 4, none.astype(np.int64), none)
+    assert found.effective == 0
+    assert len(found.std) == 0
+
+
+def with_harmonics(effect: str, seed: int, hidden: int, **options) -> tuple[Fit, np.ndarray]:
+    """A fit with six harmonics per joint; (6, 6, 2) the true ones."""
+    c = campaign(effect, "absolute", seed, plan_seed=0, poses=40, harmonics=hidden, **options)
+    model = baseline(c.cell, c.readings, "absolute")
+    model = model + make("transmission_error", model.cell, c.readings.states, {"harmonics": 6})
+    truth = np.zeros((6, 6, 2))
+    given = c.world.physics.transmission_error
+    truth[:, : given.shape[1]] = given
+    return fit(model, c.readings, "absolute"), truth
+
+
+def amplitudes(found: Fit) -> np.ndarray:
+    return found.theta[found.model.slices()[-1]].reshape(6, 6, 2)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_harmonics_that_are_there_are_kept_and_absent_ones_are_not(seed):
+    found, truth = with_harmonics("transmission_error", seed, 2, strength=6.0)
+    told = amplitudes(found)
+    present = np.linalg.norm(truth, axis=2) > 0
+    # The first joint's first harmonic and the base, the last joint's and the target, are partly
+    # the same; all others are told apart.
+    large = np.linalg.norm(truth, axis=2) > 3e-5
+    large[[0, 5]] = False
+    assert large.sum() >= 4
+    off = np.linalg.norm(told - truth, axis=2)
+    assert np.all(off[large] < 0.5 * np.linalg.norm(truth, axis=2)[large])
+    size = np.linalg.norm(told, axis=2)
+    assert np.sqrt(np.mean(size[~present] ** 2)) < 0.15 * np.sqrt(np.mean(size[present] ** 2))
+    prior = found.solution.prior[found.model.slices()[-1]].reshape(6, 6, 2)
+    assert np.mean(prior[~present] == 0) > 0.4
+    low, high = found.variance_factor_interval
+    assert low < 1.1
+    assert high > 0.9
+
+
+def test_nothing_there_leaves_almost_nothing_and_costs_less_than_a_percent():
+    worse, effective = [], []
+    for seed in range(5):
+        found, _ = with_harmonics("none", seed, 6)
+        c = campaign("none", "absolute", seed, plan_seed=0, poses=40)
+        plain = fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute")
+        worse.append(found.holdout.rms_sigma / plain.holdout.rms_sigma)
+        effective.append(found.solution.effective - plain.solution.effective)
+    assert np.mean(worse) < 1.01
+    assert np.mean(effective) < 0.1 * 72
+
+
+def test_without_noise_shrinkage_costs_no_accuracy():
+    """Strong data overrule the prior."""
+    c = campaign("transmission_error", "absolute", 0, plan_seed=0, poses=40, strength=30.0)
+    clean = noiseless(c.world, plan(40))
+    model = with_effects(c.cell, clean, "absolute", ("joint_compliance", "transmission_error"))
+    found = fit(model, clean, "absolute")
+    sigma = np.sqrt(np.trace(clean.covariance, axis1=1, axis2=2).mean())
+    assert found.error.rms_m < 0.2 * sigma
+
+
+def test_a_dropped_harmonic_is_not_counted_nor_listed():
+    found, _ = with_harmonics("none", 0, 6)
+    from hilcal.identify.fit_document import parameters
+
+    prior = found.solution.prior[found.model.slices()[-1]]
+    listed = [p for p in parameters(found) if p["name"].startswith("transmission_error")]
+    assert len(listed) == np.count_nonzero(prior)
+    assert np.all(found.theta[found.model.slices()[-1]][prior == 0] == 0)

@@ -1,0 +1,315 @@
+"""The model's equilibrium: that it is one, what its Jacobian is, and that batches are states."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.optimize as so
+
+from hilcal.cell import Cell
+from hilcal.data.readings import States
+from hilcal.effects.base_compliance import BaseCompliance
+from hilcal.effects.base_frame import BaseFrame
+from hilcal.effects.encoder_offset import EncoderOffset
+from hilcal.effects.joint_compliance import JointCompliance
+from hilcal.effects.joint_stiffening import JointStiffening
+from hilcal.effects.joint_tilt_compliance import JointTiltCompliance
+from hilcal.effects.link_geometry import LinkGeometry
+from hilcal.effects.load_point import LoadPoint
+from hilcal.effects.protocol import Effect
+from hilcal.effects.target_offset import TargetOffset
+from hilcal.effects.tracker_drift import TrackerDrift
+from hilcal.errors import CannotAnswerError
+from hilcal.model import Model, Prediction
+from hilcal.robot import batch, chain, se3
+from hilcal.robot.arm import Arm
+from hilcal.robot.deviation import Deviation
+from hilcal.robot.statics import Load, slot_wrenches
+from hilcal.types import Floats
+from tests.support.arm_cases import ODD, arm_of, cell_of, displacement
+
+COUNT = 10
+RIGID: tuple[type[Effect], ...] = (
+    BaseFrame,
+    TargetOffset,
+    EncoderOffset,
+    LinkGeometry,
+    TrackerDrift,
+)
+ELASTIC: tuple[type[Effect], ...] = (
+    JointCompliance,
+    JointStiffening,
+    JointTiltCompliance,
+    BaseCompliance,
+)
+ALL = (*RIGID, *ELASTIC, LoadPoint)
+
+
+def states_of(arm: Arm, count: int = COUNT, load: float = 1.0) -> States:
+    rng = np.random.default_rng(11)
+    return States(
+        q=rng.uniform(-np.pi, np.pi, (count, arm.n)),
+        wrench=load * rng.normal(size=(count, 6)) * [50, 50, 50, 5, 5, 5],
+        time=np.arange(float(count)),
+    )
+
+
+def model_of(cell: Cell, states: States, effects: tuple[type[Effect], ...] = ALL) -> Model:
+    return Model(cell, tuple(effect(cell, states) for effect in effects))
+
+
+def ordinary(model: Model, seed: int = 12) -> Floats:
+    """Parameters of ordinary magnitude; compliances are positive."""
+    rng = np.random.default_rng(seed)
+    values = []
+    for e in model.effects:
+        draw = rng.normal(size=len(e.parameters))
+        size = np.array([p.scale for p in e.parameters])
+        values.append(size * (np.abs(draw) if e.elastic else draw))
+    return np.concatenate(values)
+
+
+def case(name: str = "ur10e", count: int = COUNT) -> tuple[Model, States, Floats]:
+    arm = arm_of(name)
+    states = states_of(arm, count)
+    model = model_of(cell_of(arm), states)
+    return model, states, ordinary(model)
+
+
+def deviation_at(model: Model, p: Prediction, states: States, theta: Floats) -> Deviation:
+    """The effects evaluated anew at the configuration of a prediction."""
+    cell, s = model.cell, p.situation
+    shift = sum(
+        (c.point for e, at in zip(model.effects, model.slices(), strict=True)
+         if (c := e.load_change(theta[at])) is not None),
+        np.zeros(3),
+    )  # fmt: skip
+    load = Load(states.wrench, cell.load_point + shift, cell.tool_mass, cell.tool_com, cell.gravity)
+    s = replace(s, wrench=slot_wrenches(cell.arm, s.chain, load))
+    parts = zip(model.effects, model.slices(), strict=True)
+    return sum((e.deviation(theta[at], s) for e, at in parts), Deviation())
+
+
+@pytest.mark.parametrize("name", ["ur10e", "ur3", ODD])
+def test_effects_at_the_equilibrium_give_its_deviation(name: str) -> None:
+    model, states, theta = case(name)
+    p = model.predict(states, theta)
+    again = deviation_at(model, p, states, theta)
+    for field in ("dq", "twist", "base", "station", "target"):
+        found, expected = getattr(p.deviation, field), getattr(again, field)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+    assert p.deviation.scale is None
+    largest = np.abs(p.deviation.dq).max()
+    assert largest > 1e-3  # the case is worth converging
+
+
+@pytest.mark.parametrize("name", ["ur10e", ODD])
+def test_more_steps_move_nothing(name: str) -> None:
+    model, states, theta = case(name)
+    p = model.predict(states, theta)
+    converged = p
+    for _ in range(10):
+        d = deviation_at(model, converged, states, theta)
+        moved = chain.evaluate(model.cell.arm, p.situation.angle, d)
+        converged = replace(converged, situation=replace(converged.situation, chain=moved))
+    np.testing.assert_allclose(
+        converged.situation.chain.position, p.situation.chain.position, rtol=0, atol=1e-12
+    )
+
+
+def test_elastic_pendulum_hangs_where_its_torques_balance() -> None:
+    # One horizontal joint of compliance c carries m g at a lever l: dq = c m g l cos(q + dq).
+    turned, lever = [0, 0, 0, -np.pi / 2, 0, 0], [0.8, 0, 0, 0, 0, 0]
+    arm = Arm(
+        name="pendulum",
+        links=np.array([displacement(t) for t in (turned, lever)]),
+        masses=np.array([0.0]),
+        coms=np.zeros((1, 3)),
+        q_min=np.array([-np.pi]),
+        q_max=np.array([np.pi]),
+        torque_max=np.array([100.0]),
+        payload=1.0,
+        joint_names=("j1",),
+        source="made up",
+    )  # fmt: skip
+    cell = replace(
+        cell_of(arm, (0, 0, -10.0)), tool_mass=7.0, tool_com=np.zeros(3), registration=np.eye(4)
+    )
+    q = np.linspace(-2, 2, 9)
+    states = States(q=q[:, None], wrench=np.zeros((9, 6)))
+    model = model_of(cell, states, (JointCompliance,))
+    compliance = 1e-3
+    p = model.predict(states, np.array([compliance]))
+    assert p.deviation.dq is not None
+    for i in range(9):
+        gap = lambda x, i=i: x - compliance * 7.0 * 10.0 * 0.8 * np.cos(q[i] + x)  # noqa: E731
+        expected = so.brentq(gap, -1, 1, xtol=1e-15, rtol=1e-15)
+        assert abs(p.deviation.dq[i, 0] - expected) < 1e-13
+        height = -0.8 * np.sin(q[i] + expected)
+        assert abs(p.situation.chain.position[-1, i, 2] - height) < 1e-12
+
+
+def test_without_elastic_effects_the_arm_is_rigid() -> None:
+    arm = arm_of("ur10e")
+    states = states_of(arm)
+    model = model_of(cell_of(arm), states, RIGID)
+    theta = ordinary(model)
+    p = model.predict(states, theta)
+    again = deviation_at(model, p, states, theta)
+    np.testing.assert_array_equal(p.deviation.dq, again.dq)
+    placed = chain.evaluate(arm, states.q, again)
+    np.testing.assert_array_equal(p.situation.chain.position, placed.position)
+
+
+def test_laws_see_the_joints_that_the_encoders_report() -> None:
+    model, states, theta = case()
+    off = 1e-2 * np.random.default_rng(13).normal(size=states.q.shape)
+    told = model.predict(replace(states, q=states.q + 1.0, q_actual=states.q + off), theta)
+    meant = model.predict(replace(states, q=states.q + off), theta)
+    np.testing.assert_array_equal(told.observation.position, meant.observation.position)
+
+
+def test_no_equilibrium_is_said_in_words() -> None:
+    model, states, theta = case()
+    with pytest.raises(CannotAnswerError, match=r"no static equilibrium.*joint_compliance"):
+        model.predict(states, 3000 * theta)
+
+
+# the Jacobian
+
+
+def slope_of_model(model: Model, states: States, theta: Floats, p: int, m: int) -> Floats:
+    """Central difference (N, m) of the whole model by one parameter."""
+    scale = [s.scale for e in model.effects for s in e.parameters][p]
+    h = 0.05 * scale
+    ends = []
+    for t in (theta[p] + h, theta[p] - h):
+        moved = theta.copy()
+        moved[p] = t
+        ends.append(model.predict(states, moved).observation)
+    position = (ends[0].position - ends[1].position) / (2 * h)
+    turn = ends[0].rotation @ np.swapaxes(ends[1].rotation, 1, 2)
+    return np.hstack([position, se3.rotation_vector(turn) / (2 * h)])[:, :m]
+
+
+@pytest.mark.parametrize("m", [3, 6])
+def test_jacobian_of_a_stiff_arm_is_the_models_slope(m: int) -> None:
+    # With no compliance yet, wrenches do not change with the parameters: nothing is neglected.
+    arm = arm_of("ur10e")
+    states = states_of(arm)
+    model = model_of(cell_of(arm), states, (*RIGID, *ELASTIC))
+    theta = ordinary(model)
+    for e, at in zip(model.effects, model.slices(), strict=True):
+        if e.elastic:
+            theta[at] = 0.0
+    jacobian = model.jacobian(model.predict(states, theta), theta, m)
+    elastic = [e.elastic for e in model.effects for _ in e.parameters]
+    for p in range(model.size):
+        expected = slope_of_model(model, states, theta, p, m)
+        # A compliance that is moved off zero feeds back on itself, by h: symmetric, to first
+        # order; what is left is of second order.
+        bound = 2e-6 if elastic[p] else 1e-7
+        assert np.abs(jacobian[:, :, p] - expected).max() <= bound * np.abs(expected).max()
+
+
+def test_neglected_part_of_the_jacobian_shrinks_with_the_loads() -> None:
+    """Frozen wrenches: the relative error is about deflection/reach, so linear in the loads."""
+    arm = arm_of("ur10e")
+    effects = (EncoderOffset, JointCompliance, JointTiltCompliance, BaseCompliance, LoadPoint)
+    errors, deflections = [], []
+    for load in (1.0, 0.1):
+        states = states_of(arm, load=load)
+        cell = cell_of(arm, (0, 0, -9.80665 * load))
+        model = model_of(cell, states, effects)
+        theta = ordinary(model)
+        prediction = model.predict(states, theta)
+        stiff = model_of(cell, states, effects[:1])
+        rigid = stiff.predict(states, theta[: arm.n])
+        shift = prediction.observation.position - rigid.observation.position
+        deflections.append(np.linalg.norm(shift, axis=1).max())
+        jacobian = model.jacobian(prediction, theta, 3)
+        worst = []
+        for p in range(model.size):
+            expected = slope_of_model(model, states, theta, p, 3)
+            size = np.abs(expected).max()
+            worst.append(np.abs(jacobian[:, :, p] - expected).max() / size)
+        errors.append(np.array(worst))
+    assert np.all(errors[0] <= 10 * deflections[0] / arm.reach)
+    assert np.all(errors[1] <= 10 * deflections[1] / arm.reach)
+    assert np.all(errors[1] <= 0.15 * errors[0])
+    assert errors[0].max() > 1e-4  # there is something to shrink
+
+
+def test_jacobian_of_an_effect_outside_the_model() -> None:
+    arm = arm_of("ur10e")
+    states = states_of(arm)
+    cell = cell_of(arm)
+    model = model_of(cell, states, (BaseFrame, JointCompliance))
+    theta = ordinary(model)
+    outside = EncoderOffset(cell, states)
+    more = model + outside
+    extended = np.append(theta, np.zeros(arm.n))
+    np.testing.assert_allclose(
+        model.jacobian_of((outside,), model.predict(states, theta), theta, 6),
+        more.jacobian(more.predict(states, extended), extended, 6)[:, :, -arm.n :],
+        rtol=0,
+        atol=1e-12,
+    )
+    assert model.jacobian_of((), model.predict(states, theta), theta, 3).shape == (COUNT, 3, 0)
+
+
+# batches
+
+
+def everything(model: Model, states: States, theta: Floats) -> dict[str, Floats]:
+    """All that a prediction says, states first."""
+    p = model.predict(states, theta)
+    s = p.situation
+    ordinary_size = [x.scale for e in model.effects for x in e.parameters]
+    return {
+        "position": p.observation.position,
+        "rotation": p.observation.rotation,
+        "axes": p.observation.axes,
+        "dq": np.asarray(p.deviation.dq),
+        "twist": np.asarray(p.deviation.twist),
+        "elastic angle": 2e-5 * s.wrench,  # by an ordinary compliance
+        "slots": np.swapaxes(s.chain.position, 0, 1),
+        "slot_axes": np.swapaxes(s.chain.rotation, 0, 1),
+        "jacobian": model.jacobian(p, theta, 6) * ordinary_size,
+    }
+
+
+def assert_all_close(a: dict[str, Floats], b: dict[str, Floats]) -> None:
+    for key, value in a.items():
+        np.testing.assert_allclose(value, b[key], rtol=0, atol=1e-12, err_msg=key)
+
+
+def test_one_state_at_a_time_gives_the_same_numbers() -> None:
+    model, states, theta = case()
+    together = everything(model, states, theta)
+    for i in range(COUNT):
+        alone = everything(model, states[i : i + 1], theta)
+        assert_all_close(alone, {k: v[i : i + 1] for k, v in together.items()})
+
+
+@pytest.mark.parametrize("size", [1, 3, COUNT])
+def test_chunks_give_the_same_numbers(size: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    model, states, theta = case()
+    together = everything(model, states, theta)
+    monkeypatch.setattr(batch, "CHUNK", size)
+    assert_all_close(everything(model, states, theta), together)
+
+
+def test_order_of_the_states_does_not_matter() -> None:
+    model, states, theta = case()
+    order = np.random.default_rng(14).permutation(COUNT)
+    together = everything(model, states, theta)
+    shuffled = everything(model, states[order], theta)
+    assert_all_close(shuffled, {k: v[order] for k, v in together.items()})
+
+
+def test_no_states() -> None:
+    model, states, theta = case()
+    p = model.predict(states[:0], theta)
+    assert p.observation.position.shape == (0, 3)
+    assert model.jacobian(p, theta, 3).shape == (0, 3, model.size)

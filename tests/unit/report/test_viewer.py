@@ -1,0 +1,350 @@
+"""The recording, read back: what the story says is what the viewer gets."""
+
+import os
+import re
+import socket
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rerun as rr
+from rerun.chunk import RrdReader
+
+from hilcal.errors import InputError
+from hilcal.report.picture import executable
+from hilcal.report.primitive_arm import arm_meshes, body_poses
+from hilcal.report.story import StoryRevision, StorySuspect
+from hilcal.report.viewer import Limits, digest, layout, save, serve, style, words
+from tests.support.viewer_story import story, ur10e
+
+FORBIDDEN = "█▏░─│⟂∥∈∝ᵀ✘漢"
+READINGS = 90
+
+
+@pytest.fixture(autouse=True)
+def _strict():
+    rr.set_strict_mode(True)
+    yield
+    rr.set_strict_mode(False)
+
+
+@pytest.fixture(scope="module")
+def told():
+    return story()
+
+
+@pytest.fixture(scope="module")
+def recording(told, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("viewer") / "story.rrd"
+    save(told, path)
+    return path
+
+
+def column(path: Path, entity: str, component: str, timeline: str) -> dict[int, object]:
+    """Return the values of a component by time, read back from a recording."""
+    values: dict[int, object] = {}
+    for chunk in RrdReader(path).stream().filter(content=entity).to_chunks():
+        batch = chunk.to_record_batch()
+        if timeline in batch.schema.names and component in batch.schema.names:
+            times = batch.column(timeline).to_pylist()
+            found = batch.column(component).to_pylist()
+            values.update({int(t): v for t, v in zip(times, found, strict=True) if v is not None})
+    return values
+
+
+def texts(path: Path) -> list[str]:
+    """Return every string that a viewer would have to draw."""
+    out: list[str] = []
+    for chunk in RrdReader(path).stream().to_chunks():
+        batch = chunk.to_record_batch()
+        for name in batch.schema.names:
+            if name.endswith((":text", ":labels", ":names", ":name")):
+                for row in batch.column(name).to_pylist():
+                    out += [t for t in row or [] if t is not None]
+    return out
+
+
+def test_errors_are_the_storys(told, recording):
+    for name, value in (
+        ("fit", lambda r: r.error_fit["rms_m"]),
+        ("holdout", lambda r: r.error_holdout["rms_m"]),
+        ("worst", lambda r: r.error_fit["max_m"]),
+        ("noise", lambda _: told.noise_floor_m),
+    ):
+        read = column(recording, f"/error/{name}", "Scalars:scalars", "revision")
+        assert set(read) == {0, 1, 2, 3}
+        for r in told.revisions:
+            assert read[r.revision] == pytest.approx([1e6 * value(r)])
+
+
+def test_timelines_are_revision_and_pose(recording):
+    names = {
+        name for chunk in RrdReader(recording).stream().to_chunks() for name in chunk.timeline_names
+    }
+    assert names == {"revision", "pose"}
+
+
+def test_every_reading_has_its_arrow(told, recording):
+    drawn = column(recording, "/world/residual/arrows", "Arrows3D:vectors", "revision")
+    scale = digest.digest(told, Limits()).residual_scale
+    for r in told.revisions:
+        vectors = np.array(drawn[r.revision])
+        assert vectors.shape == (READINGS, 3)
+        length = np.linalg.norm(r.residual, axis=1) * scale
+        np.testing.assert_allclose(
+            np.linalg.norm(vectors, axis=1), np.minimum(length, digest.ARROW_CAP), rtol=1e-5
+        )
+
+
+def test_one_ball_per_pose_and_arm_moves_through_poses(told, recording):
+    balls = column(recording, "/world/residual/noise", "Ellipsoids3D:half_sizes", "revision")
+    assert {len(b) for b in balls.values()} == {30}
+    moves = column(recording, "/world/arm/body6", "Transform3D:translation", "pose")
+    bodies = body_poses(told.arm, told.q[::3])
+    assert sorted(moves) == list(range(30))
+    read = np.array([moves[k][0] for k in range(30)])
+    np.testing.assert_allclose(read, bodies[:, 6, :3, 3], atol=1e-6)
+
+
+def test_arm_stands_in_the_worst_pose(told, recording):
+    stands = column(recording, "/world/arm/body7", "Transform3D:translation", "revision")
+    for r in told.revisions:
+        i = int(np.argmax(r.whitened_norm2))
+        expected = body_poses(told.arm, told.q[i : i + 1])[0, -1, :3, 3]
+        np.testing.assert_allclose(stands[r.revision][0], expected, atol=1e-6)
+
+
+def test_bars_hold_every_pose_once_under_its_level(told, recording):
+    for r in told.revisions:
+        total = 0
+        for name in style.LEVEL_NAMES:
+            bars = column(recording, f"/bars/{name}", "BarChart:values", "revision")
+            values = np.array(bars[r.revision][0]["buffer"], dtype=float)
+            total += int((values > 0).sum())
+        assert total == 30
+
+
+def test_verdict_names_suspects_with_their_figures(told, recording):
+    read = column(recording, "/words/verdict", "TextDocument:text", "revision")
+    first = read[0][0]
+    assert "base_compliance" in first.replace("\\", "")
+    assert "86 %" in first
+    assert "84 %" in first
+    assert "■■■■■■■■■" in first
+    assert "Adequate" in read[3][0]
+    assert "86 %" not in read[3][0]
+
+
+def test_saving_twice_gives_equal_recordings(told, recording, tmp_path):
+    again, other = tmp_path / "again.rrd", tmp_path / "other.rrd"
+    save(told, again)
+    save(story(seed=2), other)
+    assert compare(recording, again) == 0
+    assert compare(recording, other) != 0
+
+
+def compare(a: Path, b: Path) -> int:
+    command = [executable(), "rrd", "compare", str(a), str(b)]
+    return subprocess.run(command, capture_output=True, check=False).returncode
+
+
+def test_no_character_without_a_glyph_reaches_the_viewer(tmp_path):
+    path = tmp_path / "names.rrd"
+    save(story(poses=4, names=f" |{FORBIDDEN}\U0001f916\t*x*"), path)
+    found = texts(path)
+    assert any("joint_tilt_compliance" in t.replace("\\", "") for t in found)
+    assert [c for t in found for c in t if c in FORBIDDEN or ord(c) > 0x2FFF] == []
+    assert [t for t in found if style.safe(t) != t] == []
+
+
+def test_user_names_cannot_break_a_table(told):
+    r = replace(told.revisions[0], suspects=(StorySuspect("a|b\nc", 0.5, 0.4, 0.01),))
+    table = words.suspects(r).splitlines()
+    assert len(table) == 3
+    assert {len(re.findall(r"(?<!\\)\|", line)) for line in table} == {7}
+
+
+def test_unidentifiable_parameters_show_no_number(told):
+    row = next(
+        line for line in words.parameters(told.revisions[0], 40).splitlines() if "joint1" in line
+    )
+    assert "not identifiable" in row
+    assert not re.search(r"\d\.\d", row)
+
+
+def test_thousands_of_readings_stay_small_and_say_what_they_show(tmp_path):
+    big, path = story(poses=3000, loads=1, mode="absolute"), tmp_path / "big.rrd"
+    save(big, path)
+    assert path.stat().st_size < 20e6
+    arrows = column(path, "/world/residual/arrows", "Arrows3D:vectors", "revision")
+    assert all(100 < len(a) < 300 for a in arrows.values())
+    title = layout.residual_title(digest.digest(big, Limits()))
+    assert f"about {len(arrows[0])} of 3000" in title
+    balls = column(path, "/world/residual/noise", "Ellipsoids3D:centers", "revision")
+    origins = column(path, "/world/residual/arrows", "Arrows3D:origins", "revision")
+    for k in range(4):
+        assert {tuple(c) for c in balls[k]} <= {tuple(o) for o in origins[k]}
+    assert len(column(path, "/world/arm/body3", "Transform3D:translation", "pose")) == 3000
+
+
+def test_subsample_keeps_the_worst():
+    badness = np.random.default_rng(0).random(1000)
+    chosen = digest.worst_and_even(badness, 50)
+    assert len(chosen) <= 50
+    assert set(np.argsort(-badness)[:10]) <= set(chosen.tolist())
+    assert np.diff(chosen).max() < 100
+
+
+def test_ellipsoids_give_the_covariance_back():
+    rng = np.random.default_rng(3)
+    a = rng.standard_normal((50, 3, 3))
+    covariance = a @ a.transpose(0, 2, 1)
+    half, quaternion = digest.ellipsoids(covariance)
+    x, y, z, w = quaternion.T
+    rotation = np.stack(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    ).transpose(2, 0, 1)
+    again = rotation * half[:, None] ** 2 @ rotation.transpose(0, 2, 1)
+    np.testing.assert_allclose(again, covariance, atol=1e-12)
+
+
+def test_levels_hold_the_share_of_noise_they_name():
+    norm2 = np.random.default_rng(4).chisquare(3, 200_000)
+    share = np.bincount(style.levels(norm2), minlength=3) / len(norm2)
+    assert share[1] == pytest.approx(0.0099, abs=0.001)
+    assert share[2] == pytest.approx(0.0001, abs=0.0001)
+
+
+def test_body_meshes_are_closed_and_face_outwards():
+    for mesh in arm_meshes(ur10e()):
+        a, b, c = (mesh.vertices[mesh.triangles[:, k]] for k in range(3))
+        area = np.cross(b - a, c - a)
+        volume = float(np.einsum("ij,ij->", a, area)) / 6
+        assert volume > 0
+        outward = np.einsum("ij,ij->i", area, mesh.normals[mesh.triangles].mean(1))
+        assert outward.min() > -1e-12
+
+
+def test_arm_of_another_shape_is_drawn(tmp_path):
+    six = ur10e()
+    four = replace(
+        six,
+        links=six.links[:5],
+        masses=six.masses[:4],
+        coms=six.coms[:4],
+        joint_names=six.joint_names[:4],
+    )
+    told = story(poses=3)
+    path = tmp_path / "four.rrd"
+    save(replace(told, arm=four, q=told.q[:, :4]), path)
+    assert len(column(path, "/world/arm/body5", "Transform3D:translation", "pose")) == 3
+
+
+@pytest.mark.parametrize(
+    ("change", "names"),
+    [
+        ({"q": np.zeros((READINGS, 5))}, "story.q"),
+        ({"anchor": np.full((READINGS, 3), np.nan)}, "story.anchor"),
+        ({"revisions": ()}, "story.revisions"),
+        ({"load_names": ("a",)}, "story.load_names"),
+        ({"noise_floor_m": float("nan")}, "noise_floor_m"),
+    ],
+)
+def test_a_story_that_does_not_fit_together_is_refused(told, tmp_path, change, names):
+    with pytest.raises(InputError, match=names):
+        save(replace(told, **change), tmp_path / "x.rrd")
+
+
+def test_a_bad_revision_is_refused_by_its_number(told, tmp_path):
+    bad: StoryRevision = replace(told.revisions[1], residual=np.zeros((3, 3)))
+    with pytest.raises(InputError, match="revision 1: residual"):
+        save(replace(told, revisions=(told.revisions[0], bad)), tmp_path / "x.rrd")
+
+
+def test_missing_folder_is_refused(told, tmp_path):
+    with pytest.raises(InputError, match="no folder"):
+        save(told, tmp_path / "none" / "x.rrd")
+
+
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")
+def test_a_viewer_that_joins_late_gets_the_whole_story(told, tmp_path, monkeypatch, free_port):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    late = tmp_path / "late.rrd"
+    with serve(told, port=free_port) as served:
+        assert served.url == f"rerun+http://127.0.0.1:{free_port}/proxy"
+        client = subprocess.Popen(
+            [executable(), "--save", str(late), served.url],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        try:
+            end = time.monotonic() + 30
+            while not {"/error/fit", "/error/along/noise"} <= entities(late):
+                assert time.monotonic() < end, "the late viewer did not receive the story"
+                time.sleep(0.1)
+        finally:
+            client.terminate()
+            client.wait(10)
+
+
+def entities(path: Path) -> set[str]:
+    """Return the entities that a file holds so far; it may still be growing."""
+    if not path.exists() or path.stat().st_size == 0:
+        return set()
+    try:
+        return {str(c.entity_path) for c in RrdReader(path).stream().to_chunks()}
+    except (ValueError, RuntimeError):  # nothing in it yet; a part of a message
+        return set()
+
+
+def test_a_port_in_use_is_refused(told, free_port):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", free_port))
+        taken.listen()
+        with (
+            pytest.raises(InputError, match=f"{free_port}.*free port"),
+            serve(told, port=free_port),
+        ):
+            pass
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no file size limits on Windows")
+def test_a_file_that_cannot_grow_leaves_what_was_there(tmp_path):
+    path = tmp_path / "x.rrd"
+    path.write_text("before")
+    code = (
+        "import resource, signal, sys; from pathlib import Path\n"
+        "from viewer_story import story; from hilcal.report.viewer import save\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, resource.RLIM_INFINITY))\n"
+        "save(story(), Path(sys.argv[1]))\n"
+    )
+    here = Path(__file__).parent
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(path)],
+        env=os.environ | {"PYTHONPATH": f"{here}{os.pathsep}{here.parent}"},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert done.stderr.strip().splitlines()[-1].startswith("hilcal.errors.HilcalError: recording")
+    assert "cannot be written" in done.stderr
+    assert path.read_text() == "before"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.fixture
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])

@@ -1,0 +1,138 @@
+"""A recording becomes a picture, headless, without a complaint from any view."""
+
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rerun as rr
+
+from hilcal.errors import HilcalError, InputError
+from hilcal.report import picture
+from hilcal.report.picture import Shot, pictures, vulkan_available
+from hilcal.report.viewer import Limits, digest, layout, save, style
+from tests.support.viewer_story import story
+
+SIZE, LONGEST = (960, 540), 480
+needs_vulkan = pytest.mark.skipif(not vulkan_available(), reason="no Vulkan driver installed")
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory) -> Path:
+    rr.set_strict_mode(True)
+    path = tmp_path_factory.mktemp("picture") / "story.rrd"
+    save(story(), path)
+    rr.set_strict_mode(False)
+    return path
+
+
+def pixels(png: Path) -> np.ndarray:
+    """Decode an 8-bit PNG without interlace into (height, width, channels)."""
+    data, at, body = png.read_bytes(), 8, b""
+    while at < len(data):
+        size, kind = struct.unpack(">I4s", data[at : at + 8])
+        chunk = data[at + 8 : at + 8 + size]
+        if kind == b"IHDR":
+            width, height, depth, color = struct.unpack(">IIBB", chunk[:10])
+        elif kind == b"IDAT":
+            body += chunk
+        at += size + 12
+    assert depth == 8
+    channels = {2: 3, 6: 4}[color]
+    raw = np.frombuffer(zlib.decompress(body), np.uint8).reshape(height, width * channels + 1)
+    out = np.zeros((height, width * channels), dtype=np.uint8)
+    above = np.zeros(width * channels, dtype=np.uint8)
+    for i, line in enumerate(raw):
+        above = out[i] = unfilter(int(line[0]), line[1:], above, channels)
+    return out.reshape(height, width, channels)
+
+
+def unfilter(kind: int, line: np.ndarray, above: np.ndarray, step: int) -> np.ndarray:
+    """Undo one PNG line filter."""
+    if kind == 0:
+        return line
+    if kind == 1:
+        return np.cumsum(line.reshape(-1, step), axis=0, dtype=np.uint8).reshape(-1)
+    if kind == 2:
+        return line + above
+    done = [0] * step
+    corner = [0] * step + above.tolist()
+    for k, (value, up) in enumerate(zip(line.tolist(), above.tolist(), strict=True)):
+        left, diagonal = done[k], corner[k]
+        if kind == 3:
+            guess = (left + up) // 2
+        else:
+            p = left + up - diagonal
+            guess = min((left, up, diagonal), key=lambda c: abs(p - c))
+        done.append((value + guess) & 255)
+    return np.array(done[step:], dtype=np.uint8)
+
+
+def share_of_red(picture_: np.ndarray) -> float:
+    """Return the share of pixels in the colour of a reading that the model fails."""
+    distance = np.abs(picture_[..., :3].astype(int) - style.RED).max(axis=2)
+    return float((distance < 40).mean())
+
+
+def colors(picture_: np.ndarray) -> int:
+    return len(np.unique(picture_.reshape(-1, picture_.shape[2]), axis=0))
+
+
+@pytest.mark.vulkan
+@needs_vulkan
+def test_the_picture_shows_the_red_vanish(recording, tmp_path):
+    told = story()
+    reached = [style.levels(r.whitened_norm2).max() for r in told.revisions]
+    assert (reached[0], reached[3] < 2) == (2, True)  # red at first, none in the end
+    view = layout.residual_title(digest.digest(told, Limits()))
+    shots = [Shot(tmp_path / f"{k}.png", "revision", k, view) for k in (0, 3)]
+    reports = pictures(recording, shots, SIZE, LONGEST)
+    assert len(reports) >= 10
+    assert [v for v in reports if v.problems] == []
+    first, last = (pixels(s.png) for s in shots)
+    assert colors(first) > 500
+    assert share_of_red(first) > 0
+    assert share_of_red(last) == 0
+
+
+@pytest.mark.vulkan
+@pytest.mark.slow
+@needs_vulkan
+def test_every_view_is_drawn_without_a_report(recording, tmp_path):
+    d = digest.digest(story(), Limits())
+    names = [
+        layout.residual_title(d),
+        layout.deflection_title(d),
+        layout.bars_title(d),
+        *("Verdict", "How to read this", layout.FOLLOWS, layout.LIMITS, "Table", "Log"),
+        *("Parameters ± σ", "Parameters in σ (whiskers ±2 σ)"),
+    ]
+    shots = [Shot(tmp_path / f"{i}.png", "revision", 1, n) for i, n in enumerate(names)]
+    shots.append(Shot(tmp_path / "pose.png", "pose", 7))
+    reports = pictures(recording, shots, SIZE, LONGEST)
+    assert set(names) <= {v.name for v in reports}
+    assert [v for v in reports if v.problems] == []
+    for shot in shots:
+        assert colors(pixels(shot.png)) > 20, shot
+
+
+@pytest.mark.vulkan
+@needs_vulkan
+def test_unknown_timeline_and_view_are_named(recording, tmp_path):
+    with pytest.raises(InputError, match=r"no timeline 'frame'; the recording has .*revision"):
+        picture.picture(recording, tmp_path / "a.png", "frame", 0, size=(320, 200))
+    with pytest.raises(InputError, match=r"no view 'Nothing'; the recording has .*Verdict"):
+        picture.picture(recording, tmp_path / "a.png", view="Nothing", size=(320, 200))
+
+
+def test_missing_recording_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"no such file"):
+        picture.picture(tmp_path / "none.rrd", tmp_path / "a.png")
+
+
+def test_missing_driver_says_what_to_install(recording, tmp_path, monkeypatch):
+    monkeypatch.setenv("VK_DRIVER_FILES", str(tmp_path / "none.json"))
+    assert not vulkan_available()
+    with pytest.raises(HilcalError, match="mesa-vulkan-drivers"):
+        picture.picture(recording, tmp_path / "a.png")

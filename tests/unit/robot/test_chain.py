@@ -1,0 +1,208 @@
+"""The deviated chain and its Jacobians against Pinocchio, matrix products and differences."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from hilcal.robot import se3
+from hilcal.robot.arm import Arm
+from hilcal.robot.chain import Chain, evaluate, joint_jacobian, slot_jacobian
+from hilcal.robot.deviation import Deviation
+from hilcal.robot.pinocchio_model import FLANGE, pinocchio_model
+from hilcal.types import Floats
+from tests.support.arm_cases import ARMS, ODD, arm_of, displacement, slope, slots_of, twisted
+
+TOLERANCE = 1e-12
+COUNT = 12
+
+
+def angles(arm: Arm, count: int = COUNT) -> Floats:
+    return np.random.default_rng(1).uniform(-np.pi, np.pi, (count, arm.n))
+
+
+def random_deviation(arm: Arm, size: float, count: int = COUNT) -> Deviation:
+    """Joint displacements and link twists of a size; the second slot has none."""
+    rng = np.random.default_rng(2)
+    twist = size * rng.normal(size=(count, arm.n + 1, 6))
+    twist[:, 1] = 0.0
+    return Deviation(dq=size * rng.normal(size=(count, arm.n)), twist=twist)
+
+
+def pinocchio_flange(arm: Arm, q: Floats) -> pin.SE3:
+    model = pinocchio_model(arm)
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, q)
+    return data.oMf[model.getFrameId(FLANGE)]
+
+
+@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("size", [0.0, 1e-3])
+def test_joints_agree_with_pinocchio(name: str, size: float) -> None:
+    arm = arm_of(name)
+    q, dq = angles(arm), size * np.random.default_rng(3).normal(size=(COUNT, arm.n))
+    chain = evaluate(arm, q, Deviation(dq=dq) if size else None)
+    for i in range(COUNT):
+        flange = pinocchio_flange(arm, q[i] + dq[i])
+        np.testing.assert_allclose(
+            chain.position[-1, i], flange.translation, rtol=0, atol=TOLERANCE
+        )
+        np.testing.assert_allclose(chain.rotation[-1, i], flange.rotation, rtol=0, atol=TOLERANCE)
+
+
+@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("size", [1e-9, 1e-3, 0.5])
+def test_twisted_links_agree_with_pinocchio(name: str, size: float) -> None:
+    arm = arm_of(name)
+    q, d = angles(arm), random_deviation(arm, size)
+    assert d.dq is not None
+    assert d.twist is not None
+    chain = evaluate(arm, q, d)
+    for i in range(COUNT):
+        flange = pinocchio_flange(twisted(arm, d.twist[i]), q[i] + d.dq[i])
+        np.testing.assert_allclose(
+            chain.position[-1, i], flange.translation, rtol=0, atol=TOLERANCE
+        )
+        np.testing.assert_allclose(chain.rotation[-1, i], flange.rotation, rtol=0, atol=TOLERANCE)
+
+
+@pytest.mark.parametrize("name", ["ur10e", ODD])
+def test_every_frame_is_its_matrix_product(name: str) -> None:
+    arm = arm_of(name)
+    q, d = angles(arm), random_deviation(arm, 0.02)
+    assert d.dq is not None
+    assert d.twist is not None
+    chain = evaluate(arm, q, d)
+    for i in range(COUNT):
+        links = arm.links @ np.array([displacement(t) for t in d.twist[i]])
+        pose = links[0]
+        for k in range(arm.n + 1):
+            here = se3.matrix(chain.rotation[k, i], chain.position[k, i])
+            np.testing.assert_allclose(here, pose, rtol=0, atol=TOLERANCE)
+            if k < arm.n:
+                pose = pose @ displacement([0, 0, 0, 0, 0, q[i, k] + d.dq[i, k]])
+                com = pose[:3, :3] @ arm.coms[k] + pose[:3, 3]
+                np.testing.assert_allclose(chain.com[k, i], com, rtol=0, atol=TOLERANCE)
+                pose = pose @ links[k + 1]
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_joint_jacobian_is_pinocchios(name: str) -> None:
+    arm = arm_of(name)
+    q, d = angles(arm), random_deviation(arm, 0.02)
+    assert d.dq is not None
+    assert d.twist is not None
+    chain = evaluate(arm, q, d)
+    jacobian = joint_jacobian(chain, chain.position[-1])
+    for i in range(COUNT):
+        model = pinocchio_model(twisted(arm, d.twist[i]))
+        frame = model.getFrameId(FLANGE)
+        expected = pin.computeFrameJacobian(
+            model,
+            model.createData(),
+            q[i] + d.dq[i],
+            frame,
+            pin.ReferenceFrame.LOCAL_WORLD_ALIGNED,
+        )
+        np.testing.assert_allclose(jacobian[i], expected, rtol=0, atol=TOLERANCE)
+
+
+def motion_by(arm: Arm, q: Floats, d: Deviation, change: Deviation, offset: Floats) -> Floats:
+    """Motion (N, 6) of a flange-fixed point per change along a deviation, by differences."""
+    r0 = evaluate(arm, q, d).rotation[-1]
+
+    def moved(t: float) -> Floats:
+        scaled = Deviation(
+            dq=None if change.dq is None else t * change.dq,
+            twist=None if change.twist is None else t * change.twist,
+        )
+        chain = evaluate(arm, q, d + scaled)
+        turn = chain.rotation[-1] @ np.swapaxes(r0, 1, 2)
+        spin = [turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]]
+        return np.column_stack([chain.point(offset), *spin])
+
+    return slope(moved, 1e-3)
+
+
+OFFSET = np.array([0.05, -0.1, 0.2])
+
+
+@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("size", [0.0, 1e-3, 0.3])
+def test_jacobians_are_slopes(name: str, size: float) -> None:
+    arm = arm_of(name)
+    count = 3
+    q, d = angles(arm, count), random_deviation(arm, size, count)
+    chain = evaluate(arm, q, d)
+    x = chain.point(OFFSET)
+    by_joint = joint_jacobian(chain, x)
+    for j in range(arm.n):
+        change = np.zeros((count, arm.n))
+        change[:, j] = 1.0
+        expected = motion_by(arm, q, d, Deviation(dq=change), OFFSET)
+        assert_close_relative(by_joint[:, :, j], expected)
+    for k in range(arm.n + 1):
+        by_slot = slot_jacobian(chain, k, x)
+        for axis in range(6):
+            twist = np.zeros((count, arm.n + 1, 6))
+            twist[:, k, axis] = 1.0
+            expected = motion_by(arm, q, d, Deviation(twist=twist), OFFSET)
+            assert_close_relative(by_slot[:, :, axis], expected)
+
+
+def assert_close_relative(found: Floats, expected: Floats) -> None:
+    """Within 1e-7 of the longest motion."""
+    assert np.abs(found - expected).max() <= 1e-7 * np.abs(expected).max()
+
+
+def test_slot_jacobian_of_an_untwisted_arm_needs_no_twists() -> None:
+    arm = arm_of("ur5e")
+    q = angles(arm)
+    plain, zero = evaluate(arm, q), evaluate(arm, q, random_deviation(arm, 0.0))
+    for k in range(arm.n + 1):
+        x = plain.position[-1]
+        np.testing.assert_array_equal(slot_jacobian(plain, k, x), slot_jacobian(zero, k, x))
+
+
+def test_nothing_deviates_exactly() -> None:
+    arm = arm_of("ur10e")
+    q = angles(arm)
+    plain, zero = evaluate(arm, q), evaluate(arm, q, random_deviation(arm, 0.0))
+    np.testing.assert_array_equal(plain.rotation, zero.rotation)
+    np.testing.assert_array_equal(plain.position, zero.position)
+    for i in range(COUNT):
+        slots = slots_of(arm, q[i])
+        np.testing.assert_allclose(plain.position[:, i], slots[:, :3, 3], rtol=0, atol=TOLERANCE)
+
+
+def test_a_point_may_differ_from_state_to_state() -> None:
+    arm = arm_of("ur10e")
+    chain = evaluate(arm, angles(arm))
+    offsets = np.random.default_rng(4).normal(size=(COUNT, 3))
+    for i in range(COUNT):
+        np.testing.assert_allclose(
+            chain.point(offsets)[i], chain.point(offsets[i])[i], rtol=0, atol=1e-15
+        )
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_layout_of_the_input_does_not_matter(order: str) -> None:
+    arm = arm_of("ur10e")
+    q, d = angles(arm), random_deviation(arm, 1e-3)
+    assert d.dq is not None
+    assert d.twist is not None
+    laid = Deviation(
+        dq=np.array(d.dq, order=order),  # type: ignore[call-overload]
+        twist=np.array(d.twist, order=order),  # type: ignore[call-overload]
+    )
+    a: Chain = evaluate(arm, q, d)
+    b: Chain = evaluate(arm, np.array(q, order=order), laid)  # type: ignore[call-overload]
+    np.testing.assert_array_equal(a.position, b.position)
+    np.testing.assert_array_equal(a.rotation, b.rotation)
+
+
+def test_no_states() -> None:
+    arm = arm_of("ur10e")
+    chain = evaluate(arm, np.zeros((0, 6)), Deviation(twist=np.zeros((0, 7, 6))))
+    assert chain.position.shape == (7, 0, 3)
+    assert joint_jacobian(chain, chain.position[-1]).shape == (0, 6, 6)
+    assert slot_jacobian(chain, 2, chain.position[-1]).shape == (0, 6, 6)

@@ -1,0 +1,168 @@
+"""Shapes of arms, and what they touch: against known distances and another way to count."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hilcal.config import Obstacle
+from hilcal.robot.body import capsules, is_known
+from hilcal.robot.catalogue import load_arm, robot_names
+from hilcal.robot.scene import FLOOR, Scene, Segment
+from hilcal.robot.segments import segment_distance
+from tests.support.arm_cases import ODD, arm_of
+from tests.support.fake_bench import POSES
+from tests.support.space_cases import frames, gap, gap_to, placed, self_gap
+
+POINT = st.tuples(*[st.floats(-2.0, 2.0, width=32)] * 3)
+UPRIGHT = np.array([0.0, -np.pi / 2, 0.0, -np.pi / 2, 0.0, 0.0])
+TABLE = Obstacle(name="table", center_m=(0.0, 0.0, -0.1), size_m=(3.0, 3.0, 0.1))
+
+
+@given(POINT, POINT, POINT, POINT)
+def test_distance_of_segments(a, b, c, d) -> None:
+    ends = [np.array(p) for p in (a, b, c, d)]
+    share = np.linspace(0.0, 1.0, 81)[:, None]
+    first = ends[0] + share * (ends[1] - ends[0])
+    second = ends[2] + share * (ends[3] - ends[2])
+    nearest = np.linalg.norm(first[:, None] - second[None], axis=2).min()
+    coarse = (np.linalg.norm(ends[1] - ends[0]) + np.linalg.norm(ends[3] - ends[2])) / 160
+    found = float(segment_distance(*ends))
+    assert nearest - coarse - 1e-9 <= found <= nearest + 1e-9
+
+
+@pytest.mark.parametrize(
+    ("c", "d", "known"),
+    [
+        ((0, 3, 0), (1, 3, 0), 3.0),  # parallel
+        ((0.5, 0, 2), (0.5, 1, 2), 2.0),  # crossing above
+        ((4, 4, 0), (9, 9, 0), 5.0),  # beyond an end
+        ((0.3, 0, 0), (0.3, 1, 0), 0.0),  # touching
+        ((0.5, 2, 0), (0.5, 2, 0), 2.0),  # a point
+    ],
+)
+def test_known_distances_of_segments(c, d, known: float) -> None:
+    a, b = np.zeros(3), np.array([1.0, 0.0, 0.0])
+    assert segment_distance(a, b, np.array(c, float), np.array(d, float)) == pytest.approx(known)
+
+
+@pytest.mark.parametrize("name", robot_names())
+def test_usual_poses_are_free_and_folded_ones_are_not(name: str) -> None:
+    scene = Scene(load_arm(name), obstacles=(TABLE,))
+    usual = np.array([UPRIGHT, [0.0, -1.5, 1.5, -1.5, -1.5, 0.0], *POSES.values()])
+    assert is_known(load_arm(name))
+    assert scene.pairs(usual, 0.01) == ()
+    folded = np.array([[0.0, -1.5, 3.0, -1.5, -1.5, 0.0]])
+    hit = {name for pair in scene.pairs(folded, 0.0) for name in pair}
+    assert {"upper arm", "wrist 1"} <= hit
+    assert scene.self_touching(folded, 0.0).all()
+    down = np.array([[0.0, 0.4, 0.3, -1.5, -1.5, 0.0]])  # through the table
+    assert ("forearm", "table") in scene.pairs(down, 0.0)
+    assert scene.obstacles_touching(down, 0.0).all()
+
+
+FOOT = {"ur3": 128, "ur3e": 128, "ur5": 149, "ur5e": 149, "ur20": 245, "ur30": 245}
+
+
+@pytest.mark.parametrize("name", robot_names())
+def test_shapes_hold_the_crossings_of_axes_and_are_no_wider_than_the_foot(name: str) -> None:
+    """Feet: data sheets, mm; the tool's flange of a UR3e measures 63 mm."""
+    arm = load_arm(name)
+    assert all(0.03 <= part.radius <= FOOT.get(name, 190) / 2000 for part in capsules(arm))
+    for q in np.random.default_rng(1).uniform(-np.pi, np.pi, (5, 6)):
+        at = frames(arm, q)
+        for k in (2, 5, 6, 7):  # shoulder, wrists and flange; elsewhere the axes do not cross
+            centre = at[k][:3, 3][None]
+            near = [p.body for p in capsules(arm) if gap(placed(p, at), centre) <= p.radius]
+            assert {k - 1, k} & set(near)
+
+
+def test_known_distances_to_a_ball_a_box_and_a_cylinder() -> None:
+    """Upright, the UR10e's upper arm stands 176.2 mm beside the base's axis, 60 mm thick."""
+    arm = load_arm("ur10e")
+    height = 0.1807 + 0.3
+    side = np.array([0.0, -1.0, 0.0])  # of the upper arm, at joint 1 = 0
+    at = 0.5 * side + [0.0, 0.0, height]
+    ball = Segment("ball", at, at, 0.05)
+    scene = Scene(arm)
+    assert scene.distance(UPRIGHT, ball) == pytest.approx(0.5 - 0.1762 - 0.06 - 0.05, abs=1e-6)
+    turned = np.array([np.pi, *UPRIGHT[1:]])
+    assert scene.distance(turned, ball) > 0.4
+    box = Obstacle(name="wall", center_m=(0.0, -0.5, height), size_m=(0.1, 0.2, 0.1))
+    tube = 0.5 - 0.1 - 0.1762 - 0.06
+    for thing in (box, Obstacle(name="x", bottom_m=(0, -0.5, 0.45), radius_m=0.1, height_m=0.06)):
+        for margin, touches in ((tube - 1e-3, False), (tube + 1e-3, True)):
+            hit = Scene(arm, obstacles=(thing,)).obstacles_touching(UPRIGHT[None], margin)
+            assert hit.all() == touches
+
+
+def test_the_floor_stops_forearm_and_wrists_but_not_the_mount() -> None:
+    arm = load_arm("ur10e")
+    straight = np.zeros((1, 6))  # stretched out at the height of the shoulder, wrist 2 hangs
+    at = frames(arm, straight[0])
+    parts = [p for p in capsules(arm) if p.body > 2]
+    low = min(float(placed(p, at)[:, 2].min()) - p.radius for p in parts)
+    for floor, touches in ((low - 0.021, False), (low - 0.019, True)):
+        scene = Scene(arm, floor=floor)
+        assert scene.obstacles_touching(straight, 0.02).all() == touches
+    assert {b for _, b in Scene(arm, floor=low + 0.01).pairs(straight, 0.0)} == {FLOOR}
+    assert not Scene(arm, floor=0.0).obstacles_touching(UPRIGHT[None], 0.0).any()
+
+
+things = st.one_of(
+    st.builds(
+        lambda c, s: Obstacle(name="box", center_m=c, size_m=s),
+        POINT,
+        st.tuples(*[st.floats(0.05, 1.0)] * 3),
+    ),
+    st.builds(
+        lambda c, r, h: Obstacle(name="tripod", bottom_m=c, radius_m=r, height_m=h),
+        POINT,
+        st.floats(0.05, 0.5),
+        st.floats(0.05, 2.0),
+    ),
+)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.sampled_from(["ur3e", "ur5", "ur10e", "ur20"]), things, st.integers(0, 999))
+def test_whatever_is_free_is_free_by_another_way_to_count(
+    name: str, thing: Obstacle, seed: int
+) -> None:
+    """Both ways: what is counted free keeps the margin, what is not comes closer than that."""
+    arm = load_arm(name)
+    scene = Scene(arm, obstacles=(thing,))
+    q = np.random.default_rng(seed).uniform(-np.pi, np.pi, (20, 6))
+    itself, around = scene.self_touching(q, 0.01), scene.obstacles_touching(q, 0.02)
+    both = scene.arm_touching(q, 0.01, 0.02)
+    np.testing.assert_array_equal(both, itself | around)
+    coarse = 0.04 * arm.reach / 2  # the ends of the points' spacing
+    for k, state in enumerate(q):
+        at = frames(arm, state)
+        own = self_gap(capsules(arm), at)
+        far = min(gap_to(thing, placed(p, at)) - p.radius for p in capsules(arm) if p.body > 1)
+        assert own >= 0.01 - 1e-9 or itself[k]
+        assert far >= 0.02 - 1e-9 or around[k]
+        assert own <= 0.01 + coarse or not itself[k]
+        assert far <= 0.02 + coarse or not around[k]
+
+
+def test_an_arm_of_unknown_shape_gets_links_and_can_move() -> None:
+    arm = arm_of(ODD)
+    assert not is_known(arm)
+    parts = capsules(arm)
+    assert {p.body for p in parts} <= set(range(arm.n + 1))
+    for part in parts:  # each spans its link
+        assert np.linalg.norm(part.end - part.start) == pytest.approx(
+            np.linalg.norm(arm.links[part.body][:3, 3])
+        )
+    q = np.random.default_rng(0).uniform(-2.0, 2.0, (200, arm.n))
+    share = Scene(arm).self_touching(q, 0.0).mean()
+    assert 0.0 < share < 0.9
+
+
+def test_an_arm_of_a_known_name_and_another_build_is_unknown() -> None:
+    assert not is_known(replace(arm_of(ODD), name="ur10e"))
+    assert is_known(replace(load_arm("ur10e"), q_max=np.full(6, 1.0)))

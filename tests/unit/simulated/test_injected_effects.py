@@ -1,0 +1,271 @@
+"""Hidden effects: their laws, their strength, their names, and nothing shared with hilcal's."""
+
+import ast
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+import drivers.simulated
+from drivers.simulated.campaign import dead_weights, rehearsal_states
+from drivers.simulated.injected_effects import DEFLECTION_EFFECTS, EFFECTS, hide, nothing_hidden
+from drivers.simulated.truth import Truth
+from drivers.simulated.world import World
+from hilcal.data.readings import States
+from hilcal.errors import InputError
+from tests.support.example_cell import ur10e_cell
+
+CELL = ur10e_cell()
+WEIGHTS = dead_weights([4.0, 8.0, 12.0], CELL.gravity)
+STATES, POSE, LOAD, CYCLE = rehearsal_states(CELL, 10, WEIGHTS, np.random.default_rng(0))
+VISIBLE = [(e, "absolute") for e in EFFECTS] + [(e, "deflection") for e in DEFLECTION_EFFECTS]
+
+
+def without(world: World, effect: str) -> World:
+    """The same world where the effect is gone."""
+    gone = np.zeros_like(getattr(world.physics, effect))
+    return replace(world, physics=world.physics.with_effect(effect, gone))
+
+
+@pytest.mark.parametrize("m", [3, 6])
+@pytest.mark.parametrize(("effect", "mode"), VISIBLE)
+def test_strength_is_the_one_asked_for(effect, mode, m):
+    wanted = 2.0
+    world = hide(effect, CELL, STATES, wanted, mode, np.random.default_rng(11), m=m)
+    clean = without(world, effect)
+    after, before = world.sight(STATES), clean.sight(STATES)
+    change = after.position - before.position
+    if m == 6:
+        turn = after.rotation @ np.swapaxes(before.rotation, 1, 2)
+        change = np.hstack([change, Rotation.from_matrix(turn).as_rotvec()])
+    cov = clean.covariance(before, m)
+    if mode == "deflection":
+        first = np.array([np.flatnonzero((p == POSE) & (LOAD == 0))[0] for p in POSE])
+        change, cov = (change - change[first])[LOAD > 0], (cov + cov[first])[LOAD > 0]
+    squares = np.einsum("ni,nij,nj->n", change, np.linalg.inv(cov), change)
+    assert np.sqrt(squares.sum() / change.size) == pytest.approx(wanted, rel=0.01)
+    assert any(name.startswith(f"{effect}.") for name in world.truth)
+    assert all(name.split(".")[0] in (effect, "joint_compliance") for name in world.truth)
+
+
+def rigid_world(**effects):
+    world = nothing_hidden(CELL, np.random.default_rng(2))
+    truth = replace(Truth.rigid(CELL.arm), **effects)
+    return replace(world, physics=truth)
+
+
+def by_hand(world, states, dq=0.0, links=CELL.arm.links, base=None, offset=0.0):
+    """Target positions of a rigid arm, by matrix products, sensor axes."""
+    out = []
+    for q in states.q + dq:
+        place = world.registration @ (np.eye(4) if base is None else base) @ links[0]
+        for angle, link in zip(q, links[1:], strict=True):
+            step = np.eye(4)
+            step[:3, :3] = Rotation.from_euler("z", angle).as_matrix()
+            place = place @ step @ link
+        out.append(place[:3, :3] @ (CELL.target[:3, 3] + offset) + place[:3, 3])
+    return np.array(out)
+
+
+def exp(twist):
+    v, (x, y, z) = twist[:3], twist[3:]
+    return expm(np.array([[0, -z, y, v[0]], [z, 0, -x, v[1]], [-y, x, 0, v[2]], [0, 0, 0, 0]]))
+
+
+def test_effects_without_load_follow_their_laws():
+    rng = np.random.default_rng(3)
+    q = STATES.q
+
+    def same(world, expected):
+        np.testing.assert_allclose(world.sight(STATES).position, expected, atol=1e-12)
+
+    o = 1e-3 * rng.standard_normal(6)
+    world = rigid_world(encoder_offset=o)
+    same(world, by_hand(world, STATES, o))
+    world = rigid_world(hysteresis=o)
+    same(world, by_hand(world, STATES, o * STATES.approach))
+    ab = 1e-3 * rng.standard_normal((6, 2, 2))
+    dq = sum(ab[:, k - 1, 0] * np.cos(k * q) + ab[:, k - 1, 1] * np.sin(k * q) for k in (1, 2))
+    world = rigid_world(transmission_error=ab)
+    same(world, by_hand(world, STATES, dq))
+    twist = 1e-2 * rng.standard_normal((7, 6))
+    world = rigid_world(link_geometry=twist)
+    links = [link @ exp(t) for link, t in zip(CELL.arm.links, twist, strict=True)]
+    same(world, by_hand(world, STATES, links=links))
+    offset = rng.standard_normal(3)
+    world = rigid_world(target_offset=offset)
+    same(world, by_hand(world, STATES, offset=offset))
+    base = 1e-2 * rng.standard_normal(6)
+    world = rigid_world(base_frame=base)
+    same(world, by_hand(world, STATES, base=exp(base)))
+    rate = 1e-6 * rng.standard_normal(6)
+    world = rigid_world(tracker_drift=rate)
+    still = by_hand(world, STATES)
+    moved = [(exp(rate * t) @ [*p, 1.0])[:3] for t, p in zip(STATES.time, still, strict=True)]
+    same(world, np.array(moved))
+
+
+def test_load_point_adds_the_moment_of_the_load():
+    shift = np.array([0.02, -0.03, 0.05])
+    compliance = np.full(6, 1e-5)
+    moved = rigid_world(joint_compliance=compliance, load_point=shift)
+    cell = replace(CELL, load_point=CELL.load_point + shift)
+    told = replace(rigid_world(joint_compliance=compliance), cell=cell)
+    np.testing.assert_allclose(
+        moved.sight(STATES).position, told.sight(STATES).position, atol=1e-14
+    )
+
+
+FIRST = np.array([np.flatnonzero((p == POSE) & (LOAD == 0))[0] for p in POSE])
+ABSOLUTE_ONLY = tuple(e for e in EFFECTS if e not in DEFLECTION_EFFECTS)
+
+
+@pytest.mark.parametrize("effect", ABSOLUTE_ONLY)
+def test_effects_that_cancel_hardly_show_in_deflections(effect):
+    """They cancel to first order: where no temperature changes with the load."""
+    still = replace(
+        STATES,
+        air_temperature=STATES.air_temperature[FIRST],
+        joint_temperature=STATES.joint_temperature[FIRST],
+    )
+    world = hide(effect, CELL, still, 3.0, "absolute", np.random.default_rng(1))
+    change = world.sight(still).position - without(world, effect).sight(still).position
+    left = np.abs(change - change[FIRST]).max()
+    assert left < 0.02 * np.abs(change).max()
+
+
+@pytest.mark.parametrize("effect", DEFLECTION_EFFECTS)
+def test_effects_that_do_not_cancel_show_in_deflections(effect):
+    """As strong in deflections as they are in absolute readings, within a few times."""
+    world = hide(effect, CELL, STATES, 3.0, "absolute", np.random.default_rng(1))
+    change = world.sight(STATES).position - without(world, effect).sight(STATES).position
+    left = np.sqrt(np.mean((change - change[FIRST])[LOAD > 0] ** 2))
+    assert left > (0.01 if effect == "tracker_drift" else 0.1) * np.sqrt(np.mean(change**2))
+
+
+@pytest.mark.parametrize("effect", ["thermal_growth", "thermal_joint_drift"])
+def test_temperatures_change_too_little_within_a_pose_to_show_in_deflections(effect):
+    world = hide(effect, CELL, STATES, 3.0, "absolute", np.random.default_rng(1))
+    change = world.sight(STATES).position - without(world, effect).sight(STATES).position
+    left = np.sqrt(np.mean((change - change[FIRST])[LOAD > 0] ** 2))
+    assert left < 0.1 * np.sqrt(np.mean(change**2))
+
+
+def test_truth_is_named_in_si():
+    world = hide("transmission_error", CELL, STATES, 1.0, "absolute", np.random.default_rng(1))
+    assert len(world.truth) == 6 + 6 * 6 * 2
+    assert world.truth["transmission_error.j2.sin3"] == world.physics.transmission_error[1, 2, 1]
+    assert 4e-6 < world.truth["joint_compliance.j1"] < 8e-6
+    world = hide("joint_stiffening", CELL, STATES, 1.0, "absolute", np.random.default_rng(1))
+    assert world.truth["joint_stiffening.j2"] < 0.0
+
+
+def test_an_effect_can_be_hidden_beside_another():
+    rng = np.random.default_rng(6)
+    first = hide("hysteresis", CELL, STATES, 2.0, "absolute", rng)
+    both = hide("encoder_offset", CELL, STATES, 2.0, "absolute", rng, world=first)
+    assert both.physics.hysteresis is first.physics.hysteresis
+    assert np.all(both.physics.encoder_offset != 0.0)
+
+
+def test_the_same_seed_hides_the_same():
+    one, two = (
+        hide("link_geometry", CELL, STATES, 3.0, "absolute", np.random.default_rng(8))
+        for _ in range(2)
+    )
+    assert one.truth == two.truth
+    np.testing.assert_array_equal(one.registration, two.registration)
+    other = hide("link_geometry", CELL, STATES, 3.0, "absolute", np.random.default_rng(9))
+    assert one.truth != other.truth
+
+
+def test_unknown_registration_and_target_are_the_worlds_own():
+    cell = replace(CELL, target_known=False)
+    world = nothing_hidden(cell, np.random.default_rng(1))
+    assert np.hypot(*world.registration[:2, 3]) == pytest.approx(3.0)
+    np.testing.assert_allclose(world.registration[2, :3], [0, 0, 1], atol=1e-15)
+    assert np.any(world.physics.target_offset != 0.0)
+    told = nothing_hidden(ur10e_cell(registration_known=True), np.random.default_rng(1))
+    np.testing.assert_array_equal(told.registration, np.eye(4))
+    assert np.hypot(*told.station[:2, 3]) == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize(
+    ("effect", "strength", "mode", "message"),
+    [
+        ("gear_wear", 3.0, "absolute", "effect 'gear_wear' is unknown; valid: joint_compliance, "),
+        ("encoder_offset", 3.0, "deflection", "cancels in deflections; valid .*hysteresis"),
+        ("hysteresis", 3.0, "relative", "readings 'relative' is unknown; valid: absolute"),
+        ("hysteresis", -1.0, "absolute", "strength -1.0"),
+        ("hysteresis", float("nan"), "absolute", "strength nan"),
+        ("joint_stiffening", 300.0, "absolute", "cannot reach 300 sigma .*c \\+ 3 s tau"),
+    ],
+)
+def test_what_cannot_be_hidden_is_refused(effect, strength, mode, message):
+    with pytest.raises(InputError, match=message) as caught:
+        hide(effect, CELL, STATES, strength, mode, np.random.default_rng(0))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("effect", "column"),
+    [
+        ("hysteresis", "approach"),
+        ("tracker_drift", "time"),
+        ("creep", "load_time"),
+        ("thermal_growth", "air_temperature"),
+        ("thermal_joint_drift", "joint_temperature"),
+    ],
+)
+def test_states_without_what_the_effect_needs_are_refused(effect, column):
+    bare = States(q=STATES.q, wrench=STATES.wrench)
+    with pytest.raises(InputError, match=f"^{column}: {effect} is hidden"):
+        hide(effect, CELL, bare, 3.0, "absolute", np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("effect", ["wrench_bias", "wrench_gain", "sensor_misalignment"])
+def test_a_sensor_cannot_misread_what_is_not_there(effect):
+    unloaded = replace(STATES, wrench=np.zeros_like(STATES.wrench))
+    with pytest.raises(InputError, match="no state has a load; valid: ") as caught:
+        hide(effect, CELL, unloaded, 3.0, "absolute", np.random.default_rng(0))
+    assert "\n" not in str(caught.value)
+
+
+def test_joints_drift_from_the_first_temperature_of_the_states():
+    warm = replace(STATES, joint_temperature=STATES.joint_temperature + 6.0)
+    world = hide("thermal_joint_drift", CELL, warm, 3.0, "absolute", np.random.default_rng(0))
+    assert world.joint_reference == pytest.approx(warm.joint_temperature[0].mean())
+    later = hide("thermal_joint_drift", CELL, warm[np.arange(len(warm))[::-1]], 3.0, "absolute",
+                 np.random.default_rng(0))  # fmt: skip
+    assert later.joint_reference == world.joint_reference
+
+
+def test_a_pose_without_an_unloaded_reading_is_refused():
+    keep = ~((POSE == 3) & (LOAD == 0))
+    with pytest.raises(InputError, match="pose 3 has no unloaded reading"):
+        hide(
+            "base_compliance", CELL, STATES[keep], 3.0, "deflection", np.random.default_rng(0),
+            pose=POSE[keep],
+        )  # fmt: skip
+
+
+def test_the_world_shares_no_physics_with_the_program():
+    allowed = {"hilcal.robot.arm", "hilcal.cell", "hilcal.data.readings", "hilcal.errors",
+               "hilcal.types"}  # fmt: skip
+    files = ("rigid", "elastic_tree", "elasticity", "conditions", "mechanics", "misreading",
+             "temperatures", "tracker", "truth", "world", "draw", "hidden",
+             "campaign")  # fmt: skip
+    folder = Path(drivers.simulated.__file__).parent
+    for name in files:
+        for node in ast.walk(ast.parse((folder / f"{name}.py").read_text(encoding="utf-8"))):
+            names = []
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                assert node.level == 0, name
+                names = [node.module]
+            for module in names:
+                assert not module.startswith("hilcal") or module in allowed, (name, module)

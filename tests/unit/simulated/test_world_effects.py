@@ -1,0 +1,283 @@
+"""Laws of the world's further effects, each against a formula or an arm that is built that way."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from drivers.simulated.campaign import dead_weights, rehearsal_states
+from drivers.simulated.injected_effects import nothing_hidden
+from drivers.simulated.truth import Truth
+from drivers.simulated.world import World
+from hilcal.data.readings import States
+from hilcal.errors import InputError
+from tests.support.example_cell import ur10e_cell
+from tests.support.world_cases import frames, moment_beyond
+
+CELL = ur10e_cell()
+ARM = CELL.arm
+PULLS = [*dead_weights([5.0, 10.0], CELL.gravity),
+         ("pull", np.array([60.0, -30.0, 20.0, 4.0, -7.0, 5.0]))]  # fmt: skip
+STATES, POSE, LOAD, CYCLE = rehearsal_states(CELL, 6, PULLS, np.random.default_rng(4))
+JOINT = np.array([6.0, 8.0, 9.0, 30.0, 35.0, 40.0]) * 1e-6
+SOFT = {
+    "joint_compliance": JOINT,
+    "joint_tilt_compliance": 0.4 * JOINT,
+    "base_compliance": np.array([2.0, 3.0, 1.5]) * 1e-6,
+    "tool_compliance": np.array([1e-5, 3e-5]),
+}
+
+
+def world(cell=CELL, **effects) -> World:
+    base = nothing_hidden(CELL, np.random.default_rng(2))
+    return replace(base, cell=cell, physics=replace(Truth.rigid(cell.arm), **effects))
+
+
+def cell_with(**changes):
+    return replace(CELL, arm=replace(ARM, **changes))
+
+
+def close(a: World, b: World, states=STATES, atol=1e-13):
+    """Both rest alike and are seen alike."""
+    one, two = a.sight(states), b.sight(states)
+    np.testing.assert_allclose(one.position, two.position, rtol=0, atol=atol)
+    np.testing.assert_allclose(one.rotation, two.rotation, rtol=0, atol=atol)
+
+
+def rigid_torques(states):
+    """(N, n) torques at the drives of the rigid arm."""
+    return np.array(
+        [
+            [np.dot(*moment_beyond(CELL, q, w, j)[:2]) for j in range(6)]
+            for q, w in zip(states.q, states.wrench, strict=True)
+        ]
+    )
+
+
+def drive_angles(w: World, states):
+    return w.rest(states).deflection[:, w.drives]
+
+
+def test_the_flange_turns_by_the_moment_there_along_and_across_its_axis():
+    small = 1e-8  # the next order is smaller by c M, about 1e-6
+    along, across = 2.0 * small, 5.0 * small
+    rest = world(tool_compliance=np.array([along, across])).rest(STATES)
+    for i in range(len(STATES)):
+        stiff = frames(ARM, STATES.q[i])[2]
+        turn = stiff[:3, :3]
+        moment = STATES.wrench[i, 3:] + np.cross(turn @ CELL.load_point, STATES.wrench[i, :3])
+        moment = moment + np.cross(turn @ CELL.tool_com, CELL.tool_mass * CELL.gravity)
+        expected = np.array([across, across, along]) * (turn.T @ moment)
+        seen = Rotation.from_matrix(turn.T @ rest.flange[i, :3, :3]).as_rotvec()
+        second = expected @ expected  # three successive turns are no rotation vector
+        np.testing.assert_allclose(seen, expected, rtol=1e-4, atol=second)
+        np.testing.assert_allclose(rest.flange[i, :3, 3], stiff[:3, 3], atol=1e-13)
+
+
+def test_periodic_compliance_goes_twice_round_with_the_commanded_angle():
+    ab = 1e-11 * np.random.default_rng(0).normal(size=(6, 2))
+    torque = rigid_torques(STATES)
+    give = ab[:, 0] * np.cos(2 * STATES.q) + ab[:, 1] * np.sin(2 * STATES.q)
+    seen = drive_angles(world(periodic_joint_compliance=ab), STATES)
+    np.testing.assert_allclose(seen, torque * give, rtol=1e-5, atol=1e-15)
+    # where all stand at one angle it is a plain compliance, also where that is no small one
+    same = replace(STATES, q=np.full_like(STATES.q, 0.4))
+    big = np.column_stack([3.0 * JOINT, -2.0 * JOINT])
+    plain = (3.0 * np.cos(0.8) - 2.0 * np.sin(0.8)) * JOINT
+    close(world(periodic_joint_compliance=big), world(joint_compliance=plain), same)
+
+
+def test_play_is_crossed_with_the_sign_of_the_torque():
+    b = 1e-9 * np.arange(1.0, 7.0)
+    torque, tenth = rigid_torques(STATES), 0.01 * ARM.torque_max
+    seen = drive_angles(world(backlash=b), STATES)
+    np.testing.assert_allclose(seen, b * np.tanh(torque / tenth), rtol=1e-5, atol=1e-15)
+    far = np.abs(torque) > 10.0 * tenth
+    assert 0.2 < far.mean() < 1.0
+    np.testing.assert_allclose(seen[far], (b * np.sign(torque))[far], rtol=1e-7)
+
+
+@pytest.mark.parametrize("unknown", [np.inf, np.nan, 0.0])
+def test_play_of_a_drive_without_a_torque_limit_is_that_of_150(unknown):
+    b = np.full(6, 1e-4)
+    limits = np.full(6, 150.0)
+    told = world(cell_with(torque_max=limits), backlash=b)
+    close(told, world(cell_with(torque_max=np.full(6, unknown)), backlash=b))
+
+
+def test_creep_softens_the_drives_by_decades_of_the_time_under_load():
+    k = 0.05
+    for time, decades in ((0.0, 0.0), (9.0, 1.0), (99.0, 2.0)):
+        states = replace(STATES, load_time=np.full(len(STATES), time))
+        creeping = world(**SOFT, creep=np.array([k]))
+        softer = world(**{**SOFT, "joint_compliance": (1.0 + k * decades) * JOINT})
+        close(creeping, softer, states)
+    close(world(creep=np.array([k])), world())  # what does not give way does not creep
+
+
+def test_links_grow_with_the_temperature_of_the_air():
+    alpha, count = 2e-4, len(STATES)
+    states = replace(STATES, air_temperature=np.linspace(10.0, 40.0, count))
+    grown = world(**SOFT, thermal_growth=np.array([alpha]))
+    seen = grown.sight(states)
+    for i in range(0, count, 5):
+        links = ARM.links.copy()
+        links[:, :3, 3] *= 1.0 + alpha * (states.air_temperature[i] - 20.0)
+        long = world(cell_with(links=links), **SOFT).sight(states[i : i + 1])
+        np.testing.assert_allclose(seen.position[i], long.position[0], rtol=0, atol=1e-13)
+        np.testing.assert_allclose(seen.jacobian[i], long.jacobian[0], rtol=0, atol=1e-12)
+    rigid = world(thermal_growth=np.array([alpha])).rest(states).flange
+    stiff = np.array([frames(ARM, q)[2] for q in states.q])
+    factor = 1.0 + alpha * (states.air_temperature - 20.0)
+    np.testing.assert_allclose(rigid[:, :3, 3], factor[:, None] * stiff[:, :3, 3], atol=1e-12)
+    np.testing.assert_allclose(rigid[:, :3, :3], stiff[:, :3, :3], atol=1e-12)
+
+
+def test_without_air_it_is_the_mean_of_the_joints_and_at_20_degrees_nothing():
+    grown = world(**SOFT, thermal_growth=np.array([1e-4]))
+    bare = replace(STATES, air_temperature=None)
+    mean = replace(STATES, air_temperature=STATES.joint_temperature.mean(axis=1))
+    close(grown, grown, bare, 0.0)
+    np.testing.assert_array_equal(grown.sight(bare).position, grown.sight(mean).position)
+    at_20 = replace(STATES, air_temperature=np.full(len(STATES), 20.0))
+    close(grown, world(**SOFT), at_20)
+
+
+def test_long_links_that_bend_grow_as_well():
+    beams = np.array([[8.0, 12.0], [9.0, 10.0]]) * 1e-6
+    alpha = 1e-3
+    states = replace(STATES, air_temperature=np.full(len(STATES), 30.0))
+    grown = world(link_compliance=beams, thermal_growth=np.array([alpha])).sight(states).position
+    bent = world(link_compliance=beams).sight(states).position
+    rigid = world().sight(states).position
+    long = world(thermal_growth=np.array([alpha])).sight(states).position
+    bending = np.linalg.norm(bent - rigid, axis=1).max()
+    assert bending > 1e-4
+    # the rest is how a part in a hundred more length changes the bending: its lever, squared
+    assert np.linalg.norm(grown - bent - (long - rigid), axis=1).max() < 0.05 * bending
+
+
+def test_joints_drift_with_their_own_temperature_from_a_reference():
+    kappa = 1e-5 * np.arange(1.0, 7.0)
+    drifting = replace(world(thermal_joint_drift=kappa), joint_reference=25.0)
+    turned = replace(STATES, q=STATES.q + kappa * (STATES.joint_temperature - 25.0))
+    np.testing.assert_allclose(
+        drifting.sight(STATES).position, world().sight(turned).position, rtol=0, atol=1e-13
+    )
+    assert world().joint_reference == 22.0
+
+
+def test_first_moments_shift_the_centres_of_mass():
+    moments = 0.3 * np.random.default_rng(7).normal(size=(6, 3))
+    coms = ARM.coms + moments / ARM.masses[:, None]
+    close(world(**SOFT, link_mass=moments), world(cell_with(coms=coms), **SOFT))
+
+
+def test_first_moments_pull_by_their_weight_also_where_a_link_has_no_mass():
+    moment = np.array([0.2, -0.3, 0.4])
+    for k in range(6):
+        masses = ARM.masses.copy()
+        masses[k] = 0.0
+        cell, moments = cell_with(masses=masses), np.zeros((6, 3))
+        moments[k] = moment
+        off, told = world(cell, link_mass=moments), world(cell)
+        change = off.drive_torque(STATES) - told.drive_torque(STATES)
+        for i in range(0, len(STATES), 5):
+            bodies, slots, _ = frames(ARM, STATES.q[i])
+            couple = np.cross(bodies[k][:3, :3] @ moment, CELL.gravity)
+            expected = [slots[j][:3, 2] @ couple if j <= k else 0.0 for j in range(6)]
+            np.testing.assert_allclose(change[i], expected, rtol=0, atol=1e-7)
+
+
+BIAS = np.array([3.0, -5.0, 8.0, 0.4, -0.7, 0.5])
+GAIN = np.array([0.05, -0.08, 0.1, -0.06, 0.04, 0.07])
+TURN = np.array([0.06, -0.1, 0.2])
+
+
+def acting(flange, said, *, bias=0.0, gain=0.0, turn=(0.0, 0.0, 0.0)):
+    """What acts where the sensor in this flange says so; (N, 6), base axes."""
+    out = np.zeros_like(said)
+    axes = Rotation.from_rotvec(turn).as_matrix()
+    for i, wrench in enumerate(said):
+        if np.any(wrench):
+            R = flange[i, :3, :3]
+            own = (np.concatenate([R.T @ wrench[:3], R.T @ wrench[3:]]) - bias) / (1.0 + gain)
+            out[i] = np.concatenate([R @ axes @ own[:3], R @ axes @ own[3:]])
+    return out
+
+
+@pytest.mark.parametrize(
+    ("hidden", "told"),
+    [
+        ({"wrench_bias": BIAS}, {"bias": BIAS}),
+        ({"wrench_gain": GAIN}, {"gain": GAIN}),
+        ({"sensor_misalignment": TURN}, {"turn": TURN}),
+        (
+            {"wrench_bias": BIAS, "wrench_gain": GAIN, "sensor_misalignment": TURN},
+            {"bias": BIAS, "gain": GAIN, "turn": TURN},
+        ),
+    ],
+)
+def test_the_arm_rests_under_what_acts_where_the_sensor_misreads_it(hidden, told):
+    misread = world(**SOFT, **hidden)
+    flange = misread.rest(STATES).flange
+    truly = replace(STATES, wrench=acting(flange, STATES.wrench, **told))
+    perfect = world(**SOFT)
+    np.testing.assert_allclose(perfect.rest(truly).flange, flange, rtol=0, atol=1e-12)
+    loaded = LOAD > 0
+    moved = np.abs(perfect.rest(STATES).flange - flange).max(axis=(1, 2))
+    assert moved[loaded].min() > 1e-6
+    assert moved[~loaded].max() == 0.0
+    torque = misread.drive_torque(STATES) - perfect.drive_torque(truly)
+    assert np.abs(torque).max() < 1e-9
+
+
+def test_a_gain_of_nothing_is_refused():
+    with pytest.raises(InputError, match=r"wrench_gain .*read nothing"):
+        world(wrench_gain=-np.ones(6)).sight(STATES)
+
+
+def test_a_scale_lengthens_what_is_read_and_turns_nothing():
+    s = 3e-4
+    soft = {**SOFT, "tracker_drift": 1e-7 * np.arange(1.0, 7.0)}
+    before, after = (world(**soft, **more).sight(STATES) for more in
+                     ({}, {"tracker_scale": np.array([s])}))  # fmt: skip
+    np.testing.assert_allclose(after.position, (1.0 + s) * before.position, rtol=1e-15)
+    np.testing.assert_array_equal(after.rotation, before.rotation)
+    np.testing.assert_allclose(after.jacobian[:, :3], (1.0 + s) * before.jacobian[:, :3])
+    np.testing.assert_array_equal(after.jacobian[:, 3:], before.jacobian[:, 3:])
+
+
+def test_parameters_are_named_in_the_order_of_their_arrays():
+    rng = np.random.default_rng(1)
+    rigid = Truth.rigid(ARM)
+    names = {
+        "tool_compliance": "along across",
+        "periodic_joint_compliance": " ".join(f"j{j}.cos2 j{j}.sin2" for j in range(1, 7)),
+        "backlash": "j1 j2 j3 j4 j5 j6",
+        "creep": "k",
+        "thermal_growth": "alpha",
+        "thermal_joint_drift": "j1 j2 j3 j4 j5 j6",
+        "link_mass": " ".join(f"link{k}.{axis}" for k in range(1, 7) for axis in "xyz"),
+        "wrench_bias": "fx fy fz mx my mz",
+        "wrench_gain": "fx fy fz mx my mz",
+        "sensor_misalignment": "rx ry rz",
+        "tracker_scale": "scale",
+    }
+    for effect, labels in names.items():
+        value = rng.normal(size=getattr(rigid, effect).shape)
+        named = rigid.with_effect(effect, value).named(ARM)
+        assert list(named) == [f"{effect}.{label}" for label in labels.split()]
+        assert list(named.values()) == value.ravel().tolist()
+
+
+def test_states_without_a_temperature_are_refused_by_what_they_lack():
+    bare = States(q=STATES.q, wrench=STATES.wrench)
+    for hidden, column in (
+        ({"thermal_growth": np.array([1e-5])}, "air_temperature"),
+        ({"thermal_joint_drift": np.full(6, 1e-5)}, "joint_temperature"),
+        ({"creep": np.array([0.1])}, "load_time"),
+    ):
+        with pytest.raises(InputError, match=f"^{column}: {next(iter(hidden))} is hidden"):
+            world(**SOFT, **hidden).sight(bare)

@@ -1,0 +1,206 @@
+"""The elastic arm against mechanics written out by hand: energy, torques, laws, cantilever."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.spatial.transform import Rotation
+
+from drivers.simulated.elastic_tree import build, long_links
+from drivers.simulated.elasticity import elasticity
+from drivers.simulated.mechanics import equilibrium
+from hilcal.errors import InputError
+from hilcal.robot.arm import Arm
+from tests.support.example_cell import ur10e_arm, ur10e_cell
+from tests.support.world_cases import frames, moment_beyond
+
+CELL = ur10e_cell()
+ARM = CELL.arm
+JOINT = np.array([6.0, 8.0, 9.0, 30.0, 35.0, 40.0]) * 1e-6
+TILT = np.array([3.0, 4.0, 5.0, 15.0, 15.0, 20.0]) * 1e-6
+BASE = np.array([2.0, 3.0, 1.5]) * 1e-6
+BEAM = np.array([[8.0, 12.0], [9.0, 10.0]]) * 1e-6
+STIFF = -JOINT / 9.0 / np.array([300.0, 300.0, 150.0, 60.0, 50.0, 50.0]) ** 2
+NONE = np.zeros(6)
+Q = np.array([[0.3, -1.1, 1.4, 0.5, -0.7, 0.2], [-2.0, -0.6, 0.9, -1.8, 1.1, 2.5]])
+WRENCH = np.array([[20.0, -35.0, -110.0, 6.0, -4.0, 9.0], [-60.0, 10.0, -80.0, 2.0, 7.0, -5.0]])
+
+
+def solve(q, wrench, *, joint=NONE, stiff=NONE, tilt=NONE, base=NONE[:3], beam=None):
+    tree = build(
+        ARM, ARM.links, CELL.tool_mass, CELL.tool_com, CELL.gravity, beams=beam is not None
+    )
+    law = elasticity(tree, joint, stiff, tilt, base, np.zeros((0, 2)) if beam is None else beam)
+    rest = equilibrium(tree, law, np.atleast_2d(q), np.atleast_2d(wrench), CELL.load_point)
+    return tree, law, rest
+
+
+def everything():
+    return solve(Q, WRENCH, joint=JOINT, stiff=STIFF, tilt=TILT, base=BASE, beam=BEAM)
+
+
+def test_energy_is_stationary_and_virtual_work_of_the_moment_balances():
+    tree, law, rest = everything()
+    stencil = ((-2, 1.0 / 12), (-1, -8.0 / 12), (1, 8.0 / 12), (2, -1.0 / 12))
+    h = 1e-3
+    for i in range(len(Q)):
+
+        def work(delta, i=i):
+            give = {k: delta[dofs] for k, dofs in zip(tree.beam_link, tree.beam, strict=True)}
+            bodies, _, flange = frames(
+                ARM, Q[i] + delta[tree.drive], delta[tree.base], delta[tree.tilt], give
+            )
+            out = 0.0
+            for body, mass, com in zip(bodies, ARM.masses, ARM.coms, strict=True):
+                out += mass * CELL.gravity @ (body[:3, :3] @ com + body[:3, 3])
+            tool = flange[:3, :3] @ CELL.tool_com + flange[:3, 3]
+            load = flange[:3, :3] @ CELL.load_point + flange[:3, 3]
+            out += CELL.tool_mass * CELL.gravity @ tool + WRENCH[i, :3] @ load
+            return out, flange
+
+        delta = rest.deflection[i]
+        here = work(delta)[1]
+        np.testing.assert_allclose(rest.flange[i], here, atol=1e-13)
+        for d in range(len(delta)):
+            slope, spin = 0.0, np.zeros((3, 3))
+            for step, weight in stencil:
+                moved = delta.copy()
+                moved[d] += step * h
+                energy, flange = work(moved)
+                slope += weight * energy / h
+                spin += weight * flange[:3, :3] / h
+            spin = spin @ here[:3, :3].T
+            omega = np.array([spin[2, 1], spin[0, 2], spin[1, 0]])
+            exerted = slope + WRENCH[i, 3:] @ omega
+            assert abs(exerted - rest.torque[i, d]) < 1e-7  # rounding of 100 J over 1 mrad
+        spring = law.linear @ rest.torque[i] + law.cubic * rest.torque[i] ** 3
+        np.testing.assert_allclose(delta, spring, atol=1e-16, rtol=1e-12)
+
+
+def test_residual_torque_is_at_rounding():
+    tree, law, rest = everything()
+    model, data = tree.model, tree.model.createData()
+    for i in range(len(Q)):
+        q = rest.deflection[i].copy()
+        q[tree.drive] += Q[i]
+        gravity = pin.computeGeneralizedGravity(model, data, q)
+        frame = model.addFrame(
+            pin.Frame(f"load{i}", tree.last, pin.SE3(tree.flange), pin.FrameType.OP_FRAME)
+        )
+        data = model.createData()
+        jac = pin.computeFrameJacobian(model, data, q, frame, pin.LOCAL_WORLD_ALIGNED)
+        pin.framesForwardKinematics(model, data, q)
+        lever = data.oMf[frame].rotation @ CELL.load_point
+        force, moment = WRENCH[i, :3], WRENCH[i, 3:] + np.cross(lever, WRENCH[i, :3])
+        load = jac.T @ np.concatenate([force, moment])
+        exerted = load - gravity
+        give = law.linear @ exerted + law.cubic * exerted**3
+        stiffness = 1.0 / np.diag(law.linear)
+        residual = stiffness * (rest.deflection[i] - give)
+        assert np.abs(residual).max() < 1e-10
+
+
+def test_small_deflections_follow_the_torques_of_the_rigid_arm():
+    small = 1e-4  # the next order is smaller by c dtau/dq, about 1e-6 here
+    tree, _, rest = solve(Q, WRENCH, joint=small * JOINT)
+    for i in range(len(Q)):
+        for j in range(6):
+            moment, axis, _, _ = moment_beyond(CELL, Q[i], WRENCH[i], j)
+            expected = small * JOINT[j] * (axis @ moment)
+            assert rest.deflection[i, tree.drive[j]] == pytest.approx(expected, rel=1e-4)
+
+
+def test_the_linear_law_is_the_limit():
+    errors = []
+    for small in (1.0, 0.1, 0.01):
+        tree, _, rest = solve(Q[0], WRENCH[0], joint=small * JOINT)
+        linear = [
+            small * JOINT[j] * np.dot(*moment_beyond(CELL, Q[0], WRENCH[0], j)[:2])
+            for j in range(6)
+        ]
+        errors.append(np.abs(rest.deflection[0, tree.drive] - linear).max() / small)
+    assert errors[0] / errors[1] == pytest.approx(10.0, rel=0.1)
+    assert errors[1] / errors[2] == pytest.approx(10.0, rel=0.1)
+
+
+@pytest.mark.parametrize("kind", ["tilt", "base"])
+def test_small_bearing_and_base_tilts_turn_the_flange_as_the_law_says(kind):
+    small = 1e-4
+    q, wrench = Q[0], WRENCH[0]
+    flange = frames(ARM, q)[2]
+    omega = np.zeros(3)
+    if kind == "tilt":
+        rest = solve(q, wrench, tilt=small * TILT)[2]
+        for j in range(6):
+            moment, axis, _, _ = moment_beyond(CELL, q, wrench, j)
+            omega += small * TILT[j] * (moment - axis * (axis @ moment))
+    else:
+        rest = solve(q, wrench, base=small * BASE)[2]
+        omega = small * BASE * moment_beyond(CELL, q, wrench, 0)[0]  # slot 0 is at the origin
+    change = rest.flange[0, :3, :3] @ flange[:3, :3].T
+    seen = Rotation.from_matrix(change).as_rotvec()
+    np.testing.assert_allclose(seen, omega, rtol=1e-4, atol=1e-5 * np.linalg.norm(omega))
+
+
+def cantilever():
+    """One joint, and a massless level link of 0.8 m to a second one that carries the flange."""
+    links = np.tile(np.eye(4), (3, 1, 1))
+    links[1, 0, 3] = 0.8
+    return Arm(
+        name="cantilever", links=links, masses=np.zeros(2), coms=np.zeros((2, 3)),
+        q_min=np.full(2, -3.0), q_max=np.full(2, 3.0), torque_max=np.full(2, 100.0),
+        payload=5.0, joint_names=("a", "b"), source="test",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("force", [[0.0, 3.0, -7.0], [0.0, 0.0, 0.0]])
+def test_a_long_link_bends_as_a_cantilever(force):
+    arm, length, bend, twist = cantilever(), 0.8, 2e-7, 5e-7
+    moment = np.array([0.4, -0.3, 0.6])
+    tree = build(arm, arm.links, 0.0, np.zeros(3), CELL.gravity, beams=True)
+    assert list(long_links(arm)) == [1]
+    none = np.zeros(2)
+    law = elasticity(tree, none, none, none, np.zeros(3), np.array([[bend, twist]]))
+    wrench = np.concatenate([force, moment])[None]
+    rest = equilibrium(tree, law, np.zeros((1, 2)), wrench, np.zeros(3))
+    # handbook: deflection L³/3EI F ± L²/2EI M, slope L²/2EI F ± L/EI M, twist L/GJ M
+    y = length**3 / 3 * bend * force[1] + length**2 / 2 * bend * moment[2]
+    z = length**3 / 3 * bend * force[2] - length**2 / 2 * bend * moment[1]
+    about = np.array([
+        length * twist * moment[0],
+        length * bend * moment[1] - length**2 / 2 * bend * force[2],
+        length * bend * moment[2] + length**2 / 2 * bend * force[1],
+    ])  # fmt: skip
+    # over 1 µm and 1 µrad the next order is 1e-6 of the first
+    np.testing.assert_allclose(rest.flange[0, :3, 3], [0.8, y, z], atol=1e-5 * (abs(y) + abs(z)))
+    seen = Rotation.from_matrix(rest.flange[0, :3, :3]).as_rotvec()
+    np.testing.assert_allclose(seen, about, rtol=1e-4)
+
+
+def test_jacobian_is_the_derivative_of_the_flange():
+    tree, _, rest = solve(Q, WRENCH)
+    h = 1e-6
+    for j in range(6):
+        ahead, behind = (solve(Q + s * h * np.eye(6)[j], WRENCH)[2].flange for s in (1, -1))
+        move = (ahead[:, :3, 3] - behind[:, :3, 3]) / (2 * h)
+        spin = ((ahead - behind) / (2 * h))[:, :3, :3] @ np.swapaxes(rest.flange, 1, 2)[:, :3, :3]
+        omega = np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=1)
+        np.testing.assert_allclose(rest.jacobian[:, :3, j], move, atol=1e-8)
+        np.testing.assert_allclose(rest.jacobian[:, 3:, j], omega, atol=1e-8)
+    assert len(tree.drive) == 6
+
+
+def test_a_gear_that_would_spring_back_is_refused():
+    with pytest.raises(InputError, match=r"state 0: joint_stiffening is too strong"):
+        solve(Q, WRENCH, joint=JOINT, stiff=-JOINT / 50.0**2)
+
+
+def test_an_arm_that_collapses_is_refused():
+    with pytest.raises(InputError, match=r"state \d: .*equilibrium"):
+        solve(Q, WRENCH, joint=np.full(6, 0.3))
+
+
+def test_example_arm_stands_where_its_dh_table_says():
+    flange = frames(ur10e_arm(), np.zeros(6))[2]
+    np.testing.assert_allclose(
+        flange[:3, 3], [-0.6127 - 0.57155, -0.17415 - 0.11655, 0.1807 - 0.11985], atol=1e-12
+    )

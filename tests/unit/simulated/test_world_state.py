@@ -1,0 +1,317 @@
+"""The living world: what it publishes is what the arm's statics say."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from drivers.simulated.blackboard import Blackboard
+from drivers.simulated.truth import Truth
+from drivers.simulated.world import World
+from drivers.simulated.world_state import LivingWorld
+from hilcal.errors import InputError
+from tests.support.arm_cases import ODD, arm_of
+from tests.support.living_cell import (
+    PULL,
+    WEIGHT,
+    Life,
+    Q,
+    config,
+    everything,
+    life,
+    same,
+    states,
+    world_of,
+)
+
+
+@pytest.mark.parametrize(("load", "wrench"), [(None, np.zeros(6)), ("5kg", WEIGHT), ("pull", PULL)])
+def test_the_truth_is_the_equilibrium_of_the_state(tmp_path, load, wrench):
+    rng = np.random.default_rng(11)
+    cell = life(tmp_path, joint_std=1e-4, **everything(rng))
+    cell.living.hang(load)
+    for _ in range(3):
+        q = rng.uniform(-2.0, 2.0, 6)
+        truth = cell.rest_at(q)
+        state = states(q, wrench, float(truth["time"]))
+        slip = cell.living.slip(cell.arrivals)[None]
+        sight, rest = cell.world.sight(state, slip), cell.world.rest(state, slip)
+        assert truth["arrivals"] == cell.arrivals
+        assert same(truth["target"], sight.position[0])
+        assert same(truth["target_rotation"], sight.rotation[0])
+        assert same(truth["flange"], rest.flange[0])
+
+
+def test_the_drive_torque_is_that_of_weight_and_load(tmp_path):
+    cell = life(tmp_path, joint_std=0.0, **everything(np.random.default_rng(2)))
+    cell.living.hang("pull")
+    torque = cell.rest_at(Q)["drive_torque"]
+    assert same(torque, cell.world.drive_torque(states(Q, PULL, 0.0))[0])
+
+
+def test_the_encoders_see_neither_slip_nor_elasticity(tmp_path):
+    cell = life(tmp_path, joint_std=1e-2)
+    cell.living.hang("5kg")
+    read = np.array([cell.rest_at(Q)["encoder"] for _ in range(200)]) - Q
+    spread = np.sqrt(np.mean(read**2))
+    # 1200 draws of 2e-6 rad: the rms is within 5 of its standard errors, 2 %
+    assert abs(spread / 2e-6 - 1.0) < 5.0 / np.sqrt(2 * read.size)
+
+
+def test_a_resting_arm_is_not_computed_anew_but_its_encoders_are_read(tmp_path):
+    cell = life(tmp_path)
+    first = cell.rest_at(Q)
+    second = cell.look()
+    assert same(first["target"], second["target"])
+    assert not same(first["encoder"], second["encoder"])
+    assert second["time"] > first["time"]
+
+
+def test_a_drifting_tracker_moves_the_target_while_the_arm_rests(tmp_path):
+    rate = np.array([1e-3, -2e-3, 3e-3, 1e-3, 0.0, 0.0])
+    cell = life(tmp_path, tracker_drift=rate)
+    first = cell.rest_at(Q)
+    time.sleep(0.02)
+    second = cell.look()
+    assert second["time"] - first["time"] >= 0.02 * 20.0
+    want = cell.world.sight(states(Q, np.zeros(6), float(second["time"])), slip_of(cell))
+    assert same(second["target"], want.position[0])
+    assert not same(second["target"], first["target"])
+
+
+def test_warm_up_is_slow_and_ends(tmp_path):
+    cell = life(tmp_path)
+    truth = cell.rest_at(Q)
+    assert truth["air_temperature"] == 22.0
+    assert np.all(truth["joint_temperature"] > 22.0)
+    assert np.all(truth["joint_temperature"] < 34.0)
+
+
+def slip_of(cell):
+    return cell.living.slip(cell.arrivals)[None]
+
+
+# repeatability
+
+
+def test_the_slip_stays_until_the_next_arrival_and_comes_new_with_it(tmp_path):
+    cell = life(tmp_path)
+    first = cell.rest_at(Q)["flange"].copy()
+    cell.board.write("arm", moving=1.0, q=Q + 0.1)
+    on_the_way = cell.look()["flange"]
+    assert np.abs(on_the_way - first).max() > 1e-2
+    cell.board.write("arm", q=Q, moving=1.0)
+    assert same(cell.look()["flange"], first)
+    assert not same(cell.rest_at(Q)["flange"], first)
+
+
+def test_the_published_scatter_of_arrivals_is_that_of_the_joints(tmp_path):
+    cell = life(tmp_path, joint_std=3e-5)
+    count = 400
+    seen = np.array([cell.rest_at(Q)["target"] for _ in range(count)])
+    sight = cell.world.sight(states(Q, np.zeros(6), 0.0))
+    jac = sight.jacobian[0, :3] * cell.world.joint_std
+    white = np.linalg.solve(np.linalg.cholesky(jac @ jac.T), (seen - sight.position).T)
+    # |white|² is chi-square of 3 degrees: mean 3, variance 6
+    assert abs(np.mean(np.sum(white**2, axis=0)) - 3.0) < 5.0 * np.sqrt(6.0 / count)
+    assert np.abs(white.mean(axis=1)).max() < 5.0 / np.sqrt(count)
+    neighbours = np.mean(np.sum(white[:, 1:] * white[:, :-1], axis=0))
+    assert abs(neighbours) < 5.0 * np.sqrt(3.0 / count)
+
+
+def test_the_slip_of_an_arrival_does_not_depend_on_who_looked(tmp_path):
+    made = config()
+    world = world_of(made)
+    (tmp_path / "other").mkdir()
+    a, b = Life(world, made, tmp_path), Life(world, made, tmp_path / "other")
+    for _ in range(4):
+        first = a.rest_at(Q)
+    b.arrivals = 3
+    assert same(first["flange"], b.rest_at(Q)["flange"])
+    other = Life(world, made, tmp_path / "other", seed=6)
+    other.arrivals = 3
+    assert not same(first["flange"], other.rest_at(Q)["flange"])
+
+
+# the wrench on the sensor
+
+MOUNT = {"origin_m": [0.01, -0.02, 0.045], "rotvec_rad": [0.3, -0.9, 2.1]}
+SENSOR = {"force_sensor": {"driver": "ft300", "port": "x", **MOUNT}}
+
+
+def test_the_sensor_feels_the_weight_of_tool_and_load_in_its_own_axes(tmp_path):
+    cell = life(tmp_path, sections=SENSOR, load_point=np.array([0.004, 0.0, -0.003]))
+    cell.living.hang("5kg")
+    for q in (Q, -Q, Q + 0.8):
+        truth = cell.rest_at(q)
+        flange = Rotation.from_matrix(truth["flange"][:3, :3])
+        in_base = flange * Rotation.from_rotvec(MOUNT["rotvec_rad"])
+        force, moment = in_base.apply(truth["sensor_wrench"].reshape(2, 3))
+        np.testing.assert_allclose(force, [0.0, 0.0, -5.8 * 9.80665], atol=1e-9)
+        # a weight has no moment about its own centre
+        tool, load = np.array([0.01, 0.02, 0.06]), np.array([0.104, -0.03, 0.147])
+        centre = flange.apply((0.8 * tool + 5.0 * load) / 5.8 - MOUNT["origin_m"])
+        np.testing.assert_allclose(moment, np.cross(centre, force), atol=1e-9)
+
+
+def test_the_sensor_feels_a_pull_and_its_moment(tmp_path):
+    cell = life(tmp_path, sections=SENSOR)
+    empty = cell.rest_at(Q)
+    cell.living.hang("pull")
+    pulled = cell.board.read("truth")
+    turns = [
+        Rotation.from_matrix(t["flange"][:3, :3]) * Rotation.from_rotvec(MOUNT["rotvec_rad"])
+        for t in (empty, pulled)
+    ]
+    change = turns[1].apply(pulled["sensor_wrench"].reshape(2, 3))[0]
+    change -= turns[0].apply(empty["sensor_wrench"].reshape(2, 3))[0]
+    np.testing.assert_allclose(change, PULL[:3], atol=1e-9)
+
+
+def test_a_sensor_at_the_flange_agrees_with_the_last_drive(tmp_path):
+    # the flange's z is the last axis, and the last body's centre of mass lies on it
+    cell = life(tmp_path)
+    assert np.all(arm_of("ur10e").coms[5][:2] == 0.0)
+    cell.living.hang("pull")
+    for q in (Q, Q - 0.9):
+        truth = cell.rest_at(q)
+        assert truth["sensor_wrench"][5] == pytest.approx(truth["drive_torque"][5], abs=1e-9)
+        assert abs(truth["drive_torque"][5]) > 0.5
+
+
+# what the people in the cell do
+
+
+def test_hanging_is_true_at_once_and_dated(tmp_path):
+    cell = life(tmp_path)
+    up = cell.rest_at(Q)["flange"][2, 3]
+    assert cell.living.hang("5kg") == "5kg"
+    truth = cell.board.read("truth")
+    assert truth["load"] == 1
+    assert 0.0 < truth["load_since"] <= truth["time"]
+    assert truth["flange"][2, 3] < up - 1e-4
+    assert cell.living.hang(None) is None
+    assert cell.board.read("truth")["load"] == 0
+    assert cell.board.read("truth")["flange"][2, 3] == up
+
+
+def test_a_mistake_is_made_once_and_told(tmp_path):
+    cell = life(tmp_path)
+    cell.living.mistake("pull")
+    assert cell.living.hang("5kg") == "pull"
+    assert cell.board.read("truth")["load"] == 2
+    assert cell.living.hang("5kg") == "5kg"
+    cell.living.mistake(None)
+    assert cell.living.hang("5kg") is None
+    events = [entry["event"] for entry in cell.living.log()]
+    assert events == [
+        "asked for 5kg, hung pull",
+        "asked for 5kg, hung 5kg",
+        "asked for 5kg, hung none",
+    ]
+
+
+def test_pushing_adds_to_the_load(tmp_path):
+    cell = life(tmp_path)
+    cell.living.hang("5kg")
+    lean = np.array([5.0, -7.0, 9.0, 1.0, 2.0, -1.0])
+    cell.living.push(lean.tolist())
+    truth = cell.rest_at(Q)
+    want = cell.world.rest(states(Q, WEIGHT + lean, 0.0), slip_of(cell))
+    assert same(truth["flange"], want.flange[0])
+    cell.living.push([0.0] * 6)
+    want = cell.world.rest(states(Q, WEIGHT, 0.0), slip_of(cell))
+    assert same(cell.board.read("truth")["flange"], want.flange[0])
+
+
+def test_what_the_arm_does_not_bear_is_refused_and_changes_nothing(tmp_path):
+    made = config()
+    world = world_of(made)
+    lift = [
+        abs(world.drive_torque(states(Q, wrench, 0.0))[0, 1]) for wrench in (np.zeros(6), WEIGHT)
+    ]
+    assert lift[0] < 0.9 * lift[1]
+    # c + 3 s tau² is 0 between the two torques: the gear has no equilibrium under the load
+    hidden = np.zeros(6)
+    hidden[1] = -world.physics.joint_compliance[1] / 3.0 / np.mean(lift) ** 2
+    cell = Life(world_of(made, joint_stiffening=hidden), made, tmp_path)
+    before = cell.rest_at(Q)
+    with pytest.raises(InputError, match="spring back"):
+        cell.living.hang("5kg")
+    with pytest.raises(InputError, match="spring back"):
+        cell.living.push(WEIGHT.tolist())
+    after = cell.look()
+    assert (after["load"], after["load_since"]) == (0, 0.0)
+    assert same(before["flange"], after["flange"])
+    again = cell.rest_at(Q)
+    assert again["arrivals"] == before["arrivals"] + 1
+    np.testing.assert_allclose(again["flange"], before["flange"], atol=1e-3)
+
+
+def test_a_pose_without_equilibrium_is_logged_and_the_world_lives_on(tmp_path):
+    made = config()
+    world = world_of(made)
+    upright = np.array([0.0, -np.pi / 2, 0.0, 0.0, 0.0, 0.0])
+    lift = [abs(world.drive_torque(states(q, np.zeros(6), 0.0))[0, 1]) for q in (upright, 0 * Q)]
+    hidden = np.zeros(6)
+    hidden[1] = -world.physics.joint_compliance[1] / 3.0 / np.mean(lift) ** 2
+    cell = Life(world_of(made, joint_stiffening=hidden), made, tmp_path)
+    before = cell.rest_at(upright)
+    stretched = cell.rest_at(0 * Q)
+    assert same(stretched["flange"], before["flange"])
+    assert "spring back" in cell.living.log()[0]["event"]
+    cell.look()
+    assert len(cell.living.log()) == 1
+    assert cell.rest_at(upright)["arrivals"] == 3
+
+
+@pytest.mark.parametrize(
+    "wrong", [[1.0], [np.nan] * 6, [0.0, 0.0, 1e9, 0.0, 0.0, 0.0], [[0.0] * 6]]
+)
+def test_what_nobody_can_push_is_refused(tmp_path, wrong):
+    cell = life(tmp_path)
+    with pytest.raises(InputError, match="valid: six numbers"):
+        cell.living.push(wrong)
+    with pytest.raises(InputError, match="valid: six numbers"):
+        cell.living.swing(wrong, period=1.0, decay=1.0)
+    with pytest.raises(InputError, match="valid: over 0"):
+        cell.living.swing([1.0] * 6, period=1.0, decay=0.0)
+
+
+def test_an_unknown_load_is_refused_with_the_known_ones(tmp_path):
+    cell = life(tmp_path)
+    for refused in (cell.living.hang, cell.living.mistake):
+        with pytest.raises(InputError, match=r'no load \'5 kg\' \(did you mean "5kg"\?\); valid: '):
+            refused("5 kg")
+
+
+def test_a_load_swings_for_a_while_and_rests_where_it_should(tmp_path):
+    cell = life(tmp_path)
+    cell.rest_at(Q)
+    cell.living.swing([0.0, 0.0, 20.0, 0.0, 0.0, 0.0], period=1e-3, decay=0.2)  # world s
+    cell.living.hang("5kg")
+    still = cell.world.rest(states(Q, WEIGHT, 0.0), slip_of(cell)).flange[0]
+    seen = [cell.look()["flange"] for _ in range(2)]
+    assert not same(seen[0], still)
+    assert not same(seen[0], seen[1])
+    time.sleep(0.2)  # 4 s of the world, 20 decays
+    assert same(cell.look()["flange"], still)
+
+
+def test_an_arm_of_seven_joints_is_refused(tmp_path):
+    made = config()
+    usual = world_of(made)
+    arm = arm_of(ODD)
+    odd = World(
+        cell=replace(usual.cell, arm=arm),
+        physics=Truth.rigid(arm),
+        registration=np.eye(4),
+        station=np.eye(4),
+        noise=usual.noise,
+        joint_std=np.zeros(7),
+    )
+    board = Blackboard.create(tmp_path / "world.bin", 1.0)
+    with pytest.raises(InputError, match="arm odd has 7 joints; valid: arms of 6 joints"):
+        LivingWorld(odd, made, board, 1)

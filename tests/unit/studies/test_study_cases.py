@@ -1,0 +1,168 @@
+"""Campaigns of the study of the diagnosis: what is hidden in them, and how strongly."""
+
+import numpy as np
+import pytest
+
+from drivers.simulated.campaign import dead_weights
+from drivers.simulated.injected_effects import EFFECTS
+from drivers.simulated.unmodelled_laws import INVENTED, invented, shift
+from hilcal.cell import cell_from_config
+from hilcal.cli.demo import CELL
+from hilcal.config import CellConfig, load_config
+from hilcal.data.whitening import MODES, Mode
+from hilcal.diagnose.misfit_breakdown import where
+from hilcal.diagnose.projection import projection
+from hilcal.effects.catalogue import make
+from hilcal.errors import InputError
+from hilcal.identify.baseline import baseline
+from hilcal.identify.fit import fit
+from hilcal.robot.catalogue import configs_dir
+from hilcal.types import Floats
+from studies.diagnosis import intervals
+from studies.study_cases import (
+    StudyCase,
+    effects_shown,
+    laws_shown,
+    study_case,
+    with_study_loads,
+)
+
+
+def config() -> CellConfig:
+    return load_config(configs_dir() / "cells" / CELL)
+
+
+def case(*hidden: str, mode: Mode = "absolute", strength: float = 2.0, **given: float) -> StudyCase:
+    return study_case(
+        config(), "ur10e", mode, hidden, strength, int(given.get("seed", 3)),
+        cycles=int(given.get("cycles", 1)),
+        stated=given.get("stated", 1.0),
+        n_poses=int(given.get("poses", 8)),
+    )  # fmt: skip
+
+
+def seen(c: StudyCase) -> Floats:
+    """What would be read without noise."""
+    return c.readings.value - c.noise
+
+
+@pytest.mark.parametrize("robot", ["ur3e", "ur5e", "ur10e"])
+def test_loads_are_what_the_arm_can_carry(robot: str) -> None:
+    own, loads = with_study_loads(config(), robot)
+    arm = cell_from_config(own).arm
+    assert len(loads) == 5
+    carried = [float(np.linalg.norm(w[:3])) / 9.81 + own.tool.mass_kg for _, w in loads]
+    assert max(carried) <= arm.payload
+    assert max(carried) > 0.7 * arm.payload
+    c = study_case(config(), robot, "deflection", (), 0.0, 0)
+    assert len(c.readings) == 180
+    assert set(c.readings.load_names) == {"none", *(name for name, _ in loads)}
+    pulls = np.array([w for _, w in loads])
+    assert np.linalg.matrix_rank(pulls) >= 4
+    assert pulls[0] == pytest.approx(dead_weights([-pulls[0, 2] / 9.81], [0, 0, -9.81])[0][1])
+
+
+def test_equal_arguments_give_equal_campaigns_and_strength_changes_the_effect_alone() -> None:
+    a, b = case("hysteresis"), case("hysteresis")
+    assert np.array_equal(a.readings.value, b.readings.value)
+    weak = case("hysteresis", strength=0.5)
+    assert np.array_equal(weak.readings.states.q, a.readings.states.q)
+    assert weak.noise == pytest.approx(a.noise, abs=1e-8)
+    ratio = np.asarray(a.world.physics.hysteresis) / weak.world.physics.hysteresis
+    assert ratio == pytest.approx(4.0, rel=1e-2)
+    other = case("hysteresis", seed=4)
+    assert not np.allclose(other.readings.states.q, a.readings.states.q)
+
+
+def test_the_noise_is_as_large_as_stated_or_as_misjudged() -> None:
+    for stated in (0.5, 1.0, 2.0):
+        many = [case(mode="deflection", seed=s, stated=stated, cycles=2) for s in range(4)]
+        white = [
+            np.linalg.solve(np.linalg.cholesky(c.readings.covariance), c.noise[:, :, None])
+            for c in many
+        ]
+        # 4 · 96 readings of three elements: 2 % of a standard deviation
+        assert np.std(np.concatenate(white)) == pytest.approx(1 / stated, rel=0.08)
+
+
+def test_repeats_are_the_same_states_twice() -> None:
+    r = case(cycles=2).readings
+    assert len(r) == 96
+    assert np.array_equal(r.states.q[:48], r.states.q[48:])
+    assert set(r.cycle) == {0, 1}
+
+
+def test_several_effects_are_hidden_at_once() -> None:
+    both = case("creep", "encoder_offset").world.truth
+    names = {name.split(".")[0] for name in both}
+    assert names == {"joint_compliance", "creep", "encoder_offset"}
+
+
+@pytest.mark.parametrize("law", INVENTED, ids=lambda law: law.name)
+def test_a_law_outside_of_the_catalogue_acts_at_the_strength_asked(law) -> None:
+    for mode in law.readings:
+        c = case(law.name, mode=mode, strength=3.0)
+        assert c.variables == law.variables
+        clean = c.world.sight(c.readings.states)
+        change = seen(c) - clean.position
+        covariance = c.world.covariance(clean)
+        if mode == "deflection":
+            first = np.repeat(np.arange(0, 48, 6), 6)
+            change = change - change[first]
+            covariance = covariance + covariance[first]
+            loaded = c.readings.load > 0
+            change, covariance = change[loaded], covariance[loaded]
+        white = np.linalg.solve(np.linalg.cholesky(covariance), change[:, :, None])
+        assert np.sqrt(np.mean(white**2)) == pytest.approx(3.0, rel=1e-6)
+
+
+def test_the_variables_of_a_law_are_those_that_a_diagnosis_knows() -> None:
+    for mode in MODES:
+        c = case(mode=mode)
+        f = fit(baseline(c.cell, c.readings, mode), c.readings, mode)
+        known = {w.variable for w in where(projection(f))}
+        for name in laws_shown(mode):
+            assert set(invented(name).variables) <= known
+
+
+def test_laws_and_effects_that_do_not_fit_are_refused() -> None:
+    with pytest.raises(InputError, match="crossed gear"):
+        invented("crossed gears")
+    with pytest.raises(InputError, match="absolute"):
+        case("crossed gear", mode="deflection")
+    with pytest.raises(InputError, match="cancels in deflections"):
+        case("encoder_offset", mode="deflection")
+    c = case()
+    still = c.readings.states
+    law, none = invented("base that turns"), np.zeros(3, dtype=np.int64)
+    with pytest.raises(InputError, match="no loaded reading"):
+        shift(law, c.world, still[none], 3.0, "deflection", none, none)
+    with pytest.raises(InputError, match="no unloaded reading"):
+        shift(law, c.world, still[none + 1], 3.0, "deflection", none, none)
+    with pytest.raises(InputError, match="changes nothing"):
+        shift(invented("swaying bench"), c.world, still[none], 3.0, "absolute", none, none)
+
+
+def test_true_parameters_have_the_program_s_names() -> None:
+    for effect in EFFECTS:
+        if effect == "joint_compliance":
+            continue
+        c = case(effect, poses=30 if effect == "transmission_error" else 8)  # for its harmonics
+        effects = {effect, "joint_compliance"}
+        names = {
+            f"{e}.{p.name}" for e in effects for p in make(e, c.cell, c.readings.states).parameters
+        }
+        assert {n.split(".")[0] for n in c.world.truth} == effects
+        assert set(c.world.truth) <= names, effect
+    assert set(effects_shown("absolute")) == set(EFFECTS) - {"joint_compliance"}
+
+
+def test_intervals_hold_true_parameters_and_no_others() -> None:
+    c = study_case(config(), "ur10e", "absolute", (), 0.0, 1)
+    f = fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute")
+    (told,) = intervals(f, c.world.truth)
+    assert (told.effect, told.parameters) == ("joint_compliance", 6)
+    assert told.inside >= 4
+    doubled = {name: 2 * value for name, value in c.world.truth.items()}
+    assert intervals(f, doubled)[0].inside < told.inside
+    assert intervals(f, {}) == ()

@@ -1,0 +1,300 @@
+"""`study diagnosis`: what it counts and asks, on one process and on several."""
+
+import io
+import json
+from collections import Counter
+
+import pytest
+from rich.console import Console
+
+from hilcal.data.whitening import MODES
+from hilcal.errors import InputError
+from studies.diagnosis import Inside, Outcome, Sample, run_case
+from studies.diagnosis_claims import claims
+from studies.diagnosis_document import document
+from studies.diagnosis_pool import run_all
+from studies.diagnosis_questions import Extent, questions
+from studies.diagnosis_rates import (
+    afterwards,
+    both_added,
+    both_found,
+    by_effect,
+    coverage_by_effect,
+    followed,
+    found,
+    named,
+    unknown,
+)
+from studies.diagnosis_table import report
+from studies.study_cases import effects_shown, laws_shown
+from tests.support.cli_cases import ok, refused
+from tests.support.study_diagnosis_cases import asked, outcome, quick, refined, said
+
+Capsys = pytest.CaptureFixture[str]
+
+
+def extent(*kinds: str, **given: object) -> Extent:
+    usual: dict[str, object] = {
+        "kinds": kinds,
+        "robots": ("ur3e", "ur10e"),
+        "modes": MODES,
+        "effects": {m: effects_shown(m) for m in MODES},
+        "laws": {m: laws_shown(m) for m in MODES},
+    }
+    return Extent(**{**usual, **given})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("lead", "same_as", "right"),
+    [
+        ("creep", (), True),
+        ("creep", ("a", "b", "c"), True),  # it is first, whatever else is not excluded
+        ("a", ("creep",), True),
+        ("a", ("b", "creep"), True),
+        ("a", ("b", "c", "creep"), False),  # a set of four is no answer
+        ("a", (), False),
+    ],
+)
+def test_found_is_first_or_in_a_set_of_at_most_three(
+    lead: str, same_as: tuple[str, ...], right: bool
+) -> None:
+    assert found(outcome(lead, *same_as)) is right
+
+
+def test_named_takes_a_verdict_that_names_an_effect() -> None:
+    quiet = Outcome(asked(), said(verdict="adequate"))
+    assert found(quiet)
+    assert not named(quiet)
+    assert named(Outcome(asked(), said(verdict="ambiguous")))
+
+
+def test_what_came_first_instead_is_counted() -> None:
+    cases = [
+        outcome(),
+        outcome("backlash", "creep"),
+        outcome("hysteresis"),
+        outcome("hysteresis"),
+        outcome("load_point", "a", "b", "creep"),
+        Outcome(asked(), failure="InputError: no"),
+    ]
+    (row,) = by_effect(cases)
+    assert (row.found.hits, row.found.cases) == (2, 6)
+    assert row.size == pytest.approx(1.5)
+    expected = {"hysteresis": 2, "failed": 1, "load_point (set of 4)": 1}
+    assert dict(row.instead) == expected
+    assert row.instead[0] == ("hysteresis", 2)
+
+
+def test_a_further_round_is_counted_by_itself() -> None:
+    again = asked(again=True)
+    cases = [Outcome(again, said("a"), again=said()), Outcome(again, said("a"), again=said("b"))]
+    (row,) = by_effect(cases)
+    assert (row.found.hits, row.again.hits, row.again.cases) == (0, 1, 2)
+    assert row.size_again == 1.0
+    (claim,) = (c for c in claims(cases) if "further round" in c.words)
+    assert (claim.rate.share, claim.met) == (0.5, False)
+
+
+def test_refinements_count_where_the_effect_was_found_and_named() -> None:
+    inside = (Inside("creep", 1, 1), Inside("joint_compliance", 4, 6))
+    right = Outcome(asked(), said(), refined("creep", inside=inside))
+    more = Outcome(asked(), said(), refined("creep", "backlash", holdout=1.06))
+    wrong = Outcome(asked(), said("backlash"), refined("backlash", holdout=9.0))
+    (row,) = afterwards([right, more, wrong])
+    assert (row.right.hits, row.right.cases) == (1, 2)
+    assert (row.holdout.hits, row.holdout.cases) == (1, 2)
+    assert (row.intervals.hits, row.intervals.cases) == (5, 7)
+    told = dict(coverage_by_effect([right, more, wrong]))
+    assert told["joint_compliance"].share == pytest.approx(4 / 6)
+
+
+def test_of_two_effects_a_set_that_was_added_stands_for_its_members() -> None:
+    pair = asked(kind="pairs", hidden=("creep", "backlash"))
+    both = Outcome(pair, said(), refined("creep", "backlash"))
+    stand_in = Outcome(pair, said(), refined("creep", "load_point", same_as=("backlash", "x")))
+    one = Outcome(pair, said(), refined("creep"))
+    assert [both_added(o) for o in (both, stand_in, one)] == [True, False, False]
+    assert [both_found(o) for o in (both, stand_in, one)] == [True, True, False]
+
+
+def test_outside_of_the_catalogue_the_verdict_and_the_variable_count() -> None:
+    law = asked(kind="outside", hidden=("swaying bench",))
+    late = Outcome(law, said(), refined("creep", verdict="unknown_effect"), variables=("time",))
+    never = Outcome(law, said(), refined("creep"), variables=("joint 2 angle",))
+    carried = said(variables=("pose", "load"), carriers=("joint 2 angle",))
+    assert [unknown(o) for o in (late, never)] == [True, False]
+    assert [followed(o) for o in (late, never)] == [True, False]
+    assert followed(Outcome(law, carried, variables=("joint 2 angle",)))
+    assert not followed(Outcome(law, carried, variables=("time",)))
+
+
+def test_claims_are_met_or_not_by_what_is_asked() -> None:
+    quiet = [Outcome(asked(kind="nothing", hidden=()), said(verdict="adequate"))] * 99
+    loud = Outcome(asked(kind="nothing", hidden=()), said())
+    (claim,) = claims([*quiet, loud])
+    assert (claim.rate.share, claim.met) == (0.99, True)
+    (claim,) = claims([*quiet, loud, loud])
+    assert claim.met is False
+    # An interval may hold too often as well.
+    (always,) = (
+        c
+        for c in claims(
+            [Outcome(asked(), said(), refined("creep", inside=(Inside("creep", 9, 9),)))]
+        )
+        if "intervals" in c.words
+    )
+    assert always.met is False
+
+
+def test_everything_is_asked_of_every_arm() -> None:
+    every = questions(extent("hidden", seeds=3))
+    assert len(set(every)) == len(every)
+    shown = sum(len(effects_shown(m)) for m in MODES)
+    assert len(every) == 3 * 2 * 3 * shown
+    assert not any("joint_compliance" in q.hidden for q in every)
+    # A study that is stopped after a third has asked of everything once.
+    first = every[: len(every) // 3]
+    assert {q.seed for q in first} == {0}
+    assert {(q.mode, q.hidden) for q in first} == {(q.mode, q.hidden) for q in every}
+
+
+def test_totals_are_shared_by_the_arms() -> None:
+    every = questions(extent("nothing", "noise", nothing=10, noise=4))
+    count = Counter((q.kind, q.mode, q.stated) for q in every)
+    assert count["nothing", "absolute", 1.0] == count["nothing", "deflection", 1.0] == 10
+    assert all(count["noise", m, stated] == 4 for m in MODES for stated in (0.5, 2.0))
+    assert Counter(q.robot for q in every if q.kind == "nothing") == {"ur3e": 10, "ur10e": 10}
+    assert all(q.cycles == 2 for q in every if q.kind == "noise")
+
+
+def test_pairs_are_random_and_the_same_every_time() -> None:
+    every = questions(extent("pairs", pairs=40))
+    assert every == questions(extent("pairs", pairs=40))
+    assert all(len(set(q.hidden)) == 2 for q in every)
+    assert len({q.hidden for q in every}) > 60
+    alone = {m: ("creep",) for m in MODES}
+    assert questions(extent("pairs", effects=alone)) == ()
+
+
+def test_a_further_round_is_asked_at_half_sigma() -> None:
+    every = questions(extent("hidden", seeds=1, again=True))
+    assert {q.strength for q in every if q.again} == {0.5}
+
+
+def test_a_case_that_fails_is_a_miss_that_says_why() -> None:
+    def broken(question: object) -> Sample:
+        raise ValueError("no\n such thing")
+
+    o = run_case(asked(), broken)
+    assert o.failure == "ValueError: no such thing"
+    assert not found(o)
+    shown = written([o])
+    assert "1 cases failed" in shown
+    assert "creep, ur10e, absolute, 2 σ, seed 0" in shown
+
+
+def test_a_campaign_that_cannot_be_does_not_count() -> None:
+    def beyond(question: object) -> Sample:
+        raise InputError("effect 'creep' cannot reach 2 sigma")
+
+    o = run_case(asked(), beyond)
+    assert (o.failure, o.impossible) == ("", "effect 'creep' cannot reach 2 sigma")
+    (row,) = by_effect([outcome(), o])
+    assert (row.found.hits, row.found.cases, row.instead) == (1, 1, ())
+    assert "1 campaigns cannot be" in written([outcome(), o])
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_results_come_in_order_of_the_questions(jobs: int) -> None:
+    every = tuple(asked(seed=s) for s in range(30))
+    told: list[int] = []
+    outcomes, complete = run_all(every, quick, jobs, told.append)
+    assert complete
+    assert tuple(o.asked for o in outcomes) == every
+    assert sum(told) == 30
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_ctrl_c_leaves_what_there_is(jobs: int) -> None:
+    every = tuple(asked(seed=s) for s in range(200))
+    done: list[int] = []
+
+    def interrupted(step: int) -> None:
+        done.append(step)
+        if len(done) == 5:
+            raise KeyboardInterrupt
+
+    outcomes, complete = run_all(every, quick, jobs, interrupted)
+    assert not complete
+    assert len(outcomes) == 5
+    assert all(o.asked in every for o in outcomes)
+
+
+def test_an_error_of_a_case_ends_the_study_and_its_processes() -> None:
+    every = tuple(asked(seed=s) for s in (1, 2, -1, 3))
+    with pytest.raises(RuntimeError, match="below 0"):
+        run_all(every, quick, 2, lambda step: None)
+
+
+def written(outcomes: list[Outcome]) -> str:
+    out = Console(file=io.StringIO(), width=100)
+    for part in report(outcomes):
+        out.print(part)
+    assert isinstance(out.file, io.StringIO)
+    return out.file.getvalue()
+
+
+def test_tables_show_rates_and_what_came_first_instead() -> None:
+    cases = [outcome(), outcome("backlash"), outcome("backlash"), outcome(strength=0.5)]
+    row, other = (line for line in written(cases).splitlines() if line.startswith("creep"))
+    assert row.split() == [
+        *("creep", "3", "33", "%", "33", "%", "1.0", "100", "%", "100", "%", "1.0"),
+    ]
+    assert other.split() == ["creep", "backlash", "2"]
+
+
+def test_the_document_is_json_and_holds_every_case() -> None:
+    cases = [outcome(), Outcome(asked(), failure="InputError: no")]
+    d = document(cases, complete=False)
+    again = json.loads(json.dumps(d))
+    assert again["complete"] is False
+    assert [c["failure"] for c in again["cases"]] == ["", "InputError: no"]
+    assert again["effects"][0]["found"] == {"share": 0.5, "hits": 1, "cases": 2}
+
+
+SMALL = (
+    "studies", "diagnosis", "hidden", "--robot", "ur10e", "--readings", "deflection",
+    "--effect", "hysteresis", "--strength", "3", "--strength", "1", "--seeds", "1", "--json",
+)  # fmt: skip
+
+
+def test_the_command_gives_the_same_on_any_number_of_processes(capsys: Capsys) -> None:
+    one = ok(capsys, *SMALL, "--jobs", "1").document
+    two = ok(capsys, *SMALL, "--jobs", "2").document
+    assert one == two
+    assert one["complete"] is True
+    assert [c["failure"] for c in one["cases"]] == ["", ""]
+    strong, _ = one["cases"]
+    assert strong["found"] is True
+    assert strong["refined"]["model"][-1] == "hysteresis"
+    assert {c["kind"] for c in one["claims"]} == {"hidden"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("everything",), "valid: hidden, nothing"),
+        (("--robot", "ur99"), "ur10e"),
+        (("--effect", "hysterisis"), "hysteresis"),
+        (("--readings", "deflection", "--effect", "encoder_offset"), "valid: "),
+        (("--readings", "both"), "deflection, absolute"),
+        (("--strength", "0"), "over 0"),
+        (("--seeds", "0"), "from 1"),
+        (("--jobs", "0"), "from 1"),
+        (("--first-seed", "-1"), "from 0"),
+    ],
+)
+def test_wrong_input_is_refused_in_one_line(
+    capsys: Capsys, arguments: tuple[str, ...], words: str
+) -> None:
+    assert words in refused(capsys, 2, "studies", "diagnosis", *arguments)

@@ -1,0 +1,302 @@
+"""`study plans`: what it counts, what it compares, and what it claims of plans."""
+
+import io
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from hilcal.cell import cell_from_config
+from hilcal.config import CellConfig, load_config
+from hilcal.data.readings import Readings, States
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.plan.noise_model import reading_covariance
+from hilcal.types import Floats
+from studies.plans import DOUBLE, GRID, PARAMETERS, RANDOM, TEST, PlansStudy, plans_study
+from studies.plans_command import SimulatedArm, arms, with_robot
+from studies.plans_errors import Asked, Errors, readings_asked, run_campaign, subject
+from studies.plans_kinds import Scene, at_random, grid, matching, optimal, scene
+from studies.plans_statistics import Measured, summary
+from studies.plans_table import as_predicted, halved, report
+from tests.support.cli_cases import CELL, run
+from tests.support.study_plans_cases import configured
+
+SEED = 5
+
+
+def scene_of(config: CellConfig, candidates: int = 120) -> Scene:
+    return scene(cell_from_config(config), config, candidates, np.random.default_rng(SEED))
+
+
+@pytest.fixture(scope="module")
+def deflection() -> Scene:
+    return scene_of(configured())
+
+
+@pytest.fixture(scope="module")
+def absolute() -> Scene:
+    return scene_of(configured("absolute"))
+
+
+@pytest.fixture(scope="module")
+def small() -> PlansStudy:
+    config = configured()
+    return plans_study(
+        cell_from_config(config), config, arms(0), readings=60, campaigns=3, candidates=80, seed=3
+    )
+
+
+def errors_of(parameter: Floats, std: Floats, position: float = 1.0) -> Errors:
+    return Errors(parameter, std, np.array([1.0, 10.0]), position, 2.0, 60, 12)
+
+
+def test_errors_are_summarised_over_campaigns() -> None:
+    std = np.array([1.0, 2.0])
+    s = summary([errors_of(np.array([3.0, -8.0]), std, 1.0), errors_of(np.zeros(2), std, 7.0)])
+    assert s.parameter == pytest.approx(np.sqrt(1.0 * 0.2))
+    assert s.parameter_real.value == pytest.approx(np.sqrt(3.0 / np.sqrt(2) * 0.8 / np.sqrt(2)))
+    assert s.spread.value == pytest.approx(np.sqrt((9 + 16) / 4))
+    assert s.position_real.value == pytest.approx(5.0)
+    assert s.position_ratio.value == pytest.approx(2.5)
+    assert (s.campaigns, s.readings, s.poses) == (2, 60, 12)
+
+
+def test_the_stated_uncertainty_of_the_simulation_is_that_of_repeated_studies() -> None:
+    rng = np.random.default_rng(1)
+    std = np.array([1.0, 2.0])
+    many = [
+        summary(
+            [
+                errors_of(std * rng.standard_normal(2), std, float(abs(rng.standard_normal())))
+                for _ in range(50)
+            ]
+        )
+        for _ in range(300)
+    ]
+    for figure in ("parameter_real", "spread", "position_real"):
+        found = [getattr(s, figure) for s in many]
+        scatter = np.std([f.value for f in found])
+        assert np.mean([f.std for f in found]) == pytest.approx(scatter, rel=0.15)
+    assert np.mean([s.spread.value for s in many]) == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "verdict"),
+    [(1.09, 0.01, "yes"), (0.91, 0.2, "yes"), (1.15, 0.03, "unclear"), (0.8, 0.04, "no")],
+)
+def test_a_verdict_tells_a_miss_from_noise(value: float, std: float, verdict: str) -> None:
+    assert as_predicted(Measured(value, std)) == verdict
+
+
+@pytest.mark.parametrize("mode", ["deflection", "absolute"])
+def test_every_plan_keeps_its_readings_and_the_limits_of_the_cell(
+    mode: str, request: pytest.FixtureRequest
+) -> None:
+    of: Scene = request.getfixturevalue(mode)
+    plans = [at_random(of, 60, np.random.default_rng(k)) for k in range(3)]
+    plans += [grid(of, 60), optimal(of, TEST, 60, np.random.default_rng(0))]
+    for plan in plans:
+        asked = readings_asked(plan)
+        assert 58 <= len(asked.pose) == plan.readings <= 60
+        assert len(np.unique(asked.pose)) == plan.poses
+        for k, name in enumerate(asked.load_names):
+            here = asked.states[asked.load == k]
+            assert of.space.allowed(here.q, name).all()
+            assert np.array_equal(
+                here.wrench, np.tile(of.exact.candidates.wrench[k], (len(here), 1))
+            )
+
+
+def test_deflections_have_their_own_unloaded_reading_each_time(deflection: Scene) -> None:
+    plan = optimal(deflection, PARAMETERS, 60, np.random.default_rng(0))
+    assert plan.counts.max() > 1  # a unit is taken again
+    asked = readings_asked(plan)
+    groups = Counter(zip(asked.pose.tolist(), asked.cycle.tolist(), strict=True))
+    unloaded = Counter(
+        (p, c)
+        for p, c, load in zip(asked.pose, asked.cycle, asked.load, strict=True)
+        if asked.load_names[load] == "none"
+    )
+    assert len(groups) == int(plan.counts.sum())
+    assert set(unloaded) == set(groups)
+    assert set(unloaded.values()) == {1}
+
+
+def test_a_grid_is_regular_and_random_plans_are_not(deflection: Scene) -> None:
+    by_hand = readings_asked(grid(deflection, 100)).states.q
+    assert all(len(np.unique(by_hand[:, j].round(9))) <= 6 for j in range(6))
+    first = at_random(deflection, 100, np.random.default_rng(0))
+    other = at_random(deflection, 100, np.random.default_rng(1))
+    assert not np.array_equal(first.counts, other.counts)
+    assert len(np.unique(readings_asked(first).states.q[:, 0].round(9))) == first.poses
+
+
+@pytest.mark.parametrize("mode", ["deflection", "absolute"])
+def test_a_planned_campaign_beats_the_others_where_it_is_asked_to(
+    mode: str, request: pytest.FixtureRequest
+) -> None:
+    of: Scene = request.getfixturevalue(mode)
+    plan = optimal(of, TEST, 60, np.random.default_rng(0)).predicted.position
+    rest = [at_random(of, 60, np.random.default_rng(k)) for k in range(5)] + [grid(of, 60)]
+    assert plan is not None
+    assert all(r.predicted.position > plan for r in rest if r.predicted.position is not None)
+
+
+def test_the_readings_of_random_plans_for_an_accuracy_are_found(deflection: Scene) -> None:
+    at_120 = [at_random(deflection, 120, np.random.default_rng(k)) for k in range(20)]
+    wanted = np.sqrt(np.mean([float(p.predicted.position or np.nan) ** 2 for p in at_120]))
+    found = matching(deflection, float(wanted), 60, np.random.default_rng(77))
+    assert found == pytest.approx(120, rel=0.1)
+    assert matching(deflection, 1e-9, 60, np.random.default_rng(77)) is None
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_the_simulated_noise_is_the_planned_one(known: bool) -> None:
+    of = scene_of(configured(known=known))
+    asked = readings_asked(at_random(of, 60, np.random.default_rng(0)))
+    measured = arms(0)(of.cell, of.config, 4).measure(asked, np.random.default_rng(0))
+    model, theta = of.assumed.model, of.assumed.theta
+    planned = reading_covariance(of.assumed, of.config, model.predict(asked.states, theta))
+    # The tracker is turned at random, and the arm sags by about 1 mm: axes and beams differ.
+    axes = np.linalg.eigvalsh(planned)
+    assert np.allclose(np.linalg.eigvalsh(measured.covariance), axes, rtol=5e-3)
+
+
+def test_arms_differ_and_equal_numbers_give_equal_arms() -> None:
+    config = configured()
+    cell = cell_from_config(config)
+    first, again, other = (arms(0)(cell, config, k).parameters for k in (1, 1, 2))
+    assert np.array_equal(first["joint_compliance"], again["joint_compliance"])
+    assert not np.allclose(first["joint_compliance"], other["joint_compliance"], rtol=1e-3)
+
+
+@dataclass(frozen=True)
+class Noisy:
+    """An arm that is read with more noise than is stated."""
+
+    arm: SimulatedArm
+    factor: float
+
+    @property
+    def parameters(self) -> Mapping[str, Floats]:
+        return self.arm.parameters
+
+    def measure(self, asked: Asked, rng: np.random.Generator) -> Readings:
+        r = self.arm.measure(asked, rng)
+        extra = np.sqrt(self.factor**2 - 1) * np.linalg.cholesky(r.covariance)
+        noise = np.einsum("nij,nj->ni", extra, rng.standard_normal(r.value.shape))
+        return replace(r, value=r.value + noise)
+
+    def position(self, states: States) -> Floats:
+        return self.arm.position(states)
+
+
+@pytest.mark.parametrize("factor", [1.0, 2.0])
+def test_errors_are_those_of_the_noise_that_is_there(factor: float) -> None:
+    of = scene_of(configured(known=True))
+    plan = at_random(of, 60, np.random.default_rng(0))
+    errors = []
+    for number in range(16):
+        made = arms(0)(of.cell, of.config, number)
+        assert isinstance(made, SimulatedArm)
+        told = subject(of, Noisy(made, factor))
+        errors.append(run_campaign(of, plan, told, np.random.default_rng([number, 1])))
+    s = summary(errors)
+    for ratio in (s.spread, s.position_ratio):
+        assert ratio.std < 0.1 * factor
+        assert abs(ratio.value - factor) < 3 * ratio.std
+
+
+def test_too_few_readings_are_refused(deflection: Scene) -> None:
+    plan = at_random(deflection, 5, np.random.default_rng(0))
+    told = subject(deflection, arms(0)(deflection.cell, deflection.config, 0))
+    with pytest.raises((CannotAnswerError, InputError)):
+        run_campaign(deflection, plan, told, np.random.default_rng(0))
+
+
+@pytest.mark.slow
+def test_the_study_depends_on_its_seed_alone(small: PlansStudy) -> None:
+    config = configured()
+    cell = cell_from_config(config)
+    again = plans_study(cell, config, arms(0), readings=60, campaigns=3, candidates=80, seed=3)
+    other = plans_study(cell, config, arms(1), readings=60, campaigns=3, candidates=80, seed=4)
+    assert again == small
+    assert other.of(RANDOM).result.position_real != small.of(RANDOM).result.position_real
+
+
+def test_the_study_compares_equal_numbers_of_readings(small: PlansStudy) -> None:
+    assert [line.kind for line in small.lines] == [TEST, PARAMETERS, RANDOM, GRID, DOUBLE]
+    for line in small.lines:
+        wanted = 120 if line.kind == DOUBLE else 60
+        assert wanted - 2 <= line.result.readings <= wanted
+    assert [line.kind for line in small.planned] == [TEST, PARAMETERS]
+    for s in small.shrinkage():
+        own, base = small.of(s.kind).result, small.of(RANDOM).result
+        assert s.position == pytest.approx(base.position / own.position)
+        assert s.parameter_real.value == pytest.approx(
+            base.parameter_real.value / own.parameter_real.value
+        )
+
+
+def test_people_see_every_plan_and_every_verdict(small: PlansStudy) -> None:
+    console = Console(width=100, file=io.StringIO())
+    for part in report(small):
+        console.print(part)
+    shown = console.file.getvalue()  # type: ignore[attr-defined]
+    assert all(line.kind in shown for line in small.lines)
+    assert max(map(len, shown.splitlines())) <= 100
+    assert halved(small, small.shrinkage()[0]) in shown
+
+
+def test_another_robot_carries_loads_by_its_payload() -> None:
+    config = load_config(CELL)
+    small = with_robot(config, "ur5e")
+    assert small.robot.model == "ur5e"
+    share = cell_from_config(small).arm.payload / cell_from_config(config).arm.payload
+    assert [load.mass_kg for load in small.loads] == pytest.approx(
+        [share * load.mass_kg for load in config.loads]
+    )
+    assert small.loads[-1].force_N == pytest.approx(share * np.array(config.loads[-1].force_N))
+    assert small.loads[0].name == f"{share * 5:.3g}kg"
+    assert with_robot(config, config.robot.model) is config
+
+
+def test_the_command_gives_one_document(capsys: pytest.CaptureFixture[str]) -> None:
+    done = run(
+        capsys, "studies", "plans", "--robot", "ur5e", "--campaigns", "2", "--readings", "50",
+        "--candidates", "60", "--json",
+    )  # fmt: skip
+    assert done.code == 0, done.err
+    (robot,) = done.document["robots"]
+    assert robot["robot"] == "ur5e"
+    assert robot["campaigns"] == 2
+    kinds = {line["kind"]: line for line in robot["lines"]}
+    assert set(kinds) == {TEST, PARAMETERS, "test, robust", "D, robust", RANDOM, GRID, DOUBLE}
+    assert 0.9 < kinds[TEST]["efficiency"] <= 1.0
+    assert kinds[RANDOM]["efficiency"] is None
+    # Each plan is the best in what it was made for.
+    assert kinds[TEST]["result"]["position"] < kinds["test, robust"]["result"]["position"]
+    assert kinds["test, robust"]["position_open"] < kinds[TEST]["position_open"]
+    for s in robot["shrinkage"]:
+        assert {s["as_predicted"], s["half"]} <= {"yes", "no", "unclear"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--campaigns", "1"), "at least 2 campaigns"),
+        (("--candidates", "0"), "--candidates 0"),
+        (("--robot", "nobody"), "nobody"),
+        (("nowhere.toml",), "nowhere.toml"),
+    ],
+)
+def test_wrong_input_is_one_line(
+    arguments: tuple[str, ...], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    done = run(capsys, "studies", "plans", *arguments)
+    assert done.code == 2
+    assert words in done.err
+    assert len(done.err.strip().splitlines()) == 1

@@ -1,0 +1,141 @@
+"""Refinement: effect by effect, until the held-out error lies on the noise floor."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from drivers.simulated.injected_effects import hide
+from hilcal.data.readings import Readings
+from hilcal.diagnose.effect_ranking import candidates, rank_suspects
+from hilcal.diagnose.paired_test import LEAST_GAIN
+from hilcal.diagnose.projection import projection
+from hilcal.effects.catalogue import make
+from hilcal.errors import InputError
+from hilcal.identify.baseline import baseline
+from hilcal.identify.fit import fit
+from hilcal.model import Model
+from hilcal.refine import MOST_REVISIONS, Refinement, add, refine
+from tests.support.campaigns import campaign, cell_of, measured, plan, world_of
+
+
+def check_steps(r: Refinement) -> None:
+    """What holds of every refinement."""
+    assert 1 <= len(r.steps) <= MOST_REVISIONS
+    assert r.steps[0].added is None
+    for before, after in zip(r.steps, r.steps[1:], strict=False):
+        assert after.added is not None
+        assert after.fit.model.names == (*before.fit.model.names, after.added)
+        assert after.added in before.diagnosis.significant
+        held = [s.fit.holdout.rms_sigma for s in (before, after)]
+        assert held[1] < (1 - LEAST_GAIN) * held[0]
+        assert after.fit.readings is before.fit.readings
+    assert set(r.rejected).isdisjoint(r.steps[-1].fit.model.names)
+
+
+@pytest.mark.parametrize(
+    ("effect", "mode"), [("encoder_offset", "absolute"), ("joint_stiffening", "deflection")]
+)
+def test_a_hidden_effect_is_added_and_the_error_falls_to_the_noise(effect, mode):
+    c = campaign(effect, mode, 1, poses=30)
+    said: list[str] = []
+    r = refine(baseline(c.cell, c.readings, mode), c.readings, mode, said.append)
+    check_steps(r)
+    assert effect in r.steps[-1].fit.model.names
+    assert r.verdict in ("adequate", "ambiguous"), r.message
+    first, last = r.steps[0].fit, r.steps[-1].fit
+    assert last.holdout.rms_sigma < 0.6 * first.holdout.rms_sigma
+    # On poses left out: the noise, and what the parameters cost.
+    cost = np.sqrt(1 + 2 * last.rank / last.whitening.rank)
+    assert last.holdout.rms_sigma < cost * (1 + 4 / np.sqrt(2 * last.dof))
+    assert f"adding {effect}" in said
+
+
+def test_two_hidden_effects_are_found_one_after_the_other():
+    cell, p = cell_of(), plan(30, 5)
+    rng = np.random.default_rng(5)
+    world = world_of(cell, rng)
+    for effect in ("hysteresis", "encoder_offset"):
+        world = hide(effect, cell, p.states, 3.0, "absolute", rng, world=world)
+    readings = measured(world, p, rng)
+    r = refine(baseline(cell, readings, "absolute"), readings, "absolute")
+    check_steps(r)
+    assert {s.added for s in r.steps[1:]} == {"hysteresis", "encoder_offset"}
+    assert r.verdict == "adequate", r.message
+    assert 0.7 < r.steps[-1].fit.variance_factor < 1.35
+
+
+def test_nothing_hidden_adds_nothing():
+    c = campaign(seed=2, poses=15)
+    r = refine(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute")
+    assert len(r.steps) == 1
+    assert r.verdict == "adequate"
+    assert r.rejected == ()
+    assert r.steps[0].diagnosis.message == r.message
+
+
+def with_pose_errors(readings: Readings, seed: int) -> Readings:
+    """Readings with an error per pose that follows nothing: no effect explains it elsewhere."""
+    rng = np.random.default_rng(seed)
+    off = 1e-4 * rng.normal(size=(len(readings.pose_names), 3))[readings.pose]
+    return replace(readings, value=readings.value + off)
+
+
+@pytest.mark.parametrize(("poses", "seed"), [(15, 1), (15, 2), (30, 1)])
+def test_what_no_effect_predicts_is_never_called_adequate(poses, seed):
+    """A large family can reproduce any error of few poses; poses left out tell."""
+    c = campaign(seed=3, plan_seed=0, poses=poses)
+    readings = with_pose_errors(c.readings, seed)
+    r = refine(baseline(c.cell, readings, "absolute"), readings, "absolute")
+    check_steps(r)
+    assert r.steps[-1].fit.holdout.rms_sigma > 3
+    assert r.verdict in ("unknown_effect", "noise_misjudged"), r.message
+    assert r.message
+
+
+def test_shares_on_poses_left_out_are_what_a_refit_reaches_there():
+    """Random errors of each pose: a family of many columns explains them, but nowhere else."""
+    c = campaign(seed=3, plan_seed=0, poses=15)
+    readings = with_pose_errors(c.readings, 1)
+    before = fit(baseline(c.cell, readings, "absolute"), readings, "absolute")
+    p = projection(before)
+    for s in rank_suspects(p, candidates(p.fit)):
+        if s.effect not in ("transmission_error", "link_geometry", "encoder_offset"):
+            continue
+        after = add(before, s.effect)
+        squares = [np.sum(f.whitening.whiten(f.left_out) ** 2) for f in (before, after)]
+        reached = (squares[0] - squares[1]) / squares[0]
+        assert s.holdout_share < max(reached, 0) + 0.3, (s.effect, s.holdout_share, reached)
+
+
+def test_adding_starts_where_the_fit_stands():
+    c = campaign("hysteresis", seed=0, plan_seed=0)
+    before = fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute")
+    after = add(before, "hysteresis")
+    again = fit(after.model, c.readings, "absolute")
+    assert np.abs((after.theta - again.theta) / after.uncertainty.formal).max() < 1e-4
+    assert after.chi2 == pytest.approx(again.chi2, rel=1e-7)
+    assert after.chi2 < before.chi2
+
+
+def test_an_effect_cannot_be_added_twice_nor_without_its_columns_nor_unknown():
+    c = campaign(plan_seed=0)
+    readings = replace(c.readings, states=replace(c.readings.states, approach=None))
+    found = fit(baseline(c.cell, readings, "absolute"), readings, "absolute")
+    with pytest.raises(InputError, match="joint_compliance is in the model already"):
+        add(found, "joint_compliance")
+    with pytest.raises(InputError, match="unknown effect 'gear_wear'"):
+        add(found, "gear_wear")
+    with pytest.raises(InputError, match="hysteresis needs approach"):
+        add(found, "hysteresis")
+
+
+def test_it_starts_from_any_model():
+    """Also from frames alone: joint compliance is then an effect like others."""
+    c = campaign(seed=6, poses=20)
+    start = baseline(c.cell, c.readings, "absolute")
+    frames = Model(start.cell, (make("base_frame", start.cell, c.readings.states),))
+    r = refine(frames, c.readings, "absolute")
+    check_steps(r)
+    assert r.steps[1].added == "joint_compliance"
+    assert r.verdict == "adequate", r.message

@@ -1,0 +1,114 @@
+"""A stored revision comes back as the same fit."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from drivers.simulated.rehearsal import Rehearsal
+from hilcal.data.records import content_hash
+from hilcal.data.revision import RevisionRecord, from_text, to_text
+from hilcal.diagnose.verdict import diagnose
+from hilcal.errors import InputError
+from hilcal.identify.baseline import baseline
+from hilcal.identify.fit import Fit, fit
+from hilcal.identify.fit_document import plain, registration, to_json
+from hilcal.refine import add
+from hilcal.revisions import chain, restore, restore_model, to_record, usual_mode
+from tests.support.cli_cases import rehearsal
+
+
+def baseline_fit(r: Rehearsal) -> Fit:
+    return fit(baseline(r.cell, r.readings, r.mode), r.readings, r.mode)
+
+
+def record_of(r: Rehearsal, found: Fit, added: str | None = None) -> RevisionRecord:
+    return to_record(found, None, added, content_hash(r.readings))
+
+
+@pytest.mark.parametrize("effect", ["hysteresis", "transmission_error", "link_geometry"])
+def test_the_same_fit_comes_back(effect: str) -> None:
+    r = rehearsal(effect)
+    found = add(baseline_fit(r), effect)
+    text = to_text(to_record(found, diagnose(found), effect, content_hash(r.readings)))
+    again = restore(from_text(text, 2), r.cell, r.readings)
+    assert again.model.names == found.model.names
+    assert [e.options for e in again.model.effects] == [e.options for e in found.model.effects]
+    np.testing.assert_array_equal(again.solution.prior, found.solution.prior)
+    seen = found.uncertainty.identifiable
+    change = np.abs(again.theta - found.theta)[seen] / found.uncertainty.std[seen]
+    assert change.max() < 1e-3
+    assert again.chi2 == pytest.approx(found.chi2, rel=1e-6)
+    assert again.dof == pytest.approx(found.dof, rel=1e-6)
+    assert again.holdout.rms_m == pytest.approx(found.holdout.rms_m, rel=1e-5)
+    assert again.solution.iterations <= 2
+    np.testing.assert_array_equal(again.outlier, found.outlier)
+
+
+def test_a_gross_error_stays_set_aside() -> None:
+    r = rehearsal("nothing")
+    value = r.readings.value.copy()
+    value[17] += 0.004
+    readings = replace(r.readings, value=value)
+    found = fit(baseline(r.cell, readings, "absolute"), readings, "absolute")
+    assert np.flatnonzero(found.outlier).tolist() == [17]
+    record = to_record(found, None, None, content_hash(readings))
+    assert record.parameters_json["outliers"] == [17]
+    again = restore(record, r.cell, readings)
+    np.testing.assert_array_equal(again.outlier, found.outlier)
+    (gross,) = to_json(found)["outliers"]
+    assert gross["pose"] == readings.pose_names[readings.pose[17]]
+    assert gross["sigma"] > 50
+
+
+def test_other_readings_are_refused() -> None:
+    r = rehearsal("nothing")
+    record = record_of(r, baseline_fit(r))
+    with pytest.raises(InputError, match="identify again"):
+        restore(record, r.cell, r.readings[:-1])
+
+
+def test_parameters_of_another_program_are_refused() -> None:
+    r = rehearsal("nothing")
+    record = record_of(r, baseline_fit(r))
+    other = {**record.parameters_json, "names": [*record.parameters_json["names"][:-1], "x.y"]}
+    with pytest.raises(InputError, match="identify again"):
+        restore_model(replace(record, parameters_json=other), r.cell, r.readings)
+
+
+def test_the_registration_that_is_reported_is_the_true_one() -> None:
+    r = rehearsal("nothing", poses=30)
+    found = baseline_fit(r)
+    away = np.linalg.inv(r.world.registration) @ registration(found)
+    np.testing.assert_allclose(away, np.eye(4), atol=3e-5)
+    assert not np.allclose(found.model.cell.registration, r.world.registration, atol=3e-5)
+
+
+def test_a_chain_starts_at_its_first_model() -> None:
+    r = rehearsal("nothing")
+    one = record_of(r, baseline_fit(r))
+    records = tuple(
+        replace(one, added=added, number=k)
+        for k, added in enumerate([None, "hysteresis", None, "load_point", "base_compliance"], 1)
+    )
+    assert [c.number for c in chain(records)] == [3, 4, 5]
+    assert [c.number for c in chain(records[:2])] == [1, 2]
+    assert [c.number for c in chain(records[:3])] == [3]
+    assert chain(()) == ()
+
+
+def test_deflections_are_usual_where_every_load_has_its_unloaded_reading() -> None:
+    readings = rehearsal("nothing").readings
+    assert usual_mode(readings) == "deflection"
+    assert usual_mode(readings[readings.unloaded]) == "absolute"
+    first = np.arange(len(readings)) == np.flatnonzero(readings.unloaded)[0]
+    assert usual_mode(readings[~first]) == "absolute"
+    other = np.where(readings.pose == 0, 1, 0) * readings.unloaded  # another cycle
+    assert usual_mode(replace(readings, cycle=other.astype(np.int64))) == "absolute"
+
+
+def test_what_json_cannot_hold_becomes_null() -> None:
+    content = {"a": [1.0, float("nan")], "b": (np.float64("inf"), 2, "x", None, True)}
+    assert plain(content) == {"a": [1.0, None], "b": [None, 2, "x", None, True]}
+    json.dumps(plain(content), allow_nan=False)

@@ -1,0 +1,254 @@
+"""The one who hangs the loads: a simulated person, and a real one at a terminal."""
+
+import fcntl
+import json
+import os
+import pty
+import subprocess
+import sys
+import termios
+import time
+
+import pytest
+
+from drivers.simulated import admin
+from drivers.simulated.operator import open_operator as open_simulated
+from drivers.terminal_operator import open_operator as open_terminal
+from hilcal.acquire import devices
+from hilcal.errors import DeviceError, InputError
+from tests.support.living_cell import config
+
+# the simulated person
+
+
+def simulated(socket, clock=50.0, **options):
+    made = {"driver": "simulated", "options": {"socket": str(socket), **options}}
+    return config(operator=made, simulation={"clock": clock})
+
+
+@pytest.fixture
+def world(tmp_path):
+    """A socket that remembers who was asked for what."""
+    asked = []
+
+    def answer(op, given):
+        asked.append((op, given, time.monotonic()))
+        if given.get("name") == "pull":
+            raise ValueError("the hook is bent")
+
+    admin.serve(tmp_path / "world.sock", answer)
+    return tmp_path / "world.sock", asked
+
+
+def test_the_simulated_person_hangs_what_is_asked_for_and_takes_it_off(world):
+    socket, asked = world
+    made = simulated(socket, hand_s=0)
+    person: devices.Operator = open_simulated(made)
+    person.hang(made.loads[0], "")
+    person.hang(None, "that was 5kg")
+    person.close()
+    person.close()
+    assert [(op, given) for op, given, _ in asked] == [
+        ("hang", {"name": "5kg"}),
+        ("hang", {"name": None}),
+    ]
+
+
+def test_the_simulated_person_takes_time_of_the_cell(world):
+    socket, asked = world
+    made = simulated(socket)  # 20 s, 50 times as fast
+    begun = time.monotonic()
+    open_simulated(made).hang(made.loads[0], "")
+    assert asked[0][2] - begun >= 0.4
+
+
+def test_what_the_simulated_world_refuses_is_told(world):
+    socket, _ = world
+    made = simulated(socket, hand_s=0)
+    with pytest.raises(DeviceError, match="the hook is bent"):
+        open_simulated(made).hang(made.loads[1], "")
+
+
+def test_a_simulated_person_without_a_world_reports_it(world, tmp_path):
+    assert open_simulated(simulated(world[0])).report().problems == ()
+    lost = open_simulated(simulated(tmp_path / "none.sock", hand_s=0))
+    report = lost.report()
+    assert report.device == "operator"
+    assert len(report.problems) == 1
+    assert "none.sock" in report.problems[0]
+    with pytest.raises(DeviceError, match=r"none\.sock"):
+        lost.hang(None, "")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, "lacks socket"),
+        ({"socket": 3}, "lacks socket"),
+        ({"socket": "x", "hand_s": -1}, "hand_s = -1; valid"),
+        ({"socket": "x", "hand_s": True}, "hand_s = True; valid"),
+        ({"socket": "x", "hands": 2}, "no key 'hands'"),
+    ],
+)
+def test_wrong_options_of_the_simulated_person_are_refused(options, message):
+    made = config(operator={"driver": "simulated", "options": options})
+    with pytest.raises(InputError, match=message):
+        open_simulated(made)
+
+
+# the person at the terminal, in a process whose terminal the test holds
+
+PROGRAM = """
+import json, sys
+from tests.support.living_cell import config
+from drivers.terminal_operator import open_operator
+from hilcal.errors import DeviceError
+made = config()
+person = open_operator(made)
+print(json.dumps(person.report().problems), flush=True)
+loads = {load.name: load for load in made.loads}
+for request in json.loads(sys.argv[1]):
+    try:
+        person.hang(loads.get(request[0]), request[1])
+        print("done", flush=True)
+    except DeviceError as error:
+        print("error:", error, flush=True)
+    except KeyboardInterrupt:
+        print("interrupted", flush=True)
+person.close()
+"""
+
+
+class Person:
+    """Sits at a pseudo-terminal; stdout is what the program found, stderr what it showed."""
+
+    def __init__(self, *requests, stdin=None):
+        self.master, slave = pty.openpty()
+        here = os.path.dirname(__file__)
+        path = os.pathsep.join([here, os.path.dirname(here)])
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", PROGRAM, json.dumps(requests)],
+            stdin=slave if stdin is None else stdin,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            env={**os.environ, "PYTHONPATH": path},
+            start_new_session=True,
+            preexec_fn=lambda: fcntl.ioctl(slave, termios.TIOCSCTTY, 0),
+        )
+        os.close(slave)
+        self.shown = ""
+
+    def sees(self, words):
+        """Wait until the person sees the words."""
+        os.set_blocking(self.process.stderr.fileno(), False)
+        end = time.monotonic() + 20.0
+        while words not in self.shown:
+            assert time.monotonic() < end, f"never shown: {words!r}\n{self.shown}"
+            self.shown += (self.process.stderr.read() or b"").decode()
+            time.sleep(0.01)
+        at = self.shown.index(words) + len(words)
+        before, self.shown = self.shown[:at], self.shown[at:]
+        return before
+
+    def types(self, text):
+        os.write(self.master, text.encode())
+
+    def found(self):
+        """Wait for the program's end, and return what it found."""
+        os.set_blocking(self.process.stderr.fileno(), True)
+        out, rest = self.process.communicate(timeout=20.0)
+        assert b"Traceback" not in rest
+        assert self.process.returncode == 0
+        problems, *lines = out.decode().splitlines()
+        return json.loads(problems), lines
+
+
+@pytest.fixture
+def sit():
+    people = []
+
+    def make(*requests, **more):
+        people.append(Person(*requests, **more))
+        return people[-1]
+
+    yield make
+    for person in people:
+        person.process.kill()
+        person.process.wait()
+        for stream in (person.process.stdout, person.process.stderr):
+            stream.close()
+        os.close(person.master)
+
+
+END = "q = give up: "
+
+
+def test_the_person_is_asked_and_presses_enter(sit):
+    person = sit(["5kg", ""], ["pull", "the sensor feels 49.0 N instead"], [None, ""])
+    asked = person.sees(END)
+    assert "Hang the load 5kg at the load point [0.1, -0.03, 0.15] m" in asked
+    assert "5 kg, 49.0 N" in asked
+    person.types("\n")
+    asked = person.sees(END)
+    assert "the sensor feels 49.0 N instead" in asked
+    assert "[80, 10, 0] N, base axes" in asked
+    assert "[0, 6, -3] N·m, base axes" in asked
+    assert "weight" not in asked
+    person.types("\n")
+    assert "Take every load off" in person.sees(END)
+    person.types("\n")
+    assert person.found() == ([], ["done", "done", "done"])
+
+
+def test_the_person_gives_up(sit):
+    person = sit(["5kg", ""])
+    person.sees(END)
+    person.types("q\n")
+    assert person.found() == ([], ["error: stopped by the operator"])
+
+
+def test_another_answer_is_asked_again(sit):
+    person = sit(["5kg", ""])
+    person.sees(END)
+    person.types("yes [bold]\n")
+    assert "'yes [bold]' is no answer" in person.sees(END)
+    person.types("\n")
+    assert person.found() == ([], ["done"])
+
+
+def test_what_was_typed_before_the_question_is_no_answer(sit):
+    person = sit(["5kg", ""])
+    person.types("q\n")  # typed ahead, while the program starts
+    person.sees(END)
+    person.types("\n")
+    assert person.found() == ([], ["done"])
+
+
+def test_a_closed_terminal_is_no_answer(sit):
+    person = sit(["5kg", ""])
+    person.sees(END)
+    person.types("\x04")  # end of file
+    assert person.found() == (
+        [],
+        ["error: operator: the terminal was closed before the load was hung"],
+    )
+
+
+def test_ctrl_c_goes_through(sit):
+    person = sit(["5kg", ""])
+    person.sees(END)
+    person.types("\x03")
+    assert person.found() == ([], ["interrupted"])
+
+
+def test_without_a_terminal_nobody_is_asked(sit):
+    person = sit(["5kg", ""], [None, ""], stdin=subprocess.DEVNULL)
+    problems, lines = person.found()
+    want = "operator: standard input is not a terminal"
+    assert [p[: len(want)] for p in problems] == [want]
+    assert [line[: len(want) + 7] for line in lines] == [f"error: {want}"] * 2
+
+
+def test_the_terminal_has_no_options():
+    with pytest.raises(InputError, match="has socket"):
+        open_terminal(config(operator={"options": {"socket": "x"}}))

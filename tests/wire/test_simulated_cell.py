@@ -1,0 +1,304 @@
+"""The whole simulated cell: started, killed and ended, with nothing left behind."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+
+from drivers.simulated import cell_processes
+from drivers.simulated.blackboard import Blackboard
+from drivers.simulated.cell_processes import UR_PORTS, SimulatedCell, free_host
+from drivers.simulated.device_process import DeviceProcess
+from drivers.simulated.truth import Truth
+from drivers.simulated.world import World
+from hilcal.errors import DeviceError, InputError
+from tests.support.arm_cases import ODD, arm_of
+from tests.support.living_cell import WEIGHT, config, same, states, world_of
+
+DEVICES = ("world", "arm", "tracker", "force")
+SENSOR = {"driver": "ft300", "port": "to be filled in", "origin_m": [0.0, 0.0, 0.04]}
+
+
+def whole(**sections):
+    return config(force_sensor=SENSOR, **sections)
+
+
+def start(directory, made=None, seed=3):
+    made = made or whole()
+    return SimulatedCell.start(world_of(made), made, directory, seed)
+
+
+@pytest.fixture(scope="module")
+def cell(tmp_path_factory):
+    with start(tmp_path_factory.mktemp("c")) as cell:
+        yield cell
+
+
+def answers(host, port):
+    with socket.socket() as line:
+        line.settimeout(2.0)
+        return line.connect_ex((host, port)) == 0
+
+
+def gone(pids, seconds=5.0):
+    """Whether the processes end within so many seconds."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if not any(map(running, pids)):
+            return True
+        time.sleep(0.02)
+    return False
+
+
+def running(pid):
+    try:
+        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
+
+
+def children():
+    return set(psutil.Process().children(recursive=True))
+
+
+# a running cell
+
+
+def test_every_device_is_a_process_of_its_own_and_answers(cell):
+    pids = cell.processes()
+    assert tuple(pids) == DEVICES
+    assert len({*pids.values(), os.getpid()}) == 5
+    for device in DEVICES:
+        assert isinstance(cell.ask(device, "state"), dict)
+    with pytest.raises(InputError, match="no device 'robot'; valid: world, arm, tracker, force"):
+        cell.ask("robot", "state")
+
+
+def test_the_configuration_leads_to_the_devices_and_keeps_the_rest(cell):
+    given, filled = whole(), cell.config
+    assert (filled.robot.driver, filled.tracker.driver) == ("ur", "geocom")
+    assert (filled.force_sensor.driver, filled.operator.driver) == ("ft300", "simulated")
+    assert Path(filled.tracker.port) == cell.directory / "tracker"
+    assert Path(filled.force_sensor.port) == cell.directory / "force"
+    assert filled.operator.options == {"socket": str(cell.directory / "world.sock")}
+    host = filled.robot.host
+    assert host.startswith("127.")
+    assert host != "127.0.0.1"
+    assert all(answers(host, port) for port in UR_PORTS)
+    untouched = {
+        "robot": filled.robot.model_copy(update={"driver": None, "host": None}),
+        "tracker": filled.tracker.model_copy(update={"driver": None, "port": None}),
+        "operator": given.operator,
+        "force_sensor": given.force_sensor,
+    }
+    assert filled.model_copy(update=untouched) == given
+    assert filled == type(filled).from_json(filled.to_json())
+
+
+def test_what_is_true_when_the_cell_is_ready_belongs_to_its_arm(cell):
+    board = Blackboard.attach(cell.directory / "world.bin")
+    assert board.scale == 20.0
+    arm, truth = board.read("arm"), board.read("truth")
+    assert arm["alive"] == 1.0
+    np.testing.assert_allclose(truth["encoder"], arm["q"], atol=1e-4)
+    assert truth["arrivals"] == arm["arrivals"]
+
+
+def test_two_cells_have_arms_of_their_own(cell, tmp_path):
+    with start(tmp_path, config()) as other:
+        assert tuple(other.processes()) == DEVICES[:3]  # no force sensor was configured
+        assert other.config.robot.host != cell.config.robot.host
+        other.ask("world", "hang", name="5kg")
+        assert cell.ask("world", "state")["load"] is None
+        pids = other.processes().values()
+    assert not any(map(running, pids))
+    assert all(map(running, cell.processes().values()))
+
+
+def test_a_directory_in_use_is_refused(cell):
+    with pytest.raises(InputError, match="another one runs in"):
+        start(cell.directory)
+    assert all(map(running, cell.processes().values()))
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_killed_device_comes_back_at_the_same_place(cell, device):
+    before = cell.processes()
+    cell.ask("world", "hang", name="5kg")
+    cell.kill(device)
+    assert not running(before[device])
+    assert device not in cell.processes()
+    with pytest.raises(DeviceError):
+        cell.ask(device, "state")
+    cell.restart(device)
+    after = cell.processes()
+    assert after.pop(device) != before.pop(device)
+    assert after == before
+    assert isinstance(cell.ask(device, "state"), dict)
+    assert cell.ask("world", "state")["load"] == "5kg"
+    assert all(answers(cell.config.robot.host, port) for port in UR_PORTS)
+    cell.ask("world", "hang", name=None)
+
+
+def test_restarting_what_runs_replaces_it(cell):
+    before = cell.processes()["tracker"]
+    cell.restart("tracker")
+    assert cell.processes()["tracker"] != before
+    assert not running(before)
+
+
+def test_the_truth_goes_on_with_the_arm_after_a_restart_of_the_world(cell):
+    cell.restart("world")
+    board = Blackboard.attach(cell.directory / "world.bin")
+    cell.ask("world", "hang", name="5kg")
+    truth, state = board.read("truth"), cell.ask("world", "state")
+    arm = board.read("arm")
+    state_of = replace(states(arm["q"], WEIGHT, 0.0), approach=arm["side"][None].copy())
+    want = world_of(whole()).sight(state_of, np.array([state["slip"]]))
+    assert same(truth["target"], want.position[0])
+    cell.ask("world", "hang", name=None)
+
+
+# its end
+
+
+def test_nothing_is_left_behind(tmp_path):
+    before, threads = children(), psutil.Process().num_threads()
+    cell = start(tmp_path)
+    pids = list(cell.processes().values())
+    with pytest.raises(KeyError, match="the campaign"), cell:
+        raise KeyError("the campaign")
+    assert not any(map(running, pids))
+    assert children() == before
+    assert psutil.Process().num_threads() == threads
+    assert not list(tmp_path.glob("*.sock"))
+    cell.close()
+
+
+def test_a_directory_can_be_used_again(tmp_path):
+    with start(tmp_path, config()) as first:
+        first.ask("world", "hang", name="5kg")
+    with start(tmp_path, config()) as second:
+        assert second.ask("world", "state")["load"] is None
+
+
+PARENT = """
+import sys, time
+from pathlib import Path
+from tests.support.living_cell import config, world_of
+from drivers.simulated.cell_processes import SimulatedCell
+made = config(force_sensor={"driver": "bota", "port": "x"})
+cell = SimulatedCell.start(world_of(made), made, Path(sys.argv[1]), 3)
+print(*cell.processes().values(), flush=True)
+time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+def test_the_devices_end_with_a_parent_that_is_killed(tmp_path, how):
+    here = os.path.dirname(__file__)
+    with subprocess.Popen(
+        [sys.executable, "-c", PARENT, str(tmp_path)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([here, os.path.dirname(here)])},
+    ) as parent:
+        pids = [int(word) for word in parent.stdout.readline().split()]
+        assert len(pids) == 4
+        assert all(map(running, pids))
+        parent.send_signal(how)
+        parent.wait(10.0)
+        assert gone(pids)
+
+
+# what goes wrong at the start
+
+
+def test_an_address_that_another_program_took_is_not_insisted_on(tmp_path, monkeypatch):
+    taken, free = free_host(), free_host()
+    hosts = iter([taken, free])
+    monkeypatch.setattr(cell_processes, "free_host", lambda: next(hosts))
+    with socket.socket() as line:
+        line.bind((taken, UR_PORTS[0]))
+        line.listen()
+        with start(tmp_path) as cell:
+            assert cell.config.robot.host == free
+            assert isinstance(cell.ask("arm", "state"), dict)
+
+
+def test_a_free_address_is_one_where_all_ports_are_free():
+    seen = {free_host() for _ in range(20)}
+    assert len(seen) > 1
+    for host in seen:
+        for port in UR_PORTS:
+            with socket.socket() as line:
+                line.bind((host, port))
+
+
+def broken(monkeypatch, module, *arguments):
+    """Let the tracker of the next cells be another module."""
+    devices = cell_processes._devices
+
+    def replaced(world, made, directory, *more):
+        wrong = DeviceProcess("tracker", module, directory, arguments)
+        return {**devices(world, made, directory, *more), "tracker": wrong}
+
+    monkeypatch.setattr(cell_processes, "_devices", replaced)
+
+
+def test_a_device_that_ends_early_is_named_with_its_last_words(tmp_path, monkeypatch):
+    before = children()
+    broken(monkeypatch, "drivers.simulated.no_such_device")
+    with pytest.raises(DeviceError, match=r"tracker: ended with exit code 1: .*No module"):
+        start(tmp_path)
+    assert children() == before
+
+
+def test_a_device_that_never_gets_ready_is_named_at_the_deadline(tmp_path, monkeypatch):
+    before = children()
+    (tmp_path / "asleep.py").write_text("import time\ntime.sleep(600)\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    broken(monkeypatch, "asleep")
+    monkeypatch.setattr(cell_processes, "START_TIMEOUT", 2.0)
+    with pytest.raises(DeviceError, match=r"tracker: not ready within 2 s; see .*\.log"):
+        start(tmp_path, config())
+    assert children() == before
+
+
+def test_what_cannot_be_simulated_is_refused_before_anything_starts(tmp_path):
+    made = whole()
+    world = world_of(made)
+
+    def refused(match, world=world, made=made, directory=tmp_path):
+        with pytest.raises(InputError, match=match):
+            SimulatedCell.start(world, made, directory, 1)
+
+    refused(
+        "no simulated force sensor 'ati'; valid: ft300",
+        made=config(force_sensor={**SENSOR, "driver": "ati"}),
+    )
+    refused("too long for its sockets", directory=tmp_path / ("x" * 100))
+    refused(
+        "differ in load_point",
+        made=whole(
+            tool={"target_m": [0.06, 0.02, 0.12], "mass_kg": 0.8, "com_m": [0.01, 0.02, 0.06]}
+        ),
+    )
+    at_the_base = replace(world, station=np.diag([-1.0, -1.0, 1.0, 1.0]))
+    refused("a station measures from where it stands", world=at_the_base)
+    arm = arm_of(ODD)
+    odd = World(
+        replace(world.cell, arm=arm), Truth.rigid(arm), *(np.eye(4),) * 2, world.noise, np.zeros(7)
+    )
+    refused("the arm odd has 7 joints", world=odd)
+    (tmp_path / "force").mkdir()
+    refused("cannot be used")
+    assert not list(tmp_path.glob("*.log"))

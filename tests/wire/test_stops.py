@@ -1,0 +1,178 @@
+"""A campaign that is stopped, in every way, at every moment; and then goes on.
+
+The arm stands within half a second, no process is left, and the resumed campaign has every
+reading exactly once.
+"""
+
+import signal
+import sqlite3
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilcal.data.campaign import Campaign
+from hilcal.data.run_log import RunLog
+from tests.support.campaign_cases import (
+    STARVED,
+    begin,
+    cell,
+    failed,
+    finish,
+    nothing_goes_on,
+    path,
+    right,
+    stopped_on_its_way,
+    stopped_within,
+    whole,
+)
+from tests.support.campaign_run import BEGUN, EndedError, Run
+from tests.support.campaign_site import Site
+
+__all__ = ["cell", "nothing_goes_on", "path"]  # fixtures
+
+LONGEST = 5.0
+"""The moment of a kill is drawn up to here, s; a run takes longer."""
+SLOW = 0.3
+"""Position of the speed slider meanwhile: the arm moves for about half of the time."""
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        signal.SIGINT,
+        pytest.param(signal.SIGTERM, marks=pytest.mark.slow),
+        pytest.param(signal.SIGHUP, marks=pytest.mark.slow),
+    ],
+)
+def test_a_plea_to_end_stops_the_arm_first(kind: signal.Signals, cell: Site, path: Path) -> None:
+    run, goal = begin(cell, path, Run.moving)
+    since = time.monotonic()
+    if kind == signal.SIGINT:
+        run.interrupt()  # a terminal sends it to the whole group
+    else:
+        run.process.send_signal(kind)
+    assert "interrupted" in failed(run, 130)
+    stopped_on_its_way(cell, since, goal)
+    right(cell, path)
+    with Campaign.open(path) as campaign:
+        assert RunLog(campaign).events()[-1]["kind"] == "interrupted"
+
+
+@pytest.mark.slow
+def test_ctrl_c_twice_in_a_row_stops_it_too(cell: Site, path: Path) -> None:
+    run, goal = begin(cell, path, Run.moving)
+    since = time.monotonic()
+    run.interrupt()
+    time.sleep(0.05)
+    run.interrupt()
+    code, words = run.end()
+    # the interpreter, once it is about to end, takes a signal in the way of the system
+    assert code in (3, 130, -signal.SIGINT)
+    assert words.splitlines()[-1].startswith("error: ")
+    assert "Traceback" not in words
+    stopped_on_its_way(cell, since, goal)
+    assert run.left_behind() == []
+    right(cell, path)
+
+
+def _kill_at_random(cell: Site, path: Path, kills: int, seed: int) -> int:
+    """Kill one run after the other; returns in how many of them the arm moved.
+
+    The moment of every second one counts from when all devices are ready: whatever the kill
+    before has left behind, it must not be refused. None may end before it is killed.
+    """
+    rng = np.random.default_rng(seed)
+    killed = moved = starved = 0
+    cell.slider(SLOW)
+    while killed < kills:
+        run = Run(cell, path)
+        moment = rng.uniform(0.0, LONGEST)
+        try:
+            if killed % 2 == 1:
+                run.wait_until(lambda run=run: BEGUN in run.words, "a beginning")
+            end = time.monotonic() + moment
+            run.wait_until(lambda end=end: time.monotonic() >= end, "it was killed")
+        except EndedError as error:
+            starved += 1
+            if starved > 1 + kills // 20 or not STARVED.search(str(error)):
+                raise
+            continue
+        killed += 1
+        since = time.monotonic()
+        run.kill()
+        run.process.wait()
+        moves = cell.ask("arm", "state")["moving"]
+        assert run.left_behind() == []
+        assert "error:" not in run.words
+        if moves:
+            stopped_within(cell, since)
+        moved += moves
+        if path.exists():
+            _sound(path)
+    cell.slider(1.0)
+    return moved
+
+
+def _sound(path: Path) -> None:
+    with Campaign.open(path) as campaign:
+        log = RunLog(campaign)
+        assert campaign.n_readings == len(log.done()) == len(log.details())
+
+
+def test_kill_minus_nine_at_random_moments(cell: Site, tmp_path: Path) -> None:
+    short = cell.shorter(tmp_path, poses=2)
+    path = tmp_path / "killed.hilcal"
+    _kill_at_random(short, path, 2, 1)
+    finish(short, path)
+
+
+@pytest.mark.slow
+def test_kill_minus_nine_at_a_hundred_random_moments(cell: Site, tmp_path: Path) -> None:
+    long = cell.shorter(tmp_path, poses=25)
+    path = tmp_path / "killed.hilcal"
+    assert _kill_at_random(long, path, 100, 2) > 10
+    finish(long, path)
+
+
+@pytest.mark.slow
+def test_a_full_disk_stops_the_arm_and_loses_nothing(cell: Site, tmp_path: Path) -> None:
+    short = cell.shorter(tmp_path, poses=1)
+    path = tmp_path / "full.hilcal"
+    run = Run(short, path, limit=56 << 10)
+    line = failed(run)
+    assert "make room on the disk" in line
+    assert not cell.ask("arm", "state")["moving"]
+    finish(short, path)
+
+
+@pytest.mark.slow
+def test_two_programs_at_one_cell(cell: Site, tmp_path: Path) -> None:
+    short = cell.shorter(tmp_path, poses=2)
+    first, _ = begin(short, tmp_path / "first.hilcal", Run.measuring)
+    second = Run(short, tmp_path / "second.hilcal")
+    line = failed(second)
+    assert line.count("in use by another program") == 2  # both serial ports
+    code, words = first.end()
+    assert code == 0, words
+    whole(short, tmp_path / "first.hilcal")
+
+
+@pytest.mark.slow
+def test_two_programs_at_one_campaign_file(cell: Site, tmp_path: Path) -> None:
+    short = cell.shorter(tmp_path, poses=1)
+    path = tmp_path / "locked.hilcal"
+    run, _ = begin(short, path, Run.measuring)
+    with sqlite3.connect(path, isolation_level=None) as other:
+        other.execute("BEGIN EXCLUSIVE")
+        line = failed(run, 2)
+        other.execute("ROLLBACK")
+    other.close()
+    assert "another program" in line
+    assert not cell.ask("arm", "state")["moving"]
+    finish(short, path)
+
+
+def test_the_stopped_campaign_has_every_reading_exactly_once(cell: Site, path: Path) -> None:
+    finish(cell, path)

@@ -1,0 +1,223 @@
+"""The UR driver on a simulated controller that is well: state, payload, motion, stop, end."""
+
+import time
+
+import numpy as np
+import pytest
+
+from drivers.ur import open_arm
+from drivers.ur_link.control import Control
+from hilcal.errors import DeviceError, InputError
+from tests.support import ur_driver_cases as cases
+
+
+@pytest.fixture(scope="module")
+def sim(tmp_path_factory):
+    running = cases.start(tmp_path_factory.mktemp("ur"))
+    yield running
+    running.close()
+
+
+@pytest.fixture
+def arm(sim):
+    opened = cases.controlled(sim)
+    yield opened
+    opened.close()
+    assert cases.children() == []
+
+
+def test_opening_and_report_move_nothing_and_upload_nothing(sim):
+    before = sim.admin()
+    arm = open_arm(cases.config(sim.host))
+    try:
+        report = arm.report()
+        words = dict(report.facts)
+        assert "UR10e" in report.name
+        assert "20235500001" in report.name
+        assert words["controller version"] == "5.11.6.1010327"
+        assert words["robot mode"] == "running"
+        assert words["safety"] == "normal"
+        assert words["remote control"] == "yes"
+        assert "°C" in words["joint temperatures"]
+        assert words["RTDE rate"].endswith("of 125 Hz")
+        assert report.problems == ()
+        sample = arm.sample()
+        np.testing.assert_allclose(sample.q, before["q"], atol=1e-4)
+        np.testing.assert_array_equal(sample.q_target, before["q"])
+        assert sample.safety == "normal"
+        assert sample.ft_raw_wrench.shape == (6,)
+        assert abs(sample.host_ns - time.monotonic_ns()) < 1e9
+        assert arm.sample().timestamp > sample.timestamp
+    finally:
+        arm.close()
+    after = sim.admin()
+    assert after["q"] == before["q"]
+    assert after["scripts"] == before["scripts"]
+
+
+def test_report_names_everything_that_hinders_a_run(sim):
+    arm = open_arm(cases.config(sim.host, model="ur5e"))
+    try:
+        sim.admin("local_mode")
+        sim.admin("emergency_stop")
+        problems = " | ".join(arm.report().problems)
+        for words in ("local mode", 'model = "ur5e"', "emergency stop", "not running (power off)"):
+            assert words in problems
+        with pytest.raises(DeviceError, match="emergency stop"):
+            arm.take_control(1.0, np.zeros(3))
+        sim.admin("release_emergency_stop")
+        with pytest.raises(DeviceError, match=r"not running \(power off\)"):
+            arm.take_control(1.0, np.zeros(3))
+    finally:
+        cases.put_right(sim)
+        arm.close()
+
+
+def test_host_and_options_are_checked():
+    with pytest.raises(InputError, match=r"\[robot\] host"):
+        open_arm(cases.config(None))
+    with pytest.raises(InputError, match=r"\[robot.options\].*receive_hz"):
+        open_arm(cases.config("127.0.0.1", receive_hz=0.5))
+    with pytest.raises(InputError, match="recieve_hz"):
+        open_arm(cases.config("127.0.0.1", recieve_hz=125.0))
+
+
+def test_moves_to_the_goal_and_knows_when_it_has_arrived(arm, sim):
+    goal = cases.away(arm, by=0.2)
+    arm.start_move(goal, cases.SPEED, cases.ACCELERATION)
+    assert arm.moving()
+    cases.finish(arm)
+    np.testing.assert_allclose(sim.admin()["q"], goal, atol=2e-5)
+    np.testing.assert_allclose(arm.sample().q, goal, atol=5e-4)
+    assert not arm.moving()
+    arm.start_move(goal, cases.SPEED, cases.ACCELERATION)  # it is there already
+    cases.finish(arm)
+
+
+def test_bad_goals_are_refused_before_anything_moves(arm, sim):
+    q = arm.sample().q
+    for goal in (q[:5], np.append(q, 0.0), np.where(np.arange(6) == 2, np.nan, q), q + 10.0):
+        with pytest.raises(InputError, match="goal"):
+            arm.start_move(goal, 0.5, 0.5)
+    for speed, acceleration in ((0.0, 1.0), (-1.0, 1.0), (np.inf, 1.0), (0.5, 0.0), (0.5, np.nan)):
+        with pytest.raises(InputError, match="not valid"):
+            arm.start_move(q, speed, acceleration)
+    assert not sim.admin()["moving"]
+    assert arm.moving() is False
+
+
+def test_payload_is_set_also_with_its_centre_at_the_flange(arm, sim):
+    state = sim.admin()
+    assert state["payload"] == cases.MASS
+    np.testing.assert_array_equal(state["payload_com"], cases.COM)
+    arm.set_payload(1.25, np.zeros(3))
+    state = sim.admin()
+    assert state["payload"] == 1.25
+    np.testing.assert_allclose(state["payload_com"], 0.0, atol=1e-5)
+    sample = arm.sample()
+    assert sample.payload == 1.25
+    np.testing.assert_allclose(sample.payload_com, 0.0, atol=1e-5)
+    for mass, com in ((-1.0, np.zeros(3)), (np.nan, np.zeros(3)), (1.0, np.zeros(2))):
+        with pytest.raises(InputError, match="payload"):
+            arm.set_payload(mass, com)
+
+
+def test_payload_that_the_controller_does_not_take_is_told(arm, sim, monkeypatch):
+    monkeypatch.setattr(Control, "set_payload", lambda *_: True)
+    with pytest.raises(DeviceError, match=r"it says 2\.5 kg at .* told a payload of 4 kg"):
+        arm.set_payload(4.0, cases.COM)
+    assert sim.admin()["payload"] == cases.MASS
+
+
+def test_stop_in_motion_keeps_control(arm, sim):
+    goal = cases.under_way(arm, sim)
+    called = time.monotonic_ns()
+    arm.stop()
+    state = sim.admin()
+    assert not state["moving"]
+    assert state["rest_ns"] - called < cases.STOP_NS
+    assert abs(state["q"][0] - goal[0]) > 0.05
+    assert arm.moving() is False
+    arm.start_move(goal, cases.SPEED, cases.ACCELERATION)
+    cases.finish(arm)
+    np.testing.assert_allclose(sim.admin()["q"], goal, atol=2e-5)
+
+
+def test_motion_that_nobody_watches_stops_by_itself(arm, sim):
+    goal = cases.under_way(arm, sim)
+    last = time.monotonic_ns()
+    state = sim.wait("moving", False)
+    assert state["rest_ns"] - last < 500_000_000 + cases.STOP_NS
+    assert abs(state["q"][0] - goal[0]) > 0.05
+    assert "nobody watched" in cases.error_of(arm.moving)
+    with pytest.raises(DeviceError, match="nobody watched"):
+        arm.start_move(goal, 0.5, 0.5)
+    arm.take_control(cases.MASS, cases.COM)
+    assert arm.moving() is False
+
+
+def test_second_program_is_refused_and_disturbs_nothing(arm, sim):
+    goal = cases.away(arm, by=0.5)
+    other = open_arm(cases.config(sim.host))
+    try:
+        arm.start_move(goal, cases.SPEED, cases.ACCELERATION)
+        assert arm.moving()
+        begun = time.monotonic()
+        with pytest.raises(DeviceError, match="another program controls it"):
+            other.take_control(0.0, np.zeros(3))
+        assert time.monotonic() - begun < 8.0
+        cases.finish(arm)
+    finally:
+        other.close()
+    np.testing.assert_allclose(sim.admin()["q"], goal, atol=2e-5)
+    assert sim.admin()["payload"] == cases.MASS
+
+
+def test_motion_in_a_world_that_goes_faster(tmp_path):
+    running = cases.start(tmp_path, scale=20.0)
+    try:
+        arm = cases.controlled(running, clock=20.0)
+        try:
+            goal = cases.away(arm, by=2.0)
+            arm.start_move(goal, cases.SPEED, cases.ACCELERATION)
+            cases.finish(arm)
+            np.testing.assert_allclose(running.admin()["q"], goal, atol=2e-5)
+        finally:
+            arm.close()
+    finally:
+        running.close()
+
+
+def test_controller_that_does_not_tell_its_payload(tmp_path):
+    running = cases.start(tmp_path, "--version", "5.4.0.0")
+    arm = None
+    try:
+        arm = open_arm(cases.config(running.host))
+        sample = arm.sample()
+        assert sample.payload_com is None
+        assert sample.ft_raw_wrench is None
+        np.testing.assert_allclose(sample.q, running.admin()["q"], atol=1e-4)
+        assert any("5.5.1" in problem for problem in arm.report().problems)
+        with pytest.raises(DeviceError, match=r"5\.5\.1"):
+            arm.take_control(1.0, np.zeros(3))
+        running.wait("script_running", False)
+    finally:
+        if arm is not None:
+            arm.close()
+        running.close()
+
+
+def test_polyscope_x_is_read_but_not_controlled(tmp_path):
+    running = cases.start(tmp_path, "--version", "10.7.0.0")
+    arm = None
+    try:
+        arm = open_arm(cases.config(running.host))
+        np.testing.assert_allclose(arm.sample().q, running.admin()["q"], atol=1e-4)
+        assert ["PolyScope X" in problem for problem in arm.report().problems] == [True]
+        with pytest.raises(DeviceError, match="cannot take control: PolyScope X"):
+            arm.take_control(cases.MASS, cases.COM)
+        arm.stop()
+    finally:
+        if arm is not None:
+            arm.close()
+        running.close()
