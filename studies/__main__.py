@@ -1,5 +1,6 @@
 """`python -m studies`: evaluations of the program itself, which are not part of the wheel."""
 
+import sys
 from collections.abc import Sequence
 
 import typer
@@ -19,7 +20,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     app.command("diagnosis")(diagnosis)
     app.command("plans")(plans)
     app.callback()(_group)
-    execute(app, "studies", arguments)
+    execute(lambda: app, "studies", sys.argv[1:] if arguments is None else arguments)
 
 
 if __name__ == "__main__":

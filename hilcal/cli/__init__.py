@@ -1,27 +1,18 @@
-"""The command line: one file per group of commands."""
+"""The command line: one file per group of commands, imported where it is used."""
 
 import os
 import sys
 import traceback
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import copy_context
 from typing import Annotated
 
 import typer
-from threadpoolctl import threadpool_limits
 
 from hilcal import __version__
-from hilcal.cli.demo import demo
-from hilcal.cli.effects import effects, new
-from hilcal.cli.fitting import compare, identify, validate
-from hilcal.cli.next import next_
-from hilcal.cli.planning import check, plan
-from hilcal.cli.refining import add, diagnose, refine, remove, view
-from hilcal.cli.running import run
-from hilcal.cli.simulating import simulate
-from hilcal.cli.study_scaling import scaling
-from hilcal.cli.tables import export, import_
-from hilcal.effects.added import scope
+from hilcal.cli.commands import COMMANDS, Command, load
 from hilcal.errors import HilcalError
 
 DEBUG = "HILCAL_DEBUG"
@@ -47,46 +38,32 @@ def application(help_text: str, *, alone: bool = False) -> typer.Typer:
     )
 
 
-def _hilcal() -> typer.Typer:
-    app = application(
-        "Calibrate a robot arm: fit, see where the model fails, name and add what is missing."
-    )
-    commands: dict[str, Callable[..., None]] = {
-        "demo": demo,
-        "simulate": simulate,
-        "check": check,
-        "plan": plan,
-        "run": run,
-        "import": import_,
-        "identify": identify,
-        "compare": compare,
-        "diagnose": diagnose,
-        "add": add,
-        "remove": remove,
-        "refine": refine,
-        "next": next_,
-        "validate": validate,
-        "view": view,
-        "export": export,
-    }
-    for name, command in commands.items():
-        app.command(name)(command)
-    known = application(
-        "List the effects that a model can have; new: begin one of your own.", alone=True
-    )
-    known.command("new")(new)
-    known.callback()(effects)
-    app.add_typer(known, name="effects")
-    study = application("Studies of the program's own mathematics.")
-    study.command("scaling")(scaling)
-    study.callback()(_group)
-    app.add_typer(study, name="study")
+def _hilcal(arguments: Sequence[str]) -> typer.Typer:
+    """Return the application; of its commands only the one that the arguments name is imported."""
+    app = application(str(_top.__doc__))
+    words = [word for word in arguments if not word.startswith("-")]
+    for name, command in COMMANDS.items():
+        if words[:1] != [name]:
+            app.command(name, help=command.summary)(_placeholder)
+        elif command.subcommands:
+            app.add_typer(_group(command), name=name)
+        else:
+            app.command(name)(load(command.place))
     app.callback()(_top)
     return app
 
 
-def _group() -> None:
-    """Studies of the program's own mathematics."""
+def _group(command: Command) -> typer.Typer:
+    """Return a command that has commands of its own."""
+    app = application(command.summary, alone=bool(command.place))
+    for name, place in command.subcommands:
+        app.command(name)(load(place))
+    app.callback(help=command.summary)(load(command.place) if command.place else _placeholder)
+    return app
+
+
+def _placeholder() -> None:
+    """Hold the place of a command that is listed and not used."""
 
 
 def _version(asked: bool) -> None:
@@ -106,35 +83,48 @@ def _top(
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command of `hilcal` and exit; see `execute`."""
-    execute(_hilcal(), "hilcal", arguments)
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    execute(lambda: _hilcal(given), "hilcal", given)
 
 
-def execute(app: typer.Typer, name: str, arguments: Sequence[str] | None = None) -> None:
+def execute(make: Callable[[], typer.Typer], name: str, arguments: Sequence[str]) -> None:
     """Run a command and exit: 0 done, 2 wrong input, 3 a device failed, 4 cannot be answered.
 
     Wrong input and failures are one line on stderr; HILCAL_DEBUG=1 shows where they came from.
 
     Args:
-        app: the commands.
+        make: returns the application; what it raises is reported like what a command raises.
         name: of the program.
-        arguments: of the command line; those of the process where None.
+        arguments: of the command line.
     """
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")
     debug = os.environ.get(DEBUG, "") not in ("", "0")
-    # The matrices are small: more threads gain nothing, and on a busy machine cost tenfold.
-    threads = threadpool_limits(limits=1, user_api="blas")
-    with warnings.catch_warnings(), threads, scope():
+    with warnings.catch_warnings():
         if not debug:
             warnings.simplefilter("ignore")
-        given = sys.argv[1:] if arguments is None else list(arguments)
-        sys.exit(_run(app, name, given, debug))
+        sys.exit(_run(make, name, list(arguments), debug))
 
 
-def _run(app: typer.Typer, name: str, arguments: list[str], debug: bool) -> int:
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Limit BLAS to one thread: more gain nothing on small matrices, and cost on a busy machine."""
+    if "numpy" not in sys.modules:  # --help, --version: nothing is computed
+        yield
+        return
+    from threadpoolctl import threadpool_limits
+
+    with threadpool_limits(limits=1, user_api="blas"):
+        yield
+
+
+def _run(make: Callable[[], typer.Typer], name: str, arguments: list[str], debug: bool) -> int:
     try:
-        result = app(arguments, prog_name=name, standalone_mode=False)
+        app = make()
+        with _one_thread():
+            # Effects of files are in the catalogue of this context only.
+            result = copy_context().run(app, arguments, prog_name=name, standalone_mode=False)
         sys.stdout.flush()
     except HilcalError as error:
         return _fail(error, str(error), error.exit_code, debug)

@@ -19,6 +19,7 @@ from hilcal.report.picture import executable
 from hilcal.report.primitive_arm import arm_meshes, body_poses
 from hilcal.report.story import StoryRevision, StorySuspect
 from hilcal.report.viewer import Limits, digest, layout, save, serve, style, words
+from tests.support.paths import ROOT
 from tests.support.viewer_story import story, ur10e
 
 FORBIDDEN = "█▏░─│⟂∥∈∝ᵀ✘漢"
@@ -323,15 +324,14 @@ def test_a_file_that_cannot_grow_leaves_what_was_there(tmp_path):
     path.write_text("before")
     code = (
         "import resource, signal, sys; from pathlib import Path\n"
-        "from viewer_story import story; from hilcal.report.viewer import save\n"
+        "from tests.support.viewer_story import story; from hilcal.report.viewer import save\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, resource.RLIM_INFINITY))\n"
         "save(story(), Path(sys.argv[1]))\n"
     )
-    here = Path(__file__).parent
     done = subprocess.run(
         [sys.executable, "-c", code, str(path)],
-        env=os.environ | {"PYTHONPATH": f"{here}{os.pathsep}{here.parent}"},
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
         check=False,

@@ -1,0 +1,78 @@
+"""The list of commands: where each stands and what it is for, without importing any of them."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """A command by the place of its function, which is imported when the command is used.
+
+    Attributes:
+        place: "module:function" in `hilcal.cli`; empty for a group that does nothing by itself.
+        summary: first line of the function's docstring, for the list of commands.
+        subcommands: "module:function" by name; with any, the command is a group.
+    """
+
+    place: str
+    summary: str
+    subcommands: tuple[tuple[str, str], ...] = ()
+
+
+def load(place: str) -> Callable[..., Any]:
+    """Import a function by "module:function"."""
+    module, function = place.split(":")
+    found: Callable[..., Any] = getattr(import_module(f"hilcal.cli.{module}"), function)
+    return found
+
+
+COMMANDS = {
+    "demo": Command(
+        "demo:demo", "Rehearse the whole story on a simulated cell, through real drivers and wires."
+    ),
+    "simulate": Command(
+        "simulating:simulate",
+        "Run simulated devices for a cell until Ctrl-C, for `check` and `run` to talk to.",
+    ),
+    "check": Command(
+        "planning:check", "Connect to every device and say who answers; nothing moves."
+    ),
+    "plan": Command(
+        "planning:plan",
+        "Choose poses, loads and their order, with a proof of how near to the best they are.",
+    ),
+    "run": Command(
+        "running:run",
+        "Measure a campaign: every step of the plan, each reading stored before the next motion.",
+    ),
+    "import": Command("tables:import_", "Make a campaign file from a table of readings."),
+    "identify": Command(
+        "fitting:identify", "Fit a model to the readings, and keep it as a revision."
+    ),
+    "compare": Command("fitting:compare", "Show where the latest model fails."),
+    "diagnose": Command("refining:diagnose", "Say which effect the latest model lacks."),
+    "add": Command("refining:add", "Add an effect to the latest model: error before and after."),
+    "remove": Command(
+        "refining:remove", "Take an effect out of the latest model: error before and after."
+    ),
+    "refine": Command("refining:refine", "Diagnose and add until the model is adequate."),
+    "next": Command(
+        "next:next_",
+        "Plan the measurements that separate the leading suspects; exit 4 where there is no doubt.",
+    ),
+    "validate": Command(
+        "fitting:validate", "Predict readings of another campaign with the latest model."
+    ),
+    "view": Command("refining:view", "Tell the story of the latest revisions in rerun."),
+    "export": Command("tables:export", "Write readings and parameters as CSV."),
+    "effects": Command(
+        "effects:effects",
+        "List the effects that a model can have; `new` begins one of your own.",
+        (("new", "effects:new"),),
+    ),
+    "study": Command(
+        "", "Studies of the program's own mathematics.", (("scaling", "study_scaling:scaling"),)
+    ),
+}

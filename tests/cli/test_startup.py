@@ -1,0 +1,49 @@
+"""What the program loads before it is asked to do anything."""
+
+import inspect
+import subprocess
+import sys
+
+import pytest
+
+from hilcal.cli.commands import COMMANDS, Command, load
+from tests.support.paths import ROOT
+
+HEAVY = ("numpy", "scipy", "pydantic", "pinocchio", "rerun", "sklearn", "rich.console")
+
+
+def loaded(code: str) -> set[str]:
+    """Heavy modules that are loaded after a piece of code has run in a process of its own."""
+    report = f"{code}\nimport sys\nprint(*sys.modules, sep='\\n', file=sys.stderr)"
+    done = subprocess.run(
+        [sys.executable, "-c", report], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    return set(HEAVY) & set(done.stderr.split())
+
+
+@pytest.mark.parametrize("option", ["--help", "--version"])
+def test_help_and_version_load_no_library_of_the_computation(option: str) -> None:
+    code = f"""
+from hilcal.cli import main
+try:
+    main([{option!r}])
+except SystemExit as ended:
+    assert ended.code == 0
+"""
+    assert loaded(code) == set()
+
+
+def test_the_package_loads_nothing_until_a_name_is_used() -> None:
+    assert loaded("import hilcal") == set()
+    assert "numpy" in loaded("import hilcal.model")  # the measurement itself can find something
+
+
+@pytest.mark.parametrize(("name", "command"), COMMANDS.items(), ids=list(COMMANDS))
+def test_the_list_of_commands_says_what_each_says_of_itself(name: str, command: Command) -> None:
+    places = [place for _, place in command.subcommands]
+    if command.place:
+        summary = str(inspect.getdoc(load(command.place))).split("\n")[0]
+        assert summary == command.summary
+    for place in places:
+        assert callable(load(place))
+    assert command.place or places, name
