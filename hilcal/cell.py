@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hilcal.config import STANDARD_GRAVITY_M_S2, CellConfig
+from hilcal.config import STANDARD_GRAVITY_M_S2, CellConfig, load_config
+from hilcal.errors import InputError
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.se3 import rotation
@@ -26,6 +27,8 @@ class Cell:
         registration: (4, 4) T_sensor_base: maps base into sensor (tracker) coordinates.
         registration_known: False where it has to be estimated.
         target_known: False where the target's offset has to be estimated.
+        config: the configuration that the cell was made from: instruments, loads, limits; None
+            for a cell that was made from numbers alone.
     """
 
     arm: Arm
@@ -37,6 +40,27 @@ class Cell:
     registration: Floats
     registration_known: bool
     target_known: bool
+    config: CellConfig | None = None
+
+    @classmethod
+    def load(cls, path: str | Path) -> "Cell":
+        """Read a cell from its TOML file; paths in it are relative to the file.
+
+        Raises:
+            InputError: no such file, an unknown key, a bad value, or an unusable robot.
+        """
+        path = Path(path)
+        return cell_from_config(load_config(path), path.absolute().parent)
+
+    def configured(self) -> CellConfig:
+        """Return the configuration.
+
+        Raises:
+            InputError: the cell was made from numbers alone.
+        """
+        if self.config is None:
+            raise InputError("the cell has no configuration; make it with Cell.load(CELL.toml)")
+        return self.config
 
 
 STANDARD_GRAVITY = np.array([0.0, 0.0, -STANDARD_GRAVITY_M_S2])
@@ -70,6 +94,7 @@ def cell_from_config(config: CellConfig, base_dir: Path | None = None) -> Cell:
         registration=_pose(tracker.base_xyz_m, tracker.base_rotvec_rad),
         registration_known=tracker.frame == "base" or tracker.base_xyz_m is not None,
         target_known=tool.target_m is not None,
+        config=config,
     )
 
 

@@ -1,24 +1,29 @@
 """A fit: parameters, what can be said of them, and how far the model is from the data."""
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from scipy.stats import chi2
 
-from hilcal.data.readings import Readings
+from hilcal.data.readings import Readings, States
 from hilcal.data.whitening import Mode, Scaling, Whitening, inverse_root, whitening
-from hilcal.errors import CannotAnswerError
+from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.data_snooping import find_gross
 from hilcal.identify.errors import ErrorBlock, error_block
+from hilcal.identify.estimates import Estimate, Estimates
 from hilcal.identify.folds import distinct_poses, random_folds
 from hilcal.identify.gauss_newton import Solution, solve
 from hilcal.identify.holdout import leave_out
 from hilcal.identify.outliers import limit
 from hilcal.identify.residual import residual
+from hilcal.identify.summary import summary
 from hilcal.identify.uncertainty import Uncertainty, uncertainty
 from hilcal.model import Model
+from hilcal.observe import Observation
 from hilcal.types import Bools, Floats, Ints
 
+Frame = Literal["sensor", "base"]
 CONFIDENCE = 0.95
 OUTLIER_ROUNDS = 6
 MAX_OUTLIER_SHARE = 0.05
@@ -91,6 +96,64 @@ class Fit:
     def mahalanobis2(self) -> Floats:
         """(D,) squared Mahalanobis distance of each measurement by itself."""
         return mahalanobis2(self.raw, self.whitening.covariance)
+
+    @property
+    def parameters(self) -> Estimates:
+        """The parameters with their standard uncertainties, those of dropped groups left out."""
+        u, kept = self.uncertainty, self.solution.prior != 0
+        of = [(f"{e.name}.{p.name}", p.unit) for e in self.model.effects for p in e.parameters]
+        return Estimates(
+            tuple(
+                Estimate(
+                    name,
+                    float(self.theta[k]) if u.identifiable[k] else None,
+                    float(u.std[k]) if u.identifiable[k] and np.isfinite(u.std[k]) else None,
+                    unit,
+                    bool(u.identifiable[k]),
+                )
+                for k, (name, unit) in enumerate(of)
+                if kept[k]
+            )
+        )
+
+    def summary(self) -> str:
+        """Return the model, its errors and its parameters as plain text."""
+        return summary(
+            self.model.names,
+            f"{len(self.raw)} {self.mode} readings, scaling {self.scaling}",
+            self.parameters,
+            (self.error, self.holdout),
+            self.variance_factor,
+            self.variance_factor_interval,
+        )
+
+    def residuals(self, frame: Frame = "sensor") -> Floats:
+        """Residuals (D, m), measured − predicted, m and rad.
+
+        Args:
+            frame: axes that they are given in: "sensor", or "base" of the arm.
+
+        Raises:
+            InputError: another frame.
+        """
+        if frame == "sensor":
+            return self.raw
+        if frame != "base":
+            raise InputError(f"frame {frame!r} is unknown; valid: sensor, base")
+        axes = self.solution.prediction.observation.axes[self.whitening.reading]
+        parts = self.raw.reshape(len(self.raw), -1, 3)
+        return np.asarray(np.einsum("dji,dkj->dki", axes, parts).reshape(self.raw.shape))
+
+    def predict(self, states: States) -> Observation:
+        """Predict what the sensor reads in N states.
+
+        Args:
+            states: joints, wrenches and what else the model's effects need.
+
+        Raises:
+            CannotAnswerError: no static equilibrium.
+        """
+        return self.model.predict(states, self.theta).observation
 
 
 def mahalanobis2(raw: Floats, covariance: Floats) -> Floats:

@@ -32,7 +32,7 @@ def to_json(fit: Fit) -> dict[str, object]:
             "unscaled": finite(basis.condition_unscaled),
             "scaled": finite(basis.condition_scaled),
         },
-        "parameters": parameters(fit),
+        "parameters": fit.parameters.to_dicts(),
         "unidentifiable": list(fit.uncertainty.null),
         "inflated": fit.uncertainty.inflated,
         "variance_factor": fit.variance_factor,
@@ -43,27 +43,6 @@ def to_json(fit: Fit) -> dict[str, object]:
         "registration": registration(fit).tolist(),
         "notes": list(notes(fit)),
     }
-
-
-def parameters(fit: Fit) -> list[dict[str, object]]:
-    """Name, value, standard uncertainty and unit of each parameter that is not held at zero."""
-    out: list[dict[str, object]] = []
-    u, prior = fit.uncertainty, fit.solution.prior
-    for effect, rows in zip(fit.model.effects, fit.model.slices(), strict=True):
-        for p, k in zip(effect.parameters, range(rows.start, rows.stop), strict=True):
-            if prior[k] == 0:
-                continue  # a shrunk family dropped it
-            seen = bool(u.identifiable[k])
-            out.append(
-                {
-                    "name": f"{effect.name}.{p.name}",
-                    "value": float(fit.theta[k]) if seen else None,
-                    "std": finite(u.std[k]) if seen else None,
-                    "unit": p.unit,
-                    "identifiable": seen,
-                }
-            )
-    return out
 
 
 def outliers(fit: Fit) -> list[dict[str, object]]:

@@ -122,9 +122,8 @@ def test_without_noise_shrinkage_costs_no_accuracy():
 
 def test_a_dropped_harmonic_is_not_counted_nor_listed():
     found, _ = with_harmonics("none", 0, 6)
-    from hilcal.identify.fit_document import parameters
 
     prior = found.solution.prior[found.model.slices()[-1]]
-    listed = [p for p in parameters(found) if p["name"].startswith("transmission_error")]
+    listed = [p for p in found.parameters if p.name.startswith("transmission_error")]
     assert len(listed) == np.count_nonzero(prior)
     assert np.all(found.theta[found.model.slices()[-1]][prior == 0] == 0)
