@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg as sl
 
-from hilcal.diagnose.paired_test import improves
 from hilcal.diagnose.score import Score, score
 from hilcal.identify.fit import Fit
 from hilcal.identify.folds import random_folds
 from hilcal.identify.holdout import fold_equations
+from hilcal.regression.paired_test import improves
 from hilcal.types import Bools, Floats
 
 ROUNDING = 1e-10

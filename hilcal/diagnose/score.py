@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import f as f_distribution
 
-from hilcal.diagnose.quadratic_form import ratio_tail
+from hilcal.regression.quadratic_form import ratio_tail
 from hilcal.types import Floats
 
 LARGE_FAMILY = 0.1

@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from hilcal.diagnose.paired_test import LEAST_GAIN, improves
 from hilcal.diagnose.projection import left_out_by_pose
 from hilcal.effects.catalogue import make
 from hilcal.effects.options import Options, reading_options
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit, fit
 from hilcal.model import Model
+from hilcal.regression.paired_test import LEAST_GAIN, improves
 from hilcal.types import Floats
 
 

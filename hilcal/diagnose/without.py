@@ -15,7 +15,7 @@ import scipy.linalg as sl
 
 from hilcal.identify.fit import Fit
 from hilcal.identify.gauss_newton import scales_of
-from hilcal.identify.linear import find_basis
+from hilcal.regression.normal_equations import find_basis
 from hilcal.types import Floats
 
 

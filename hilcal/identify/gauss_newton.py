@@ -8,10 +8,10 @@ import scipy.linalg as sl
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Whitening
 from hilcal.errors import CannotAnswerError
-from hilcal.identify.empirical_bayes import shrink
-from hilcal.identify.linear import Basis, NormalEquations, find_basis, normal_equations
 from hilcal.identify.residual import residual
 from hilcal.model import Model, Prediction
+from hilcal.regression.empirical_bayes import shrink
+from hilcal.regression.normal_equations import Basis, NormalEquations, find_basis, normal_equations
 from hilcal.types import Floats, Ints
 
 MAX_ITERATIONS = 20

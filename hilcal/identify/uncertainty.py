@@ -24,8 +24,8 @@ from hilcal.data.whitening import Whitening
 from hilcal.identify.folds import block_folds, region_folds
 from hilcal.identify.gauss_newton import Solution, prior_of, scales_of, whitened_jacobian
 from hilcal.identify.holdout import leave_out
-from hilcal.identify.hyperparameter_uncertainty import widened, with_dropped
 from hilcal.model import Model
+from hilcal.regression.hyperparameter_uncertainty import widened, with_dropped
 from hilcal.types import Bools, Floats, Ints
 
 NULL_SHARE = 0.1

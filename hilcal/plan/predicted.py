@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.identify.linear import INFORMATION, ROUNDING
 from hilcal.identify.uncertainty import LEARNT, MEANINGLESS, NULL_SHARE
 from hilcal.plan.information import Problem
 from hilcal.plan.prediction_poses import WorkPoses
+from hilcal.regression.normal_equations import INFORMATION, ROUNDING
 from hilcal.types import Bools, Floats
 
 
@@ -91,7 +91,7 @@ def covariance(information: Floats, flat: Bools) -> tuple[Floats, Floats]:
     """Invert an information matrix, as identification does: what cannot be seen is held at zero.
 
     Directions of the flat parameters that move all data together by less than 0.2 σ at an
-    ordinary magnitude (see `identify.linear`) are left out.
+    ordinary magnitude (see `regression.normal_equations`) are left out.
 
     Args:
         information: (P, P) by parameters in ordinary magnitudes, prior included.

@@ -24,9 +24,9 @@ from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.effects.joint_tilt_compliance import JointTiltCompliance
 from hilcal.effects.target_offset import TargetOffset
 from hilcal.identify.gauss_newton import prior_of, scales_of, whitened_jacobian
-from hilcal.identify.linear import find_basis, normal_equations
 from hilcal.identify.residual import residual
 from hilcal.model import Model, Prediction
+from hilcal.regression.normal_equations import find_basis, normal_equations
 from hilcal.types import Floats
 from tests.support.arm_cases import arm_of, cell_of
 

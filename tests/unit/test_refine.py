@@ -8,7 +8,6 @@ import pytest
 from drivers.simulated.injected_effects import hide
 from hilcal.data.readings import Readings
 from hilcal.diagnose.effect_ranking import candidates, rank_suspects
-from hilcal.diagnose.paired_test import LEAST_GAIN
 from hilcal.diagnose.projection import projection
 from hilcal.effects.catalogue import make
 from hilcal.errors import InputError
@@ -16,6 +15,7 @@ from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import fit
 from hilcal.model import Model
 from hilcal.refine import MOST_REVISIONS, Refinement, add, refine
+from hilcal.regression.paired_test import LEAST_GAIN
 from tests.support.campaigns import campaign, cell_of, measured, plan, world_of
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hilcal.identify.hyperparameter_uncertainty import HIDDEN, widened, with_dropped
+from hilcal.regression.hyperparameter_uncertainty import HIDDEN, widened, with_dropped
 
 LEARNT = 0.7
 

@@ -5,8 +5,8 @@ import pytest
 
 from hilcal.effects.catalogue import make
 from hilcal.identify.baseline import baseline, with_effects
-from hilcal.identify.empirical_bayes import Shrinkage, shrink
 from hilcal.identify.fit import Fit, fit
+from hilcal.regression.empirical_bayes import Shrinkage, shrink
 from tests.support.campaigns import campaign, noiseless, plan
 
 

@@ -1,8 +1,8 @@
 """What not knowing the strength of a shrunk family adds to the uncertainty of its parameters.
 
-A group's prior N(0, τ²) is chosen from the data (`shrinkage`), but a handful of parameters tell
-little of their own spread: stated for that one τ, intervals of weak groups would be too short.
-The uncertainty is that of the mixture over τ, around the estimate that is used:
+A group's prior N(0, τ²) is chosen from the data (`empirical_bayes`), but a handful of parameters
+determine their own spread badly: stated for that one τ, intervals of weak groups would be too
+short. The uncertainty is that of the mixture over τ, around the estimate that is used:
 
     E[(θ − θ̂)²] = Σ_τ w_τ [ V_τ + (m_τ − θ̂)² ],   w_τ ∝ p(τ) |I + τ² L|^(−1/2) exp(½ bᵀ V_τ b)
 
@@ -23,14 +23,12 @@ prior for a global scale parameter*, Bayesian Analysis 7 (2012) 887-902.
 """
 
 import numpy as np
-import scipy.linalg as sl
 
+from hilcal.regression.schur import schur_complement
 from hilcal.types import Floats, Ints
 
 GRID = np.logspace(-2.0, 3.0, 101)
 """Values of τ in units of the half-Cauchy's scale."""
-
-
 ROUNDING = 1e-9
 HIDDEN = 2.0
 """Variance that a dropped group may have, in units of what noise alone makes of its parameters:
@@ -100,8 +98,9 @@ def with_dropped(
     if not seen.any():
         return np.ones(len(transform))
     inner = gram[np.ix_(seen, seen)] + np.diag(beta * reach[groups][seen] / HIDDEN)
-    part = sl.solve_triangular(np.linalg.cholesky(inner), cross[:, seen].T, lower=True)
-    wide = np.linalg.inv(h - part.T @ part)
+    cross = cross[:, seen]
+    joint = np.block([[h, cross], [cross.T, inner]])
+    wide = np.linalg.inv(schur_complement(joint, np.arange(len(h))))
     before = np.einsum("pk,kl,pl->p", transform, inverse, transform)
     after = np.einsum("pk,kl,pl->p", transform, wide, transform)
     there = before > 0

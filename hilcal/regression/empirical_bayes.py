@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg as sl
 
+from hilcal.regression.schur import eliminate
 from hilcal.types import Floats, Ints
 
 ITERATIONS = 25
@@ -65,16 +66,8 @@ def shrink(
         start: (P,) starting standard deviations.
         beta: starting noise variance factor.
     """
-    # Eliminate the flat columns exactly once.
-    if flat:
-        c = sl.cho_factor(gram[:flat, :flat], check_finite=False)
-        cross = gram[:flat, flat:]
-        solved = sl.cho_solve(c, np.column_stack([cross, rhs[:flat]]), check_finite=False)
-        g = gram[flat:, flat:] - cross.T @ solved[:, :-1]
-        b = rhs[flat:] - cross.T @ solved[:, -1]
-        yy = target_norm2 - float(rhs[:flat] @ solved[:, -1])
-    else:
-        g, b, yy = gram, rhs, target_norm2
+    g, b, yy = eliminate(gram, rhs, target_norm2, slice(0, flat))
+    g, b = g[flat:, flat:], b[flat:]
     count = int(groups.max()) + 1 if len(groups) else 0
     members = np.maximum(np.bincount(groups, minlength=count), 1)
     # Group variances; a group's strength is judged by what it does to the data.

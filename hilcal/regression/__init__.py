@@ -1,0 +1,1 @@
+"""Linear algebra and tests of a linearised least-squares problem: arrays in, values out."""

@@ -1,0 +1,113 @@
+"""Prediction of rows that are left out, with the model and a family of columns refitted.
+
+Each fold is refitted by one Gauss-Newton step from the fit to all rows, in which the fold's rows
+are taken out of the normal equations exactly. A residual of the fit to all rows would already know
+of those left out.
+
+A single pose may be the only one that determines a direction. A flat estimate along it from the
+other poses would be noise, magnified without limit, and one such pose would outweigh all others in
+the error. So without a fold the flat parameters have a prior about zero (empirical Bayes), whose
+standard deviation is their magnitude in the full fit. A direction that the other rows determine to
+1/s of this magnitude shrinks by the share 1/(1 + s²): not at all where it is well determined, to
+the model without it where it is not.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg as sl
+
+from hilcal.regression.normal_equations import NormalEquations
+from hilcal.regression.projection import Projection
+from hilcal.types import Bools, Floats, Ints
+
+ROUNDING = 1e-6
+"""Ridge of flat directions, whose gram is the identity."""
+FAMILY_ROUNDING = 1e-10
+"""Least ridge of a family, as a share of the largest square of a column."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fold:
+    """The model's normal equations without one fold.
+
+    Attributes:
+        out: (R,) rows of the fold.
+        factor: Cholesky factor of H without them.
+        rhs: (K,) right-hand side without them, for a step from the fit.
+    """
+
+    out: Bools
+    factor: tuple[Floats, bool]
+    rhs: Floats
+
+    def step(self) -> Floats:
+        """Return (K,) coordinates without the fold minus those with it."""
+        return np.asarray(sl.cho_solve(self.factor, self.rhs, check_finite=False))
+
+
+def folds(
+    p: Projection,
+    white: Floats,
+    equations: NormalEquations,
+    theta: Floats,
+    prior: Floats,
+    magnitude: Floats,
+    beta: float,
+    fold: Ints,
+) -> tuple[Fold, ...]:
+    """Return the normal equations of a step from a fit without each fold.
+
+    Args:
+        p: the fit's columns by identifiable coordinates, with the ridge of its priors.
+        white: (R,) its whitened residual.
+        equations: its normal equations, over all parameters.
+        theta: (P,) its parameters.
+        prior: (P,) their prior standard deviations, infinite for flat ones.
+        magnitude: (P,) standard deviations that flat parameters have without a fold.
+        beta: noise variance factor that priors are weighed against.
+        fold: (R,) fold of each row, from 0.
+    """
+    basis = equations.basis
+    flat, held = slice(0, len(basis.singular)), basis.held
+    h = equations.gram + np.diag(p.ridge + np.where(p.ridge > 0, 0.0, ROUNDING))
+    per_magnitude = basis.transform[:, flat] / magnitude[:, None]
+    h[flat, flat] += beta * per_magnitude.T @ per_magnitude
+    pull = np.zeros(len(h))
+    pull[flat] = per_magnitude.T @ (np.where(basis.flat, theta, 0.0) / magnitude)
+    pull[flat.stop :] = theta[held] / prior[held]
+    rhs = p.rows.T @ white - beta * pull
+    out = []
+    for f in range(int(fold.max()) + 1):
+        mine = fold == f
+        rows = p.rows[mine]
+        factor, low = sl.cho_factor(h - rows.T @ rows, check_finite=False)
+        out.append(Fold(mine, (factor, bool(low)), rhs - rows.T @ white[mine]))
+    return tuple(out)
+
+
+def left_out_residual(
+    folds: tuple[Fold, ...], p: Projection, white: Floats, x: Floats, ridge: float
+) -> Floats:
+    """Return the residual (R,) of each row, predicted without its fold by model and family.
+
+    Args:
+        folds: of the model.
+        p: the model's columns.
+        white: (R,) residual of the model fitted to all rows.
+        x: (R, F) whitened columns of the family.
+        ridge: of the family's parameters.
+    """
+    cross, gram, rhs = p.rows.T @ x, x.T @ x, x.T @ white
+    gram[np.diag_indices_from(gram)] += max(ridge, FAMILY_ROUNDING * float(gram.max(initial=0.0)))
+    left = np.zeros(len(white))
+    for fold in folds:
+        out, own, r = x[fold.out], p.rows[fold.out], white[fold.out]
+        # Eliminate the model's own coordinates, then solve for the family.
+        c = cross - own.T @ out
+        solved = sl.cho_solve(fold.factor, np.column_stack([c, fold.rhs]), check_finite=False)
+        h = gram - out.T @ out - c.T @ solved[:, :-1]
+        b = rhs - out.T @ r - c.T @ solved[:, -1]
+        step = sl.solve(h, b, assume_a="pos", check_finite=False)
+        left[fold.out] = r - own @ (solved[:, -1] - solved[:, :-1] @ step) - out @ step
+    return left

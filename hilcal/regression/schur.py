@@ -1,0 +1,142 @@
+"""The Schur complement of nuisance parameters, with a rule for singular information matrices.
+
+For the parameters of interest i beside the nuisance parameters n
+
+    S = M_ii − M_in M_nn⁻ M_ni = min over U of Uᵀ M U, U the identity at i and zero outside of i, n
+
+is the information on i when n is estimated as well. With U at its minimum, (1, −M_nn⁻ M_ni), and
+Y = M_nn⁻ at n and zero elsewhere, S is a concave function of M = Σ w_k H_k with
+
+    ∂S/∂w_k = Uᵀ H_k U,    ∂²S/∂w_k∂w_l = −Uᵀ (H_k Y H_l + H_l Y H_k) U.
+
+Rule for singular blocks: M_nn is scaled to unit diagonal, and M_nn⁻ is the inverse on its
+eigenvectors whose eigenvalue exceeds `DETERMINED`. Directions without information explain
+nothing. The scaling makes the rule independent of the units of the parameters.
+
+Source: Pukelsheim, *Optimal Design of Experiments* (1993), chapter 3.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilcal.types import Floats, Ints
+
+DETERMINED = 1e-12
+"""Least eigenvalue of an information matrix of unit diagonal that counts as information.
+
+Products of double precision leave about 1e-16 times the number of rows in place of a zero; at
+1e-12 a parameter's standard uncertainty is a million times what it were if the others were known.
+"""
+_SOUND = 1e-2
+"""Share of the largest admissible inverse, 1/`DETERMINED`, up to which Cholesky's factor serves."""
+
+
+def inverse_root(block: Floats) -> Floats:
+    """Return T (..., F, F) with Tᵀ T = M⁻ of blocks M (..., F, F), by the rule for singular blocks.
+
+    Directions without information have zero rows in T.
+    """
+    size = block.shape[-1]
+    flat = block.reshape(-1, size, size)
+    root = np.sqrt(np.maximum(np.diagonal(flat, axis1=1, axis2=2), 0.0))
+    root[root == 0.0] = 1.0
+    scaled = flat / (root[:, :, None] * root[:, None, :])
+    try:
+        out = np.linalg.inv(np.linalg.cholesky(scaled))
+        # The trace of the inverse is at least the inverse of the least eigenvalue.
+        sound = np.einsum("nij,nij->n", out, out) < _SOUND / DETERMINED
+    except np.linalg.LinAlgError:
+        out = np.zeros_like(scaled)
+        sound = np.zeros(len(flat), dtype=np.bool_)
+    for k in np.flatnonzero(~sound):
+        values, vectors = np.linalg.eigh(scaled[k])
+        kept = values > DETERMINED
+        inverse = np.where(kept, 1.0 / np.sqrt(np.where(kept, values, 1.0)), 0.0)
+        out[k] = inverse[:, None] * vectors.T
+    return np.asarray((out / root[:, None, :]).reshape(block.shape))
+
+
+def nuisance_inverse(m: Floats, nuisance: Ints) -> Floats:
+    """Return Y (P, P): M_nn⁻ at the nuisance parameters, zero elsewhere."""
+    out = np.zeros_like(m)
+    root = inverse_root(m[np.ix_(nuisance, nuisance)])
+    out[np.ix_(nuisance, nuisance)] = root.T @ root
+    return out
+
+
+def schur_complement(m: Floats, interest: Ints, nuisance: Ints | None = None) -> Floats:
+    """Return S (..., I, I) of information matrices M (..., P, P).
+
+    Args:
+        m: symmetric, positive semidefinite.
+        interest: (I,) indices of the parameters of interest.
+        nuisance: (N,) indices of those that are estimated as well; all others by default.
+    """
+    if nuisance is None:
+        nuisance = np.setdiff1d(np.arange(m.shape[-1]), interest)
+    own = m[..., interest[:, None], interest]
+    block = m[..., nuisance[:, None], nuisance]
+    explained = inverse_root(block) @ m[..., nuisance[:, None], interest]
+    return np.asarray(own - np.swapaxes(explained, -1, -2) @ explained)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SchurComplement:
+    """S at one M, with what its derivatives by M need.
+
+    Attributes:
+        matrix: (I, I) S.
+        lift: (P, I) U.
+        inverse: (P, P) Y; None where there is no nuisance parameter.
+    """
+
+    matrix: Floats
+    lift: Floats
+    inverse: Floats | None
+
+    def embed(self, inner: Floats) -> Floats:
+        """Return U G Uᵀ (P, P) of G (I, I): the gradient by M of tr(G S)."""
+        return np.asarray(self.lift @ inner @ self.lift.T)
+
+
+def differentiable_schur_complement(m: Floats, interest: Ints | None) -> SchurComplement:
+    """Return S of one M (P, P) beside all other parameters; M itself where no interest is given."""
+    size = len(m)
+    if interest is None or len(interest) == size:
+        return SchurComplement(m, np.eye(size), None)
+    others = np.setdiff1d(np.arange(size), interest)
+    inverse = nuisance_inverse(m, others)
+    lift = np.zeros((size, len(interest)))
+    lift[interest] = np.eye(len(interest))
+    lift -= inverse @ m[:, interest]
+    s = m[interest] @ lift
+    return SchurComplement((s + s.T) / 2, lift, inverse)
+
+
+def eliminate(
+    gram: Floats, rhs: Floats, square: float, out: slice, ridge: float = 0.0
+) -> tuple[Floats, Floats, float]:
+    """Eliminate parameters from normal equations, or add them to a model: the same operation.
+
+    With G = XᵀX, b = Xᵀy and ‖y‖² of all columns X, o the columns to eliminate and λ their ridge,
+
+        G ← G − G_o (G_oo + λ 1)⁻ G_oᵀ,   b ← b − G_o (G_oo + λ 1)⁻ b_o,
+        ‖y‖² ← ‖y‖² − b_oᵀ (G_oo + λ 1)⁻ b_o
+
+    are those of the other columns beside them, and the penalised sum of squares that they leave.
+
+    Args:
+        gram: (P, P) G.
+        rhs: (P,) b.
+        square: ‖y‖².
+        out: columns to eliminate.
+        ridge: λ, inverse of their prior variance in units of the noise.
+
+    Returns:
+        (P, P), (P,) and the sum of squares; the rows of the eliminated columns are of no use.
+    """
+    inner = gram[out, out] + ridge * np.eye(len(rhs[out]))
+    solved = inverse_root(inner) @ np.column_stack([gram[out], rhs[out]])
+    cross, own = solved[:, :-1], solved[:, -1]
+    return gram - cross.T @ cross, rhs - cross.T @ own, square - float(own @ own)

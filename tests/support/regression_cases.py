@@ -1,0 +1,68 @@
+"""Random linear problems, and the same in dense algebra."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilcal.regression.projection import Projection, projection
+from hilcal.types import Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """A model with and without priors, fitted to y, and a family beside it.
+
+    Attributes:
+        rows: (R, K) columns of the model.
+        ridge: (K,) of their priors.
+        x: (R, P) columns of the family.
+        y: (R,) the data.
+    """
+
+    rows: Floats
+    ridge: Floats
+    x: Floats
+    y: Floats
+
+    @property
+    def projection(self) -> Projection:
+        return projection(self.rows, self.ridge)
+
+    @property
+    def dense(self) -> Floats:
+        """M (R, R)."""
+        h = self.rows.T @ self.rows + np.diag(self.ridge)
+        return np.eye(len(self.y)) - self.rows @ np.linalg.inv(h) @ self.rows.T
+
+    @property
+    def estimate(self) -> Floats:
+        """(K,) of the model."""
+        h = self.rows.T @ self.rows + np.diag(self.ridge)
+        return np.linalg.solve(h, self.rows.T @ self.y)
+
+
+def problem(
+    kind: str = "priors", rows: int = 60, family: int = 4, noise: float = 1.0, seed: int = 0
+) -> Problem:
+    """Return a random problem; kinds: "flat", "priors", "no columns", "rank deficient".
+
+    The family of the last kind has two columns that are linear combinations of others and of
+    the model's.
+    """
+    rng = np.random.default_rng(seed)
+    size = 0 if kind == "no columns" else 7
+    b = rng.standard_normal((rows, size))
+    ridge = np.zeros(size)
+    if kind != "flat":
+        ridge[size // 2 :] = rng.uniform(0.1, 30.0, size - size // 2)
+    x = rng.standard_normal((rows, family)) * np.logspace(-0.5, 1, family)
+    if size:
+        x += b[:, :1]
+    if kind == "rank deficient":
+        x = np.hstack([x, x[:, :1] + x[:, 1:2], b[:, :1]])
+    y = noise * rng.standard_normal(rows) + b @ rng.standard_normal(size)
+    y += x[:, :family] @ (0.7 / np.logspace(-0.5, 1, family))
+    return Problem(b, ridge, x, y)
+
+
+KINDS = ("flat", "priors", "no columns", "rank deficient")

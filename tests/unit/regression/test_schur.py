@@ -1,0 +1,117 @@
+"""Schur complements, regular and singular, against least squares and finite differences."""
+
+import numpy as np
+import pytest
+
+from hilcal.regression.schur import (
+    differentiable_schur_complement,
+    eliminate,
+    inverse_root,
+    nuisance_inverse,
+    schur_complement,
+)
+from hilcal.types import Floats
+
+INTEREST = np.array([0, 2, 5])
+OTHERS = np.array([1, 3, 4, 6, 7])
+
+
+def columns(*, singular: bool, units: Floats | float = 1.0) -> Floats:
+    """(R, 8) columns; where singular, two of the nuisance columns are combinations of others."""
+    a = np.random.default_rng(3).standard_normal((40, 8))
+    if singular:
+        a[:, 6] = a[:, 1] - 2 * a[:, 3]
+        a[:, 7] = 0.0
+    return a * units
+
+
+def beyond(a: Floats, x: Floats) -> Floats:
+    """Information on columns X when A is estimated as well, from residuals of least squares."""
+    left = x - a @ np.linalg.lstsq(a, x, rcond=1e-9)[0]
+    return left.T @ left
+
+
+@pytest.mark.parametrize("singular", [False, True])
+def test_it_is_the_information_of_the_residual_columns(singular: bool) -> None:
+    a = columns(singular=singular)
+    expected = beyond(a[:, OTHERS], a[:, INTEREST])
+    m = a.T @ a
+    np.testing.assert_allclose(schur_complement(m, INTEREST), expected, rtol=1e-11)
+    single = differentiable_schur_complement(m, INTEREST)
+    np.testing.assert_allclose(single.matrix, expected, rtol=1e-11)
+    np.testing.assert_allclose(single.lift.T @ m @ single.lift, expected, rtol=1e-11)
+    some = beyond(a[:, OTHERS[:2]], a[:, INTEREST])
+    np.testing.assert_allclose(schur_complement(m, INTEREST, OTHERS[:2]), some, rtol=1e-11)
+
+
+@pytest.mark.parametrize("singular", [False, True])
+def test_units_of_the_parameters_do_not_matter(singular: bool) -> None:
+    """Standard units of an arm's parameters differ by 1e9: rad/Nm beside m."""
+    units = np.logspace(-5, 5, 8)[::-1]
+    a, scaled = columns(singular=singular), columns(singular=singular, units=units)
+    expected = schur_complement(a.T @ a, INTEREST) * np.outer(units[INTEREST], units[INTEREST])
+    np.testing.assert_allclose(schur_complement(scaled.T @ scaled, INTEREST), expected, rtol=1e-9)
+
+
+def test_many_matrices_at_once() -> None:
+    m = np.stack([c.T @ c for c in (columns(singular=False), columns(singular=True))] * 2)
+    found = schur_complement(m.reshape(2, 2, 8, 8), INTEREST)
+    each = [schur_complement(one, INTEREST) for one in m]
+    np.testing.assert_allclose(found.reshape(4, 3, 3), each, rtol=1e-13)
+
+
+@pytest.mark.parametrize("singular", [False, True])
+def test_the_inverse_root_is_one_of_the_pseudoinverse(singular: bool) -> None:
+    a = columns(singular=singular)
+    m = a.T @ a
+    t = inverse_root(m)
+    inverse = t.T @ t
+    np.testing.assert_allclose(m @ inverse @ m, m, atol=1e-11)
+    assert np.linalg.matrix_rank(inverse) == (6 if singular else 8)
+    y = nuisance_inverse(m, OTHERS)
+    assert not y[INTEREST].any()
+    assert not y[:, INTEREST].any()
+
+
+def test_without_nuisance_it_is_the_matrix() -> None:
+    a = columns(singular=False)
+    m = a.T @ a
+    assert differentiable_schur_complement(m, None).matrix is m
+    np.testing.assert_array_equal(schur_complement(m, np.arange(8)), m)
+
+
+def test_its_derivatives_by_the_information() -> None:
+    a = columns(singular=False)
+    m = a.T @ a
+    rng = np.random.default_rng(0)
+    h, k = (c.T @ c for c in rng.standard_normal((2, 3, 8)))
+    g = np.diag([1.0, 2.0, 0.5])
+
+    def value(t: float, u: float = 0.0) -> float:
+        return float(np.trace(g @ schur_complement(m + t * h + u * k, INTEREST)))
+
+    at = differentiable_schur_complement(m, INTEREST)
+    step = 1e-4
+    gradient = at.embed(g)
+    slope = (value(step) - value(-step)) / (2 * step)
+    assert float(np.sum(gradient * h)) == pytest.approx(slope, rel=1e-7)
+    assert at.inverse is not None
+    bend = (
+        value(step, step) - value(step, -step) - value(-step, step) + value(-step, -step)
+    ) / (4 * step**2)  # fmt: skip
+    expected = -2 * float(np.trace(gradient @ h @ at.inverse @ k))
+    assert bend == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize("ridge", [0.0, 0.7])
+def test_elimination_gives_the_normal_equations_of_the_residual(ridge: float) -> None:
+    a, y = columns(singular=False), np.random.default_rng(1).standard_normal(40)
+    out, rest = slice(2, 5), np.array([0, 1, 5, 6, 7])
+    x = np.vstack([a[:, out], np.sqrt(ridge) * np.eye(3)])
+    wide, data = np.vstack([a, np.zeros((3, 8))]), np.append(y, np.zeros(3))
+    p = np.eye(43) - x @ np.linalg.inv(x.T @ x) @ x.T
+    g, b, square = eliminate(a.T @ a, a.T @ y, float(y @ y), out, ridge)
+    np.testing.assert_allclose(g[np.ix_(rest, rest)], (wide.T @ p @ wide)[np.ix_(rest, rest)],
+                               rtol=1e-11, atol=1e-11)  # fmt: skip
+    np.testing.assert_allclose(b[rest], (wide.T @ p @ data)[rest], rtol=1e-11, atol=1e-11)
+    assert square == pytest.approx(float(data @ p @ data), rel=1e-12)
