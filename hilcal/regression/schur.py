@@ -38,6 +38,8 @@ def inverse_root(block: Floats) -> Floats:
     Directions without information have zero rows in T.
     """
     size = block.shape[-1]
+    if not size:
+        return block
     flat = block.reshape(-1, size, size)
     root = np.sqrt(np.maximum(np.diagonal(flat, axis1=1, axis2=2), 0.0))
     root[root == 0.0] = 1.0
