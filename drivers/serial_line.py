@@ -90,15 +90,6 @@ def drain(port: serial.Serial, quiet: float, limit: float) -> bool:
     return False
 
 
-def plugged_in(port: serial.Serial) -> bool:
-    """Whether the adapter is still there; `port.is_open` stays True when it is unplugged."""
-    try:
-        termios.tcgetattr(port.fileno())
-        return os.path.samestat(os.fstat(port.fileno()), os.stat(str(port.port)))
-    except (OSError, termios.error):
-        return False
-
-
 def close_port(port: serial.Serial) -> None:
     """Give the port back, whatever state it is in. Never raises, may be called twice."""
     with contextlib.suppress(OSError, termios.error):

@@ -37,21 +37,6 @@ def secret_of(config: CellConfig, plan: Plan, choice: str, seed: int) -> Secret:
     return replace(secret, world=replace(secret.world, noise=measurement_noise(config)))
 
 
-def rehearse_plan(config: CellConfig, plan: Plan, choice: str, seed: int) -> Rehearsal:
-    """Draw the readings of a plan in a simulated cell, through no wire.
-
-    Args:
-        config: the cell; `[simulation]` tells the strength of what is hidden.
-        plan: what is measured, each reading the mean of several measurements.
-        choice: an effect, "random" or "nothing".
-        seed: of everything random.
-
-    Raises:
-        InputError: an unknown choice, or a cell without loads.
-    """
-    return read_plan(secret_of(config, plan, choice, seed), plan, [seed, 1])
-
-
 def read_plan(s: Secret, plan: Plan, seed: Sequence[int], begun: float = 0.0) -> Rehearsal:
     """Draw the readings of a plan in a simulated cell that is there already.
 

@@ -10,7 +10,7 @@ R is the mean of the posterior of the random covariance, with the stated one as 
 ν0 = 20 repeats (an inverse Wishart law; Gelman et al., *Bayesian Data Analysis*, section 3.6): a
 few repeats are a poor estimate of six or more variances, but the stated figures are one of a
 kind of instrument, not of today's air. τ is 1 unless the scatter cannot be explained by the
-stated noise (see `scatter_ratio`; p < 0.001): then it is their ratio, so that an instrument that
+stated noise (chi² test, p < 0.001): then it is their ratio, so that an instrument that
 is far worse than stated is not believed.
 """
 
@@ -58,15 +58,7 @@ class Average:
     warnings: tuple[str, ...]
 
 
-def average(
-    samples: Sequence[TrackerSample], systematic_share: float = 0.0
-) -> tuple[Floats, Floats]:
-    """Return the mean (m,) of samples and its covariance (m, m); see `combine`."""
-    result = combine(samples, systematic_share)
-    return result.value, result.covariance
-
-
-def combine(samples: Sequence[TrackerSample], systematic_share: float = 0.0) -> Average:
+def average(samples: Sequence[TrackerSample], systematic_share: float = 0.0) -> Average:
     """Average K samples of one target at rest; the law is that of the module.
 
     A gross outlier among them is left out: its squared distance from the median, whitened by
@@ -110,22 +102,6 @@ def combine(samples: Sequence[TrackerSample], systematic_share: float = 0.0) -> 
     return Average(mean, (covariance + covariance.T) / 2, ratio, p, left_out, tuple(warnings))
 
 
-def scatter_ratio(samples: Sequence[TrackerSample]) -> tuple[float, float]:
-    """Trace test of the scatter: T / (m (K - 1)) with T = Σ_k r_kᵀ Σ̄⁻¹ r_k, and its p-value.
-
-    Under the stated noise T follows chi² with m (K - 1) degrees of freedom.
-
-    Args:
-        samples: at least 2.
-
-    Returns:
-        Mean square scatter over the stated one, and P(chi² >= T).
-    """
-    values = np.array([sample.value for sample in samples])
-    prior = np.mean([sample.covariance for sample in samples], axis=0)
-    return _trace_test(deviations(values)[1], prior)
-
-
 def deviations(values: Floats) -> tuple[Floats, Floats]:
     """Mean (m,) of values (K, m), and each one's deviation from it (K, m).
 
@@ -148,7 +124,10 @@ def deviations(values: Floats) -> tuple[Floats, Floats]:
 
 
 def _trace_test(residuals: Floats, prior: Floats) -> tuple[float, float]:
-    """Scatter over the stated one, and the probability of at least as much."""
+    """T / (m (K - 1)) and P(chi² >= T), with T = Σ_k r_kᵀ Σ̄⁻¹ r_k.
+
+    Under the stated noise T follows chi² with m (K - 1) degrees of freedom.
+    """
     count, m = residuals.shape
     white = residuals @ inverse_root(prior).T
     total, dof = float(np.sum(white**2)), m * (count - 1)

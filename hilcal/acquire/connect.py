@@ -10,7 +10,7 @@ from hilcal.acquire import devices
 from hilcal.acquire.devices import Report
 from hilcal.acquire.rig import Rig
 from hilcal.config import CellConfig
-from hilcal.errors import DeviceError, HilcalError, InputError
+from hilcal.errors import HilcalError, InputError
 from hilcal.toml import suggest
 
 Factory = Callable[[CellConfig], Any]
@@ -113,18 +113,6 @@ def connect(config: CellConfig) -> tuple[Rig | None, tuple[Answer, ...]]:
         operator=made["operator"],
     )
     return rig, answers
-
-
-def open_rig(config: CellConfig) -> Rig:
-    """Open every device.
-
-    Raises:
-        DeviceError: names every device that failed.
-    """
-    rig, answers = connect(config)
-    if rig is None:
-        raise DeviceError("; ".join(a.failure for a in answers if a.failure))
-    return rig
 
 
 def _wanted(config: CellConfig) -> list[_Wanted]:

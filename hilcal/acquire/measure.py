@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.acquire.average import Average, combine
+from hilcal.acquire.average import Average, average
 from hilcal.acquire.clock import Clock
 from hilcal.acquire.devices import (
     ArmSample,
@@ -137,7 +137,7 @@ class Taker:
         if why is not None:
             return None, why
         try:
-            mean = combine(tracker, self._config.acquire.systematic_share)
+            mean = average(tracker, self._config.acquire.systematic_share)
         except DeviceError as error:
             return None, str(error)
         if not (np.isfinite(mean.value).all() and np.isfinite(mean.covariance).all()):

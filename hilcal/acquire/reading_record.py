@@ -1,12 +1,13 @@
 """One reading as a row of the campaign, and everything raw behind it as JSON."""
 
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
 
+from hilcal.acquire.devices import ArmSample, Losses, TrackerSample, WrenchSample
 from hilcal.acquire.force import Feeling
 from hilcal.acquire.measure import Measured
-from hilcal.acquire.raw import plain
 from hilcal.data.plan import Step
 from hilcal.data.readings import Readings, States
 from hilcal.types import Floats
@@ -104,3 +105,23 @@ def feeling_of(stored: dict[str, Any]) -> Feeling | None:
     return Feeling(
         np.array(felt["wrench"]), np.array(felt["covariance"]), np.array(stored["q_actual"])
     )
+
+
+def plain(sample: ArmSample | TrackerSample | WrenchSample | Losses | None) -> Any:
+    """Return a sample as a JSON object with the names of its fields; arrays as lists."""
+    if sample is None:
+        return None
+    return {f.name: _value(getattr(sample, f.name)) for f in fields(sample)}
+
+
+def _value(value: Any) -> Any:
+    """Return a JSON value; what is not a finite number becomes null."""
+    if isinstance(value, np.ndarray):
+        return [_value(x) for x in value.tolist()]
+    if isinstance(value, list):
+        return [_value(x) for x in value]
+    if isinstance(value, float | np.floating):
+        return float(value) if np.isfinite(value) else None
+    if isinstance(value, np.integer):
+        return int(value)
+    return value

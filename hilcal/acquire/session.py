@@ -18,8 +18,7 @@ from hilcal.acquire.loads import Hook, payload
 from hilcal.acquire.measure import Measured, Taker
 from hilcal.acquire.motion import Mover
 from hilcal.acquire.progress import Judged, Phase, Remark, Taken, Watcher
-from hilcal.acquire.raw import plain
-from hilcal.acquire.reading_record import detail, feeling_of, row
+from hilcal.acquire.reading_record import detail, feeling_of, plain, row
 from hilcal.acquire.rig import Rig
 from hilcal.acquire.route import Stop
 from hilcal.acquire.session_state import Memory

@@ -4,7 +4,6 @@ import numpy as np
 
 from hilcal.data.columns import POSITION, ROTATION, WRENCH
 from hilcal.data.csvfile import Columns
-from hilcal.data.readings import Readings
 from hilcal.errors import InputError
 from hilcal.robot.arm import Arm
 from hilcal.types import Floats, Ints
@@ -195,26 +194,4 @@ def check_same_pose(table: Columns, pose: Ints, names: list[str], q: Floats) -> 
         raise InputError(
             f"{table.at(i)}: pose '{names[pose[i]]}' commands joint {j + 1} to {q[i, j]:.9g} rad, "
             f"row {table.rows[k]} to {q[k, j]:.9g}; give another pose another name"
-        )
-
-
-def check_deflection(readings: Readings) -> None:
-    """Refuse loaded readings without an unloaded reading of the same pose and cycle.
-
-    Raises:
-        InputError: names the pose and the cycle.
-    """
-    key = np.stack([readings.pose, readings.cycle], axis=1)
-    group = np.unique(key, axis=0, return_inverse=True)[1].reshape(-1)
-    has_unloaded = np.zeros(int(group.max(initial=-1)) + 1, dtype=bool)
-    has_unloaded[group[readings.unloaded]] = True
-    lacking = ~has_unloaded[group]
-    if lacking.any():
-        i = int(np.argmax(lacking))
-        pose, cycle = readings.pose_names[readings.pose[i]], int(readings.cycle[i])
-        count = len(np.unique(group[lacking]))
-        more = f" ({count} such in all)" if count > 1 else ""
-        raise InputError(
-            f"pose '{pose}', cycle {cycle} has no unloaded reading{more}; deflections need a row "
-            f"with load 'none' there, or use --readings absolute"
         )

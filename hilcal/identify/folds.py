@@ -10,7 +10,6 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from hilcal.data.readings import Readings
-from hilcal.data.whitening import Whitening
 from hilcal.types import Floats, Ints
 
 SAME_POSE = 2e-3
@@ -66,8 +65,3 @@ def region_folds(angle: Floats, pose: Ints, count: int = FOLDS) -> Ints:
     for number, rows in enumerate(regions):
         fold[rows] = number
     return fold[pose]
-
-
-def of_measurements(per_reading: Ints, w: Whitening) -> Ints:
-    """(D,) value of the reading behind each measurement."""
-    return per_reading[w.reading]

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.stats import chi2
 
-from hilcal.types import Bools, Floats
+from hilcal.types import Floats
 
 FALSE_ALARMS = 1e-3
 """Expected number of good readings set aside in a whole campaign, when the model is right."""
@@ -27,8 +27,3 @@ def limit(m: int, count: int, scale: float = 1.0) -> float:
     far = float(chi2.isf(FALSE_ALARMS / count, m)) * max(1.0, scale)
     chance, sure = MISFIT
     return far * float(MISFIT_FACTOR ** np.clip((scale - chance) / (sure - chance), 0.0, 1.0))
-
-
-def find_outliers(distance2: Floats, m: int) -> Bools:
-    """Which measurements (D,) are gross errors, by their squared Mahalanobis distances."""
-    return np.asarray(distance2 > limit(m, len(distance2), bulk(distance2, m)))

@@ -42,10 +42,6 @@ class Predicted:
         """Standard uncertainties with the model complete, SI."""
         return dict(zip(self.names, (float(s) for s in self.std), strict=True))
 
-    def values_by_name(self) -> dict[str, float]:
-        """Values at which the parameters are assumed, SI."""
-        return dict(zip(self.names, (float(v) for v in self.values), strict=True))
-
 
 def predicted(
     problem: Problem,

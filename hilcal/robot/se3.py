@@ -110,18 +110,6 @@ def adjoint(r: Floats, p: Floats) -> Floats:
     return ad
 
 
-def right_jacobian(twist: Floats) -> Floats:
-    """J_r with exp(ξ + δ) = exp(ξ) exp(J_r(ξ) δ) to first order; (..., 6) -> (..., 6, 6).
-
-    J_r = [J, Q; 0, J] with the blocks of `right_jacobian_blocks`.
-    """
-    j, q = right_jacobian_blocks(twist)
-    out = np.zeros((*twist.shape[:-1], 6, 6))
-    out[..., :3, :3] = out[..., 3:, 3:] = j
-    out[..., :3, 3:] = q
-    return out
-
-
 def right_jacobian_blocks(twist: Floats) -> tuple[Floats, Floats]:
     """Blocks J(ω) and Q(v, ω) of the right Jacobian, both (..., 3, 3).
 

@@ -185,11 +185,11 @@ def test_the_tracker_repeats_itself_as_it_says(rig: Rig, there: tuple[CellConfig
         assert s.covariance.shape == (m, m)
         assert np.linalg.eigvalsh(s.covariance).min() > 0
     assert samples[-1].host_ns > samples[0].host_ns
-    mean, cov = average(samples, 0.0)
-    off = np.array([s.value[:3] - mean[:3] for s in samples])
+    mean = average(samples, 0.0)
+    off = np.array([s.value[:3] - mean.value[:3] for s in samples])
     white = np.linalg.solve(np.linalg.cholesky(samples[0].covariance[:3, :3]), off.T)
     assert np.sum(white**2) < 3.0 * 3 * 11  # chi2 with 33 degrees of freedom: mean 33, std 8
-    assert np.trace(cov) < np.trace(samples[0].covariance)
+    assert np.trace(mean.covariance) < np.trace(samples[0].covariance)
 
 
 def test_the_tracker_sees_the_arm_move(ready: Rig) -> None:

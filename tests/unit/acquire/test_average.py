@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from hilcal.acquire.average import average, combine, deviations, scatter_ratio
+from hilcal.acquire.average import average, deviations
 from hilcal.acquire.devices import TrackerSample
 from hilcal.errors import DeviceError
 
@@ -34,7 +34,8 @@ def covered(rng, count, windows, share=0.0, worse=1.0):
     for _ in range(windows):
         common = rng.multivariate_normal(np.zeros(3), share * V)
         values = drawn(rng, count, (1 - share) * worse**2 * V) + common
-        value, covariance = average(samples_of(values), share)
+        mean = average(samples_of(values), share)
+        value, covariance = mean.value, mean.covariance
         off = value - PLACE
         inside += off @ np.linalg.solve(covariance, off) < stats.chi2.ppf(0.95, 3)
     return inside / windows
@@ -44,7 +45,8 @@ def covered(rng, count, windows, share=0.0, worse=1.0):
 
 
 def test_samples_that_agree_have_the_posterior_covariance():
-    value, covariance = average(samples_of([PLACE] * 5))
+    mean = average(samples_of([PLACE] * 5))
+    value, covariance = mean.value, mean.covariance
     assert value == pytest.approx(PLACE, abs=1e-15)
     assert covariance == pytest.approx(20 / 24 * V / 5, rel=1e-12)
 
@@ -52,7 +54,8 @@ def test_samples_that_agree_have_the_posterior_covariance():
 def test_scatter_enters_with_its_weight_against_the_prior():
     off = np.array([10e-6, -20e-6, 5e-6])
     values = [PLACE + off, PLACE - off, PLACE]
-    value, covariance = average(samples_of(values))
+    mean = average(samples_of(values))
+    value, covariance = mean.value, mean.covariance
     assert value == pytest.approx(PLACE, abs=1e-15)
     assert covariance == pytest.approx((20 * V + 2 * np.outer(off, off)) / 22 / 3, rel=1e-9)
 
@@ -60,20 +63,20 @@ def test_scatter_enters_with_its_weight_against_the_prior():
 def test_systematic_share_is_not_averaged_away():
     rng = np.random.default_rng(0)
     values = drawn(rng, 1000, 0.7 * V)
-    covariance = average(samples_of(values), 0.3)[1]
+    covariance = average(samples_of(values), 0.3).covariance
     assert np.trace(covariance) == pytest.approx(0.3 * np.trace(V), rel=0.01)
-    assert average(samples_of([PLACE] * 10), 1.0)[1] == pytest.approx(V, rel=1e-12)
+    assert average(samples_of([PLACE] * 10), 1.0).covariance == pytest.approx(V, rel=1e-12)
 
 
 def test_mean_of_stated_covariances_is_what_counts():
     samples = samples_of([PLACE] * 2)
     samples[1] = TrackerSample(1, PLACE, 3 * V)
-    assert average(samples)[1] == pytest.approx(20 / 21 * 2 * V / 2, rel=1e-12)
+    assert average(samples).covariance == pytest.approx(20 / 21 * 2 * V / 2, rel=1e-12)
 
 
 def test_covariance_is_symmetric_to_the_last_bit():
     rng = np.random.default_rng(2)
-    covariance = average(samples_of(drawn(rng, 7)), 0.1)[1]
+    covariance = average(samples_of(drawn(rng, 7)), 0.1).covariance
     assert np.array_equal(covariance, covariance.T)
     assert np.all(np.linalg.eigvalsh(covariance) > 0)
 
@@ -97,16 +100,15 @@ def test_noise_far_above_what_is_stated_is_not_believed_away(worse):
 
 def test_scatter_p_values_are_uniform_under_the_stated_noise():
     rng = np.random.default_rng(11)
-    p = [scatter_ratio(samples_of(drawn(rng, 6)))[1] for _ in range(800)]
+    p = [average(samples_of(drawn(rng, 6))).scatter_p for _ in range(800)]
     assert stats.kstest(p, "uniform").pvalue > 1e-3
 
 
-def test_scatter_ratio_is_how_much_worse_it_is():
+def test_scatter_is_how_much_worse_it_is():
     rng = np.random.default_rng(12)
-    ratio, p = scatter_ratio(samples_of(drawn(rng, 400, 9 * V)))
-    assert ratio == pytest.approx(9, rel=0.15)
-    assert p < 1e-12
-    result = combine(samples_of(drawn(rng, 400, 9 * V)))
+    result = average(samples_of(drawn(rng, 400, 9 * V)))
+    assert result.scatter == pytest.approx(9, rel=0.15)
+    assert result.scatter_p < 1e-12
     assert "3.0 times" in result.warnings[0]
 
 
@@ -119,7 +121,8 @@ def test_rotations_average_on_the_sphere_also_across_the_half_turn():
     turns = Rotation.from_rotvec(8e-5 * rng.standard_normal((50, 3))) * middle
     values = np.hstack([drawn(rng, 50), turns.as_rotvec()])
     assert np.ptp(values[:, 5]) > 6  # both signs occur
-    value, covariance = average(samples_of(values, V6))
+    mean = average(samples_of(values, V6))
+    value, covariance = mean.value, mean.covariance
     off = (Rotation.from_rotvec(value[3:]) * middle.inv()).as_rotvec()
     assert np.linalg.norm(off) < 4 * 8e-5 / np.sqrt(50) * np.sqrt(3)
     assert np.trace(covariance[3:, 3:]) == pytest.approx(3 * 8e-5**2 / 50, rel=0.3)
@@ -144,9 +147,9 @@ def test_deviations_of_poses_turn_with_the_sensor_axes():
 def test_gross_outlier_is_left_out_and_named():
     rng = np.random.default_rng(7)
     values = drawn(rng, 10)
-    clean = combine(samples_of(np.delete(values, 3, axis=0)))
+    clean = average(samples_of(np.delete(values, 3, axis=0)))
     values[3] += [0.0, 2e-3, 0.0]
-    result = combine(samples_of(values))
+    result = average(samples_of(values))
     assert result.left_out == (3,)
     assert "reading 4 of 10" in result.warnings[0]
     assert result.value == pytest.approx(clean.value, abs=1e-15)
@@ -157,7 +160,7 @@ def test_gross_outlier_is_left_out_and_named():
 def test_one_in_five_may_be_left_out(count, bad):
     values = drawn(np.random.default_rng(count), count)
     values[:bad] += [[1e-3, 0, 0]] * np.arange(1, bad + 1)[:, None]
-    assert combine(samples_of(values)).left_out == tuple(range(bad))
+    assert average(samples_of(values)).left_out == tuple(range(bad))
 
 
 @pytest.mark.parametrize(("count", "bad"), [(5, 2), (10, 3), (20, 5)])
@@ -165,16 +168,16 @@ def test_more_than_one_in_five_is_no_reading(count, bad):
     values = drawn(np.random.default_rng(count), count)
     values[:bad] += [[1e-3, 0, 0]] * np.arange(1, bad + 1)[:, None]
     with pytest.raises(DeviceError, match=f"readings scatter: {bad} of {count}"):
-        combine(samples_of(values))
+        average(samples_of(values))
 
 
 def test_good_samples_are_never_left_out():
     rng = np.random.default_rng(8)
     for count in (3, 5, 10, 50):
         for _ in range(300):
-            assert combine(samples_of(drawn(rng, count))).left_out == ()
+            assert average(samples_of(drawn(rng, count))).left_out == ()
 
 
 def test_remarks_of_the_instrument_come_once():
-    result = combine(samples_of([PLACE] * 3, warnings=["tilted", "", "tilted"]))
+    result = average(samples_of([PLACE] * 3, warnings=["tilted", "", "tilted"]))
     assert result.warnings == ("tilted",)

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 
-from hilcal.data.checks import check_deflection
 from hilcal.data.noise import TrackerNoise, tracker_covariance, tracker_pose_covariance
 from hilcal.data.readings import Readings
 from hilcal.data.table import read_table, write_table
@@ -102,7 +101,6 @@ def test_good_table(write: Write) -> None:
     assert x.load_names == ("none", "plate")
     assert x.states.wrench[:, 2].tolist() == [0, -50] * 3
     assert x.covariance[0].tolist() == [[1e-10, 1e-11, 0], [1e-11, 4e-10, 0], [0, 0, 1e-10]]
-    check_deflection(x)
 
 
 def test_covariance_comes_from_the_instrument_when_the_table_has_none(write: Write) -> None:
@@ -331,15 +329,6 @@ def test_a_reading_at_the_station_has_no_line_of_sight(write: Write) -> None:
     rows = with_cell(5, x_m="0", y_m="0", z_m="0")
     with pytest.raises(InputError, match=r"row 5: position lies at the tracker's station"):
         read_table(write(without(rows, *COVARIANCE)), ARM, NOISE)
-
-
-def test_deflections_need_an_unloaded_reading_of_pose_and_cycle(write: Write) -> None:
-    rows = good()
-    rows[5]["cycle"] = "1"
-    with pytest.raises(InputError, match=r"pose 'P2', cycle 1 has no unloaded reading; .* 'none'"):
-        check_deflection(read_table(write(rows), ARM, None))
-    with pytest.raises(InputError, match=r"pose 'P0', cycle 0 .*\(2 such in all\)"):
-        check_deflection(read_table(write([rows[1], *rows[2:]]), ARM, None))
 
 
 @pytest.mark.parametrize("name", ["", " a", "a\n", "a\x00", "None"])

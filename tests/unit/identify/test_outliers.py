@@ -12,12 +12,16 @@ from hilcal.diagnose.verdict import diagnose
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import fit
 from hilcal.identify.fit_document import outliers
-from hilcal.identify.outliers import FALSE_ALARMS, find_outliers, limit
+from hilcal.identify.outliers import FALSE_ALARMS, bulk, limit
 from hilcal.robot.catalogue import configs_dir
 from studies.study_cases import study_case
 from tests.support.campaigns import Campaign, campaign, noiseless, plan, with_noise
 
 MODES = ("absolute", "deflection")
+
+
+def any_gross(distance2, m):
+    return bool((distance2 > limit(m, len(distance2), bulk(distance2, m))).any())
 
 
 def spoilt(readings, rows, size):
@@ -77,14 +81,14 @@ def test_a_twentieth_at_most_is_set_aside():
 def test_good_readings_are_called_gross_once_in_a_thousand_campaigns(m):
     rng = np.random.default_rng(m)
     campaigns, count = 5000, 150
-    alarms = sum(bool(find_outliers(rng.chisquare(m, count), m).any()) for _ in range(campaigns))
+    alarms = sum(any_gross(rng.chisquare(m, count), m) for _ in range(campaigns))
     expected = FALSE_ALARMS * campaigns
     assert poisson.ppf(1e-4, expected) <= alarms <= poisson.isf(1e-4, expected)
 
 
 def test_a_misfit_twice_as_wide_as_the_noise_is_not_gross():
     rng = np.random.default_rng(0)
-    alarms = sum(bool(find_outliers(4 * rng.chisquare(3, 150), 3).any()) for _ in range(2000))
+    alarms = sum(any_gross(4 * rng.chisquare(3, 150), 3) for _ in range(2000))
     assert alarms <= poisson.isf(1e-4, FALSE_ALARMS * 2000)
 
 

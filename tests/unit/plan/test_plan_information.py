@@ -182,7 +182,7 @@ def test_averaging_leaves_the_systematic_share(m):
         shared = rng.multivariate_normal(np.zeros(m), 0.3 * sample)
         own = rng.multivariate_normal(np.zeros(m), 0.7 * sample, 5)
         samples = [TrackerSample(k, x + shared, sample) for k, x in enumerate(own)]
-        stated.append(average(samples, 0.3)[1])
+        stated.append(average(samples, 0.3).covariance)
     mine = reading_covariance(a, config, prediction)[0]
     size = np.sqrt(np.outer(np.diag(mine), np.diag(mine)))
     assert np.max(np.abs(np.mean(stated, axis=0) - mine) / size) < 0.02
