@@ -20,7 +20,7 @@ from hilcal.acquire.clock import Clock
 from hilcal.acquire.devices import Report, TargetLostError, TrackerSample
 from hilcal.config import CellConfig
 from hilcal.config.cell import Tracker as TrackerConfig
-from hilcal.data.noise import TrackerNoise, tracker_covariance
+from hilcal.data.covariance import TrackerNoise, tracker_covariance
 from hilcal.errors import DeviceError, InputError
 from hilcal.toml import NonNegative, Positive, Section, check_section
 

@@ -98,6 +98,18 @@ def cell_from_config(config: CellConfig, base_dir: Path | None = None) -> Cell:
     )
 
 
+def tracker_place(cell: Cell, config: CellConfig) -> Floats | None:
+    """Return (3,) where the tracker stands, base axes, m; None where it is not known.
+
+    From a known registration T_sensor_base it is −Rᵀ p; else `[tracker] station_m` (positions in
+    base axes), else `[sight] tracker_m`.
+    """
+    if config.tracker.frame == "tracker" and cell.registration_known:
+        return np.asarray(-cell.registration[:3, :3].T @ cell.registration[:3, 3])
+    told = config.tracker.station_m or config.sight.tracker_m
+    return None if told is None else np.array(told)
+
+
 def _pose(xyz: tuple[float, ...] | None, rotvec: tuple[float, ...] | None) -> Floats:
     """(4, 4) pose; identity for what is not given."""
     pose = np.eye(4)

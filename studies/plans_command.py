@@ -10,7 +10,7 @@ import typer
 
 from drivers.simulated.campaign import simulate
 from drivers.simulated.injected_effects import nothing_hidden
-from drivers.simulated.tracker import TrackerNoise
+from drivers.simulated.rehearsal import measurement_noise
 from drivers.simulated.world import World
 from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.demo import CELL
@@ -18,7 +18,7 @@ from hilcal.cli.terminal import Json, terminal
 from hilcal.config import CellConfig, load_config
 from hilcal.data.readings import Readings, States
 from hilcal.errors import InputError
-from hilcal.plan.nominal_model import tracker_place
+from hilcal.plan.nominal_model import nominal_tracker_place
 from hilcal.report.progress import counting
 from hilcal.robot import se3
 from hilcal.robot.catalogue import configs_dir, load_arm
@@ -157,20 +157,14 @@ def world(cell: Cell, config: CellConfig, rng: np.random.Generator) -> World:
     The tracker stands where the plan takes it to be, turned about the vertical at random; a
     reading is the mean of so many samples, with the noise that a plan assumes of it.
     """
-    t, a = config.tracker, config.acquire
-    share = float(np.sqrt(a.systematic_share + (1.0 - a.systematic_share) / a.samples))
-    noise = TrackerNoise(
-        (share * t.range_std_m, share * t.range_std_per_m),
-        (share * t.transverse_std_m, share * t.transverse_std_per_m),
-        share * t.orientation_std_rad,
-    )
+    noise = measurement_noise(config, config.acquire.samples)
     drawn = nothing_hidden(
         cell, rng, noise=noise, joint_std=config.repeatability.per_joint(cell.arm.n)
     )
-    place, _ = tracker_place(cell, config)
+    place, _ = nominal_tracker_place(cell, config)
     turn = se3.rotation(np.array([0.0, 0.0, rng.uniform(0.0, 2.0 * np.pi)]))
     frame = se3.matrix(turn, -turn @ place)
     if not cell.registration_known:
         return replace(drawn, registration=frame, station=np.eye(4))
-    station = frame if t.frame == "base" else np.eye(4)
+    station = frame if config.tracker.frame == "base" else np.eye(4)
     return replace(drawn, registration=cell.registration, station=station)

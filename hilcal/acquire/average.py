@@ -1,17 +1,8 @@
 """Several measurements at rest become one reading with the covariance of their mean.
 
-Of one measurement the instrument states the covariance Σ̄ (mean over the samples), of which the
-share s is the same in all of them (it is not seen in their scatter, and averaging does not
-reduce it) and the rest is random. With residuals r_k from the mean x̄ of K samples,
-
-    R = (ν0 (1 - s) τ Σ̄ + Σ_k r_k r_kᵀ) / (ν0 + K - 1)        Cov(x̄) = s Σ̄ + R / K
-
-R is the mean of the posterior of the random covariance, with the stated one as a prior worth
-ν0 = 20 repeats (an inverse Wishart law; Gelman et al., *Bayesian Data Analysis*, section 3.6): a
-few repeats are a poor estimate of six or more variances, but the stated figures are one of a
-kind of instrument, not of today's air. τ is 1 unless the scatter cannot be explained by the
-stated noise (chi² test, p < 0.001): then it is their ratio, so that an instrument that
-is far worse than stated is not believed.
+The covariance of the mean is `data.covariance.covariance_of_mean`. Its factor τ is 1 unless the
+scatter cannot be explained by the stated noise (chi² test, p < 0.001): then it is their ratio, so
+that an instrument that is far worse than stated is not believed.
 """
 
 from collections.abc import Sequence
@@ -21,13 +12,12 @@ import numpy as np
 from scipy import stats
 
 from hilcal.acquire.devices import TrackerSample
+from hilcal.data.covariance import covariance_of_mean
 from hilcal.data.whitening import inverse_root
 from hilcal.errors import DeviceError
 from hilcal.robot import se3
 from hilcal.types import Bools, Floats
 
-PRIOR_REPEATS = 20.0
-"""ν0: so many repeats are the stated covariance worth."""
 UNEXPLAINED = 1e-3
 """Scatter less probable than this under the stated noise makes the statement unbelievable."""
 GROSS_SIGMA = 6.0
@@ -82,14 +72,11 @@ def average(samples: Sequence[TrackerSample], systematic_share: float = 0.0) -> 
             f"tracker: its readings scatter: {len(left_out)} of {len(samples)} at one pose are "
             "gross outliers; is the beam disturbed, or does something move?"
         )
-    prior, count = stated[keep].mean(axis=0), int(keep.sum())
+    prior = stated[keep].mean(axis=0)
     mean, residuals = deviations(values[keep])
     ratio, p = _trace_test(residuals, prior)
     believed = 1.0 if p >= UNEXPLAINED else ratio
-    products = residuals.T @ residuals
-    random = PRIOR_REPEATS * (1 - systematic_share) * believed * prior + products
-    random /= PRIOR_REPEATS + count - 1
-    covariance = systematic_share * prior + random / count
+    covariance = covariance_of_mean(prior, residuals, systematic_share, believed)
     warnings = [f"reading {k + 1} of {len(samples)} is a gross outlier, left out" for k in left_out]
     if p < UNEXPLAINED:
         warnings.append(
@@ -99,7 +86,7 @@ def average(samples: Sequence[TrackerSample], systematic_share: float = 0.0) -> 
     warnings += dict.fromkeys(
         s.warning for s, kept in zip(samples, keep, strict=True) if kept and s.warning
     )
-    return Average(mean, (covariance + covariance.T) / 2, ratio, p, left_out, tuple(warnings))
+    return Average(mean, covariance, ratio, p, left_out, tuple(warnings))
 
 
 def deviations(values: Floats) -> tuple[Floats, Floats]:

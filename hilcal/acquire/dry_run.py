@@ -8,8 +8,8 @@ import numpy as np
 from hilcal.acquire import workspace
 from hilcal.acquire.clearance import Clearance, clearance_of
 from hilcal.acquire.route import Stop, duration, home, route
-from hilcal.acquire.sight import UNKNOWN, Sight, sight_of, tracker_place
-from hilcal.cell import Cell
+from hilcal.acquire.sight import UNKNOWN, Sight, sight_of
+from hilcal.cell import Cell, tracker_place
 from hilcal.config import CellConfig
 from hilcal.data.plan import REFERENCE, UNLOADED, Plan, Step
 from hilcal.robot import chain as chains

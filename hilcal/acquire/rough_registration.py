@@ -3,6 +3,7 @@
 import numpy as np
 
 from hilcal.cell import Cell
+from hilcal.data.covariance import joint_scatter
 from hilcal.robot import chain as chains
 from hilcal.robot.chain import joint_jacobian
 from hilcal.types import Floats
@@ -73,12 +74,10 @@ class RoughFrame:
         """
         chain = chains.evaluate(self._cell.arm, np.asarray(q)[None])
         point = chain.point(self._cell.target[:3, 3])
-        jac = np.asarray(joint_jacobian(chain, point)[0, :3] * joint_std)
-        pose = self.pose()
+        jac, pose = joint_jacobian(chain, point)[0], self.pose()
         if pose is None:
-            return np.asarray(np.sum(jac**2) / 3.0 * np.eye(3))
-        jac = pose[0] @ jac
-        return np.asarray(jac @ jac.T)
+            return np.asarray(np.trace(joint_scatter(jac, joint_std, np.eye(3), 3)) / 3 * np.eye(3))
+        return joint_scatter(jac, joint_std, pose[0], 3)
 
     def _position(self, q: Floats) -> Floats:
         """(3,) nominal position of the target, base axes, m."""

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilcal.acquire.clearance import TOOL_RADIUS, Clearance
-from hilcal.cell import Cell
-from hilcal.config import CellConfig, Obstacle
+from hilcal.cell import tracker_place
+from hilcal.config import Obstacle
 from hilcal.robot import chain as chains
 from hilcal.robot import se3
 from hilcal.robot.scene import FLOOR, Segment
@@ -18,18 +18,6 @@ UNKNOWN = (
     "tracker_m"
 )
 _SHY = 1.5  # the beam ends so many radii of tool and beam before the target
-
-
-def tracker_place(cell: Cell, config: CellConfig) -> Floats | None:
-    """Return (3,) where the tracker stands, base axes, m; None where it is not known.
-
-    A known registration T_sensor_base tells it, −Rᵀ p; with positions in base axes
-    [tracker] station_m; else [sight] tracker_m.
-    """
-    if config.tracker.frame == "tracker" and cell.registration_known:
-        return np.asarray(-cell.registration[:3, :3].T @ cell.registration[:3, 3])
-    told = config.tracker.station_m or config.sight.tracker_m
-    return None if told is None else np.array(told)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,17 +22,12 @@ from hilcal.effects.written import chosen_options, read_effects_text, write_effe
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
-from hilcal.identify.repeatability import with_repeatability
+from hilcal.identify.full_covariance import campaign_readings
 from hilcal.model import Model
 from hilcal.report.build_story import Chapter, build_story
 from hilcal.report.progress import Say, working
 from hilcal.revisions import chain, mode_of, restore, restore_model, to_record, usual_mode
 from hilcal.types import Floats
-
-COVARIANCE = "covariance"
-"""Key among the texts about a campaign: what the stored covariances cover."""
-INSTRUMENT = "instrument"
-"""They cover the instrument alone, not the arm's repeatability."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,10 +135,7 @@ def open_run(path: Path) -> Iterator[Opened]:
     with Campaign.open(path) as campaign:
         config = CellConfig.from_json(campaign.config_json)
         cell = cell_from_config(config, Path(campaign.base_dir))
-        readings = campaign.readings()
-        if campaign.about(COVARIANCE) == INSTRUMENT:
-            scatter = config.repeatability.per_joint(cell.arm.n)
-            readings = with_repeatability(cell, readings, scatter)
+        readings = campaign_readings(campaign, cell, config)
         yield Opened(path, campaign, config, cell, readings)
 
 

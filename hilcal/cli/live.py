@@ -13,8 +13,8 @@ from hilcal.errors import HilcalError
 from hilcal.identify.baseline import with_effects
 from hilcal.identify.fit import mahalanobis2
 from hilcal.identify.folds import distinct_poses
+from hilcal.identify.full_covariance import with_joint_scatter
 from hilcal.identify.gauss_newton import Solution, scales_of, solve
-from hilcal.identify.repeatability import with_repeatability
 from hilcal.identify.residual import residual
 from hilcal.model import Model
 from hilcal.types import Floats
@@ -69,7 +69,7 @@ class LiveModel:
 
         Sigma is sqrt(rᵀ (V + J C Jᵀ)⁻¹ r / m): about 1 where the model is right.
         """
-        readings = with_repeatability(self._cell, readings, self._scatter)
+        readings = with_joint_scatter(self._cell, readings, self._scatter)
         before, last = readings[:-1], readings[-1:]
         try:
             known = self._renewed(before)

@@ -11,8 +11,7 @@ import numpy as np
 from drivers.simulated.on_the_wire import read_plan, secret_of, simulated_cell
 from drivers.simulated.rehearsal import Rehearsal, Secret, as_told
 from hilcal.acquire.dry_run import dry_run
-from hilcal.cell import Cell, cell_from_config
-from hilcal.cli.files import COVARIANCE, INSTRUMENT
+from hilcal.cell import cell_from_config
 from hilcal.cli.plan_output import refuse
 from hilcal.cli.planning import make_plan
 from hilcal.cli.running import create, measure
@@ -24,7 +23,7 @@ from hilcal.data.plan import Plan
 from hilcal.data.readings import Readings
 from hilcal.data.run_log import RunLog
 from hilcal.errors import DeviceError
-from hilcal.identify.repeatability import with_repeatability
+from hilcal.identify.full_covariance import campaign_readings
 from hilcal.report.progress import Say, counting, working
 
 TRIES = 4
@@ -96,7 +95,7 @@ def on_devices(t: Terminal, told: Told, plan: Plan) -> Iterator[tuple[Rehearsal,
                 lambda: measure(t, there.config, secret.cell, campaign),
                 lambda: campaign.n_readings,
             )
-            readings = _whole(secret.cell, there.config, campaign)
+            readings = campaign_readings(campaign, secret.cell, there.config)
             return _rehearsal(secret, there.config, readings)
 
         def further(more: Plan) -> Rehearsal:
@@ -168,15 +167,6 @@ def _write(t: Terminal, campaign: Campaign, readings: Readings) -> None:
         for begin, end in pairwise(starts):
             campaign.append_readings(readings[slice(begin, end)])
             advance(1)
-
-
-def _whole(cell: Cell, config: CellConfig, campaign: Campaign) -> Readings:
-    """Return all readings as the commands see them."""
-    readings = campaign.readings()
-    if campaign.about(COVARIANCE) == INSTRUMENT:
-        scatter = config.repeatability.per_joint(cell.arm.n)
-        readings = with_repeatability(cell, readings, scatter)
-    return readings
 
 
 def _rehearsal(secret: Secret, config: CellConfig, readings: Readings) -> Rehearsal:

@@ -20,7 +20,6 @@ from hilcal.acquire.rig import Rig
 from hilcal.acquire.run import run as run_plan
 from hilcal.cell import Cell
 from hilcal.cli.effects_from import EffectsFrom
-from hilcal.cli.files import COVARIANCE, INSTRUMENT
 from hilcal.cli.live import LiveModel
 from hilcal.cli.plan_output import POSES, refuse
 from hilcal.cli.planning import (
@@ -35,6 +34,7 @@ from hilcal.cli.terminal import Json, Terminal, terminal
 from hilcal.cli.until import Until
 from hilcal.config import CellConfig
 from hilcal.data.campaign import Campaign
+from hilcal.data.covariance import COVERS, INSTRUMENT
 from hilcal.data.plan import Plan, load_plan
 from hilcal.data.run_log import PLAN, RunLog
 from hilcal.errors import CannotAnswerError, DeviceError, InputError
@@ -153,7 +153,7 @@ def create(
     Raises:
         InputError: it cannot be written, or is there already.
     """
-    more = {PLAN: plan.to_json(), COVARIANCE: INSTRUMENT}
+    more = {PLAN: plan.to_json(), COVERS: INSTRUMENT}
     source = "measured by hilcal run"
     return Campaign.create(
         output, config.to_json(), str(base_dir), source, overwrite=overwrite, more=more

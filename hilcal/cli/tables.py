@@ -14,8 +14,8 @@ from hilcal.cli.files import open_run
 from hilcal.cli.terminal import Json, Run, terminal
 from hilcal.config import CellConfig, load_config
 from hilcal.data.campaign import Campaign
+from hilcal.data.covariance import tracker_noise
 from hilcal.data.ipa_ur10 import read_ipa_ur10
-from hilcal.data.noise import TrackerNoise
 from hilcal.data.readings import Readings
 from hilcal.data.table import read_table, write_table
 from hilcal.errors import InputError
@@ -86,14 +86,7 @@ def _read(
         found = read_ipa_ur10(table, arm)
         return found.readings, found.notes
     s = settings.tracker
-    noise = TrackerNoise(
-        s.range_std_m,
-        s.range_std_per_m,
-        s.transverse_std_m,
-        s.transverse_std_per_m,
-        s.orientation_std_rad,
-    )
-    readings = read_table(table, arm, noise, s.station_m)
+    readings = read_table(table, arm, tracker_noise(s), s.station_m)
     with table.open(encoding="utf-8-sig", errors="replace") as stream:
         stated = "cov_x_x" in stream.readline()
     if stated:

@@ -15,8 +15,8 @@ from hilcal.errors import HilcalError
 from hilcal.identify.baseline import with_effects
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.fit_document import finite
+from hilcal.identify.full_covariance import with_joint_scatter
 from hilcal.identify.gauss_newton import scales_of
-from hilcal.identify.repeatability import with_repeatability
 from hilcal.plan.feasible import Space
 from hilcal.plan.goal import JOINTS, Goal, Verdict, figures, parse_goal
 from hilcal.plan.nominal_model import after, assumed
@@ -107,7 +107,7 @@ class Until:
     def _judge(self, readings: Readings) -> tuple[Verdict, Fit] | None:
         """Fit and judge; None where that cannot be done yet."""
         try:
-            readings = with_repeatability(self._cell, readings, self._scatter)
+            readings = with_joint_scatter(self._cell, readings, self._scatter)
             mode, names = self._mode(readings), self._config.planning.model
             if readings.unloaded.all():  # no load has been hung yet
                 names = tuple(name for name in names if name != JOINTS)

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from hilcal.data import checks
+from hilcal.data.covariance import TrackerNoise, tracker_covariance
 from hilcal.data.csvfile import Columns, Dialect, read_columns
-from hilcal.data.noise import TrackerNoise, tracker_pose_covariance
 from hilcal.data.readings import Readings, States
 from hilcal.errors import InputError
 from hilcal.robot import se3
@@ -219,7 +219,7 @@ def _readings(
     rx, ry, rz = (se3.rotation(angles[:, k, None] * np.eye(3)[k]) for k in range(3))
     rxy = rx @ ry
     axes = np.stack([np.broadcast_to([1.0, 0.0, 0.0], position.shape), rx[..., 1], rxy[..., 2]], 2)
-    cov = tracker_pose_covariance(position, TRACKER)
+    cov = tracker_covariance(position, TRACKER, m=6)
     cov[:, :3, :3] += (1e-3 * spread[:, None, :3]) ** 2 * np.eye(3)
     turned = axes * np.deg2rad(spread[:, None, 3:])
     cov[:, 3:, 3:] += turned @ np.swapaxes(turned, 1, 2)

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from hilcal.data import checks, columns
+from hilcal.data.covariance import TrackerNoise, tracker_covariance
 from hilcal.data.csvfile import Columns, read_columns
-from hilcal.data.noise import TrackerNoise, tracker_covariance, tracker_pose_covariance
 from hilcal.data.readings import Readings, States
 from hilcal.errors import InputError
 from hilcal.robot.arm import Arm
@@ -163,8 +163,7 @@ def _covariances(
             f"{table.at(int(k))}: position lies at the tracker's station; set station_m in the "
             f"section [tracker] of the configuration"
         )
-    law = tracker_covariance if m == 3 else tracker_pose_covariance
-    return law(value[:, :3], noise, origin)
+    return tracker_covariance(value[:, :3], noise, origin, m)
 
 
 def write_table(readings: Readings, path: str | Path) -> None:

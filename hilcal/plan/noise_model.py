@@ -3,10 +3,14 @@
 import numpy as np
 
 from hilcal.config import CellConfig
-from hilcal.data.noise import TrackerNoise, tracker_covariance, tracker_pose_covariance
+from hilcal.data.covariance import (
+    expected_share_of_mean,
+    joint_scatter,
+    tracker_covariance,
+    tracker_noise,
+)
 from hilcal.model import Prediction
 from hilcal.plan.nominal_model import Assumed
-from hilcal.robot import se3
 from hilcal.robot.chain import joint_jacobian
 from hilcal.types import Floats
 
@@ -28,22 +32,11 @@ def reading_covariance(assumed: Assumed, config: CellConfig, predicted: Predicti
     Returns:
         (N, m, m) covariances in sensor axes; m², m·rad, rad².
     """
-    t, a, m = config.tracker, config.acquire, assumed.m
-    noise = TrackerNoise(
-        t.range_std_m,
-        t.range_std_per_m,
-        t.transverse_std_m,
-        t.transverse_std_per_m,
-        t.orientation_std_rad,
-    )
-    law = tracker_covariance if m == 3 else tracker_pose_covariance
-    share = a.systematic_share + (1.0 - a.systematic_share) / a.samples
-    out = share * law(predicted.observation.position, noise, assumed.station)
+    a, o, m = config.acquire, predicted.observation, assumed.m
+    stated = tracker_covariance(o.position, tracker_noise(config.tracker), assumed.station, m)
+    out = expected_share_of_mean(a.samples, a.systematic_share) * stated
     joint_std = config.repeatability.per_joint(assumed.cell.arm.n)
     if np.any(joint_std):
-        o = predicted.observation
-        moved = joint_jacobian(predicted.situation.chain, o.base_position) * joint_std
-        turned = [se3.product(o.axes, moved[:, rows]) for rows in (slice(0, 3), slice(3, 6))]
-        jac = np.concatenate(turned, axis=1)[:, :m]
-        out = out + jac @ np.swapaxes(jac, 1, 2)
+        jac = joint_jacobian(predicted.situation.chain, o.base_position)
+        out = out + joint_scatter(jac, joint_std, o.axes, m)
     return np.asarray(out)

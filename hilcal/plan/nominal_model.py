@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilcal.cell import Cell
+from hilcal.cell import Cell, tracker_place
 from hilcal.config import CellConfig
 from hilcal.data.readings import States
 from hilcal.effects.catalogue import catalogue, effect_class, make
@@ -75,7 +75,7 @@ def assumed(cell: Cell, config: CellConfig, m: int = 3) -> Assumed:
     Raises:
         InputError: an unknown effect (lists the valid ones).
     """
-    place, given = tracker_place(cell, config)
+    place, given = nominal_tracker_place(cell, config)
     notes = []
     if not given:
         notes.append(
@@ -121,7 +121,7 @@ def after(fit: Fit, config: CellConfig) -> Assumed:
     if fit.scaling != "gc":
         raise InputError(f"planning on needs a fit with scaling gc, this one has {fit.scaling}")
     cell, prior = replace(fit.model.cell, registration_known=True), fit.solution.prior
-    _, station = _registered(cell, config, tracker_place(cell, config)[0])
+    _, station = _registered(cell, config, nominal_tracker_place(cell, config)[0])
     # The fit weighs its priors against the noise factor β.
     std = np.where(np.isinf(prior), np.inf, prior / np.sqrt(fit.solution.beta))
     names = " + ".join(fit.model.names)
@@ -193,16 +193,11 @@ def potential_names(config: CellConfig, model: Model) -> tuple[str, ...]:
     return tuple(name for name in names if name not in model.names)
 
 
-def tracker_place(cell: Cell, config: CellConfig) -> tuple[Floats, bool]:
-    """Return where the tracker stands, (3,) base axes in m, and whether anything tells it."""
-    tracker, sight = config.tracker, config.sight
-    if tracker.frame == "tracker" and cell.registration_known:
-        rotation, origin = cell.registration[:3, :3], cell.registration[:3, 3]
-        return np.asarray(-rotation.T @ origin), True
-    for given in (tracker.station_m, sight.tracker_m):
-        if given is not None:
-            return np.array(given), True
-    reach = cell.arm.reach
+def nominal_tracker_place(cell: Cell, config: CellConfig) -> tuple[Floats, bool]:
+    """Return where the tracker stands, (3,) base axes in m, and whether that is configured."""
+    place, reach = tracker_place(cell, config), cell.arm.reach
+    if place is not None:
+        return place, True
     return np.array([DISTANCE * reach, 0.0, 0.5 * reach]), False
 
 

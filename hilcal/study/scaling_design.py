@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.data.noise import TrackerNoise, tracker_pose_covariance
+from hilcal.data.covariance import TrackerNoise, joint_scatter, tracker_covariance
 from hilcal.data.readings import Readings, States
 from hilcal.errors import CannotAnswerError
 from hilcal.robot.arm import Arm
@@ -89,8 +89,8 @@ def make_design(rng: np.random.Generator, arm: Arm, poses: int) -> Design:
     target = chain.point(TARGET)
     jacobian = joint_jacobian(chain, target)
     torque = np.einsum("pkj,lk->plj", jacobian, WRENCHES)
-    arm_noise = JOINT_STD**2 * jacobian @ np.swapaxes(jacobian, -1, -2)
-    total = arm_noise + tracker_pose_covariance(target, TRACKER, STATION)
+    arm_noise = joint_scatter(jacobian, np.full(arm.n, JOINT_STD), np.eye(3), 6)
+    total = arm_noise + tracker_covariance(target, TRACKER, STATION, 6)
     std = np.sqrt(np.diagonal(total, axis1=-2, axis2=-1))
     return Design(
         arm=arm,

@@ -13,7 +13,7 @@ from hilcal.cell import Cell
 from hilcal.data.campaign import Campaign
 from hilcal.data.plan import Step
 from hilcal.data.run_log import RunLog
-from hilcal.identify.repeatability import with_repeatability
+from hilcal.identify.full_covariance import with_joint_scatter
 from hilcal.types import Floats
 from tests.support.campaign_run import EndedError, Run
 from tests.support.campaign_site import Site, site
@@ -183,7 +183,7 @@ def right(site: Site, path: Path) -> None:
     sight = site.world.sight(readings.states)
     off = readings.value - sight.value(readings.m)
     scatter = site.config.repeatability.per_joint(site.cell.arm.n)
-    known = with_repeatability(_registered(site), readings, scatter)
+    known = with_joint_scatter(_registered(site), readings, scatter)
     white = np.linalg.solve(np.linalg.cholesky(known.covariance), off[:, :, None])
     # a wrong pose, load or a broken frame is off by hundreds
     assert np.abs(white).max() < 7.0

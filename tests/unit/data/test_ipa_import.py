@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from hilcal.data.covariance import tracker_covariance
 from hilcal.data.ipa_ur10 import COLUMNS, JOINTS, TRACKER, ImportResult, read_ipa_ur10
-from hilcal.data.noise import tracker_pose_covariance
 from hilcal.errors import InputError
 from tests.support.readings_cases import make_arm
 
@@ -75,7 +75,7 @@ def test_values_in_si(tmp_path: Path) -> None:
 
 def test_covariance_is_that_of_the_mean_and_of_the_instrument(tmp_path: Path) -> None:
     x = read(tmp_path, rows()).readings
-    own = x.covariance - tracker_pose_covariance(x.value[:, :3], TRACKER)
+    own = x.covariance - tracker_covariance(x.value[:, :3], TRACKER, m=6)
     spread = np.array([1e-5, 2e-5, 3e-5])
     np.testing.assert_allclose(own[:, :3, :3], np.tile(np.diag(spread**2), (5, 1, 1)), atol=1e-22)
     assert not own[:, :3, 3:].any()
@@ -93,7 +93,7 @@ def test_a_spread_of_zero_gets_a_floor(tmp_path: Path) -> None:
     table = rows()
     table[1] |= {f"measurement_std_{e}": 0.0 for e in ("x", "y", "z", "rx", "ry", "rz")}
     cov = read(tmp_path, table).readings.covariance
-    floor = tracker_pose_covariance(np.array([[-0.4005, -2.91, 0.005]]), TRACKER)[0]
+    floor = tracker_covariance(np.array([[-0.4005, -2.91, 0.005]]), TRACKER, m=6)[0]
     gain = np.diag(cov[1] - floor)
     np.testing.assert_allclose(gain[:3], (2e-6) ** 2, rtol=1e-6)
     # the three axes of the angles are not orthogonal, their trace is what they are

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 
-from hilcal.data.noise import TrackerNoise, tracker_covariance, tracker_pose_covariance
+from hilcal.data.covariance import TrackerNoise, tracker_covariance
 from hilcal.data.readings import Readings
 from hilcal.data.table import read_table, write_table
 from hilcal.errors import InputError
@@ -114,7 +114,7 @@ def test_covariance_comes_from_the_instrument_when_the_table_has_none(write: Wri
     path = write([row | {"rx_rad": "0.1", "ry_rad": "0", "rz_rad": "-1"} for row in posed])
     six = replace(NOISE, orientation_std=1e-4)
     x = read_table(path, ARM, six, station)
-    expected = tracker_pose_covariance(x.value[:, :3], six, station)
+    expected = tracker_covariance(x.value[:, :3], six, station, m=6)
     np.testing.assert_array_equal(x.covariance, expected)
     with pytest.raises(InputError, match="orientation_std is 0"):
         read_table(path, ARM, NOISE, station)

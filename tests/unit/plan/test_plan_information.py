@@ -9,14 +9,15 @@ from hypothesis import strategies as st
 
 from hilcal.acquire.average import average
 from hilcal.acquire.devices import TrackerSample
+from hilcal.cell import tracker_place
 from hilcal.config import CellConfig
-from hilcal.data.noise import TrackerNoise, tracker_covariance
+from hilcal.data.covariance import tracker_covariance, tracker_noise
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.baseline import baseline, with_effects
 from hilcal.identify.fit import fit
 from hilcal.plan.information import problem
 from hilcal.plan.noise_model import reading_covariance
-from hilcal.plan.nominal_model import after, assumed, nominal_states, tracker_place
+from hilcal.plan.nominal_model import after, assumed, nominal_states
 from hilcal.plan.predicted import predicted
 from hilcal.plan.prediction_poses import work_poses
 from tests.support.arm_cases import ARMS, arm_of
@@ -191,7 +192,7 @@ def test_averaging_leaves_the_systematic_share(m):
 def test_the_tracker_stands_where_the_configuration_says():
     config = config_of()
     cell = cell_of()
-    assert not tracker_place(cell, config)[1]
+    assert tracker_place(cell, config) is None
     assert any("tracker_m" in note for note in assumed(cell, config).notes)
     there = config.model_copy(
         update={"sight": config.sight.model_copy(update={"tracker_m": (0.5, -3.0, 1.0)})}
@@ -199,10 +200,7 @@ def test_the_tracker_stands_where_the_configuration_says():
     a = assumed(cell, there)
     assert a.notes == ()
     o = a.model.predict(nominal_states(poses_of(4), np.zeros((4, 6))), a.theta).observation
-    t = config.tracker
-    noise = TrackerNoise(
-        t.range_std_m, t.range_std_per_m, t.transverse_std_m, t.transverse_std_per_m
-    )
+    noise = tracker_noise(config.tracker)
     still = there.model_copy(
         update={"repeatability": there.repeatability.model_copy(update={"joint_std_rad": 0.0})}
     )
@@ -214,9 +212,9 @@ def test_the_tracker_stands_where_the_configuration_says():
         {"robot": {"model": "ur10e"}, "tracker": {"frame": "base", "station_m": [2.0, 2.0, 0.0]}}
     )
     known = cell_of(registration_known=True)
-    assert tracker_place(known, based)[0] == pytest.approx([2.0, 2.0, 0.0])
+    assert tracker_place(known, based) == pytest.approx([2.0, 2.0, 0.0])
     r = known.registration
-    assert r[:3, :3] @ tracker_place(known, config)[0] + r[:3, 3] == pytest.approx(np.zeros(3))
+    assert r[:3, :3] @ tracker_place(known, config) + r[:3, 3] == pytest.approx(np.zeros(3))
 
 
 def test_what_is_assumed_of_the_compliances_matters_little():

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hilcal.acquire.sight import tracker_place
-from hilcal.cell import cell_from_config
+from hilcal.cell import cell_from_config, tracker_place
 from hilcal.config import CellConfig
 from hilcal.data.plan import UNLOADED
 from hilcal.errors import CannotAnswerError

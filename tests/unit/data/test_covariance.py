@@ -1,4 +1,4 @@
-"""The tracker's covariance is an ellipsoid along the line of sight."""
+"""The covariance of a reading: instrument, repeats, and the scatter of the joints."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from hilcal.data.noise import TrackerNoise, tracker_covariance, tracker_pose_covariance
+from hilcal.data.covariance import (
+    TrackerNoise,
+    covariance_of_mean,
+    expected_share_of_mean,
+    joint_scatter,
+    tracker_covariance,
+)
 from hilcal.errors import InputError
 from hilcal.robot import se3
 from hilcal.types import Floats
@@ -70,7 +76,7 @@ def test_at500_at_three_metres_is_a_three_to_one_ellipsoid() -> None:
 
 def test_pose_covariance_adds_the_rotation_block() -> None:
     p = np.array([[1.0, 2.0, 3.0], [0.0, -1.0, 0.0]])
-    cov = tracker_pose_covariance(p, NOISE)
+    cov = tracker_covariance(p, NOISE, m=6)
     np.testing.assert_array_equal(cov[:, :3, :3], tracker_covariance(p, NOISE))
     np.testing.assert_array_equal(cov[:, 3:, 3:], np.tile(1e-8 * np.eye(3), (2, 1, 1)))
     assert not cov[:, :3, 3:].any()
@@ -86,4 +92,26 @@ def test_what_no_instrument_has_is_refused() -> None:
     with pytest.raises(InputError, match="reading 2 lies at the tracker's station"):
         tracker_covariance(np.array([[1.0, 0, 0], [1.0, 1, 1]]), NOISE, (1.0, 1.0, 1.0))
     with pytest.raises(InputError, match="orientation_std is 0"):
-        tracker_pose_covariance(np.ones((1, 3)), TrackerNoise(1e-5, 0.0, 1e-5, 0.0))
+        tracker_covariance(np.ones((1, 3)), TrackerNoise(1e-5, 0.0, 1e-5, 0.0), m=6)
+
+
+def test_joint_scatter_is_its_formula_and_turns_with_the_base() -> None:
+    rng = np.random.default_rng(5)
+    jac, std = rng.normal(size=(4, 6, 7)), rng.uniform(1e-5, 5e-5, 7)
+    turn = se3.rotation(rng.normal(size=(4, 3)))
+    both = np.zeros((4, 6, 6))
+    both[:, :3, :3] = both[:, 3:, 3:] = turn
+    expected = both @ jac @ np.diag(std**2) @ np.swapaxes(jac, 1, 2) @ np.swapaxes(both, 1, 2)
+    whole = joint_scatter(jac, std, turn, 6)
+    np.testing.assert_allclose(whole, expected, rtol=1e-12, atol=1e-24)
+    np.testing.assert_array_equal(joint_scatter(jac, std, turn, 3), whole[:, :3, :3])
+
+
+def test_the_mean_keeps_the_expected_share_of_what_is_stated() -> None:
+    """A scatter of just the random part makes s Σ + (1 - s) Σ / K; then nothing is learnt."""
+    stated, samples, share = np.diag([1.0, 4.0, 9.0]) * 1e-10, 6, 0.3
+    basis = np.sqrt((samples - 1) * (1 - share)) * np.linalg.cholesky(stated).T
+    scatter = np.vstack([basis, np.zeros((samples - 3, 3))])
+    expected = expected_share_of_mean(samples, share) * stated
+    found = covariance_of_mean(stated, scatter, share)
+    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-24)

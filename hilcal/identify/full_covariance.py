@@ -1,0 +1,55 @@
+"""Readings with their full covariance: what the file states, and the arm's repeatability."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from hilcal.cell import Cell
+from hilcal.config import CellConfig
+from hilcal.data.campaign import Campaign
+from hilcal.data.covariance import COVERS, INSTRUMENT, joint_scatter
+from hilcal.data.readings import Readings
+from hilcal.errors import CannotAnswerError
+from hilcal.identify.registration import register
+from hilcal.robot.chain import evaluate, joint_jacobian
+from hilcal.types import Floats
+
+
+def campaign_readings(campaign: Campaign, cell: Cell, config: CellConfig) -> Readings:
+    """Return all readings of a campaign with their full covariance, see `data.covariance`.
+
+    The arm's repeatability is added where the stored covariances cover the instrument alone, that
+    is, for measured campaigns; an imported one is taken as it is, whatever `[repeatability]` is.
+
+    Raises:
+        InputError: there are no readings yet, or they are damaged.
+    """
+    readings = campaign.readings()
+    if campaign.about(COVERS) != INSTRUMENT:
+        return readings
+    return with_joint_scatter(cell, readings, config.repeatability.per_joint(cell.arm.n))
+
+
+def with_joint_scatter(cell: Cell, readings: Readings, joint_std: Floats) -> Readings:
+    """Return the readings with the scatter of the joints added to what the instrument states.
+
+    V = V_instrument + R J Σ_q Jᵀ Rᵀ with the Jacobian of the nominal arm and R the orientation of
+    the base in the sensor's frame, estimated from the readings where it is unknown. With too few
+    poses to estimate it, the readings are returned as they are; nothing can be fitted to them
+    either.
+
+    Args:
+        cell: the cell.
+        readings: N readings whose covariances are the instrument's alone.
+        joint_std: (n,) standard deviations from one arrival to the next, rad.
+    """
+    if not np.any(joint_std):
+        return readings
+    try:
+        registered = register(cell, readings)
+    except CannotAnswerError:
+        return readings
+    chain = evaluate(cell.arm, readings.states.q)
+    jac = joint_jacobian(chain, chain.point(registered.target[:3, 3]))
+    added = joint_scatter(jac, joint_std, registered.registration[:3, :3], readings.m)
+    return replace(readings, covariance=readings.covariance + added)
