@@ -1,15 +1,17 @@
 """A model is a cell and a tuple of effects; `model + effect` is a new model."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import accumulate, pairwise
 
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.data.readings import States
+from hilcal.data.readings import Readings, States
+from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.effects.options import typical_compliances
 from hilcal.effects.protocol import Effect, Situation
+from hilcal.effects.spec import EffectSpec
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.observe import Observation, motion, observe
 from hilcal.robot import chain as chains
@@ -54,10 +56,20 @@ class Prediction:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Model:
-    """Robot and effects."""
+    """Robot and effects.
+
+    Attributes:
+        cell: the cell.
+        effects: its effects, each of another name.
+        catalogue: the effects that it could have.
+        readings: those that effects are set up for when they are added by name; None where the
+            model was made without.
+    """
 
     cell: Cell
     effects: tuple[Effect, ...]
+    catalogue: Catalogue = field(default_factory=installed)
+    readings: Readings | None = None
 
     def __post_init__(self) -> None:
         """Refuse an effect that is there twice."""
@@ -81,9 +93,28 @@ class Model:
         ends = accumulate((len(e.parameters) for e in self.effects), initial=0)
         return tuple(slice(a, b) for a, b in pairwise(ends))
 
-    def __add__(self, effect: Effect) -> "Model":
-        """Return the model with one more effect."""
+    def __add__(self, effect: Effect | EffectSpec) -> "Model":
+        """Return the model with one more effect; one that is only named is built for it.
+
+        Raises:
+            InputError: an effect that is there already, or cannot be built.
+        """
+        if isinstance(effect, EffectSpec):
+            return self._with(effect)
         return replace(self, effects=(*self.effects, effect))
+
+    def _with(self, spec: EffectSpec) -> "Model":
+        """Return the model with an effect that is built for its cell and readings."""
+        if self.readings is None:
+            raise InputError(
+                f"effect {spec.name}: this model was made without readings; add an effect that is "
+                "built for a cell and states"
+            )
+        catalogue, states, m = self.catalogue, self.readings.states, self.readings.m
+        if not isinstance(spec.kind, str) and spec.kind not in catalogue.effects:
+            catalogue = catalogue.with_effects(spec.kind)
+        made = catalogue.make(spec.name, self.cell, states, spec.options, m)
+        return replace(self, effects=(*self.effects, made), catalogue=catalogue)
 
     def predict(self, states: States, theta: Floats) -> Prediction:
         """Equilibrium of N states: elastic deviations at the deflected configuration.
@@ -186,7 +217,7 @@ class Model:
             within = np.full(len(place), -1)
             within[wanted] = np.arange(len(wanted))
             at = next((t for other, t in mine if other is e), np.zeros(len(place)))
-            columns = e.columns(s)
+            columns = e.checked_columns(s)
             if e in self.effects and e.compliance(at) is not None:
                 for other, part in mine:
                     columns += tuple(map(e.of_compliance, other.compliance_columns(part, s)))

@@ -14,7 +14,7 @@ from hilcal.data.revision import RevisionRecord
 from hilcal.data.whitening import MODES, SCALINGS, Mode, Scaling
 from hilcal.diagnose import diagnosis_document
 from hilcal.diagnose.verdict import Diagnosis
-from hilcal.effects.catalogue import make
+from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError
 from hilcal.identify import fit_document
 from hilcal.identify.fit import Fit, fit
@@ -67,7 +67,9 @@ def to_record(
     )
 
 
-def restore(record: RevisionRecord, cell: Cell, readings: Readings) -> Fit:
+def restore(
+    record: RevisionRecord, cell: Cell, readings: Readings, catalogue: Catalogue | None = None
+) -> Fit:
     """Find a stored fit again: the same model from the stored parameters, quickly.
 
     Raises:
@@ -78,20 +80,23 @@ def restore(record: RevisionRecord, cell: Cell, readings: Readings) -> Fit:
             f"revision {record.number} was fitted before readings were appended; "
             "run hilcal identify again"
         )
-    model, theta = restore_model(record, cell, readings)
+    model, theta = restore_model(record, cell, readings, catalogue)
     prior = np.array(
         [np.inf if s is None else float(s) for s in record.parameters_json["prior"]], dtype=float
     )
     return fit(model, readings, mode_of(record), scaling_of(record), theta, prior)
 
 
-def restore_model(record: RevisionRecord, cell: Cell, readings: Readings) -> tuple[Model, Floats]:
+def restore_model(
+    record: RevisionRecord, cell: Cell, readings: Readings, catalogue: Catalogue | None = None
+) -> tuple[Model, Floats]:
     """Model and parameters (P,) of a revision, in the cell as it was registered then.
 
     Args:
         record: the revision.
         cell: the cell of the campaign's configuration.
         readings: the readings that it was fitted to.
+        catalogue: has its effects; the installed ones unless given.
 
     Raises:
         InputError: the parameters are not those of the model.
@@ -100,10 +105,9 @@ def restore_model(record: RevisionRecord, cell: Cell, readings: Readings) -> tup
     cell = replace(
         cell, registration=np.array(stored["registration"]), target=np.array(stored["target"])
     )
-    options = record.options["effects"]
-    model = Model(
-        cell, tuple(make(e, cell, readings.states, options.get(e)) for e in record.effects)
-    )
+    options, known = record.options["effects"], catalogue or installed()
+    effects = (known.make(e, cell, readings.states, options.get(e)) for e in record.effects)
+    model = Model(cell, tuple(effects), known, readings)
     names = [f"{e.name}.{p.name}" for e in model.effects for p in e.parameters]
     if names != stored["names"]:
         raise InputError(

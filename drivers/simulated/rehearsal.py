@@ -13,7 +13,6 @@ from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
 from hilcal.data.readings import Readings, States
 from hilcal.data.whitening import Mode
-from hilcal.effects.catalogue import catalogue
 from hilcal.errors import InputError
 from hilcal.toml import suggest
 from hilcal.types import Ints
@@ -50,8 +49,8 @@ class Rehearsal:
 
 
 def choices() -> tuple[str, ...]:
-    """Effects that can be hidden: those of the catalogue that the world knows as well."""
-    return tuple(e for e in EFFECTS if e in catalogue() and e != "joint_compliance")
+    """Effects that can be hidden: all that the world knows; every arm has joint compliance."""
+    return tuple(e for e in EFFECTS if e != "joint_compliance")
 
 
 def check_choice(choice: str) -> None:

@@ -5,8 +5,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from contextvars import copy_context
+from contextlib import contextmanager, redirect_stdout
 from typing import Annotated
 
 import typer
@@ -101,7 +100,7 @@ def execute(make: Callable[[], typer.Typer], name: str, arguments: Sequence[str]
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")
     debug = os.environ.get(DEBUG, "") not in ("", "0")
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), redirect_stdout(sys.stdout):
         if not debug:
             warnings.simplefilter("ignore")
         sys.exit(_run(make, name, list(arguments), debug))
@@ -120,17 +119,17 @@ def _one_thread() -> Iterator[None]:
 
 
 def _run(make: Callable[[], typer.Typer], name: str, arguments: list[str], debug: bool) -> int:
+    out = sys.stdout
     try:
         app = make()
         with _one_thread():
-            # Effects of files are in the catalogue of this context only.
-            result = copy_context().run(app, arguments, prog_name=name, standalone_mode=False)
-        sys.stdout.flush()
+            result = app(arguments, prog_name=name, standalone_mode=False)
+        out.flush()
     except HilcalError as error:
         return _fail(error, str(error), error.exit_code, debug)
     except BrokenPipeError:
         # Nobody reads any more; what is still in the buffer must not raise again at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        os.dup2(os.open(os.devnull, os.O_WRONLY), out.fileno())
         return _BROKEN_PIPE
     except KeyboardInterrupt:
         return _fail(None, "interrupted", _INTERRUPTED, debug)
@@ -144,6 +143,10 @@ def _run(make: Callable[[], typer.Typer], name: str, arguments: list[str], debug
             return _fail(error, f"{told()}".replace("\n", " "), _USAGE, debug)
         if type(error).__name__ == "Abort":
             return _fail(error, "interrupted", _INTERRUPTED, debug)
+        from hilcal.effects.failure import failure_of  # loads numpy, which takes a while
+
+        if failed := failure_of(error):
+            return _fail(error, str(failed), failed.exit_code, debug)
         words = " ".join(str(error).split())
         report = (
             f"unexpected {type(error).__name__}: {words}; please report it ({DEBUG}=1 shows more)"

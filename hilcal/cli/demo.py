@@ -9,7 +9,7 @@ import typer
 
 from drivers.simulated.rehearsal import NOTHING, RANDOM, Rehearsal, check_choice
 from hilcal.cli.doubting import FIRST, STRENGTH, Doubted, doubted, in_doubt
-from hilcal.cli.effects_from import EffectsFrom
+from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import check_record, record_of, record_story
 from hilcal.cli.plan_output import POSES
 from hilcal.cli.refining import Row, revisions_json
@@ -58,7 +58,7 @@ def demo(
     as_json: Json = False,
 ) -> None:
     """Rehearse the whole story on a simulated cell, through real drivers and wires."""
-    t = terminal(as_json)
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
     check_record(record)
     path = configs_dir() / "cells" / CELL
     config = load_config(path)
@@ -72,7 +72,7 @@ def demo(
         weaker = config.simulation.model_copy(update={"strength_sigma": STRENGTH})
         config = config.model_copy(update={"simulation": weaker})
     there = output.exists()
-    told = Told(config, choice, number, output, path.parent)
+    told = Told(config, choice, number, output, path.parent, catalogue)
     doubt: Doubted | None = None
     with working(t.progress) as say:
         plan = _plan(told, poses, ambiguous, say)
@@ -81,14 +81,14 @@ def demo(
             t.notice(f"{output} existed and is replaced")
         _introduce(t, r, choice, number)
         if ambiguous:
-            doubt = doubted(t, r, number, plan, poses)
+            doubt = doubted(t, r, number, plan, poses, catalogue)
             if doubt.plan is not None:
                 r = further(doubt.plan)
                 new = len(r.readings) - doubt.readings
                 t.show(f"\n{new} readings were added. All {len(r.readings)} together:\n")
     hashed = content_hash(r.readings)
     with working(t.progress) as say:
-        model = baseline(r.cell, r.readings, r.mode)
+        model = baseline(r.cell, r.readings, r.mode, catalogue)
         found = refine_model(model, r.readings, r.mode, say)
     with Campaign.open(output) as campaign:
         if doubt is not None and doubt.plan is not None:
@@ -110,7 +110,8 @@ def demo(
     if truth:
         t.show([text.heading("What was found against what is true"), *text_demo.truth_table(truth)])
     ok, words = _judge(r, found)
-    t.show([text_refine.verdict_line(found.verdict, found.message), "", text.heading(words)])
+    line = text_refine.verdict_line(found.verdict, found.message, catalogue)
+    t.show([line, "", text.heading(words)])
     chapters = [
         Chapter(k, s.added, s.fit, s.diagnosis, s.removed)
         for k, s in zip(numbered, found.steps, strict=True)

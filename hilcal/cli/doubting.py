@@ -12,6 +12,7 @@ from hilcal.cli.terminal import Terminal
 from hilcal.data.plan import REFERENCE, Plan
 from hilcal.data.records import content_hash
 from hilcal.diagnose.verdict import Diagnosis, diagnose
+from hilcal.effects.catalogue import Catalogue
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
 from hilcal.plan.next import measure_next
@@ -57,7 +58,9 @@ def in_doubt(seed: int) -> str:
     return str(np.random.default_rng([seed, 2]).choice(CHOICE))
 
 
-def doubted(t: Terminal, r: Rehearsal, seed: int, first: Plan, poses: int) -> Doubted:
+def doubted(
+    t: Terminal, r: Rehearsal, seed: int, first: Plan, poses: int, catalogue: Catalogue
+) -> Doubted:
     """Diagnose a first campaign, and plan what separates the suspects where that is in doubt.
 
     Args:
@@ -66,10 +69,11 @@ def doubted(t: Terminal, r: Rehearsal, seed: int, first: Plan, poses: int) -> Do
         seed: of the candidates.
         first: its plan.
         poses: as asked for, see `SHARE`.
+        catalogue: the effects that a model can have.
     """
     with working(t.progress) as say:
         say("fitting and diagnosing the first readings")
-        found = fit(baseline(r.cell, r.readings, r.mode), r.readings, r.mode)
+        found = fit(baseline(r.cell, r.readings, r.mode, catalogue), r.readings, r.mode)
         d = diagnose(found)
     document: dict[str, object] = {"verdict": d.verdict, "message": d.message, "suspects": []}
     known = (content_hash(r.readings), len(r.readings))

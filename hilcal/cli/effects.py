@@ -9,11 +9,10 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from hilcal.cli.effects_from import EffectsFrom
+from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.terminal import Json, terminal
 from hilcal.effects import template
-from hilcal.effects.added import added, file_of
-from hilcal.effects.catalogue import BUILT_IN, catalogue
+from hilcal.effects.catalogue import BUILT_IN, Catalogue, installed
 from hilcal.effects.check import NAME
 from hilcal.effects.example import ROBOT, example_cell, example_states
 from hilcal.effects.option_help import option_defaults, option_help
@@ -37,10 +36,10 @@ def effects(
     """List the effects that a model can have; `new` begins one of your own."""
     if ctx.invoked_subcommand is not None:
         return
-    t = terminal(as_json)
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
     cell = example_cell()
     states = example_states(cell)
-    made = [kind(cell, states) for kind in catalogue().values()]
+    made = [kind(cell, states) for kind in catalogue.effects]
     defaults = {e.name: option_defaults(type(e), cell, states) for e in made}
     out = text.table("effect", "parameters", "unit", "needs", "law", left=(0, 2, 3, 4))
     out.columns[0].no_wrap = True
@@ -50,12 +49,15 @@ def effects(
     t.show(out)
     notes = [
         f"parameters: of a {ROBOT} with 30 poses; needs: columns that the readings must have.",
-        *(f"from {file.path}: {', '.join(e.name for e in file.effects)}" for file in added()),
+        *(
+            f"from {file.path}: {', '.join(e.name for e in file.effects)}"
+            for file in catalogue.files
+        ),
     ]
     t.show(Text("\n".join(notes), style="dim"))
     t.show(["", _options_table(made, defaults)])
     t.show(Text(OPTIONS_NOTE, style="dim"))
-    t.document({"effects": [_document(e, defaults[e.name]) for e in made]})
+    t.document({"effects": [_document(e, defaults[e.name], catalogue) for e in made]})
 
 
 def _options_table(made: list[Effect], defaults: dict[str, dict[str, object]]) -> Table:
@@ -72,7 +74,7 @@ def _options_table(made: list[Effect], defaults: dict[str, dict[str, object]]) -
     return out
 
 
-def _document(e: Effect, defaults: dict[str, object]) -> dict[str, object]:
+def _document(e: Effect, defaults: dict[str, object], catalogue: Catalogue) -> dict[str, object]:
     shown = [{"name": p.name, "unit": p.unit, "meaning": p.meaning} for p in e.parameters]
     return {
         "name": e.name,
@@ -83,16 +85,15 @@ def _document(e: Effect, defaults: dict[str, object]) -> dict[str, object]:
         "defaults": plain(defaults),
         "option_help": option_help(type(e)),
         "parameters": shown,
-        "source": _source(e.name),
+        "source": _source(type(e), catalogue),
     }
 
 
-def _source(name: str) -> str:
+def _source(kind: type[Effect], catalogue: Catalogue) -> str:
     """Return where an effect is from: "built in", "installed", or a file."""
-    file = file_of(name)
-    if file is not None:
+    if file := catalogue.file_of(kind.name):
         return file.path
-    return "built in" if any(e.name == name for e in BUILT_IN) else "installed"
+    return "built in" if kind in BUILT_IN else "installed"
 
 
 def new(
@@ -135,7 +136,7 @@ def _check_name(name: str) -> None:
             f"NAME {name!r}; valid: lower-case letters, digits and _, a letter first, no word of "
             "Python's own"
         )
-    if name in catalogue():
+    if name in installed().names:
         raise InputError(f"NAME {name}: is in the catalogue already; choose another name")
 
 

@@ -16,7 +16,7 @@ from hilcal.data.revision import RevisionRecord
 from hilcal.data.whitening import MODES, SCALINGS, Mode, Scaling
 from hilcal.diagnose.catalogue_sufficiency import look_ahead
 from hilcal.diagnose.verdict import Diagnosis, diagnose
-from hilcal.effects.catalogue import make
+from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.effects.options import Options
 from hilcal.effects.written import chosen_options, read_effects_text, write_effect
 from hilcal.errors import InputError
@@ -40,6 +40,7 @@ class Opened:
         config: the cell's configuration.
         cell: the cell.
         readings: all readings.
+        catalogue: the effects that a model can have.
     """
 
     path: Path
@@ -47,6 +48,7 @@ class Opened:
     config: CellConfig
     cell: Cell
     readings: Readings
+    catalogue: Catalogue
 
     def latest(self) -> RevisionRecord | None:
         """Return the latest revision, if there is any."""
@@ -81,13 +83,13 @@ class Opened:
         Raises:
             InputError: its readings or its effects are not at hand as they were then.
         """
-        check_sources(record, self.path)
-        return restore(record, self.cell, self.readings)
+        check_sources(record, self.path, self.catalogue)
+        return restore(record, self.cell, self.readings, self.catalogue)
 
     def model_of(self, record: RevisionRecord) -> tuple[Model, Floats]:
         """Return model and parameters of a stored fit; raises as `restore` does."""
-        check_sources(record, self.path)
-        return restore_model(record, self.cell, self.readings)
+        check_sources(record, self.path, self.catalogue)
+        return restore_model(record, self.cell, self.readings, self.catalogue)
 
     def latest_fit(self, t: Terminal, say: Say) -> tuple[int, Fit]:
         """Return the latest revision as a fit; without any, make and store the baseline."""
@@ -96,7 +98,7 @@ class Opened:
             say(f"restoring revision {record.number}")
             return record.number, self.restore(record)
         mode = self.mode(None)
-        model = baseline(self.cell, self.readings, mode)
+        model = baseline(self.cell, self.readings, mode, self.catalogue)
         say(f"fitting {' + '.join(model.names) or 'the nominal arm'}")
         found = fit(model, self.readings, mode)
         number = self.store(found, None, None)
@@ -126,8 +128,12 @@ class Opened:
 
 
 @contextmanager
-def open_run(path: Path) -> Iterator[Opened]:
+def open_run(path: Path, catalogue: Catalogue | None = None) -> Iterator[Opened]:
     """Open a campaign file.
+
+    Args:
+        path: the file.
+        catalogue: the effects that a model can have; the installed ones unless given.
 
     Raises:
         InputError: not a sound campaign, or without readings.
@@ -136,7 +142,7 @@ def open_run(path: Path) -> Iterator[Opened]:
         config = CellConfig.from_json(campaign.config_json)
         cell = cell_from_config(config, Path(campaign.base_dir))
         readings = campaign_readings(campaign, cell, config)
-        yield Opened(path, campaign, config, cell, readings)
+        yield Opened(path, campaign, config, cell, readings, catalogue or installed())
 
 
 def record_of(
@@ -148,7 +154,7 @@ def record_of(
 ) -> RevisionRecord:
     """Return a fit as it is stored, with the files that its effects are from."""
     record = to_record(found, diagnosis, added, data_hash, removed)
-    own = sources(record.effects)
+    own = sources(found.model)
     return replace(record, options={**record.options, SOURCES: own}) if own else record
 
 
@@ -178,7 +184,7 @@ def scalings(name: str) -> tuple[Scaling, ...]:
     return found
 
 
-def wanted_effects(text: str | None) -> dict[str, dict[str, object]] | None:
+def wanted_effects(text: str | None, catalogue: Catalogue) -> dict[str, dict[str, object]] | None:
     """Read `--effects "a, b(option=value)"`: options by name, see `read_effects_text`.
 
     Raises:
@@ -187,15 +193,15 @@ def wanted_effects(text: str | None) -> dict[str, dict[str, object]] | None:
     """
     if text is None:
         return None
-    wanted = read_effects_text(text, "--effects")
+    wanted = read_effects_text(text, "--effects", catalogue)
     if not wanted:
         raise InputError("--effects is empty; give one name or several, separated by commas")
     return wanted
 
 
-def effect_names(text: str | None) -> tuple[str, ...] | None:
+def effect_names(text: str | None, catalogue: Catalogue) -> tuple[str, ...] | None:
     """Read names of effects where they cannot have options; raises as `wanted_effects` does."""
-    wanted = wanted_effects(text)
+    wanted = wanted_effects(text, catalogue)
     for name, options in (wanted or {}).items():
         if options:
             raise InputError(f"--effects: {name} takes no options here; valid: {name}")
@@ -209,7 +215,7 @@ def check_options(o: Opened, wanted: Mapping[str, Options]) -> None:
         InputError: an unknown option, a bad value, or readings that lack what an effect needs.
     """
     for name, options in wanted.items():
-        make(name, o.cell, o.readings.states, options).prior_std()
+        o.catalogue.make(name, o.cell, o.readings.states, options).prior_std()
 
 
 def chosen(found: Fit) -> dict[str, dict[str, object]]:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from hilcal.cli.effects_from import EffectsFrom
+from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import (
     check_options,
     chosen,
@@ -55,18 +55,18 @@ def identify(
     as_json: Json = False,
 ) -> None:
     """Fit a model to the readings, and keep it as a revision."""
-    t = terminal(as_json)
-    wanted, named = scalings(scaling), wanted_effects(effects)
-    with open_run(run) as o:
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
+    wanted, named = scalings(scaling), wanted_effects(effects, catalogue)
+    with open_run(run, catalogue) as o:
         mode = o.mode(readings)
         check_options(o, named or {})
         fits: dict[Scaling, Fit] = {}
         with working(t.progress) as say:
             say("registering")
             if named is None:
-                model = baseline(o.cell, o.readings, mode)
+                model = baseline(o.cell, o.readings, mode, catalogue)
             else:
-                model = with_effects(o.cell, o.readings, mode, named, named)
+                model = with_effects(o.cell, o.readings, mode, named, named, catalogue)
             for s in wanted:
                 say(f"fitting {text.model_name(titles(model, o.readings))}, scaling {s}")
                 fits[s] = fit(model, o.readings, mode, s)
@@ -97,8 +97,8 @@ def options_json(found: Fit) -> dict[str, dict[str, object]]:
 
 def compare(run: Run, effects_from: EffectsFrom = None, as_json: Json = False) -> None:
     """Show where the latest model fails."""
-    t = terminal(as_json)
-    with open_run(run) as o, working(t.progress) as say:
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
+    with open_run(run, catalogue) as o, working(t.progress) as say:
         number, found = o.latest_fit(t, say)
         if found.scaling != "gc":
             raise InputError(
@@ -143,8 +143,8 @@ def validate(
     as_json: Json = False,
 ) -> None:
     """Predict readings of another campaign with the latest model."""
-    t = terminal(as_json)
-    with open_run(run) as o, open_run(other) as unseen, working(t.progress) as say:
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
+    with open_run(run, catalogue) as o, open_run(other) as unseen, working(t.progress) as say:
         if o.cell.arm.name != unseen.cell.arm.name:
             raise InputError(
                 f"{other}: robot {unseen.cell.arm.name}; the model of {run} is of {o.cell.arm.name}"

@@ -9,6 +9,7 @@ from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import whitening
+from hilcal.effects.catalogue import installed
 from hilcal.errors import HilcalError
 from hilcal.identify.baseline import with_effects
 from hilcal.identify.fit import mahalanobis2
@@ -84,7 +85,8 @@ class LiveModel:
         stale = known is None or loaded != known.loaded or count > GROWTH * known.count
         if stale and len(np.unique(distinct_poses(readings))) >= LEAST:
             # The arm's own weight bends it, too, so unloaded readings need the joints to give.
-            model = with_effects(self._cell, readings, "absolute", ("joint_compliance",))
+            names = [kind.name for kind in installed().with_role("baseline")]
+            model = with_effects(self._cell, readings, "absolute", names)
             w = whitening(readings, "absolute", "gc")
             found = solve(model, readings, w)
             rows = w.whiten(found.jacobian).reshape(-1, len(found.live))

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from hilcal.cli.effects_from import EffectsFrom
+from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import Opened, check_record, effect_names, open_run
 from hilcal.cli.plan_output import (
     POSES,
@@ -26,6 +26,7 @@ from hilcal.data.run_log import PLAN
 from hilcal.diagnose.rivals import Rivals
 from hilcal.diagnose.stepwise import remove
 from hilcal.diagnose.verdict import diagnose
+from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.fit import Fit
 from hilcal.plan.next import Next, measure_next
@@ -69,14 +70,14 @@ def next_(
     as_json: Json = False,
 ) -> None:
     """Plan the measurements that separate the leading suspects; exit 4 where there is no doubt."""
-    t = terminal(as_json)
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
     check_record(record)
     rng = generator(seed)
     if poses < 1:
         raise InputError(f"--poses {poses}; valid: a whole number from 1")
-    with open_run(run) as o, working(t.progress) as say:
+    with open_run(run, catalogue) as o, working(t.progress) as say:
         config, numbers = (o.config, o.cell) if cell is None else read_cell(cell)
-        doubt = doubt_of(t, o, _named(suspects), say)
+        doubt = doubt_of(t, o, _named(suspects, catalogue), say)
         place = reference_of(o)
         found = measure_next(
             numbers, config, doubt.fit, doubt.suspects, Request(poses), rng, say, place
@@ -188,12 +189,12 @@ def reference_of(o: Opened) -> Floats | None:
     return plan.joints(REFERENCE) if REFERENCE in plan.pose_names else None
 
 
-def _named(text: str | None) -> tuple[str, ...] | None:
+def _named(text: str | None, catalogue: Catalogue) -> tuple[str, ...] | None:
     """Split and check --suspects."""
     if text is None:
         return None
     try:
-        names = effect_names(text) or ()
+        names = effect_names(text, catalogue) or ()
     except InputError as error:
         raise InputError(str(error).replace("--effects", "--suspects")) from None
     if not 2 <= len(names) <= MOST:

@@ -9,7 +9,7 @@ import typer
 from hilcal.acquire.connect import Answer, connect
 from hilcal.acquire.dry_run import dry_run
 from hilcal.cell import Cell, cell_from_config
-from hilcal.cli.effects_from import EffectsFrom
+from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import check_record, open_run
 from hilcal.cli.plan_output import (
     POSES,
@@ -27,6 +27,7 @@ from hilcal.cli.plan_output import (
 from hilcal.cli.terminal import Json, Record, Terminal, terminal
 from hilcal.config import CellConfig, load_config
 from hilcal.data.plan import Plan, load_plan
+from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import DeviceError, InputError
 from hilcal.identify.fit import Fit
 from hilcal.plan.choice import CRITERIA
@@ -72,15 +73,15 @@ def plan(
     as_json: Json = False,
 ) -> None:
     """Choose poses, loads and their order, with a proof of how near to the best they are."""
-    t = terminal(as_json)
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
     check_record(record)
     config, numbers = read_cell(cell)
     unloaded: Literal["around", "first"] = "first" if unloaded_first else "around"
     wanted = Request(poses, readings, _criterion(criterion), unloaded=unloaded)
     with working(t.progress) as say:
-        known = None if after is None else _known(t, after, say)
+        known = None if after is None else _known(t, after, catalogue, say)
         rng = generator(seed)
-        chosen = make(numbers, config, wanted, rng, known, say)
+        chosen = make(numbers, config, wanted, rng, known, say, catalogue)
         plan_ = replace(chosen.ordered.plan, about=about(chosen))
         told = story(chosen, config, rng, say, compare=not quick)
         say("going through it in thought")
@@ -102,9 +103,9 @@ def _criterion(name: str | None) -> str | None:
     return name
 
 
-def _known(t: Terminal, path: Path, say: Say) -> Fit:
+def _known(t: Terminal, path: Path, catalogue: Catalogue, say: Say) -> Fit:
     """Return the newest fit of a campaign."""
-    with open_run(path) as run:
+    with open_run(path, catalogue) as run:
         return run.latest_fit(t, say)[1]
 
 
@@ -142,10 +143,15 @@ def read_cell(path: Path) -> tuple[CellConfig, Cell]:
 
 
 def make_plan(
-    cell: Cell, config: CellConfig, poses: int, seed: int, say: Say = lambda words: None
+    cell: Cell,
+    config: CellConfig,
+    poses: int,
+    seed: int,
+    catalogue: Catalogue,
+    say: Say = lambda words: None,
 ) -> Plan:
     """Return a plan of as many readings as so many poses take under every load of the cell."""
-    chosen = make(cell, config, Request(poses), generator(seed), None, say)
+    chosen = make(cell, config, Request(poses), generator(seed), None, say, catalogue)
     return replace(chosen.ordered.plan, about={**about(chosen), "remarks": list(remarks(chosen))})
 
 

@@ -13,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from hilcal.cli.effects_from import EffectsFrom
+from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.ending import told_to_end
 from hilcal.cli.files import (
     check_options,
@@ -28,7 +28,7 @@ from hilcal.data.revision import change
 from hilcal.diagnose.catalogue_sufficiency import look_ahead
 from hilcal.diagnose.diagnosis_document import to_json
 from hilcal.diagnose.verdict import diagnose as judge
-from hilcal.effects.catalogue import effect_class
+from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.options import Options
 from hilcal.effects.written import read_effects_text, write_effect
 from hilcal.errors import InputError
@@ -64,8 +64,8 @@ class Row:
 
 def diagnose(run: Run, effects_from: EffectsFrom = None, as_json: Json = False) -> None:
     """Say which effect the latest model lacks."""
-    t = terminal(as_json)
-    with open_run(run) as o, working(t.progress) as say:
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
+    with open_run(run, catalogue) as o, working(t.progress) as say:
         number, found = o.latest_fit(t, say)
         say(f"diagnosing revision {number}")
         d = look_ahead(judge(found), say)
@@ -86,11 +86,12 @@ def add(
     as_json: Json = False,
 ) -> None:
     """Add an effect to the latest model: error before and after."""
-    wanted = read_effects_text(effect, "EFFECT")
+    catalogue = catalogue_with(effects_from)
+    wanted = read_effects_text(effect, "EFFECT", catalogue)
     if len(wanted) != 1:
         raise InputError(f"EFFECT {effect!r} has {len(wanted)} effects; valid: one")
     ((name, options),) = wanted.items()
-    _change(run, name, record, as_json, partial(add_effect, options=options), options)
+    _change(run, name, record, as_json, catalogue, partial(add_effect, options=options), options)
 
 
 def remove(
@@ -101,8 +102,9 @@ def remove(
     as_json: Json = False,
 ) -> None:
     """Take an effect out of the latest model: error before and after."""
-    effect_class(effect)
-    _change(run, effect, record, as_json, remove_effect)
+    catalogue = catalogue_with(effects_from)
+    catalogue[effect]  # an unknown name is refused
+    _change(run, effect, record, as_json, catalogue, remove_effect)
 
 
 def _change(
@@ -110,6 +112,7 @@ def _change(
     effect: str,
     record: Path | None,
     as_json: bool,
+    catalogue: Catalogue,
     make: Callable[[Fit, str], Fit],
     options: Options | None = None,
 ) -> None:
@@ -117,7 +120,7 @@ def _change(
     t, adds = terminal(as_json), options is not None
     named = write_effect(effect, options or {})
     check_record(record)
-    with open_run(run) as o:
+    with open_run(run, catalogue) as o:
         check_options(o, {effect: options or {}} if adds else {})
         with working(t.progress) as say:
             before_number, before = o.latest_fit(t, say)
@@ -135,7 +138,7 @@ def _change(
         ]
         t.show([text_refine.revisions_table([r.shown for r in rows]), text_refine.key()])
         t.show(_fell(before, after, named) if adds else _rose(before, after, effect))
-        t.show(["", text_refine.verdict_line(d.verdict, d.message)])
+        t.show(["", text_refine.verdict_line(d.verdict, d.message, catalogue)])
         if record is not None:
             with working(t.progress) as say:
                 chapters = o.chapters(t, say)
@@ -184,12 +187,12 @@ def refine(
     as_json: Json = False,
 ) -> None:
     """Diagnose and add until the model is adequate."""
-    t = terminal(as_json)
-    named = wanted_effects(effects)
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
+    named = wanted_effects(effects, catalogue)
     check_record(record)
     if from_latest and (named is not None or readings is not None):
         raise InputError("--from-latest keeps effects and readings; leave out the other options")
-    with open_run(run) as o:
+    with open_run(run, catalogue) as o:
         latest = o.latest() if from_latest else None
         if from_latest and latest is None:
             raise InputError(f"{run}: no revision yet; leave out --from-latest")
@@ -201,10 +204,10 @@ def refine(
                 model = o.restore(latest).model
             elif named is None:
                 say("registering")
-                model = baseline(o.cell, o.readings, mode)
+                model = baseline(o.cell, o.readings, mode, catalogue)
             else:
                 say("registering")
-                model = with_effects(o.cell, o.readings, mode, named, named)
+                model = with_effects(o.cell, o.readings, mode, named, named, catalogue)
             found = refine_model(model, o.readings, mode, say)
         rows: list[Row] = []
         for k, step in enumerate(found.steps):
@@ -218,7 +221,7 @@ def refine(
         t.show(text_refine.revisions_table([r.shown for r in rows]))
         t.show(text_refine.key())
         t.show(options_line(rows[-1].fit))
-        t.show(text_refine.verdict_line(found.verdict, found.message))
+        t.show(text_refine.verdict_line(found.verdict, found.message, catalogue))
         if found.rejected:
             t.show(
                 f"Tried and left out, since the error on poses left out did not fall: "
@@ -269,9 +272,9 @@ def view(
     as_json: Json = False,
 ) -> None:
     """Tell the story of the latest revisions in rerun."""
-    t = terminal(as_json)
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
     check_record(record)
-    with open_run(run) as o, working(t.progress) as say:
+    with open_run(run, catalogue) as o, working(t.progress) as say:
         chapters = o.chapters(t, say)
     if record is not None:
         record_story(t, chapters, record)

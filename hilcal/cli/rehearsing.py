@@ -22,6 +22,7 @@ from hilcal.data.campaign import Campaign
 from hilcal.data.plan import Plan
 from hilcal.data.readings import Readings
 from hilcal.data.run_log import RunLog
+from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import DeviceError
 from hilcal.identify.full_covariance import campaign_readings
 from hilcal.report.progress import Say, counting, working
@@ -41,6 +42,7 @@ class Told:
         seed: of everything random.
         output: the campaign file to make.
         base_dir: directory that paths in the configuration are relative to.
+        catalogue: the effects that a model can have.
     """
 
     config: CellConfig
@@ -48,6 +50,7 @@ class Told:
     seed: int
     output: Path
     base_dir: Path
+    catalogue: Catalogue
 
 
 Further = Callable[[Plan], Rehearsal]
@@ -65,7 +68,7 @@ def first_plan(told: Told, config: CellConfig, poses: int, say: Say) -> Plan:
     """
     config = as_told(config, told.choice)
     cell = cell_from_config(config, told.base_dir)
-    plan = make_plan(cell, config, poses, told.seed, say)
+    plan = make_plan(cell, config, poses, told.seed, told.catalogue, say)
     refuse(dry_run(cell, config, plan), "the plan")
     return plan
 

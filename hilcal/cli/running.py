@@ -19,7 +19,7 @@ from hilcal.acquire.progress import Watcher
 from hilcal.acquire.rig import Rig
 from hilcal.acquire.run import run as run_plan
 from hilcal.cell import Cell
-from hilcal.cli.effects_from import EffectsFrom
+from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.live import LiveModel
 from hilcal.cli.plan_output import POSES, refuse
 from hilcal.cli.planning import (
@@ -76,9 +76,9 @@ def run(
     as_json: Json = False,
 ) -> None:
     """Measure a campaign: every step of the plan, each reading stored before the next motion."""
-    t = terminal(as_json)
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
     config, numbers = read_cell(cell)
-    goal = None if until is None else Until(until, numbers, config)
+    goal = None if until is None else Until(until, numbers, config, catalogue)
     base_dir = cell.absolute().parent
     with ExitStack() as stack:
         if resume:
@@ -98,8 +98,11 @@ def run(
                     f"{output}: the file exists; go on with it by --resume, add a plan by "
                     "--append, or choose another name"
                 )
-            seed = config.simulation.seed
-            made = make_plan(numbers, config, POSES, seed) if plan is None else load_plan(plan)
+            made = (
+                make_plan(numbers, config, POSES, config.simulation.seed, catalogue)
+                if plan is None
+                else load_plan(plan)
+            )
             refuse(dry_run(numbers, config, made), str(plan or "the plan"))
         if rehearse:
             with working(t.progress) as say:

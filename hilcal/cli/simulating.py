@@ -9,7 +9,7 @@ import typer
 
 from drivers.simulated.on_the_wire import secret_of, simulated_cell
 from drivers.simulated.rehearsal import NOTHING
-from hilcal.cli.effects_from import EffectsFrom
+from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.ending import told_to_end
 from hilcal.cli.plan_output import POSES
 from hilcal.cli.planning import CellFile, PlanFile, make_plan, read_cell
@@ -37,12 +37,12 @@ def simulate(
     effects_from: EffectsFrom = None,
 ) -> None:
     """Run simulated devices for a cell until Ctrl-C, for `check` and `run` to talk to."""
-    t = terminal(False)
+    t, catalogue = terminal(False), catalogue_with(effects_from)
     config, numbers = read_cell(cell)
     number = config.simulation.seed if seed is None else seed
     if number < 0:
         raise InputError(f"--seed {number}; valid: a whole number, 0 or more")
-    made = make_plan(numbers, config, POSES, number) if plan is None else load_plan(plan)
+    made = make_plan(numbers, config, POSES, number, catalogue) if plan is None else load_plan(plan)
     base_dir = cell.absolute().parent
     secret = secret_of(config, made, hide or config.simulation.hide or NOTHING, number)
     with told_to_end(signal.SIGTERM, signal.SIGINT, signal.SIGHUP) as wait, ExitStack() as stack:

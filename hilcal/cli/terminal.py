@@ -5,7 +5,7 @@ import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TextIO
 
 import typer
 from rich.console import Console, RenderableType
@@ -31,11 +31,13 @@ class Terminal:
         json: whether stdout is for one JSON document.
         people: where tables and words for people go.
         progress: where progress and notices go.
+        out: where the document goes.
     """
 
     json: bool
     people: Console
     progress: Console
+    out: TextIO
 
     def show(self, parts: Iterable[RenderableType] | RenderableType) -> None:
         """Print for people."""
@@ -51,13 +53,20 @@ class Terminal:
     def document(self, content: object) -> None:
         """Print the JSON document, where it is asked for."""
         if self.json:
-            print(json.dumps(plain(content), allow_nan=False, indent=2))
+            print(json.dumps(plain(content), allow_nan=False, indent=2), file=self.out, flush=True)
 
 
 def terminal(as_json: bool) -> Terminal:
-    """Return the streams of a command."""
-    progress = console(stderr=True)
-    return Terminal(as_json, progress if as_json else console(stderr=False), progress)
+    """Return the streams of a command.
+
+    With `as_json`, `sys.stdout` becomes stderr until the command ends, see `hilcal.cli.execute`:
+    what a user's effect prints must not be in the document.
+    """
+    progress, out = console(stderr=True), sys.stdout
+    people = progress if as_json else console(stderr=False)
+    if as_json:
+        sys.stdout = sys.stderr
+    return Terminal(as_json, people, progress, out)
 
 
 def console(*, stderr: bool) -> Console:

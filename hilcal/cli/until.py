@@ -11,6 +11,7 @@ from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode
+from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import HilcalError
 from hilcal.identify.baseline import with_effects
 from hilcal.identify.fit import Fit, fit
@@ -18,7 +19,7 @@ from hilcal.identify.fit_document import finite
 from hilcal.identify.full_covariance import with_joint_scatter
 from hilcal.identify.gauss_newton import scales_of
 from hilcal.plan.feasible import Space
-from hilcal.plan.goal import JOINTS, Goal, Verdict, figures, parse_goal
+from hilcal.plan.goal import Goal, Verdict, figures, parse_goal
 from hilcal.plan.nominal_model import after, assumed
 from hilcal.plan.predicted import positions_of, rms
 from hilcal.plan.prediction_poses import work_poses
@@ -46,7 +47,12 @@ class Until:
     """
 
     def __init__(
-        self, text: str, cell: Cell, config: CellConfig, now: Callable[[], float] = time.monotonic
+        self,
+        text: str,
+        cell: Cell,
+        config: CellConfig,
+        catalogue: Catalogue | None = None,
+        now: Callable[[], float] = time.monotonic,
     ) -> None:
         """Read a goal, and refuse it where nothing of the cell's model is meant.
 
@@ -54,6 +60,7 @@ class Until:
             text: the goal, e.g. "joint std < 2 %".
             cell: the cell.
             config: `[planning]`, loads, repeatability.
+            catalogue: the effects that a model can have; the installed ones unless given.
             now: seconds that pass for people.
 
         Raises:
@@ -62,8 +69,9 @@ class Until:
         self.goal: Goal = parse_goal(text)
         self.standing = self._state(None, met=False)
         self._cell, self._config, self._now = cell, config, now
+        self._catalogue = catalogue or installed()
         self._scatter = config.repeatability.per_joint(cell.arm.n)
-        model = assumed(cell, config)
+        model = assumed(cell, config, 3, catalogue)
         effects = model.model.effects
         self.goal.check({f"{e.name}.{p.name}": p.unit for e in effects for p in e.parameters})
         self._work_q: tuple[tuple[float, ...], ...] = ()
@@ -110,8 +118,9 @@ class Until:
             readings = with_joint_scatter(self._cell, readings, self._scatter)
             mode, names = self._mode(readings), self._config.planning.model
             if readings.unloaded.all():  # no load has been hung yet
-                names = tuple(name for name in names if name != JOINTS)
-            model = with_effects(self._cell, readings, mode, names)
+                elastic = {kind.name for kind in self._catalogue.with_role("baseline")}
+                names = tuple(name for name in names if name not in elastic)
+            model = with_effects(self._cell, readings, mode, names, None, self._catalogue)
             found = fit(model, readings, mode)
             std, value = figures(found)
             held = dict(zip(std, found.solution.prior == 0, strict=True))

@@ -11,8 +11,6 @@ from hilcal.diagnose.score import Score, score
 from hilcal.diagnose.without import Without, leave_out_effect, whitened_columns
 from hilcal.identify.fit import Fit
 
-KEPT = ("base_frame", "target_offset", "joint_compliance")
-"""Effects that every model starts with: they are there whether they are seen or not."""
 CHANCE = 0.01
 """An effect with a smaller p-value is kept."""
 
@@ -32,7 +30,7 @@ class Needless:
 
 def needless(fit: Fit) -> tuple[Needless, ...]:
     """Return the effects of a fit that its readings do not ask for, the least asked for first."""
-    judged = [name for name in fit.model.names if name not in KEPT]
+    judged = [e.name for e in fit.model.effects if e.role == "effect"]
     if not judged:
         return ()
     x = whitened_columns(fit)

@@ -7,8 +7,6 @@ import numpy as np
 from hilcal.diagnose.minimum_detectable_effect import Strength, least_strength
 from hilcal.diagnose.projection import Projection
 from hilcal.diagnose.score import Score
-from hilcal.effects.catalogue import catalogue, make
-from hilcal.effects.options import reading_options
 from hilcal.effects.protocol import Effect
 from hilcal.identify.fit import Fit
 from hilcal.types import Floats
@@ -60,10 +58,10 @@ class Family:
 def candidates(fit: Fit) -> tuple[Effect, ...]:
     """Effects that are not in the model and can be computed from these readings."""
     states = fit.readings[~fit.outlier].states
-    out = []
-    for name, kind in catalogue().items():
-        if name not in fit.model.names and kind.computable(states):
-            effect = make(name, fit.model.cell, states, reading_options(name, fit.whitening.m))
+    model, out = fit.model, []
+    for kind in model.catalogue.effects:
+        if kind.name not in model.names and kind.computable(states):
+            effect = model.catalogue.make(kind.name, model.cell, states, m=fit.whitening.m)
             out.append(effect.for_scoring(states))
     return tuple(out)
 

@@ -1,10 +1,12 @@
 """Changes of a model: an effect more, one less, one in place of another."""
 
+from dataclasses import replace
+
 import numpy as np
 
+from hilcal.data.readings import Readings
 from hilcal.diagnose.projection import left_out_by_pose
-from hilcal.effects.catalogue import make
-from hilcal.effects.options import Options, reading_options
+from hilcal.effects.options import Options
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit, fit
 from hilcal.model import Model
@@ -29,8 +31,7 @@ def add(before: Fit, effect: str, options: Options | None = None) -> Fit:
         raise InputError(
             f"effect {effect} is in the model already: {', '.join(before.model.names)}"
         )
-    all_options = {**reading_options(effect, readings.m), **(options or {})}
-    model = before.model + make(effect, before.model.cell, readings.states, all_options)
+    model = _with(before.model, effect, readings, options)
     start = np.concatenate([before.theta, np.zeros(model.size - before.model.size)])
     return fit(model, readings, before.mode, before.scaling, start)
 
@@ -52,7 +53,12 @@ def _rest(before: Fit, effect: str) -> tuple[Model, Floats]:
         raise InputError(f"effect {effect} is not in the model: {', '.join(model.names)}")
     place = model.names.index(effect)
     rest = tuple(e for e in model.effects if e.name != effect)
-    return Model(model.cell, rest), np.delete(before.theta, model.slices()[place])
+    return replace(model, effects=rest), np.delete(before.theta, model.slices()[place])
+
+
+def _with(model: Model, effect: str, readings: Readings, options: Options | None = None) -> Model:
+    """Return the model with one more effect, set up for the readings of a fit."""
+    return model + model.catalogue.make(effect, model.cell, readings.states, options, readings.m)
 
 
 def exchange(before: Fit, effect: str, other: str) -> Fit:
@@ -65,7 +71,7 @@ def exchange(before: Fit, effect: str, other: str) -> Fit:
     if other in before.model.names:
         raise InputError(f"effect {other} is in the model already: {', '.join(before.model.names)}")
     readings = before.readings
-    model = rest + make(other, rest.cell, readings.states, reading_options(other, readings.m))
+    model = _with(rest, other, readings)
     start = np.concatenate([start, np.zeros(model.size - rest.size)])
     return fit(model, readings, before.mode, before.scaling, start)
 

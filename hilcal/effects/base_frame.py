@@ -17,6 +17,7 @@ class BaseFrame(Effect):
     name = "base_frame"
     summary = "registration of the tracker to the arm's base is off"
     option_names = ("prior_m", "prior_rad")
+    role = "registration"
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

@@ -1,17 +1,19 @@
-"""The catalogue: canonical names of the effects that ship, and those that users install."""
+"""The catalogue: the effects that ship, those of installed packages, and those of files."""
 
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.metadata import entry_points
+from pathlib import Path
 
 from hilcal.cell import Cell
 from hilcal.data.readings import States
-from hilcal.effects.added import added
 from hilcal.effects.backlash import Backlash
 from hilcal.effects.base_compliance import BaseCompliance
 from hilcal.effects.base_frame import BaseFrame
-from hilcal.effects.check import accepted
+from hilcal.effects.check import check_effect
 from hilcal.effects.creep import Creep
 from hilcal.effects.encoder_offset import EncoderOffset
+from hilcal.effects.from_file import EffectFile, read_effects
 from hilcal.effects.hysteresis import Hysteresis
 from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.effects.joint_stiffening import JointStiffening
@@ -22,7 +24,7 @@ from hilcal.effects.link_mass import LinkMass
 from hilcal.effects.load_point import LoadPoint
 from hilcal.effects.options import Options
 from hilcal.effects.periodic_joint_compliance import PeriodicJointCompliance
-from hilcal.effects.protocol import Effect
+from hilcal.effects.protocol import Effect, Role, source_of
 from hilcal.effects.sensor_misalignment import SensorMisalignment
 from hilcal.effects.target_offset import TargetOffset
 from hilcal.effects.thermal_growth import ThermalGrowth
@@ -66,46 +68,108 @@ BUILT_IN: tuple[type[Effect], ...] = (
 )
 
 
-def catalogue() -> dict[str, type[Effect]]:
-    """All effects by name: built in, installed as entry points, and added from files."""
-    own = {e.name: e for file in added() for e in file.effects}
-    return {**_installed(), **own}
+@dataclass(frozen=True, slots=True, eq=False)
+class Catalogue:
+    """The effects that a model can have.
+
+    Attributes:
+        effects: classes, each of another name.
+        files: the files that some of them are from.
+    """
+
+    effects: tuple[type[Effect], ...]
+    files: tuple[EffectFile, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the effects, in order."""
+        return tuple(kind.name for kind in self.effects)
+
+    def __getitem__(self, name: str) -> type[Effect]:
+        """Return the class of an effect.
+
+        Raises:
+            InputError: on an unknown name; lists the valid ones.
+        """
+        for kind in self.effects:
+            if kind.name == name:
+                return kind
+        raise InputError(
+            f"unknown effect {name!r}{suggest(name, self.names)}; valid: {', '.join(self.names)}"
+        )
+
+    def make(
+        self, name: str, cell: Cell, states: States, options: Options | None = None, m: int = 3
+    ) -> Effect:
+        """Build an effect by name.
+
+        Args:
+            name: of the effect.
+            cell: the cell.
+            states: those that it is set up for.
+            options: where they are not the usual ones.
+            m: 3 for readings of positions, 6 for poses.
+
+        Raises:
+            InputError: on an unknown effect or option, a bad value, or where `states` lacks a
+                needed column.
+        """
+        kind = self[name]
+        return kind(cell, states, {**kind.usual_options(m), **(options or {})})
+
+    def with_role(self, *roles: Role) -> tuple[type[Effect], ...]:
+        """Return the effects of some roles, in order."""
+        return tuple(kind for kind in self.effects if kind.role in roles)
+
+    def with_effects(self, *kinds: type[Effect]) -> "Catalogue":
+        """Return the catalogue with more effects, each checked by `check_effect`.
+
+        Raises:
+            InputError: on an effect that cannot be used, or whose name is taken.
+        """
+        known = self
+        for kind in kinds:
+            check_effect(kind)
+            if kind.name in known.names:
+                raise InputError(
+                    f"{source_of(kind)}: class {kind.__name__}: effect {kind.name} is in the "
+                    "catalogue already; choose another name"
+                )
+            known = replace(known, effects=(*known.effects, kind))
+        return known
+
+    def with_file(self, path: Path) -> "Catalogue":
+        """Return the catalogue with the effects of a Python file, see `read_effects`.
+
+        Raises:
+            InputError: on a file, or an effect in it, that cannot be used, or whose name is taken.
+        """
+        file = read_effects(path)
+        return replace(self.with_effects(*file.effects), files=(*self.files, file))
+
+    def file_of(self, name: str) -> EffectFile | None:
+        """Return the file that an effect is from; None for one that is installed."""
+        return next((f for f in self.files if any(e.name == name for e in f.effects)), None)
 
 
 @cache
-def _installed() -> dict[str, type[Effect]]:
-    """Effects that are there without a file, by name."""
-    found = {e.name: e for e in BUILT_IN}
+def installed() -> Catalogue:
+    """Return the effects that are built in, and those of installed packages (entry points).
+
+    Raises:
+        InputError: on an entry point that cannot be loaded, or an effect that cannot be used.
+    """
+    found = Catalogue(BUILT_IN)
     for point in entry_points(group=ENTRY_POINT_GROUP):
         where = f"entry point {point.name} = {point.value}"
         try:
             kind = point.load()
+            if not (isinstance(kind, type) and issubclass(kind, Effect)):
+                raise InputError("not an Effect class")
+            found = found.with_effects(kind)
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from None
         except Exception as error:
             words = f"cannot be loaded ({type(error).__name__}: {error})"
             raise InputError(f"{where}: {words}") from error
-        if not (isinstance(kind, type) and issubclass(kind, Effect)):
-            raise InputError(f"{where}: not an Effect class")
-        effect = accepted(kind, where)
-        if effect.name in found:
-            raise InputError(f"{where}: effect {effect.name} is there already")
-        found[effect.name] = effect
     return found
-
-
-def effect_class(name: str) -> type[Effect]:
-    """Class of an effect by name.
-
-    Raises:
-        InputError: on an unknown name; lists the valid ones.
-    """
-    known = catalogue()
-    if name not in known:
-        raise InputError(
-            f"unknown effect {name!r}{suggest(name, tuple(known))}; valid: {', '.join(known)}"
-        )
-    return known[name]
-
-
-def make(name: str, cell: Cell, states: States, options: Options | None = None) -> Effect:
-    """Build an effect by name for a cell and the states at hand."""
-    return effect_class(name)(cell, states, options)

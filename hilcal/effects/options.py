@@ -96,8 +96,3 @@ def prior_of_lengths_and_turns(effect: str, options: Options, size: int) -> Floa
     if min(values) <= 0:
         raise InputError(f"effect {effect}: prior_m and prior_rad must be positive")
     return np.repeat(values, 3)[:size]
-
-
-def reading_options(effect: str, m: int) -> dict[str, object]:
-    """Options of an effect that follow from the kind of reading: m = 3 positions, 6 poses."""
-    return {"rotation": True} if effect == "target_offset" and m == 6 else {}

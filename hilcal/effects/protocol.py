@@ -23,6 +23,8 @@ from hilcal.robot.statics import Load
 from hilcal.types import Bools, Floats, Ints
 
 Field = Literal["dq", "twist", "base", "station", "target", "scale"]
+Role = Literal["registration", "target", "baseline", "effect"]
+FRAME_ROLES: tuple[Role, ...] = ("registration", "target")
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,6 +138,16 @@ class Effect(ABC):
         elastic: the deviation depends on the transmitted wrenches.
         needs: columns of `States` without which the effect cannot be computed; "a or b"
             where one of two will do.
+        option_names: names of the options that the constructor takes.
+        role: which models have the effect without being told:
+            "registration": every model while the tracker-to-base registration is unknown; its
+                six parameters are a twist of the base, in base axes.
+            "target": every model while the target's place on the flange is unknown; its first
+                three parameters are a displacement of the target, flange axes.
+            "baseline": every starting model where a load acts.
+            "effect": none; it is added by name, or where a diagnosis finds it missing.
+            An effect that is not of the last role is never removed by a diagnosis. Those of the
+            first two take the options `prior_m` and `prior_rad`.
     """
 
     name: ClassVar[str]
@@ -143,6 +155,7 @@ class Effect(ABC):
     elastic: ClassVar[bool] = False
     needs: ClassVar[tuple[str, ...]] = ()
     option_names: ClassVar[tuple[str, ...]] = ()
+    role: ClassVar[Role] = "effect"
 
     def __init__(self, cell: Cell, states: States, options: Options | None = None) -> None:
         """Build the effect for a cell and the states at hand.
@@ -174,6 +187,26 @@ class Effect(ABC):
     @abstractmethod
     def columns(self, s: Situation) -> tuple[Columns, ...]:
         """Derivative of the deviation by the parameters, at fixed wrenches."""
+
+    def checked_columns(self, s: Situation) -> tuple[Columns, ...]:
+        """Return the columns, for use by the model.
+
+        Raises:
+            InputError: a value is not finite, or the values are of another number of states.
+        """
+        found = self.columns(s)
+        for c in found:
+            if len(c.values) not in (1, len(s.angle)):
+                wrong = f"{len(c.values)} states; expected {len(s.angle)} or 1"
+            elif not np.isfinite(c.values).all():
+                wrong = "which some are not finite"
+            else:
+                continue
+            raise InputError(
+                f"{source_of(type(self))}: effect {self.name}: columns has {c.field} values of "
+                f"{wrong}"
+            )
+        return found
 
     def response(self, theta: Floats, s: Situation, change: Floats) -> Response:
         """Change of the deviation by changes (N, P, n + 1, 6) of the slot wrenches."""
@@ -229,6 +262,11 @@ class Effect(ABC):
         return None
 
     @classmethod
+    def usual_options(cls, m: int) -> Options:
+        """Options that follow from readings of m elements: 3 for positions, 6 for poses."""
+        return {}
+
+    @classmethod
     def computable(cls, states: States) -> bool:
         """Whether `states` has all the columns that the effect needs."""
         return all(_has(states, need) for need in cls.needs)
@@ -243,19 +281,33 @@ class Effect(ABC):
 
     def deviation(self, theta: Floats, s: Situation) -> Deviation:
         """Deviation of N states at parameters theta (P,)."""
-        count, n = s.angle.shape
-        width = {"dq": (n,), "twist": (n + 1, 6), "scale": ()}
-        fields: dict[str, Floats] = {}
-        for c in self.columns(s):
-            total = fields.setdefault(c.field, zeros(count, *width.get(c.field, (6,))))
-            t = theta[c.parameter]
-            if c.field in ("dq", "twist"):
-                for e in np.unique(c.element):
-                    mine = c.element == e
-                    total[:, e] += np.einsum("np...,p->n...", c.values[:, mine], t[mine])
-            else:
-                total += np.einsum("np...,p->n...", c.values, t)
-        return Deviation(**fields)
+        return total(self.checked_columns(s), theta, s)
+
+
+def total(columns: tuple[Columns, ...], theta: Floats, s: Situation) -> Deviation:
+    """Return the deviation Σ columns_p θ_p of N states."""
+    count, n = s.angle.shape
+    width = {"dq": (n,), "twist": (n + 1, 6), "scale": ()}
+    fields: dict[str, Floats] = {}
+    for c in columns:
+        field = fields.setdefault(c.field, zeros(count, *width.get(c.field, (6,))))
+        t = theta[c.parameter]
+        if c.field in ("dq", "twist"):
+            for e in np.unique(c.element):
+                mine = c.element == e
+                field[:, e] += np.einsum("np...,p->n...", c.values[:, mine], t[mine])
+        else:
+            field += np.einsum("np...,p->n...", c.values, t)
+    return Deviation(**fields)
+
+
+def source_of(kind: type[Effect]) -> str:
+    """Return the file that an effect class is defined in; its module where that is unknown."""
+    for member in vars(kind).values():
+        function = getattr(member, "fget", getattr(member, "__func__", member))
+        if code := getattr(function, "__code__", None):
+            return str(code.co_filename)
+    return kind.__module__
 
 
 def _has(states: States, need: str) -> bool:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from hilcal.data.readings import States
-from hilcal.effects.options import prior_of_lengths_and_turns
+from hilcal.effects.options import Options, prior_of_lengths_and_turns
 from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
 from hilcal.errors import InputError
 from hilcal.types import Floats
@@ -20,6 +20,7 @@ class TargetOffset(Effect):
     name = "target_offset"
     summary = "the tracked target sits elsewhere on the flange than configured"
     option_names = ("rotation", "prior_m", "prior_rad")
+    role = "target"
 
     def setup(self, states: States) -> None:
         """Read whether rotations take part."""
@@ -39,6 +40,11 @@ class TargetOffset(Effect):
         """Unit displacements of the target."""
         index = np.arange(self.size)
         return (Columns("target", index, 0 * index, np.eye(6)[None, : self.size]),)
+
+    @classmethod
+    def usual_options(cls, m: int) -> Options:
+        """Return `rotation` where readings are poses."""
+        return {"rotation": True} if m == 6 else {}
 
     def prior_std(self) -> Floats | None:
         """Prior of displacement and rotation, where given."""

@@ -5,8 +5,8 @@ import re
 from collections.abc import Iterator
 
 from hilcal.data.readings import States
-from hilcal.effects.catalogue import effect_class
-from hilcal.effects.options import Options, reading_options
+from hilcal.effects.catalogue import Catalogue
+from hilcal.effects.options import Options
 from hilcal.effects.protocol import Effect
 from hilcal.errors import InputError
 
@@ -22,7 +22,7 @@ _WORD = re.compile(r"[^\s\"'()\[\]{}=,;]+")
 _TRUTH = {"true": True, "false": False}
 
 
-def read_effects_text(text: str, where: str) -> dict[str, dict[str, object]]:
+def read_effects_text(text: str, where: str, catalogue: Catalogue) -> dict[str, dict[str, object]]:
     """Read names of effects, with their options in parentheses, separated by commas.
 
     Options are separated by "," or ";". A value is a number, true or false, a word, text in
@@ -31,6 +31,7 @@ def read_effects_text(text: str, where: str) -> dict[str, dict[str, object]]:
     Args:
         text: e.g. "joint_compliance, transmission_error(harmonics=20)".
         where: begins the message, e.g. "--effects".
+        catalogue: has the names.
 
     Returns:
         Options by name of the effect, in order.
@@ -44,7 +45,7 @@ def read_effects_text(text: str, where: str) -> dict[str, dict[str, object]]:
         if found is None:
             raise InputError(f"{where}: {part!r} is not an effect with its options; {EXAMPLE}")
         name = found[1].strip()
-        effect_class(name)
+        catalogue[name]
         if name in out:
             raise InputError(f"{where}: {name} is there twice")
         out[name] = {} if found[2] is None else _options(found[2], f"{where}: {name}")
@@ -83,7 +84,7 @@ def chosen_options(effect: Effect, states: States, m: int) -> dict[str, object]:
         states: those that it was made for.
         m: 3 for positions, 6 for poses.
     """
-    usual = type(effect)(effect.cell, states, reading_options(effect.name, m)).options
+    usual = type(effect)(effect.cell, states, effect.usual_options(m)).options
     return {
         key: value
         for key, value in effect.options.items()

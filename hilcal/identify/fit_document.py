@@ -54,10 +54,10 @@ def outliers(fit: Fit) -> list[dict[str, object]]:
 
 
 def registration(fit: Fit) -> Floats:
-    """T_sensor_base (4, 4) as fitted: the cell's, moved by `base_frame` where that is fitted."""
+    """T_sensor_base (4, 4) as fitted: the cell's, moved by the fitted twist of the base."""
     start = fit.model.cell.registration
     for effect, rows in zip(fit.model.effects, fit.model.slices(), strict=True):
-        if effect.name == "base_frame":
+        if effect.role == "registration":
             return np.asarray(start @ se3.matrix(*se3.exp(fit.theta[rows])))
     return start
 
@@ -74,10 +74,11 @@ def notes(fit: Fit) -> tuple[str, ...]:
             "the residuals are larger than the noise, so the errors are not independent: the "
             "standard uncertainties were widened to what leaving out groups of poses shows"
         )
-    if fit.mode == "deflection" and "base_frame" in fit.model.names:
+    registered = [e.name for e in fit.model.effects if e.role == "registration"]
+    if fit.mode == "deflection" and registered:
         out.append(
-            "deflections do not see where the base is, only how it is turned: base_frame holds "
-            "what the closed-form registration and the turning of deflections tell"
+            f"deflections do not see where the base is, only how it is turned: {registered[0]} "
+            "holds what the closed-form registration and the turning of deflections tell"
         )
     return tuple(out)
 

@@ -6,7 +6,6 @@ import numpy as np
 
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode, Whitening, whitening
-from hilcal.effects.catalogue import make
 from hilcal.effects.protocol import Effect
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.errors import ErrorBlock, error_block
@@ -97,21 +96,18 @@ def _register(
     model: Model, theta: Floats, fitted: Readings, other: Readings, w: Whitening
 ) -> tuple[Model, Floats]:
     """Closed-form registration to the other readings, then Gauss-Newton on `base_frame`."""
-    parts = dict(zip(model.names, (theta[s] for s in model.slices()), strict=True))
-    offset = parts.get("target_offset")
+    parts = [(e, theta[s]) for e, s in zip(model.effects, model.slices(), strict=True)]
     target = model.cell.target.copy()
-    if offset is not None:
-        target[:3, 3] += offset[:3]
+    for e, offset in parts:
+        if e.role == "target":
+            target[:3, 3] += offset[:3]
     unknown = replace(model.cell, target=target, registration_known=False, target_known=True)
     cell = replace(model.cell, registration=register(unknown, other).registration)
-    effects: list[Effect] = [
-        make(e.name, cell, fitted.states, e.options)
-        for e in model.effects
-        if e.name != "base_frame"
-    ]
-    frame = make("base_frame", cell, fitted.states)
-    moved = Model(cell, (*effects, frame))
-    values = np.concatenate([*(parts[e.name] for e in effects), np.zeros(6)])
+    kept = [(e, t) for e, t in parts if e.role != "registration"]
+    effects: list[Effect] = [type(e)(cell, fitted.states, e.options) for e, _ in kept]
+    frame = model.catalogue.with_role("registration")[0](cell, fitted.states)
+    moved = replace(model, cell=cell, effects=(*effects, frame))
+    values = np.concatenate([*(t for _, t in kept), np.zeros(6)])
     for _ in range(STEPS):
         prediction = moved.predict(other.states, values)
         target_row = w.whiten(residual(other, prediction, w)).reshape(-1)

@@ -6,10 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit
 
-JOINTS = "joint_compliance"
+JOINTS = JointCompliance.name
+"""The effect that "joint" and "j3" are short for."""
 FORMS = (
     '"joint std < 2 %"',
     '"j3 std < 3 %"',

@@ -7,9 +7,9 @@ import numpy as np
 from hilcal.cell import Cell, tracker_place
 from hilcal.config import CellConfig
 from hilcal.data.readings import States
-from hilcal.effects.catalogue import catalogue, effect_class, make
-from hilcal.effects.options import Options, reading_options
-from hilcal.effects.protocol import Effect
+from hilcal.effects.catalogue import Catalogue, installed
+from hilcal.effects.options import Options
+from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit
 from hilcal.identify.gauss_newton import prior_of
@@ -18,9 +18,6 @@ from hilcal.types import Floats, Ints
 
 DISTANCE = 2.0
 """Reaches from the base to a tracker whose place is not given."""
-HARMONICS = 4
-"""Harmonics of a transmission error that is planned for: the coarse ones, as a fit to few poses
-tries them."""
 FRAME_PRIOR = {"prior_m": 3e-3, "prior_rad": 6e-3}
 """In deflections the frames act only by turning them; they are known from the positions, about
 as well as the arm's elastic sag lets them be."""
@@ -61,20 +58,24 @@ class Assumed:
         return self.model.cell
 
 
-def assumed(cell: Cell, config: CellConfig, m: int = 3) -> Assumed:
+def assumed(
+    cell: Cell, config: CellConfig, m: int = 3, catalogue: Catalogue | None = None
+) -> Assumed:
     """Return the model of `[planning]` with ordinary parameters.
 
     What is planned hardly depends on the parameters: deflections are linear in them to about
-    1e-3. Compliances are ordinary, all else is zero.
+    1e-3. Those of the baseline's effects are ordinary, all others zero.
 
     Args:
         cell: the cell as configured.
         config: its configuration.
         m: 3 for positions, 6 for poses.
+        catalogue: the effects that a model can have; the installed ones unless given.
 
     Raises:
         InputError: an unknown effect (lists the valid ones).
     """
+    known = catalogue or installed()
     place, given = nominal_tracker_place(cell, config)
     notes = []
     if not given:
@@ -83,24 +84,15 @@ def assumed(cell: Cell, config: CellConfig, m: int = 3) -> Assumed:
             "([sight] tracker_m tells it)"
         )
     registered, station = _registered(cell, config, place)
-    frames = [
-        name
-        for name, known in (
-            ("base_frame", cell.registration_known),
-            ("target_offset", cell.target_known),
-        )
-        if not known
-    ]
-    names = tuple(dict.fromkeys((*frames, *checked(config.planning.model, "model"))))
+    unknown = {"registration": not cell.registration_known, "target": not cell.target_known}
+    frames = [kind.name for kind in known.with_role(*FRAME_ROLES) if unknown[kind.role]]
+    names = tuple(dict.fromkeys((*frames, *checked(config.planning.model, "model", known))))
     prior = FRAME_PRIOR if config.planning.readings == "deflection" else {}
-    effects = tuple(build(name, registered, m, prior if name in frames else {}) for name in names)
-    model = Model(registered, effects)
-    parts = [
-        np.array([p.scale for p in e.parameters])
-        if e.name == "joint_compliance"
-        else np.zeros(len(e.parameters))
-        for e in effects
-    ]
+    effects = tuple(
+        build(known, name, registered, m, prior if name in frames else {}) for name in names
+    )
+    model = Model(registered, effects, known)
+    parts = [(e.role == "baseline") * np.array([p.scale for p in e.parameters]) for e in effects]
     notes += random_columns(effects)
     theta = np.concatenate(parts)
     prior_std = _prior_std(model)
@@ -134,12 +126,13 @@ def after(fit: Fit, config: CellConfig) -> Assumed:
     return Assumed(fit.model, fit.theta, live, std, station, fit.readings.m, fit, notes)
 
 
-def build(name: str, cell: Cell, m: int, options: Options | None = None) -> Effect:
-    """Make an effect for a plan; a transmission error has its coarse harmonics."""
-    own: dict[str, object] = {"harmonics": HARMONICS} if name == "transmission_error" else {}
-    own |= {"reference_s": 0.0, "span_s": DURATION_S} if name == "tracker_drift" else {}
-    states = nominal_states(np.zeros((1, cell.arm.n)), np.zeros((1, 6)))
-    return make(name, cell, states, {**own, **reading_options(name, m), **(options or {})})
+def build(
+    catalogue: Catalogue, name: str, cell: Cell, m: int, options: Options | None = None
+) -> Effect:
+    """Make an effect for a plan: set up for the first and the last reading, in one pose."""
+    once = nominal_states(np.zeros((1, cell.arm.n)), np.zeros((1, 6)))
+    states = replace(once[np.zeros(2, dtype=int)], time=np.array([0.0, DURATION_S]))
+    return catalogue.make(name, cell, states, options, m)
 
 
 def random_columns(effects: tuple[Effect, ...]) -> tuple[str, ...]:
@@ -162,7 +155,7 @@ def random_columns(effects: tuple[Effect, ...]) -> tuple[str, ...]:
     )
 
 
-def checked(names: tuple[str, ...], key: str) -> tuple[str, ...]:
+def checked(names: tuple[str, ...], key: str, catalogue: Catalogue) -> tuple[str, ...]:
     """Return the names of effects, each once.
 
     Raises:
@@ -170,7 +163,7 @@ def checked(names: tuple[str, ...], key: str) -> tuple[str, ...]:
     """
     for name in names:
         try:
-            effect_class(name)
+            catalogue[name]
         except InputError as error:
             raise InputError(f"[planning] {key}: {error}") from None
     return tuple(dict.fromkeys(names))
@@ -187,9 +180,9 @@ def potential_names(config: CellConfig, model: Model) -> tuple[str, ...]:
     """
     asked = config.planning.against
     if asked == "catalogue":
-        names = tuple(name for name, kind in catalogue().items() if not kind.needs)
+        names = tuple(kind.name for kind in model.catalogue.effects if not kind.needs)
     else:
-        names = checked(asked, "against")
+        names = checked(asked, "against", model.catalogue)
     return tuple(name for name in names if name not in model.names)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.data.plan import UNLOADED
+from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.fit import Fit
 from hilcal.identify.registration import MIN_POSES
@@ -108,6 +109,7 @@ def make(
     rng: np.random.Generator,
     known: Fit | None = None,
     say: Say = lambda words: None,
+    catalogue: Catalogue | None = None,
 ) -> Planned:
     """Return the plan.
 
@@ -118,6 +120,8 @@ def make(
         rng: generator.
         known: fit of what has been measured already.
         say: told what is being done.
+        catalogue: the effects that a model can have; the installed ones unless given, or those
+            of `known`.
 
     Raises:
         InputError: numbers or names that cannot be.
@@ -131,7 +135,7 @@ def make(
     home, poses = _reference(space, drawn, rng)
     drawn = replace(drawn, q=drawn.q[poses], allowed=drawn.allowed[poses])
     say("working out what each of them tells")
-    model = assumed(cell, config) if known is None else after(known, config)
+    model = assumed(cell, config, 3, catalogue) if known is None else after(known, config)
     of = problem(model, config, drawn.q, drawn.allowed)
     work = work_poses(model, config, drawn.q, space.clear)
     budget = _budget(request, of)

@@ -56,7 +56,8 @@ def potential(assumed: Assumed, config: CellConfig, of: Candidates) -> Potential
         InputError: an unknown effect (lists the valid ones).
     """
     names = potential_names(config, assumed.model)
-    families = tuple(build(name, assumed.cell, assumed.m) for name in names)
+    known = assumed.model.catalogue
+    families = tuple(build(known, name, assumed.cell, assumed.m) for name in names)
     strength = _strengths(assumed, config, of, families)
     chosen: list[tuple[Effect, float]] = []
     notes = [*random_columns(families)]

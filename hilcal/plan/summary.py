@@ -6,12 +6,14 @@ import numpy as np
 
 from hilcal.config import CellConfig
 from hilcal.data.plan import REFERENCE
+from hilcal.effects.protocol import FRAME_ROLES, Role
 from hilcal.errors import CannotAnswerError
 from hilcal.plan.approximate_design import relax
 from hilcal.plan.candidates import sense
 from hilcal.plan.choice import choose, only, unknown
 from hilcal.plan.compound_criteria import robust_question
 from hilcal.plan.confounding import Confounding
+from hilcal.plan.information import Problem
 from hilcal.plan.planner import Planned, Say
 from hilcal.plan.predicted import Predicted, predicted
 from hilcal.plan.rivals import VISIBLE
@@ -22,8 +24,6 @@ from hilcal.types import Floats, Ints
 COMPARED = ("D", "A", "E", "K", "test")
 SHARES = (0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
 """Sizes of the plans of the curve, by the plan's own."""
-FRAMES = ("base_frame.", "target_offset.")
-"""Deflections do not tell where a frame lies; nobody asks them to."""
 LOOSE = 3e-3
 DRAWS = 5
 _SEED = 20240611
@@ -67,7 +67,8 @@ def story(
             for name, std, value, unit in zip(
                 knows.names, knows.std, knows.values, knows.units, strict=True
             )
-            if np.isfinite(std) or not name.startswith(FRAMES)
+            # deflections do not determine where a frame is
+            if np.isfinite(std) or not name.startswith(_prefixes(of, *FRAME_ROLES))
         ),
         position_std_m=_finite(knows.position),
         bought=bought,
@@ -143,7 +144,7 @@ def _row(made: Planned, name: str, counts: Floats, efficiency: float) -> Bought:
         criterion=name,
         position_std_m=_finite(knows.position),
         position_open_m=_finite(knows.position_open),
-        joint_share=_joint_share(knows),
+        joint_share=_joint_share(knows, _prefixes(of, "baseline")),
         o1=volume / np.sqrt(readings),
         o2=float(alone[0] / alone[-1]),
         o3=float(sigma[0]),
@@ -151,12 +152,17 @@ def _row(made: Planned, name: str, counts: Floats, efficiency: float) -> Bought:
     )
 
 
-def _joint_share(knows: Predicted) -> float | None:
+def _prefixes(of: Problem, *roles: Role) -> tuple[str, ...]:
+    """Return what the names of the parameters of some roles begin with."""
+    return tuple(f"{e.name}." for e in of.assumed.model.effects if e.role in roles)
+
+
+def _joint_share(knows: Predicted, joints: tuple[str, ...]) -> float | None:
     """Largest standard uncertainty of a joint's compliance, by its value."""
     shares = [
         std / abs(value)
         for name, std, value in zip(knows.names, knows.std, knows.values, strict=True)
-        if name.startswith("joint_compliance.") and value
+        if name.startswith(joints) and value
     ]
     return _finite(max(shares)) if shares else None
 

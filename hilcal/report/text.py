@@ -157,7 +157,7 @@ def remarks(fit: Fit) -> Iterator[RenderableType]:
         yield from (f"  {d}" for d in null[:DIRECTIONS])
         if len(null) > DIRECTIONS:
             yield f"  ... and {len(null) - DIRECTIONS} more; --json lists all"
-    if "base_frame" in fit.model.names:
+    if any(e.role == "registration" for e in fit.model.effects):
         yield placed(fit)
     for note in notes(fit):
         yield note[0].upper() + note[1:] + "."

@@ -23,7 +23,7 @@ def step_report(number: int, change: str, d: Diagnosis) -> Iterator[RenderableTy
     if d.significant:
         yield ""
         yield text_refine.suspects_table(d)
-    yield text_refine.sentence(d.message)
+    yield numbers.sentence(d.message, d.fit.model.catalogue.names)
     yield ""
 
 

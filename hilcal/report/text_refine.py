@@ -6,7 +6,7 @@ from rich.console import RenderableType
 from rich.text import Text
 
 from hilcal.diagnose.verdict import Diagnosis
-from hilcal.effects.catalogue import catalogue
+from hilcal.effects.catalogue import Catalogue
 from hilcal.identify.fit import Fit
 from hilcal.identify.full_prediction import everything
 from hilcal.report import numbers, text
@@ -23,17 +23,11 @@ VERDICTS: Mapping[str, str] = {
 SUSPECTS = 6
 
 
-def sentence(message: str) -> str:
-    """Write a message as a sentence; effects keep their spelling."""
-    return numbers.sentence(message, catalogue())
-
-
-def verdict_line(verdict: str, message: str) -> Text:
-    """Return the verdict with its message."""
+def verdict_line(verdict: str, message: str, catalogue: Catalogue) -> Text:
+    """Return the verdict with its message; names of the catalogue keep their spelling."""
     style = "bold green" if verdict == "adequate" else "bold yellow"
-    return Text.assemble(
-        "Verdict: ", (VERDICTS.get(verdict, verdict), style), f".\n{sentence(message)}"
-    )
+    words = numbers.sentence(message, catalogue.names)
+    return Text.assemble("Verdict: ", (VERDICTS.get(verdict, verdict), style), f".\n{words}")
 
 
 def suspects_table(d: Diagnosis, most: int = SUSPECTS) -> RenderableType:
@@ -60,7 +54,7 @@ def diagnosis_report(d: Diagnosis) -> Iterator[RenderableType]:
     if d.verdict != "adequate" and not d.carriers:
         yield text.follows(d.where)
     yield ""
-    yield verdict_line(d.verdict, d.message)
+    yield verdict_line(d.verdict, d.message, d.fit.model.catalogue)
     yield ""
     if d.significant:
         yield suspects_table(d)

@@ -15,12 +15,11 @@ from hilcal.data.whitening import Mode
 from hilcal.diagnose.effect_ranking import Suspect, candidates, rank_suspects
 from hilcal.diagnose.projection import projection
 from hilcal.diagnose.verdict import diagnose
-from hilcal.effects.catalogue import make
-from hilcal.effects.options import reading_options
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
 from hilcal.model import Model
 from tests.support.campaigns import campaign
+from tests.support.effect_cases import make
 
 pytestmark = pytest.mark.slow
 
@@ -50,8 +49,7 @@ def largest(found: Fit) -> Model:
     names = {e.name: len(e.parameters) for e in candidates(found)}
     name = max(names, key=lambda n: names[n])
     states = found.readings.states
-    options = reading_options(name, found.readings.m)
-    return found.model + make(name, found.model.cell, states, options)
+    return found.model + make(name, found.model.cell, states, m=found.readings.m)
 
 
 def score(found: Fit) -> tuple[Suspect, ...]:

@@ -12,7 +12,7 @@ from drivers.simulated.campaign import simulate
 from hilcal import __version__
 from hilcal.data.campaign import Campaign
 from hilcal.data.table import read_table
-from hilcal.effects.catalogue import catalogue
+from hilcal.effects.catalogue import installed
 from tests.support.cli_cases import CELL, ok, refused, rehearsal, run, table
 
 Capsys = pytest.CaptureFixture[str]
@@ -272,11 +272,11 @@ def test_export_writes_tables_that_go_in_again(
 
 def test_effects_lists_the_catalogue(capsys: Capsys) -> None:
     d = ok(capsys, "effects", "--json").document
-    assert [e["name"] for e in d["effects"]] == list(catalogue())
+    assert [e["name"] for e in d["effects"]] == list(installed().names)
     assert all(e["law"] and e["parameters"] for e in d["effects"])
     assert {e["source"] for e in d["effects"]} == {"built in"}
     words = ok(capsys, "effects").out
-    assert all(name in words for name in catalogue())
+    assert all(name in words for name in installed().names)
 
 
 def test_study_scaling(tmp_path: Path, capsys: Capsys) -> None:

@@ -12,7 +12,7 @@ from hilcal.data.whitening import MODES
 from hilcal.diagnose.effect_ranking import candidates, rank_suspects
 from hilcal.diagnose.projection import projection
 from hilcal.diagnose.stepwise import add
-from hilcal.effects.catalogue import catalogue
+from hilcal.effects.catalogue import installed
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import fit
 from tests.support.campaigns import NOTHING, campaign
@@ -61,7 +61,7 @@ def p_values(kind: str, mode: str, seeds: range) -> dict[str, list[float]]:
 
 def check(kind: str, mode: str, count: int) -> None:
     found = p_values(kind, mode, range(count))
-    assert len(found) > len(catalogue()) // 2
+    assert len(found) > len(installed().names) // 2
     for effect, p in found.items():
         assert len(p) > 0.8 * count, effect
         # Families are tested one by one, about fifty over all cases: one in 1e5 each.

@@ -4,7 +4,7 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.data.readings import States
-from hilcal.effects.catalogue import BUILT_IN, make
+from hilcal.effects.catalogue import BUILT_IN, installed
 from hilcal.effects.options import typical_compliances
 from hilcal.effects.protocol import Situation
 from hilcal.model import Model
@@ -16,6 +16,8 @@ from tests.support.arm_cases import arm_of
 from tests.support.arm_cases import cell_of as odd_cell
 from tests.support.campaigns import cell_of
 
+make = installed().make
+effect_class = installed().__getitem__
 NAMES = tuple(e.name for e in BUILT_IN)
 ELASTIC = tuple(e.name for e in BUILT_IN if e.elastic)
 FIELDS = ("dq", "twist", "base", "station", "target", "scale")

@@ -9,7 +9,6 @@ from drivers.simulated.injected_effects import hide
 from hilcal.data.readings import Readings
 from hilcal.diagnose.effect_ranking import candidates, rank_suspects
 from hilcal.diagnose.projection import projection
-from hilcal.effects.catalogue import make
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import fit
@@ -17,6 +16,7 @@ from hilcal.model import Model
 from hilcal.refine import MOST_REVISIONS, Refinement, add, refine
 from hilcal.regression.paired_test import LEAST_GAIN
 from tests.support.campaigns import campaign, cell_of, measured, plan, world_of
+from tests.support.effect_cases import make
 
 
 def check_steps(r: Refinement) -> None:

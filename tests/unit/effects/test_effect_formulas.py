@@ -7,13 +7,12 @@ import pytest
 from scipy.integrate import quad_vec
 
 from drivers.simulated import elastic_tree
-from hilcal.effects.catalogue import make
 from hilcal.effects.link_compliance import long_links
 from hilcal.model import Model
 from hilcal.robot import chain as chains
 from hilcal.robot.catalogue import robot_names
 from tests.support.arm_cases import arm_of
-from tests.support.effect_cases import CELLS, SOFT, position, situation, soft, some_states
+from tests.support.effect_cases import CELLS, SOFT, make, position, situation, soft, some_states
 
 # --- elastic --------------------------------------------------------------------------------
 

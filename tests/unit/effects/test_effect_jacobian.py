@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from hilcal.effects.catalogue import make
 from hilcal.model import Model
 from tests.support.effect_cases import (
     CELLS,
     NAMES,
     VARIANTS,
     give,
+    make,
     numeric_jacobian,
     options_of,
     random_theta,

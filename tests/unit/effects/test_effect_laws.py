@@ -10,11 +10,10 @@ from drivers.simulated.truth import Truth
 from drivers.simulated.world import World
 from hilcal.cell import Cell
 from hilcal.data.readings import States
-from hilcal.effects.catalogue import make
 from hilcal.effects.protocol import Situation
 from hilcal.model import Model
 from tests.support.campaigns import true_parameters
-from tests.support.effect_cases import CELLS, NAMES, options_of, situation, some_states
+from tests.support.effect_cases import CELLS, NAMES, make, options_of, situation, some_states
 
 # --- laws, against the simulated world ------------------------------------------------------
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hilcal.effects.catalogue import make
 from hilcal.effects.link_mass import LinkMass
 from hilcal.errors import CannotAnswerError
 from hilcal.model import Model
@@ -14,7 +13,7 @@ from hilcal.robot.chain import evaluate
 from hilcal.robot.deviation import Deviation
 from hilcal.robot.statics import Load, slot_wrenches
 from hilcal.types import Floats
-from tests.support.effect_cases import CELLS, TURN, joints, position, soft, some_states
+from tests.support.effect_cases import CELLS, TURN, joints, make, position, soft, some_states
 
 
 @pytest.mark.parametrize("arm", CELLS)

@@ -6,12 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilcal.effects.catalogue import catalogue, effect_class, make
+from hilcal.effects.catalogue import installed
 from hilcal.errors import InputError
 from hilcal.model import Model
 from tests.support.effect_cases import (
     CELLS,
     NAMES,
+    effect_class,
+    make,
     options_of,
     random_theta,
     situation,
@@ -103,9 +105,8 @@ def test_the_same_effect_twice_is_refused():
 
 
 def test_the_catalogue_has_all_effects_of_the_vocabulary():
-    assert set(NAMES) <= set(catalogue())
-    for name, kind in catalogue().items():
-        assert kind.name == name
+    assert set(NAMES) <= set(installed().names)
+    for kind in installed().effects:
         assert kind.summary
 
 

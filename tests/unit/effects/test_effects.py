@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from hilcal.data.readings import Readings
-from hilcal.effects.catalogue import effect_class, make
 from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
 from hilcal.identify.fit import fit
 from hilcal.model import Model
@@ -19,7 +18,9 @@ from tests.support.effect_cases import (
     FIELDS,
     NAMES,
     VARIANTS,
+    effect_class,
     give,
+    make,
     numeric_jacobian,
     options_of,
     random_theta,

@@ -5,7 +5,6 @@ import pytest
 
 from hilcal.data.records import content_hash
 from hilcal.data.revision import from_text, to_text
-from hilcal.effects.catalogue import effect_class, make
 from hilcal.effects.per_joint import PerJoint, joint_groups
 from hilcal.effects.protocol import Columns, Effect, Parameter
 from hilcal.errors import InputError
@@ -14,7 +13,15 @@ from hilcal.identify.fit import fit
 from hilcal.model import Model
 from hilcal.revisions import restore_model, to_record
 from tests.support.campaigns import campaign
-from tests.support.effect_cases import CELLS, NAMES, options_of, random_theta, some_states
+from tests.support.effect_cases import (
+    CELLS,
+    NAMES,
+    effect_class,
+    make,
+    options_of,
+    random_theta,
+    some_states,
+)
 from tests.unit.effects.test_effect_jacobian import assert_slope
 
 PER_JOINT = tuple(name for name in NAMES if issubclass(effect_class(name), PerJoint))

@@ -4,11 +4,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilcal.effects.catalogue import BUILT_IN, catalogue, make
+from hilcal.effects.catalogue import BUILT_IN, installed
 from hilcal.effects.option_help import option_defaults, option_help
 from hilcal.effects.written import chosen_options, read_effects_text, write_effect
 from hilcal.errors import InputError
-from tests.support.effect_cases import CELLS, VARIANTS, some_states
+from tests.support.effect_cases import CELLS, VARIANTS, make, some_states
 
 
 @pytest.mark.parametrize(
@@ -45,7 +45,7 @@ from tests.support.effect_cases import CELLS, VARIANTS, some_states
     ],
 )
 def test_what_is_typed_is_what_is_read(text, expected):
-    found = read_effects_text(text, "--effects")
+    found = read_effects_text(text, "--effects", installed())
     assert found == expected
     assert list(found) == list(expected)
     for name, options in expected.items():
@@ -84,7 +84,7 @@ def test_what_is_typed_is_what_is_read(text, expected):
 )
 def test_what_cannot_be_read_is_refused_in_one_line(text, wrong):
     with pytest.raises(InputError) as caught:
-        read_effects_text(text, "--effects")
+        read_effects_text(text, "--effects", installed())
     line = str(caught.value)
     assert wrong in line
     assert "\n" not in line
@@ -103,7 +103,7 @@ values = st.one_of(
                        st.one_of(values, st.lists(values, max_size=3)), max_size=3))  # fmt: skip
 def test_what_is_written_reads_the_same(options):
     text = f"hysteresis, {write_effect('creep', options)}"
-    found = read_effects_text(text, "x")
+    found = read_effects_text(text, "x", installed())
     assert found == {"hysteresis": {}, "creep": options}
     assert repr(found["creep"]) == repr(options)
 
@@ -112,7 +112,7 @@ def test_what_is_written_reads_the_same(options):
 def test_nothing_that_is_typed_fails_otherwise(text):
     said = ""
     try:
-        read_effects_text(text, "--effects")
+        read_effects_text(text, "--effects", installed())
     except InputError as error:
         said = str(error)
     assert "\n" not in said
@@ -153,18 +153,18 @@ def test_options_are_explained_and_defaults_are_valid(kind):
 
 
 def test_help_is_that_of_the_class_before_that_of_its_base():
-    assert "Unless given, each." in option_help(catalogue()["hysteresis"])["joints"]
-    assert "given, common." in option_help(catalogue()["creep"])["joints"]
-    help_of = option_help(catalogue()["backlash"])
+    assert "Unless given, each." in option_help(installed()["hysteresis"])["joints"]
+    assert "given, common." in option_help(installed()["creep"])["joints"]
+    help_of = option_help(installed()["backlash"])
     assert help_of["crossing"].endswith("more than 0; unless given, 0.01.")
-    frame = option_help(catalogue()["base_frame"])
+    frame = option_help(installed()["base_frame"])
     assert frame["prior_m"] == frame["prior_rad"] != ""
 
 
 def test_a_default_that_follows_from_the_readings_is_not_told():
     cell = CELLS["ur10e"]
     states = some_states(cell, 60)
-    drift = option_defaults(catalogue()["thermal_joint_drift"], cell, states)
+    drift = option_defaults(installed()["thermal_joint_drift"], cell, states)
     assert drift == {"joints": "each", "reference_degC": None}
-    assert option_defaults(catalogue()["transmission_error"], cell, states)["harmonics"] is None
-    assert option_defaults(catalogue()["creep"], cell, states) == {"joints": "common"}
+    assert option_defaults(installed()["transmission_error"], cell, states)["harmonics"] is None
+    assert option_defaults(installed()["creep"], cell, states) == {"joints": "common"}

@@ -8,14 +8,13 @@ import pytest
 
 from hilcal.cell import Cell
 from hilcal.data.readings import Readings, States
-from hilcal.effects.catalogue import make
-from hilcal.effects.options import reading_options
 from hilcal.errors import CannotAnswerError
 from hilcal.identify.baseline import baseline, with_effects
 from hilcal.identify.fit import fit
 from hilcal.identify.fit_document import to_json
 from hilcal.model import Model
 from tests.support.campaigns import campaign, cell_of, noiseless, plan, true_parameters, with_noise
+from tests.support.effect_cases import make
 from tests.support.fit_cases import MODES, compliances, named, predicted
 
 FRAMES = ("base_frame", "target_offset", "encoder_offset")
@@ -66,7 +65,7 @@ def far_off(rng: np.random.Generator) -> np.ndarray:
 
 
 def of_names(names: tuple[str, ...], cell: Cell, states: States, m: int) -> Model:
-    return Model(cell, tuple(make(n, cell, states, reading_options(n, m)) for n in names))
+    return Model(cell, tuple(make(n, cell, states, m=m) for n in names))
 
 
 @pytest.mark.parametrize("m", [3, 6])

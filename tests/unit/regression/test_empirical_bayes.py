@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from hilcal.effects.catalogue import make
 from hilcal.identify.baseline import baseline, with_effects
 from hilcal.identify.fit import Fit, fit
 from hilcal.regression.empirical_bayes import Shrinkage, shrink
 from tests.support.campaigns import campaign, noiseless, plan
+from tests.support.effect_cases import make
 
 
 def linear(strength, count, rows=1200, flat=3, noise=1.0, seed=0) -> tuple[Shrinkage, np.ndarray]:

@@ -12,7 +12,6 @@ from hilcal.config import CellConfig, load_config
 from hilcal.data.whitening import MODES, Mode
 from hilcal.diagnose.misfit_breakdown import where
 from hilcal.diagnose.projection import projection
-from hilcal.effects.catalogue import make
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import fit
@@ -26,6 +25,7 @@ from studies.study_cases import (
     study_case,
     with_study_loads,
 )
+from tests.support.effect_cases import make
 
 
 def config() -> CellConfig:

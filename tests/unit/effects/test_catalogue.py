@@ -1,0 +1,86 @@
+"""The catalogue is a value, and nothing but it and the effects themselves knows their names."""
+
+import ast
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hilcal
+from hilcal.diagnose.effect_ranking import candidates
+from hilcal.effects.catalogue import installed
+from hilcal.effects.protocol import Columns, Effect, Parameter, Role
+from hilcal.effects.spec import effect
+from hilcal.errors import InputError
+from hilcal.identify.baseline import baseline
+from hilcal.identify.fit import fit
+from hilcal.model import Model
+from tests.support.campaigns import campaign
+from tests.support.effect_cases import NAMES
+
+CONFIGURATION = "config/planning.py"
+"""Holds a default that a person would write: an effect by name."""
+
+
+class Sag(Effect):
+    """dq_1 = a cos(q_2)."""
+
+    name = "sag"
+    summary = "dq_1 = a cos(q_2)"
+    role: Role = "baseline"
+
+    @property
+    def parameters(self):
+        return (Parameter("a", "rad", 1e-5),)
+
+    def columns(self, s):
+        return (Columns("dq", np.array([0]), np.array([0]), np.cos(s.angle[:, 1:2])),)
+
+
+def test_no_module_outside_of_the_effects_asks_for_one_by_its_name() -> None:
+    root = Path(hilcal.__file__).parent
+    found = [
+        f"{path.relative_to(root)}:{node.lineno}: {node.value}"
+        for path in sorted(root.rglob("*.py"))
+        if path.parent.name != "effects" and str(path.relative_to(root)) != CONFIGURATION
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Constant) and str(node.value).split(".")[0] in NAMES
+    ]
+    assert not found
+
+
+def test_an_effect_is_added_by_name_and_options() -> None:
+    c = campaign()
+    model = baseline(c.cell, c.readings, "absolute") + effect("hysteresis", joints="1-3")
+    assert model.names[-1] == "hysteresis"
+    assert model.effects[-1].options == {"joints": "1-3"}
+    with pytest.raises(InputError, match="unknown effect 'hysteresys' .did you mean"):
+        model + effect("hysteresys")
+    with pytest.raises(InputError, match="hysteresis is in the model already"):
+        model + effect("hysteresis")
+    with pytest.raises(InputError, match="unknown option 'joint'; valid: joints"):
+        model + effect("encoder_offset", joint=1)
+
+
+def test_an_effect_is_added_by_its_class_and_is_in_the_catalogue_then() -> None:
+    c = campaign()
+    model = baseline(c.cell, c.readings, "absolute") + effect(Sag)
+    assert model.names[-1] == "sag"
+    assert model.catalogue.names[-1] == "sag"
+    assert "sag" not in installed().names
+
+
+def test_a_model_without_readings_takes_effects_that_are_built_only() -> None:
+    with pytest.raises(InputError, match="creep: this model was made without readings"):
+        Model(campaign().cell, ()) + effect("creep")
+
+
+def test_what_a_model_could_have_is_what_its_catalogue_holds() -> None:
+    c = campaign()
+    mine = installed().with_effects(Sag)
+    assert "sag" in baseline(c.cell, c.readings, "absolute", mine).names  # by its role
+    bare = Model(c.cell, (), mine, c.readings) + effect("joint_compliance") + effect("base_frame")
+    found = fit(bare, c.readings, "absolute")
+    assert "sag" in {e.name for e in candidates(found)}
+    with pytest.raises(InputError, match="class Sag: effect sag is in the catalogue already"):
+        mine.with_effects(Sag)
