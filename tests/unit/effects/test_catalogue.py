@@ -54,7 +54,7 @@ def test_an_effect_is_added_by_name_and_options() -> None:
     model = baseline(c.cell, c.readings, "absolute") + effect("hysteresis", joints="1-3")
     assert model.names[-1] == "hysteresis"
     assert model.effects[-1].options == {"joints": "1-3"}
-    with pytest.raises(InputError, match="unknown effect 'hysteresys' .did you mean"):
+    with pytest.raises(InputError, match=r"unknown effect 'hysteresys' \(did you mean"):
         model + effect("hysteresys")
     with pytest.raises(InputError, match="hysteresis is in the model already"):
         model + effect("hysteresis")
