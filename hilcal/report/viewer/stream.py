@@ -4,6 +4,7 @@ import contextlib
 import hashlib
 import logging
 import os
+import shutil
 import socket
 import subprocess
 import uuid
@@ -16,7 +17,6 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from hilcal.errors import HilcalError, InputError
-from hilcal.report import picture
 from hilcal.report.story import Story, StoryRevision, check
 from hilcal.report.viewer import charts, layout, scene, style, words
 from hilcal.report.viewer.digest import Digest, Limits, digest
@@ -179,11 +179,23 @@ def disable_analytics() -> None:
     """Switch the viewer's usage statistics off for this user; they are on by default."""
     with contextlib.suppress(OSError, subprocess.SubprocessError, HilcalError):
         subprocess.run(  # noqa: S603 (our own arguments)
-            [picture.executable(), "analytics", "disable"],
+            [executable(), "analytics", "disable"],
             check=False,
             capture_output=True,
             timeout=10,
         )
+
+
+def executable() -> str:
+    """Return the path of the rerun viewer that was installed with its SDK."""
+    try:
+        import rerun_cli  # type: ignore[import-untyped, unused-ignore]
+    except ImportError:
+        found = shutil.which("rerun")
+        if found is None:
+            raise HilcalError("no rerun viewer: install rerun-sdk") from None
+        return found
+    return str(Path(str(rerun_cli.__file__)).parent / "rerun")
 
 
 def _open(story: Story, limits: Limits | None) -> tuple[Digest, rr.RecordingStream]:

@@ -15,10 +15,10 @@ import rerun as rr
 from rerun.chunk import RrdReader
 
 from hilcal.errors import InputError
-from hilcal.report.picture import executable
 from hilcal.report.primitive_arm import arm_meshes, body_poses
 from hilcal.report.story import StoryRevision, StorySuspect
 from hilcal.report.viewer import Limits, digest, layout, save, serve, style, words
+from hilcal.report.viewer.stream import executable
 from tests.support.paths import ROOT
 from tests.support.viewer_story import story, ur10e
 

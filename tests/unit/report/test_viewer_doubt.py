@@ -8,10 +8,10 @@ import pytest
 import rerun as rr
 
 from hilcal.errors import InputError
-from hilcal.report.picture import Shot, pictures, vulkan_available
 from hilcal.report.story import Story, StoryLimit, StoryParameter, StoryRival, StorySuspect
 from hilcal.report.viewer import flat, layout, save, style, words
 from hilcal.report.viewer.residuals import title
+from tests.support.picture import Shot, pictures, vulkan_available
 from tests.support.viewer_story import ANGLE, LIMITS, LOAD, doubtful, story
 from tests.unit.report.test_viewer import FORBIDDEN, column, texts
 

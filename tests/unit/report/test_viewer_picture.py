@@ -9,9 +9,9 @@ import pytest
 import rerun as rr
 
 from hilcal.errors import HilcalError, InputError
-from hilcal.report import picture
-from hilcal.report.picture import Shot, pictures, vulkan_available
 from hilcal.report.viewer import Limits, digest, layout, save, style
+from tests.support import picture
+from tests.support.picture import Shot, pictures, vulkan_available
 from tests.support.viewer_story import story
 
 SIZE, LONGEST = (960, 540), 480

@@ -10,12 +10,13 @@ from rerun.chunk import RrdReader
 from hilcal.data.plan import UNLOADED, Plan, Step
 from hilcal.errors import InputError
 from hilcal.plan.story import Promised, Seen
-from hilcal.report.picture import Shot, executable, pictures, vulkan_available
 from hilcal.report.viewer import plan_layout, style
 from hilcal.report.viewer.plan_charts import HEIGHT, LONG
 from hilcal.report.viewer.plan_digest import plan_digest
 from hilcal.report.viewer.plan_promises import shown_parameters
 from hilcal.report.viewer.plan_stream import record_plan
+from hilcal.report.viewer.stream import executable
+from tests.support.picture import Shot, pictures, vulkan_available
 from tests.support.viewer_plan import (
     BARE,
     PLAN,

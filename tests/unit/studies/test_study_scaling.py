@@ -3,13 +3,9 @@
 import io
 import json
 from dataclasses import replace
-from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from rich.console import Console
 from scipy import stats
 
@@ -18,8 +14,6 @@ from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
 from hilcal.robot.deviation import Deviation
 from hilcal.robot.se3 import rotation_vector
-from hilcal.study.chart import spread
-from hilcal.study.picture import picture
 from hilcal.study.scaling import CORRELATIONS, UNITS, ScalingStudy, scaling_study
 from hilcal.study.scaling_design import JOINT_STD, TARGET, WRENCHES, Design, bound, make_design
 from hilcal.study.scaling_table import CURVES, table
@@ -282,53 +276,3 @@ def test_table_shows_every_correlation_and_scaling(study: ScalingStudy, width: i
         for c in study.of(scaling, unit, True):
             assert f"{c.error_over_bound:.2f}x" in shown
             assert f"{100 * c.coverage:.1f}%" in shown
-
-
-def test_picture_is_a_drawing_of_all_curves(study: ScalingStudy, tmp_path: Path) -> None:
-    path = tmp_path / "scaling.svg"
-    picture(study, path)
-    root = ElementTree.parse(path).getroot()
-    curves = [e for e in root.iter() if e.tag.endswith("polyline")]
-    assert len(curves) == 4 * 5
-    width, height = float(root.attrib["width"]), float(root.attrib["height"])
-    for curve in curves:
-        points = np.array([p.split(",") for p in curve.attrib["points"].split()], dtype=float)
-        assert len(points) == len(CORRELATIONS)
-        assert np.all((points > 0) & (points < (width, height)))
-    words = " ".join(e.text or "" for e in root.iter() if e.tag.endswith("text"))
-    for word in ("none, in mm and rad", "gu", "gc", "Cramér–Rao bound", "94 to 96 %"):
-        assert word in words
-
-
-def test_picture_draws_larger_errors_higher(study: ScalingStudy, tmp_path: Path) -> None:
-    """In the first panel: none in mm above none in m above gu above gc, at the right end."""
-    path = tmp_path / "scaling.svg"
-    picture(study, path)
-    curves = [e for e in ElementTree.parse(path).iter() if e.tag.endswith("polyline")][:5]
-    ends = [float(c.attrib["points"].split()[-1].split(",")[1]) for c in curves]
-    shown = [study.of(scaling, unit, False)[-1].error_over_bound for scaling, unit in CURVES]
-    assert list(np.argsort(ends)) == list(np.argsort(shown)[::-1])
-
-
-def test_picture_of_one_correlation(tmp_path: Path) -> None:
-    path = tmp_path / "one.svg"
-    picture(scaling_study(np.random.default_rng(0), runs=20, correlations=(0.0,)), path)
-    assert "nan" not in path.read_text(encoding="utf-8")
-
-
-@pytest.mark.parametrize("name", ["scaling.png", "missing/scaling.svg"])
-def test_picture_that_cannot_be_written(study: ScalingStudy, tmp_path: Path, name: str) -> None:
-    with pytest.raises(InputError, match="scaling"):
-        picture(study, tmp_path / name)
-
-
-@given(st.lists(st.floats(-500, 500), min_size=1, max_size=8), st.floats(1, 40))
-def test_labels_stand_apart_in_the_order_of_their_curves(places: list[float], gap: float) -> None:
-    moved = np.array(spread(places, gap))
-    order = np.argsort(places, kind="stable")
-    assert np.all(np.diff(moved[order]) > gap - 1e-6)
-    assert moved.mean() == pytest.approx(np.mean(places), abs=1e-6)
-
-
-def test_labels_that_are_apart_stay() -> None:
-    assert spread([50.0, 10.0, 30.0], 16.0) == [50.0, 10.0, 30.0]

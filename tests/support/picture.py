@@ -5,7 +5,6 @@ import ctypes
 import ctypes.util
 import json
 import os
-import shutil
 import socket
 import subprocess
 import tempfile
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hilcal.errors import HilcalError, InputError
+from hilcal.report.viewer.stream import executable
 
 if TYPE_CHECKING:
     from rerun.experimental import ViewerClient, ViewerState
@@ -175,7 +175,7 @@ def _headless(size: tuple[int, int]) -> Iterator["ViewerClient"]:
         command += ["--bind", "127.0.0.1", "--port", str(port)]
         command += ["--window-size", f"{size[0]}x{size[1]}"]
         with log.open("wb") as sink:
-            process = subprocess.Popen(  # noqa: S603 (our own arguments)
+            process = subprocess.Popen(
                 command, env=_environment(Path(home)), stdout=sink, stderr=subprocess.STDOUT
             )
         try:
@@ -210,18 +210,6 @@ def _connect(process: subprocess.Popen[bytes], port: int) -> "ViewerClient":
             time.sleep(0.05)
         else:
             return client
-
-
-def executable() -> str:
-    """Return the path of the rerun viewer that was installed with its SDK."""
-    try:
-        import rerun_cli  # type: ignore[import-untyped, unused-ignore]
-    except ImportError:
-        found = shutil.which("rerun")
-        if found is None:
-            raise HilcalError("no rerun viewer: install rerun-sdk") from None
-        return found
-    return str(Path(str(rerun_cli.__file__)).parent / "rerun")
 
 
 def _environment(home: Path) -> dict[str, str]:
