@@ -1,0 +1,30 @@
+"""What the benchmarks measured, against what is claimed: printed at the end of `make bench`."""
+
+from collections.abc import Callable
+
+import pytest
+
+_CLAIMS = pytest.StashKey[list[str]]()
+
+Claim = Callable[[str, str, str], None]
+
+
+@pytest.fixture
+def claim(request: pytest.FixtureRequest) -> Claim:
+    """Function that notes a claim, what was measured of it, and the limit, all in words."""
+
+    def note(what: str, measured: str, limit: str) -> None:
+        claims = request.config.stash.setdefault(_CLAIMS, [])
+        claims.append(f"{what}: {measured} ({limit})")
+
+    return note
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Print the claims below the tables of times."""
+    claims = terminalreporter.config.stash.get(_CLAIMS, [])
+    if claims:
+        terminalreporter.section("claims of the benchmarks: measured (limit)")
+        for line in claims:
+            terminalreporter.write_line(line)
