@@ -1,6 +1,7 @@
 """Fixtures that several test files share."""
 
 import os
+import signal
 from pathlib import Path
 
 import hypothesis
@@ -35,6 +36,18 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         default=None,
         help="run tests/test_devices.py on the real devices of this cell; the arm moves",
     )
+
+
+def pytest_configure() -> None:
+    """Take signals as at a terminal, where the caller has them ignored.
+
+    A shell's background job ignores SIGINT, nohup SIGHUP, and programs inherit it: those that the
+    tests start would not end on them.
+    """
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 LONG = (

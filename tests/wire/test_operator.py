@@ -17,6 +17,7 @@ from drivers.terminal_operator import open_operator as open_terminal
 from hilcal.acquire import devices
 from hilcal.errors import DeviceError, InputError
 from tests.support.living_cell import config
+from tests.support.paths import ROOT
 
 # the simulated person
 
@@ -124,14 +125,12 @@ class Person:
 
     def __init__(self, *requests, stdin=None):
         self.master, slave = pty.openpty()
-        here = os.path.dirname(__file__)
-        path = os.pathsep.join([here, os.path.dirname(here)])
         self.process = subprocess.Popen(
             [sys.executable, "-c", PROGRAM, json.dumps(requests)],
             stdin=slave if stdin is None else stdin,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
-            env={**os.environ, "PYTHONPATH": path},
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
             start_new_session=True,
             preexec_fn=lambda: fcntl.ioctl(slave, termios.TIOCSCTTY, 0),
         )

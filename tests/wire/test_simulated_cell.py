@@ -22,6 +22,7 @@ from drivers.simulated.world import World
 from hilcal.errors import DeviceError, InputError
 from tests.support.arm_cases import ODD, arm_of
 from tests.support.living_cell import WEIGHT, config, same, states, world_of
+from tests.support.paths import ROOT
 
 DEVICES = ("world", "arm", "tracker", "force")
 SENSOR = {"driver": "ft300", "port": "to be filled in", "origin_m": [0.0, 0.0, 0.04]}
@@ -204,12 +205,11 @@ time.sleep(60)
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
 def test_the_devices_end_with_a_parent_that_is_killed(tmp_path, how):
-    here = os.path.dirname(__file__)
     with subprocess.Popen(
         [sys.executable, "-c", PARENT, str(tmp_path)],
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join([here, os.path.dirname(here)])},
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
     ) as parent:
         pids = [int(word) for word in parent.stdout.readline().split()]
         assert len(pids) == 4
