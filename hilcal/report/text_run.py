@@ -1,7 +1,6 @@
-"""What `plan`, `check` and `run` say."""
+"""The words that `check` and `run` print."""
 
 from collections.abc import Iterator
-from pathlib import Path
 
 from rich.console import RenderableType
 from rich.padding import Padding
@@ -10,8 +9,6 @@ from rich.text import Text
 
 from hilcal.acquire.connect import Answer
 from hilcal.acquire.dry_run import DryRun
-from hilcal.data.plan import UNLOADED, Plan
-from hilcal.report import text
 
 
 def spoken(seconds: float) -> str:
@@ -20,23 +17,6 @@ def spoken(seconds: float) -> str:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60.0)
     return f"{minutes} min" if minutes < 100 else f"{minutes // 60} h {minutes % 60:02d} min"
-
-
-def plan_report(plan: Plan, dry: DryRun, path: Path) -> Iterator[RenderableType]:
-    """Yield what a plan does and what it costs."""
-    yield text.heading("Plan")
-    rows = Table.grid(padding=(0, 2))
-    loads = [name for name in plan.loads if name != UNLOADED]
-    rows.add_row("poses", f"{len(plan.pose_names)}, spread over the joint space")
-    rows.add_row("loads", ", ".join(["unloaded", *loads]))
-    rows.add_row("readings", str(len(plan.steps)))
-    rows.add_row("motions", str(dry.motions))
-    rows.add_row("load changes", f"{dry.load_changes} (by hand)")
-    rows.add_row("takes about", spoken(dry.duration))
-    yield Padding(rows, (0, 0, 1, 0))
-    for remark in dry.remarks:
-        yield f"note: {remark}"
-    yield f"The plan is in {path}: a file that you may edit. Every limit was checked."
 
 
 def check_report(answers: tuple[Answer, ...], dry: DryRun | None) -> Iterator[RenderableType]:

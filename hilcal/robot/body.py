@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilcal.robot.arm import Arm
+from hilcal.robot.chain import evaluate
 from hilcal.types import Floats
 
 BASE = "base"
@@ -91,6 +92,30 @@ def capsules(arm: Arm) -> tuple[Capsule, ...]:
     most an eighth of the radius, which the margins of collision checks cover.
     """
     return _of_ur(arm, _FIGURES[arm.name]) if is_known(arm) else _of_any(arm)
+
+
+def body_poses(arm: Arm, q: Floats) -> Floats:
+    """Poses T_base_body of base and bodies, and of the flange.
+
+    T_base_body0 = 1, T_base_bodyi = L_0 Rz(q_1) ... L_{i-1} Rz(q_i).
+
+    Args:
+        arm: the arm.
+        q: (N, n) joint angles, rad.
+
+    Returns:
+        (N, n + 2, 4, 4): base, the n bodies, flange.
+    """
+    chain = evaluate(arm, q)
+    out = np.tile(np.eye(4), (len(q), arm.n + 2, 1, 1))
+    out[:, 1:, :3, :3] = np.swapaxes(chain.rotation, 0, 1)
+    out[:, 1:, :3, 3] = np.swapaxes(chain.position, 0, 1)
+    turn = np.tile(np.eye(3), (len(q), arm.n, 1, 1))
+    turn[..., 0, 0] = turn[..., 1, 1] = np.cos(q)
+    turn[..., 1, 0] = np.sin(q)
+    turn[..., 0, 1] = -turn[..., 1, 0]
+    out[:, 1:-1, :3, :3] = out[:, 1:-1, :3, :3] @ turn
+    return out
 
 
 def flange_capsule(arm: Arm, name: str, start: Floats, end: Floats, radius: float) -> Capsule:

@@ -111,7 +111,9 @@ def adjoint(r: Floats, p: Floats) -> Floats:
 
 
 def right_jacobian_blocks(twist: Floats) -> tuple[Floats, Floats]:
-    """Blocks J(ω) and Q(v, ω) of the right Jacobian, both (..., 3, 3).
+    """Blocks J(ω) and Q(v, ω) of the right Jacobian J_r = [J, Q; 0, J], both (..., 3, 3).
+
+    exp(ξ + δ) = exp(ξ) exp(J_r(ξ) δ) to first order.
 
         J = (1 − c θ²) I − b [ω]× + c ω ωᵀ
         Q = dJ(ω + ε v)/dε = −b [v]× + c (v ωᵀ + ω vᵀ) − 2 c d I

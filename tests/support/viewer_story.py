@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from hilcal.report.primitive_arm import body_poses
 from hilcal.report.story import (
     Regressor,
     Story,
@@ -16,6 +15,7 @@ from hilcal.report.story import (
     StorySuspect,
 )
 from hilcal.robot.arm import Arm
+from hilcal.robot.body import body_poses
 
 EFFECTS = ("joint_compliance", "base_compliance", "joint_tilt_compliance", "hysteresis")
 _DH = (  # d, a, alpha of a UR10e (Universal Robots' published DH parameters)

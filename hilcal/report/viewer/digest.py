@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.report.primitive_arm import body_poses
 from hilcal.report.story import Story, StoryRevision
 from hilcal.report.viewer import style
+from hilcal.robot.body import body_poses
 from hilcal.types import Floats, Ints
 
 SIGMA_LENGTH = 0.02  # one σ is drawn this long, m

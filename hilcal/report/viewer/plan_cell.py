@@ -4,15 +4,13 @@ import numpy as np
 import rerun as rr
 
 from hilcal.config import Obstacle
-from hilcal.report.primitive_arm import DARK, METAL
-from hilcal.report.viewer import plan_style, style
+from hilcal.report.viewer import arm_shapes, plan_style, style
 from hilcal.report.viewer.plan_digest import PlanDigest
 from hilcal.robot import body
 from hilcal.types import Floats, Ints
 
 BEAD, BEAD_GAP = 0.0075, 0.016
 """Radius of a bead and distance of two in a stack, shares of the reach."""
-_LIGHT = (205, 208, 214)
 _OBSTACLE = (122, 112, 104)
 _BOX = (64, 82, 108)
 _TRACKER = (235, 235, 240)
@@ -22,7 +20,8 @@ _HEAD = 0.07  # m, of the drawn tracker
 def static_scene(rec: rr.RecordingStream, d: PlanDigest) -> None:
     """Log what never changes: shapes of the arm, what stands around, and a bead per reading."""
     rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    _parts(rec, d)
+    own = len(body.capsules(d.cell.arm))
+    arm_shapes.log_bodies(rec, d.shapes.scene.parts[:own], d.shapes.scene.parts[own:])
     _obstacles(rec, d.config.obstacles)
     _workspace(rec, d)
     _beads(rec, d)
@@ -30,51 +29,11 @@ def static_scene(rec: rr.RecordingStream, d: PlanDigest) -> None:
         _tracker(rec, d.tracker)
 
 
-def capsules(start: Floats, end: Floats, radius: Floats, colors: object) -> rr.Capsules3D:
-    """Return capsules between ends (K, 3); rerun's lie along z from the origin."""
-    way = end - start
-    length = np.linalg.norm(way, axis=1)
-    z = way / np.where(length > 0.0, length, 1.0)[:, None]
-    # half-way turn that leads z to the way: q = (1 + z·way, z × way) normalised
-    half = np.stack([-z[:, 1], z[:, 0], np.zeros(len(z)), 1.0 + z[:, 2]], 1)
-    flat = np.linalg.norm(half, axis=1) < 1e-9
-    half[flat] = [1.0, 0.0, 0.0, 0.0]
-    half[length == 0.0] = [0.0, 0.0, 0.0, 1.0]
-    return rr.Capsules3D(
-        lengths=length,
-        radii=radius,
-        translations=start,
-        quaternions=half / np.linalg.norm(half, axis=1, keepdims=True),
-        colors=colors,  # type: ignore[arg-type]
-        fill_mode="solid",
-    )
-
-
 def bead_places(d: PlanDigest, steps: Ints) -> Floats:
     """(K, 3) where the beads of some steps are: stacked upwards from the target, m."""
     up = np.zeros((len(steps), 3))
     up[:, 2] = d.rank[steps] * BEAD_GAP * d.reach
     return np.asarray(d.target[steps] + up)
-
-
-def _parts(rec: rr.RecordingStream, d: PlanDigest) -> None:
-    """Log the capsules of every body in their true radii, in the body's frame."""
-    own = len(body.capsules(d.cell.arm))  # what comes after them is carried
-    for i in range(d.cell.arm.n + 1):
-        parts = [(k, p) for k, p in enumerate(d.shapes.scene.parts) if p.body == i]
-        if not parts:
-            continue
-        shade = METAL if i % 2 else _LIGHT
-        rec.log(
-            f"world/arm/body{i}",
-            capsules(
-                np.array([p.start for _, p in parts]),
-                np.array([p.end for _, p in parts]),
-                np.array([p.radius for _, p in parts]),
-                np.array([DARK if k >= own else shade for k, _ in parts], dtype=np.uint8),
-            ),
-            static=True,
-        )
 
 
 def _obstacles(rec: rr.RecordingStream, things: tuple[Obstacle, ...]) -> None:
@@ -184,7 +143,7 @@ def _tracker(rec: rr.RecordingStream, place: Floats) -> None:
     up = np.array([0.0, 0.0, 1.0])
     rec.log(
         "world/tracker",
-        capsules(
+        arm_shapes.capsules(
             (place - 1.2 * _HEAD * up)[None],
             (place + 0.2 * _HEAD * up)[None],
             np.array([_HEAD]),

@@ -15,8 +15,8 @@ from hilcal.data.plan import Plan
 from hilcal.errors import InputError
 from hilcal.plan.story import PlanStory
 from hilcal.plan.timing import pace, timeline
-from hilcal.report.primitive_arm import body_poses
 from hilcal.robot import chain as chains
+from hilcal.robot.body import body_poses
 from hilcal.types import Bools, Floats, Ints
 
 SEEN, TURNED, HIDDEN, UNKNOWN = range(4)

@@ -3,7 +3,7 @@
 import numpy as np
 import rerun as rr
 
-from hilcal.report.viewer import plan_cell, plan_style, style
+from hilcal.report.viewer import arm_shapes, plan_cell, plan_style, style
 from hilcal.report.viewer.digest import quaternions_of
 from hilcal.report.viewer.plan_digest import SEEN, PlanDigest
 from hilcal.types import Floats
@@ -122,7 +122,7 @@ def _loads(rec: rr.RecordingStream, d: PlanDigest) -> None:
                 end = np.array([x.end[i] for x in hung])
                 radius = np.array([x.radius for x in hung])
                 rec.log(
-                    f"world/load/{_PARTS[0]}", plan_cell.capsules(start, end, radius, [colors[k]])
+                    f"world/load/{_PARTS[0]}", arm_shapes.capsules(start, end, radius, [colors[k]])
                 )
             if arrow is not None:
                 rec.log(

@@ -4,10 +4,10 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from hilcal.report.primitive_arm import BodyMesh, arm_meshes, tool_mesh
 from hilcal.report.story import StoryRevision
-from hilcal.report.viewer import style
+from hilcal.report.viewer import arm_shapes, style
 from hilcal.report.viewer.digest import Digest, capped, deviation, quaternions_of
+from hilcal.robot.body import capsules
 from hilcal.types import Floats
 
 _DEFLECTION_CAP = 0.6
@@ -18,10 +18,8 @@ def static_scene(rec: rr.RecordingStream, d: Digest) -> None:
     """Log what never changes: the arm's shapes and the axes of the world."""
     arm = d.story.arm
     rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    for i, mesh in enumerate(arm_meshes(arm)):
-        rec.log(f"world/arm/body{i}", _mesh(mesh), static=True)
-    flange = tool_mesh(arm, d.target, style.MEASURED)
-    rec.log(f"world/arm/body{arm.n + 1}", _mesh(flange), static=True)
+    arm_shapes.log_bodies(rec, capsules(arm))
+    arm_shapes.log_target(rec, arm, d.target, style.MEASURED)
 
 
 def revision_scene(rec: rr.RecordingStream, d: Digest, r: StoryRevision) -> None:
@@ -173,15 +171,6 @@ def _deflections(rec: rr.RecordingStream, d: Digest, r: StoryRevision) -> None:
             colors=style.LEVEL_COLORS[style.levels(r.whitened_norm2[some])],
             radii=rr.Radius.ui_points(1.6),
         ),
-    )
-
-
-def _mesh(mesh: BodyMesh) -> rr.Mesh3D:
-    return rr.Mesh3D(
-        vertex_positions=mesh.vertices.astype(np.float32),
-        vertex_normals=mesh.normals.astype(np.float32),
-        triangle_indices=mesh.triangles.astype(np.uint32),
-        vertex_colors=mesh.colors.astype(np.uint8),
     )
 
 

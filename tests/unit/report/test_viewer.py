@@ -13,12 +13,13 @@ import numpy as np
 import pytest
 import rerun as rr
 from rerun.chunk import RrdReader
+from scipy.spatial.transform import Rotation
 
 from hilcal.errors import InputError
-from hilcal.report.primitive_arm import arm_meshes, body_poses
 from hilcal.report.story import StoryRevision, StorySuspect
 from hilcal.report.viewer import Limits, digest, layout, save, serve, style, words
 from hilcal.report.viewer.stream import executable
+from hilcal.robot.body import body_poses, capsules
 from tests.support.paths import ROOT
 from tests.support.viewer_story import story, ur10e
 
@@ -224,14 +225,23 @@ def test_levels_hold_the_share_of_noise_they_name():
     assert share[2] == pytest.approx(0.0001, abs=0.0001)
 
 
-def test_body_meshes_are_closed_and_face_outwards():
-    for mesh in arm_meshes(ur10e()):
-        a, b, c = (mesh.vertices[mesh.triangles[:, k]] for k in range(3))
-        area = np.cross(b - a, c - a)
-        volume = float(np.einsum("ij,ij->", a, area)) / 6
-        assert volume > 0
-        outward = np.einsum("ij,ij->i", area, mesh.normals[mesh.triangles].mean(1))
-        assert outward.min() > -1e-12
+def test_the_arm_is_drawn_as_its_capsules(told, recording):
+    for i in range(told.arm.n + 1):
+        own = [c for c in capsules(told.arm) if c.body == i]
+        entity = f"/world/arm/body{i}"
+        (start,), (radius,), (length,), (turn,) = (
+            [x for chunk in RrdReader(recording).stream().filter(content=entity).to_chunks()
+             if name in (batch := chunk.to_record_batch()).schema.names
+             for x in batch.column(name).to_pylist()]
+            for name in ("Capsules3D:translations", "Capsules3D:radii", "Capsules3D:lengths",
+                         "Capsules3D:quaternions")
+        )  # fmt: skip
+        assert len(own) >= 1
+        np.testing.assert_allclose(start, [c.start for c in own], atol=1e-6)
+        np.testing.assert_allclose(radius, [c.radius for c in own], atol=1e-6)
+        axis = Rotation.from_quat(turn).apply([0.0, 0.0, 1.0])
+        end = np.array(start) + np.array(length)[:, None] * axis
+        np.testing.assert_allclose(end, [c.end for c in own], atol=1e-6)
 
 
 def test_arm_of_another_shape_is_drawn(tmp_path):

@@ -3,7 +3,7 @@
 import numpy as np
 
 from hilcal.data.plan import REFERENCE, UNLOADED
-from hilcal.report.viewer import plan_cell, plan_style, plan_words, style
+from hilcal.report.viewer import arm_shapes, plan_style, plan_words, style
 from hilcal.report.viewer.plan_digest import HIDDEN, SEEN, TURNED, UNKNOWN, plan_digest
 from hilcal.report.viewer.plan_stream import record_plan
 from hilcal.robot.chain import evaluate
@@ -31,7 +31,7 @@ def test_capsules_end_where_they_should_in_any_direction():
     way = np.random.default_rng(1).normal(size=(20, 3))
     way[:3] = [[0.0, 0.0, 0.4], [0.0, 0.0, -0.4], [0.0, 0.0, 0.0]]
     start = np.ones((20, 3))
-    made = plan_cell.capsules(start, start + way, np.full(20, 0.1), [(1, 2, 3)])
+    made = arm_shapes.capsules(start, start + way, np.full(20, 0.1), [(1, 2, 3)])
     quaternion = np.array(made.quaternions.as_arrow_array().to_pylist())
     length = np.array(made.lengths.as_arrow_array().to_pylist())
     np.testing.assert_allclose(length[:, None] * turned(quaternion), way, atol=1e-6)
