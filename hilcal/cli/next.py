@@ -106,7 +106,7 @@ def separates(found: Next) -> dict[str, object]:
     return {
         "separates": [[t.effect, t.rival, t.then] for t in found.told],
         "separates_now": [[t.effect, t.rival, t.now] for t in found.told],
-        "inseparable": [[t.effect, t.rival] for t in found.told if t.hopeless],
+        "inseparable": [[t.effect, t.rival] for t in found.told if t.not_separable],
         "difference": found.shares,
         "notes": list(found.notes),
     }

@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.linalg as sl
 
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Whitening
@@ -12,6 +11,7 @@ from hilcal.identify.residual import residual
 from hilcal.model import Model, Prediction
 from hilcal.regression.empirical_bayes import shrink
 from hilcal.regression.normal_equations import Basis, NormalEquations, find_basis, normal_equations
+from hilcal.regression.projection import Projection, projection
 from hilcal.types import Floats, Ints
 
 MAX_ITERATIONS = 20
@@ -60,19 +60,21 @@ class Solution:
     iterations: int
     converged: bool
 
-    def rest(self) -> Floats:
-        """(R,) whitened residual after the step that is left: `white` to within that step.
+    def projection(self) -> Projection:
+        """Return the projection off the columns of the model."""
+        ridge = self.beta * self.equations.basis.prior_precision
+        return projection(self.rows, ridge, self.equations.gram)
 
-        What is added to the model beside its own parameters is scored by this one. A column that
-        the model nearly explains would else be credited with the step that the model itself could
-        still take, divided by the little of it that the model does not explain.
-        """
+    def coordinates(self) -> Floats:
+        """Return z (K,) of the parameters that have a prior; zero for flat directions."""
         basis = self.equations.basis
         z = np.zeros(len(self.equations.rhs))
         z[len(basis.singular) :] = self.theta[basis.held] / self.prior[basis.held]
-        downhill = self.rows.T @ self.white - self.beta * basis.prior_precision * z
-        step = sl.cho_solve(self.equations.factor(self.beta), downhill, check_finite=False)
-        return np.asarray(self.white - self.rows @ step)
+        return z
+
+    def projected_residual(self) -> Floats:
+        """(R,) whitened residual after the model's remaining step: `white` to within that step."""
+        return self.projection().residual(self.white, self.coordinates())
 
 
 def prior_of(model: Model) -> tuple[Floats, Ints]:

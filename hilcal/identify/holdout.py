@@ -4,25 +4,20 @@ Whole poses are left out, never single readings: readings of one pose share its 
 fold is refitted by one Gauss-Newton step from the full fit, in which the fold's rows are
 taken out of the normal equations exactly.
 
-What a single pose has told of a direction, the others may not see at all. A flat estimate along
-it would be noise, magnified without limit, and one such pose would outweigh all others in the
-error. So without a fold the flat parameters have a prior about zero, whose standard deviation is
-their ordinary magnitude, or the rms of the effect's parameters in the full fit where that is more
-(empirical Bayes). A direction that the rest sees by s σ per ordinary magnitude shrinks by the
-share 1/(1 + s²): not at all where it is well seen, to the model without it where it is not.
+Without a fold the flat parameters have a prior about zero (see `regression.leave_out`), whose
+standard deviation is their ordinary magnitude, or the rms of the effect's parameters in the full
+fit where that is more.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg as sl
 
 from hilcal.data.whitening import Whitening
 from hilcal.identify.gauss_newton import Solution, scales_of
 from hilcal.model import Model
+from hilcal.regression.leave_out import Fold, folds
 from hilcal.types import Floats, Ints
-
-ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,25 +33,24 @@ class Folds:
     change: Floats
 
 
-def fold_equations(model: Model, solution: Solution) -> tuple[Floats, Floats]:
-    """Matrix (K, K) and right-hand side (K,) of a step from the fit, all folds still in them.
+def folds_of(model: Model, solution: Solution, fold: Ints) -> tuple[Fold, ...]:
+    """Return the normal equations of a fit without each fold.
 
     Args:
         model: the model.
         solution: its fit.
+        fold: (R,) fold of each row.
     """
-    basis, beta = solution.equations.basis, solution.beta
-    flat = slice(0, len(basis.singular))
-    h = solution.equations.gram + np.diag(beta * basis.prior_precision)
-    h[np.diag_indices_from(h)] += np.where(basis.prior_precision > 0, 0.0, ROUNDING)
-    pull = np.zeros(len(h))
-    held = basis.held
-    pull[flat.stop :] = solution.theta[held] / solution.prior[held]
-    known = ordinary(model, solution.theta)
-    per_ordinary = basis.transform[:, flat] / known[:, None]
-    h[flat, flat] += beta * per_ordinary.T @ per_ordinary
-    pull[flat] = per_ordinary.T @ (np.where(basis.flat, solution.theta, 0.0) / known)
-    return h, solution.rows.T @ solution.white - beta * pull
+    return folds(
+        solution.projection(),
+        solution.white,
+        solution.equations,
+        solution.theta,
+        solution.prior,
+        ordinary(model, solution.theta),
+        solution.beta,
+        fold,
+    )
 
 
 def ordinary(model: Model, theta: Floats) -> Floats:
@@ -77,16 +71,11 @@ def leave_out(model: Model, solution: Solution, fold: Ints, w: Whitening) -> Fol
         w: the scaling of the fit.
     """
     basis = solution.equations.basis
-    full, rhs = fold_equations(model, solution)
     live = basis.transform[solution.live]
-    of_row = w.rows_of(fold)
     predicted = solution.raw.copy()
     change = np.empty((int(fold.max()) + 1, basis.transform.shape[0]))
-    for f in range(len(change)):
-        out = of_row == f
-        rows = solution.rows[out]
-        h, b = full - rows.T @ rows, rhs - rows.T @ solution.white[out]
-        step = sl.solve(h, b, assume_a="pos", check_finite=False)
+    for f, equations in enumerate(folds_of(model, solution, w.rows_of(fold))):
+        step = equations.step()
         change[f] = basis.transform @ step
         mine = fold == f
         predicted[mine] -= solution.jacobian[mine] @ (live @ step)

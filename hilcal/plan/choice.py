@@ -10,11 +10,11 @@ from hilcal.plan.approximate_design import relax
 from hilcal.plan.candidate_set import Units
 from hilcal.plan.criteria import A, D, Linear
 from hilcal.plan.criterion import Criterion
+from hilcal.plan.discriminated_pairs import discriminated_pairs
 from hilcal.plan.eigenvalue_criteria import E, K
 from hilcal.plan.information import Problem
 from hilcal.plan.optimum import Curve, Design, best, curve
 from hilcal.plan.prediction_poses import WorkPoses
-from hilcal.plan.rivals import rivals
 from hilcal.plan.t_optimality import Separate
 from hilcal.types import Bools, Floats, Ints
 
@@ -71,7 +71,7 @@ def question(problem: Problem, name: str, work: WorkPoses | None) -> Question:
             raise InputError('criterion "test" needs test poses; see [planning] work_q_rad')
         return replace(whole, criterion=Linear(work.matrix(len(names))))
     if name == "separate":
-        apart = rivals(problem)
+        apart = discriminated_pairs(problem)
         return replace(whole, criterion=Separate(apart.pairs), prior=apart.prior)
     if name == "E":
         return replace(whole, criterion=E(unknown(problem)))

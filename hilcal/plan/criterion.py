@@ -7,14 +7,8 @@ from typing import Protocol
 import numpy as np
 
 from hilcal.errors import CannotAnswerError, InputError
+from hilcal.regression.schur import DETERMINED
 from hilcal.types import Bools, Floats
-
-DETERMINED = 1e-12
-"""Least eigenvalue of an information matrix of unit diagonal that counts as information.
-
-Products of double precision leave about 1e-16 times the number of rows in place of a zero; at
-1e-12 a parameter's standard uncertainty is a million times what it were if the others were known.
-"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

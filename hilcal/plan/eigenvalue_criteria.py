@@ -6,7 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilcal.plan.criterion import Smooth, require_determined, soft_least
-from hilcal.plan.schur import Left, left_for, values_left
+from hilcal.regression.schur import (
+    SchurComplement,
+    differentiable_schur_complement,
+    schur_complement,
+)
 from hilcal.types import Floats, Ints
 
 _FLOOR = 1e-14
@@ -16,8 +20,8 @@ _FLOOR = 1e-14
 class E:
     """φ(M) = λ_min(S): the worst determined direction of the parameters of interest.
 
-    O3 of Nahvi & Hollerbach (1996), IEEE ICRA; S is M, or what is left of it where other
-    parameters are unknown as well. The surrogate is the barrier of the semidefinite program
+    O3 of Nahvi & Hollerbach (1996), IEEE ICRA; S is the Schur complement of the other parameters,
+    M itself where all are of interest. The surrogate is the barrier of the semidefinite program
     max t, S ⪰ t 1: F = max over t of t + μ log det(S − t 1), whose gradient Z = μ (S − t 1)⁻¹ has
     trace 1: λ_min(N) ≤ tr(Z N).
 
@@ -32,22 +36,22 @@ class E:
 
     def value(self, m: Floats) -> Floats:
         """Return φ of (..., P, P) matrices."""
-        s = values_left(m, self.interest)
+        s = m if self.interest is None else schur_complement(m, self.interest)
         return np.asarray(np.maximum(np.linalg.eigvalsh(s)[..., 0], 0.0))
 
     def gradient(self, m: Floats) -> Floats:
         """Return (P, P) U v vᵀ Uᵀ, v the eigenvector of the least eigenvalue."""
-        left = left_for(m, self.interest)
-        v = np.linalg.eigh(left.s)[1][:, 0]
-        return left.whole(np.outer(v, v))
+        s = differentiable_schur_complement(m, self.interest)
+        v = np.linalg.eigh(s.matrix)[1][:, 0]
+        return s.embed(np.outer(v, v))
 
     def surrogate(self, m: Floats, order: float) -> Callable[[Floats], Smooth | None]:
         """Return f = F / λ_min(m) with μ = order · λ_min(m)."""
-        values = np.linalg.eigvalsh(left_for(m, self.interest).s)
+        values = np.linalg.eigvalsh(differentiable_schur_complement(m, self.interest).matrix)
         scale = max(float(values[0]), _FLOOR * float(values[-1]))
 
         def smooth(m: Floats) -> Smooth | None:
-            part = _least(left_for(m, self.interest), order * scale)
+            part = _least(differentiable_schur_complement(m, self.interest), order * scale)
             return Smooth(
                 part.value / scale,
                 part.gradient / scale,
@@ -123,14 +127,14 @@ class K:
         require_determined(m, names)
 
 
-def _least(left: Left, width: float) -> Smooth:
+def _least(s: SchurComplement, width: float) -> Smooth:
     """Return the smooth least eigenvalue of S as a function of M."""
-    part = _part(*np.linalg.eigh(left.s), width)
-    gradient = left.whole(part.gradient)
-    products = tuple((c, left.whole(x), left.whole(y)) for c, x, y in part.products)
-    if left.others is not None:
-        products = (*products, (-2.0, gradient, left.others))
-    squares = tuple((c, left.whole(v)) for c, v in part.squares)
+    part = _part(*np.linalg.eigh(s.matrix), width)
+    gradient = s.embed(part.gradient)
+    products = tuple((c, s.embed(x), s.embed(y)) for c, x, y in part.products)
+    if s.inverse is not None:
+        products = (*products, (-2.0, gradient, s.inverse))
+    squares = tuple((c, s.embed(v)) for c, v in part.squares)
     return Smooth(part.value, gradient, products, squares, gradient)
 
 

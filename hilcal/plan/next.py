@@ -10,11 +10,19 @@ from hilcal.config import CellConfig
 from hilcal.data.plan import REFERENCE, UNLOADED
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.fit import Fit
+from hilcal.plan.discriminated_pairs import (
+    LEVEL,
+    DiscriminatedPairs,
+    discriminated_pairs,
+    not_separable_message,
+    pair_of,
+    power,
+    supported_parameters,
+)
 from hilcal.plan.feasible import Space
 from hilcal.plan.information import Problem, readings_of
 from hilcal.plan.order import Chosen, Ordering, order_plan
 from hilcal.plan.planner import Planned, Request, Say, make
-from hilcal.plan.rivals import LEVEL, Rivals, estimated, never, power, rivals
 from hilcal.plan.t_optimality import Pair
 from hilcal.robot.chain import evaluate
 from hilcal.types import Floats
@@ -38,14 +46,14 @@ class Told:
         rival: the one that is fitted in its stead.
         now: chance that the readings so far reject the rival, by a test at 1 %.
         then: the same with the planned readings.
-        hopeless: whether no measurement in this cell would do.
+        not_separable: whether no measurement in this cell would do.
     """
 
     effect: str
     rival: str
     now: float
     then: float
-    hopeless: bool
+    not_separable: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,7 +89,7 @@ def measure_next(
     """Plan the measurements that separate suspects.
 
     The criterion is the least non-centrality over all pairs of them, at the parameters that the
-    readings so far tell of each and at others that could be as well; see `rivals`.
+    readings so far tell of each and at others that could be as well; see `discriminated_pairs`.
 
     Args:
         cell: the cell.
@@ -121,41 +129,44 @@ def measure_next(
     if reference is not None and not np.array_equal(reference, made.ordered.plan.q[0]):
         made = _from_reference(cell, config, made, reference, rng, request)
     say("working out what it will tell")
-    of = rivals(made.problem)
+    of = discriminated_pairs(made.problem)
     then = of.prior + made.problem.units.information(made.counts)
     told = tuple(_told(made.problem, of, names, then))
     seen = {e.name for e in made.problem.families}
     lost = [n for n in names if n not in seen]
     notes = tuple(n for n in made.problem.notes if n.split(":")[0] in lost)
-    if of.hopeless:
-        notes = (*notes, never(of.hopeless))
+    if of.not_separable:
+        notes = (*notes, not_separable_message(of.not_separable))
     weakest = min(of.pairs, key=lambda pair: power(pair, then))
     shares, stretched = _where(made, weakest, then)
     return Next(made, told, shares, stretched, notes)
 
 
-def expected(problem: Problem, names: tuple[str, str], of: Rivals, information: Floats) -> float:
+def expected(
+    problem: Problem, names: tuple[str, str], of: DiscriminatedPairs, information: Floats
+) -> float:
     """Return the power of a pair, the mean over what its effect could be.
 
     Args:
         problem: the design problem.
         names: effect that is there, rival that is fitted.
         of: all pairs.
-        information: (P, P) of all readings, with `Rivals.prior`.
+        information: (P, P) of all readings, with `DiscriminatedPairs.prior`.
     """
     e, f = names
     where = problem.of_effect(e)
-    nuisance = np.concatenate([np.arange(problem.model_size), problem.of_effect(f)])
-    draws = estimated(problem, DRAWS).get(e)
+    draws = supported_parameters(problem, DRAWS).get(e)
     if draws is None:
         betas = [p.beta for p, n in zip(of.pairs, of.names, strict=True) if n[0] == e]
     else:
         betas = list(draws / problem.scale[where])
-    each = [power(Pair(where, b, nuisance, f"{e} from {f}"), information) for b in betas]
+    each = [power(pair_of(problem, (e, f), b), information) for b in betas]
     return float(np.mean(each)) if each else LEVEL
 
 
-def _told(problem: Problem, of: Rivals, names: tuple[str, ...], then: Floats) -> list[Told]:
+def _told(
+    problem: Problem, of: DiscriminatedPairs, names: tuple[str, ...], then: Floats
+) -> list[Told]:
     """All pairs of the suspects, those that need more first."""
     seen = {e.name for e in problem.families}
     out = []
@@ -167,8 +178,8 @@ def _told(problem: Problem, of: Rivals, names: tuple[str, ...], then: Floats) ->
                 out.append(Told(e, f, LEVEL, LEVEL, e not in seen))
                 continue
             now = expected(problem, (e, f), of, of.prior)
-            hopeless = (e, f) in of.hopeless
-            out.append(Told(e, f, now, expected(problem, (e, f), of, then), hopeless))
+            not_separable = (e, f) in of.not_separable
+            out.append(Told(e, f, now, expected(problem, (e, f), of, then), not_separable))
     return out
 
 
@@ -224,7 +235,7 @@ def _where(made: Planned, pair: Pair, then: Floats) -> tuple[dict[str, float], f
     Deflections that share an unloaded reading are correlated: a load's share is then what it
     adds to those before it.
     """
-    of, u = made.problem, pair.best(then)[0]
+    of, u = made.problem, pair.residual(then)
     taken = np.flatnonzero(made.counts)
     worth = np.array([float(np.sum((of.units.rows[k] @ u) ** 2)) for k in taken])
     worth *= made.counts[taken]

@@ -1,8 +1,10 @@
-"""What has been measured already tells of the parameters."""
+"""The information of the readings that a model was fitted to."""
 
 import numpy as np
 
 from hilcal.effects.protocol import Effect
+from hilcal.identify.gauss_newton import scales_of
+from hilcal.identify.linearisation import computable, effect_columns, model_columns
 from hilcal.plan.nominal_model import Assumed
 from hilcal.types import Floats
 
@@ -10,36 +12,23 @@ from hilcal.types import Floats
 def information_of(assumed: Assumed, more: tuple[Effect, ...], scale: Floats) -> Floats:
     """Return AᵀA (P, P) of the readings that the assumed model was fitted to; zero without any.
 
-    A are the derivatives at the fit, whitened by the readings' own covariances: exactly what
-    the fit's normal equations hold, before its priors.
+    A is the Jacobian at the fit, whitened by the readings' own covariances: what the fit's normal
+    equations hold, without its priors.
 
     Args:
         assumed: the model, whose live parameters come first.
-        more: effects that are not in the model; what the readings cannot show of them because
-            they lack a column stays unknown.
+        more: effects that are not in the model. Those that cannot be computed from these readings,
+            which lack a column, have no information.
         scale: (P,) what one unit of each parameter is, SI.
     """
     fit = assumed.fit
     if fit is None:
         return np.zeros((len(scale), len(scale)))
-    solution, w = fit.solution, fit.whitening
-    shown = tuple(e for e in more if type(e).computable(solution.prediction.situation.states))
-    model = fit.model
-    start, place = len(assumed.live), [np.arange(len(assumed.live))]
-    live = [assumed.live]
-    at = model.size
+    ordinary = [scales_of(fit.model)[assumed.live]]
+    columns = [model_columns(fit)[:, assumed.live]]
     for e in more:
-        size = len(e.parameters)
-        if e in shown:
-            place.append(start + np.arange(size))
-            live.append(at + np.arange(size))
-            at += size
-        start += size
-    where = np.concatenate(place)
-    jacobian = model.jacobian_of(
-        (*model.effects, *shown), solution.prediction, fit.theta, w.m, np.concatenate(live)
-    )
-    a = w.whiten(w.raw(jacobian * scale[where])).reshape(-1, len(where))
-    out = np.zeros((len(scale), len(scale)))
-    out[np.ix_(where, where)] = a.T @ a
-    return out
+        ordinary.append(np.array([p.scale for p in e.parameters]))
+        missing = np.zeros((len(fit.white), len(e.parameters)))
+        columns.append(effect_columns(fit, e).white if computable(fit, e) else missing)
+    a = np.hstack(columns) * (scale / np.concatenate(ordinary))
+    return np.asarray(a.T @ a)

@@ -16,10 +16,10 @@ from hilcal.plan.confounding import Confounding
 from hilcal.plan.information import Problem
 from hilcal.plan.planner import Planned, Say
 from hilcal.plan.predicted import Predicted, predicted
-from hilcal.plan.rivals import VISIBLE
-from hilcal.plan.schur import left_for
 from hilcal.plan.story import Bought, Enough, OrderStory, PlanStory, Promised, Seen
-from hilcal.types import Floats, Ints
+from hilcal.regression.evidence import VISIBLE
+from hilcal.regression.schur import schur_complement
+from hilcal.types import Floats
 
 COMPARED = ("D", "A", "E", "K", "test")
 SHARES = (0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
@@ -135,7 +135,7 @@ def _row(made: Planned, name: str, counts: Floats, efficiency: float) -> Bought:
     knows = predicted(of, counts, work=made.work)
     taken = np.flatnonzero(counts)
     known = of.units.information(counts[taken], taken)
-    left = left_for(of.prior + known, free).s
+    left = schur_complement(of.prior + known, free)
     sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(left), 0.0))
     alone = np.sqrt(np.maximum(np.linalg.eigvalsh(known[np.ix_(free, free)]), 0.0))
     readings = float(counts @ of.units.cost)
@@ -215,7 +215,7 @@ def _seen(made: Planned, config: CellConfig) -> Iterator[Seen]:
     rng = np.random.default_rng(_SEED)
     for effect in of.families:
         where = of.of_effect(effect.name)
-        left = _left(information, where, size)
+        left = schur_complement(information, where, np.arange(size))
         least = []
         for _ in range(DRAWS):
             beta = rng.standard_normal(len(where))
@@ -223,14 +223,6 @@ def _seen(made: Planned, config: CellConfig) -> Iterator[Seen]:
             size_m = float(np.sqrt(3.0 * np.mean((moved[:, where] @ beta) ** 2)))
             least.append(size_m / np.sqrt(apart) if apart > VISIBLE * len(where) else np.inf)
         yield Seen(effect.name, _finite(float(np.median(least))))
-
-
-def _left(information: Floats, where: Ints, size: int) -> Floats:
-    """Information of some parameters when the model's are unknown as well."""
-    model = np.arange(size)
-    cross = information[np.ix_(model, where)]
-    solved = np.linalg.lstsq(information[:size, :size], cross, rcond=1e-12)[0]
-    return np.asarray(information[np.ix_(where, where)] - cross.T @ solved)
 
 
 def _order(own: Confounding, shortest: Confounding, made: Planned) -> OrderStory:

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.plan.criterion import DETERMINED, Smooth, soft_least
+from hilcal.plan.criterion import Smooth, soft_least
+from hilcal.regression.schur import DETERMINED, inverse_root, nuisance_inverse
 from hilcal.types import Floats, Ints
 
-_SOUND = 1e-2  # share of the largest inverse up to which Cholesky's factor serves
 _FELT = 1e-5  # weight from which a pair enters the curvature
 
 
@@ -39,52 +39,21 @@ class Pair:
         if len(np.intersect1d(self.effect, self.nuisance)):
             raise InputError(f"{self.name}: a parameter is on both sides")
 
-    def best(self, m: Floats) -> tuple[Floats, Floats]:
-        """Return the part u (P,) that stays unexplained, and the inverse (P, P) it is solved by.
+    def residual(self, m: Floats, inverse: Floats | None = None) -> Floats:
+        """Return the parameters u (P,) of the residual after model and rival are fitted.
 
-        u has β at the effect and −M_nn⁻¹ M_ne β at the nuisance; uᵀ M u is the least of vᵀ M v
-        over all v with β at the effect. Directions without information explain nothing.
+        u has β at the effect and −M_nn⁻ M_ne β at the nuisance: uᵀ M u = βᵀ S β is the minimum of
+        vᵀ M v over all v with β at the effect, with S the Schur complement of the nuisance.
+
+        Args:
+            m: (P, P) information M.
+            inverse: (P, P) `nuisance_inverse` where it is known.
         """
-        solver = _solver(m, self.nuisance)
-        return self.left(m, solver), solver
-
-    def left(self, m: Floats, solver: Floats) -> Floats:
-        """Return u (P,), given the inverse of the nuisance."""
         u = np.zeros(len(m))
         u[self.effect] = self.beta
-        return u - solver @ (m @ u)
-
-
-def _solver(m: Floats, nuisance: Ints) -> Floats:
-    """Return (P, P) the inverse of the nuisance block, of the directions with information."""
-    out = np.zeros_like(m)
-    part = _factor(m[None], nuisance)[0]
-    out[np.ix_(nuisance, nuisance)] = part.T @ part
-    return out
-
-
-def _factor(m: Floats, nuisance: Ints) -> Floats:
-    """Return (N, F, F) T with Tᵀ T the inverse of the nuisance blocks of (N, P, P) matrices.
-
-    Of directions without information, zero rows.
-    """
-    block = m[:, nuisance[:, None], nuisance]
-    root = np.sqrt(np.maximum(np.diagonal(block, axis1=1, axis2=2), 0.0))
-    root[root == 0.0] = 1.0
-    scaled = block / (root[:, :, None] * root[:, None, :])
-    try:
-        out = np.linalg.inv(np.linalg.cholesky(scaled))
-        # the trace of the inverse is at least the inverse of the least eigenvalue
-        sound = np.einsum("nij,nij->n", out, out) < _SOUND / DETERMINED
-    except np.linalg.LinAlgError:
-        out = np.zeros_like(scaled)
-        sound = np.zeros(len(m), dtype=np.bool_)
-    for k in np.flatnonzero(~sound):
-        values, vectors = np.linalg.eigh(scaled[k])
-        kept = values > DETERMINED
-        inverse_root = np.where(kept, 1.0 / np.sqrt(np.where(kept, values, 1.0)), 0.0)
-        out[k] = inverse_root[:, None] * vectors.T
-    return np.asarray(out / root[:, None, :])
+        if inverse is None:
+            inverse = nuisance_inverse(m, self.nuisance)
+        return u - inverse @ (m @ u)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,7 +94,7 @@ class Separate:
             for j, k in enumerate(members):
                 beta[self.pairs[k].effect, j] = self.pairs[k].beta
             moved = flat @ beta
-            explained = _factor(flat, nuisance) @ moved[:, nuisance]
+            explained = inverse_root(flat[:, nuisance[:, None], nuisance]) @ moved[:, nuisance]
             out[:, members] = np.einsum("pj,npj->nj", beta, moved)
             out[:, members] -= np.einsum("nfj,nfj->nj", explained, explained)
         return np.maximum(out, 0.0).reshape(*m.shape[:-2], len(self.pairs))
@@ -136,7 +105,7 @@ class Separate:
         for pair in self.pairs:
             key = pair.nuisance.tobytes()
             if key not in known:
-                known[key] = _solver(m, pair.nuisance)
+                known[key] = nuisance_inverse(m, pair.nuisance)
         return [(pair, known[pair.nuisance.tobytes()]) for pair in self.pairs]
 
     def value(self, m: Floats) -> Floats:
@@ -145,7 +114,7 @@ class Separate:
 
     def gradient(self, m: Floats) -> Floats:
         """Return (P, P) u uᵀ of the weakest pair."""
-        u = self.pairs[int(np.argmin(self.parts(m)))].best(m)[0]
+        u = self.pairs[int(np.argmin(self.parts(m)))].residual(m)
         return np.outer(u, u)
 
     def surrogate(self, m: Floats, order: float) -> Callable[[Floats], Smooth | None]:
@@ -156,7 +125,7 @@ class Separate:
 
     def _smooth(self, m: Floats, width: float, scale: float) -> Smooth | None:
         """Return the smooth least of the pairs, its derivative Σ p u uᵀ."""
-        found = [(pair.left(m, solver), solver) for pair, solver in self._solved(m)]
+        found = [(pair.residual(m, inverse), inverse) for pair, inverse in self._solved(m)]
         us = np.array([u for u, _ in found])
         parts = np.einsum("ni,ij,nj->n", us, m, us)
         if not np.isfinite(parts).all() or width <= 0.0:
@@ -172,8 +141,8 @@ class Separate:
             if p_i > _FELT
         ]
         products = [
-            (-2.0 * p_i / scale, u, solver)
-            for p_i, (u, solver) in zip(p, found, strict=True)
+            (-2.0 * p_i / scale, u, inverse)
+            for p_i, (u, inverse) in zip(p, found, strict=True)
             if p_i > _FELT
         ]
         return Smooth(value / scale, gradient / scale, tuple(products), tuple(squares), gradient)
@@ -181,7 +150,7 @@ class Separate:
     def sure(self, m: Floats, names: Sequence[str] | None) -> None:
         """Refuse pairs that no candidate separates."""
         for pair in self.pairs:
-            u = pair.best(m)[0]
+            u = pair.residual(m)
             alone = np.zeros(len(m))
             alone[pair.effect] = pair.beta
             if float(u @ m @ u) <= DETERMINED * float(alone @ m @ alone) or not np.any(m @ alone):

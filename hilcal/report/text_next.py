@@ -25,7 +25,7 @@ def next_report(found: Next, poses: int, readings: int) -> Iterator[RenderableTy
     yield text.heading("Telling the suspects apart")
     out = text.table("if this is there", "this is ruled out", "now", "then", left=(0, 1))
     for t in found.told:
-        then = "never" if t.hopeless else numbers.percent(t.then)
+        then = "never" if t.not_separable else numbers.percent(t.then)
         out.add_row(t.effect, t.rival, numbers.percent(t.now), then)
     yield out
     yield Text(
@@ -40,7 +40,7 @@ def next_report(found: Next, poses: int, readings: int) -> Iterator[RenderableTy
 
 def summary(told: Sequence[Told], poses: int, readings: int) -> str:
     """Say in a sentence what the plan will settle."""
-    able = [t for t in told if not t.hopeless]
+    able = [t for t in told if not t.not_separable]
     least = min(able, key=lambda t: t.then)
     head = f"{readings} readings at {poses} poses"
     if least.then >= SURE and len(able) == len(told):

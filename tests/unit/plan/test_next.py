@@ -12,12 +12,18 @@ from hilcal.diagnose.projection import projection
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
+from hilcal.identify.linearisation import linearise
+from hilcal.plan.discriminated_pairs import (
+    LEVEL,
+    discriminated_pairs,
+    not_separable_message,
+    power,
+)
+from hilcal.plan.effect_estimate import estimate
 from hilcal.plan.information import Problem, problem
 from hilcal.plan.next import measure_next
 from hilcal.plan.nominal_model import after
 from hilcal.plan.planner import Request
-from hilcal.plan.rivals import LEVEL, never, power, rivals
-from hilcal.plan.suspects import estimate
 from hilcal.plan.t_optimality import Pair
 from hilcal.refine import add
 from hilcal.types import Floats
@@ -97,9 +103,9 @@ def told(effect: str, strength: float, seed: int = 2) -> tuple[Fit, Floats, Prob
 
 def test_an_estimate_holds_the_true_parameters() -> None:
     found, true, of = told(TILT, 4.0)
-    made = estimate(found, next(e for e in of.families if e.name == TILT))
+    made = estimate(linearise(found), next(e for e in of.families if e.name == TILT))
     assert made is not None
-    assert made.told
+    assert made.supported
     off = made.mean - true
     distance2 = off @ np.linalg.solve(made.root @ made.root.T, off)
     assert distance2 < stats.chi2.isf(1e-4, len(true))
@@ -111,15 +117,15 @@ def test_an_estimate_holds_the_true_parameters() -> None:
 
 def test_readings_that_do_not_speak_for_an_effect_tell_no_strength() -> None:
     found, _, of = told("hysteresis", 0.0)
-    made = estimate(found, of.families[0])
+    made = estimate(linearise(found), of.families[0])
     assert made is not None
-    assert not made.told
+    assert not made.supported
     blind = replace(found.solution.prediction.situation.states, approach=None)
     situation = replace(found.solution.prediction.situation, states=blind)
     prediction = replace(found.solution.prediction, situation=situation)
     without = replace(found, solution=replace(found.solution, prediction=prediction))
     hysteresis = next(e for e in of.families if e.name == "hysteresis")
-    assert estimate(without, hysteresis) is None
+    assert estimate(linearise(without), hysteresis) is None
 
 
 # the plan
@@ -133,7 +139,7 @@ def test_pairs_that_no_measurement_separates_are_said_so() -> None:
         measure_next(
             cell_from_config(SMALL), SMALL, first.fit, ("tracker_scale", LINK), Request(4), rng
         )
-    assert never([("a", "b"), ("a", "c"), ("b", "a"), ("c", "d")]) == (
+    assert not_separable_message([("a", "b"), ("a", "c"), ("b", "a"), ("c", "d")]) == (
         "no measurement in this cell separates a from b or c, nor c from d"
     )
 
@@ -155,7 +161,7 @@ def test_a_pair_that_looks_the_same_everywhere_is_left_out() -> None:
         matrix[:, size:] = 0.0
     alike = replace(of, units=replace(of.units, rows=rows), measured=measured, prior=prior)
     with pytest.raises(CannotAnswerError, match=f"in this cell separates {TILT} from {LINK}"):
-        rivals(alike, fitted={})
+        discriminated_pairs(alike, fitted={})
 
 
 @pytest.mark.parametrize("suspects", [(TILT,), (TILT, TILT)])

@@ -231,7 +231,7 @@ def test_separation_is_what_a_fit_leaves(twice: bool) -> None:
     assert criterion.parts(a.T @ a) == pytest.approx(left, rel=1e-8)
     assert float(criterion.value(a.T @ a)) == pytest.approx(min(left), rel=1e-8)
     for pair, expected in zip(criterion.pairs, left, strict=True):
-        u = pair.best(a.T @ a)[0]
+        u = pair.residual(a.T @ a)
         assert np.sum((a @ u) ** 2) == pytest.approx(expected, rel=1e-8)
 
 

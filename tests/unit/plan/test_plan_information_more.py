@@ -9,12 +9,12 @@ from scipy.stats import chi2
 from hilcal.data.whitening import MODES
 from hilcal.effects.catalogue import installed
 from hilcal.errors import CannotAnswerError, InputError
+from hilcal.plan.discriminated_pairs import LEVEL, discriminated_pairs, power, powers
 from hilcal.plan.information import problem
 from hilcal.plan.nominal_model import assumed, nominal_states
 from hilcal.plan.potential import MOST_ORDINARY, MOST_PARAMETERS
 from hilcal.plan.predicted import predicted
 from hilcal.plan.prediction_poses import work_poses
-from hilcal.plan.rivals import LEVEL, power, powers, rivals
 from hilcal.robot.chain import evaluate
 from tests.support.campaigns import cell_of
 from tests.support.plan_cases import config_of, everything_once, poses_of
@@ -157,7 +157,7 @@ def test_power_is_the_share_of_campaigns_that_find_the_effect():
     """Whitened campaigns with the effect in them, tested against model and rival."""
     p = made(against=("joint_tilt_compliance", "joint_stiffening"), poses=8)
     counts = everything_once(p)
-    of = rivals(p)
+    of = discriminated_pairs(p)
     assert set(of.names) == {
         ("joint_tilt_compliance", "joint_stiffening"),
         ("joint_stiffening", "joint_tilt_compliance"),
@@ -166,7 +166,7 @@ def test_power_is_the_share_of_campaigns_that_find_the_effect():
     rows = p.units.rows[counts > 0].reshape(-1, len(p.terms))
     rng = np.random.default_rng(1)
     for strong in (of.pairs[0], of.pairs[-1]):
-        u = strong.best(m)[0]
+        u = strong.residual(m)
         pair = replace(strong, beta=strong.beta * np.sqrt(9.0 / (u @ m @ u)))
         nuisance, effect = rows[:, pair.nuisance], rows[:, pair.effect]
         fitted = np.linalg.qr(nuisance)[0]
@@ -186,11 +186,11 @@ def test_given_strengths_and_wrong_suspects():
     p = made(against=("joint_tilt_compliance", "joint_stiffening"), poses=8)
     k = p.of_effect("joint_stiffening")
     size = 3.0 * p.scale[k]
-    of = rivals(p, fitted={"joint_stiffening": size})
+    of = discriminated_pairs(p, fitted={"joint_stiffening": size})
     mine = [pair for pair, (e, _) in zip(of.pairs, of.names, strict=True) if "stiff" in e]
     assert len(mine) == 1
     assert mine[0].beta == pytest.approx(np.full(6, 3.0))
     with pytest.raises(InputError, match="ghost is not among the potential terms; valid: joint_"):
-        rivals(p, ("ghost", "joint_stiffening"))
+        discriminated_pairs(p, ("ghost", "joint_stiffening"))
     with pytest.raises(InputError, match="1 effects to tell apart"):
-        rivals(p, ("joint_stiffening",))
+        discriminated_pairs(p, ("joint_stiffening",))

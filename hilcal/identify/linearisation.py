@@ -1,0 +1,187 @@
+"""The linearisation of a fit: what effects beside the model would explain, by algebra alone.
+
+The ranking of effects that could be missing and the planning of measurements that separate them
+both use it, so that the planner's power and the diagnosis's test are of the same information.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from hilcal.effects.protocol import Effect
+from hilcal.identify.fit import Fit
+from hilcal.identify.folds import random_folds
+from hilcal.identify.gauss_newton import scales_of
+from hilcal.identify.holdout import folds_of
+from hilcal.regression.backward_elimination import ReducedModel, eliminate_columns
+from hilcal.regression.evidence import FamilyScore, score_family
+from hilcal.regression.leave_out import Fold, left_out_residual
+from hilcal.regression.paired_test import improves
+from hilcal.regression.projection import Projection
+from hilcal.types import Floats
+
+LEAST_MISFIT = 3.0
+"""A misfit counts as at least so many standard deviations of χ²; a choice."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EffectColumns:
+    """The columns of an effect in ordinary magnitudes of its parameters.
+
+    Attributes:
+        effect: the effect.
+        scale: (P,) ordinary magnitudes, SI.
+        white: (R, P) whitened columns.
+        motion: (D, 3, P) displacement of each measured position, m.
+    """
+
+    effect: Effect
+    scale: Floats
+    white: Floats
+    motion: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class HeldOut:
+    """What a family explains on poses left out.
+
+    Attributes:
+        share: of the misfit; negative where it makes predictions worse.
+        sure: whether the error falls by more than it scatters from pose to pose.
+    """
+
+    share: float
+    sure: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Linearisation:
+    """A gc-scaled fit as a linear problem.
+
+    Attributes:
+        fit: the fit.
+        projection: M, off the columns of the fitted model.
+        residual: (R,) whitened residual r, after the step that the model could still take.
+    """
+
+    fit: Fit
+    projection: Projection
+    residual: Floats
+
+    @property
+    def rows(self) -> Floats:
+        """(R, K) whitened Jacobian of the model by identifiable coordinates."""
+        return self.projection.rows
+
+    @cached_property
+    def rss(self) -> float:
+        """‖r‖²."""
+        return float(self.residual @ self.residual)
+
+    @cached_property
+    def left_out(self) -> Floats:
+        """(poses,) squared whitened residual of each pose, predicted without it."""
+        return left_out_by_pose(self.fit)
+
+    @cached_property
+    def folds(self) -> tuple[Fold, ...]:
+        """The model without each fold of poses."""
+        fit = self.fit
+        return folds_of(fit.model, fit.solution, fit.whitening.rows_of(random_folds(fit.pose)))
+
+    def project_out(self, x: Floats) -> Floats:
+        """Return M X of whitened columns X (R, P)."""
+        return self.projection.project_out(x)
+
+    def information(self, x: Floats) -> Floats:
+        """Return S = Xᵀ M X (P, P) of whitened columns X (R, P)."""
+        return self.projection.information(x)
+
+    def score(self, x: Floats, s: Floats | None = None) -> FamilyScore:
+        """Score whitened columns X (R, P) beside the model.
+
+        Args:
+            x: X.
+            s: (P, P) S where it is known.
+        """
+        s = self.information(x) if s is None else s
+        return score_family(s, x.T @ self.residual, self.rss, self.fit.dof)
+
+    def misfit(self) -> float:
+        """‖r‖² − dof, the part that noise does not explain, at least `LEAST_MISFIT` of its σ."""
+        dof = self.fit.dof
+        return float(max(self.rss - dof, LEAST_MISFIT * np.sqrt(2 * dof)))
+
+    def share(self, gain: float) -> float:
+        """Share of the misfit that a reduction of ‖r‖² is, within [0, 1]."""
+        return float(np.clip(gain / self.misfit(), 0.0, 1.0))
+
+    def held_out(self, x: Floats, found: FamilyScore) -> HeldOut:
+        """Return what a family explains on poses left out; see `leave_out`.
+
+        Args:
+            x: (R, P) whitened columns of the family.
+            found: their score, for the ridge.
+        """
+        if found.rank == 0:
+            return HeldOut(0.0, False)
+        left = left_out_residual(self.folds, self.projection, self.fit.white, x, found.ridge)
+        noise = self.fit.whitening.rank
+        before, after = self.left_out, by_pose(self.fit, left)
+        misfit = max(float(before.sum()) - noise, LEAST_MISFIT * np.sqrt(2 * noise))
+        gain = float(before.sum() - after.sum())
+        return HeldOut(float(np.clip(gain / misfit, -1.0, 1.0)), improves(before, after))
+
+
+def linearise(fit: Fit) -> Linearisation:
+    """Return the linearisation of a gc-scaled fit."""
+    return Linearisation(fit, fit.solution.projection(), fit.solution.projected_residual())
+
+
+def computable(fit: Fit, effect: Effect) -> bool:
+    """Whether the fitted readings have the columns that an effect needs."""
+    return type(effect).computable(fit.solution.prediction.situation.states)
+
+
+def effect_columns(fit: Fit, effect: Effect) -> EffectColumns:
+    """Return the columns of an effect that is not in the model, at the parameters of the fit."""
+    s, w = fit.solution, fit.whitening
+    jacobian = fit.model.jacobian_of((effect,), s.prediction, s.theta, w.m)
+    scale = np.array([q.scale for q in effect.parameters])
+    raw = w.raw(jacobian * scale)
+    return EffectColumns(effect, scale, w.whiten(raw).reshape(-1, len(scale)), raw[:, :3])
+
+
+def model_columns(fit: Fit) -> Floats:
+    """Whitened Jacobian (R, P) of all parameters of a fit, in ordinary magnitudes."""
+    scale, s, w = scales_of(fit.model), fit.solution, fit.whitening
+    jacobian = fit.model.jacobian(s.prediction, s.theta, w.m) * scale
+    return w.whiten(w.raw(jacobian)).reshape(-1, len(scale))
+
+
+def eliminate_effect(fit: Fit, columns: Floats, effect: str) -> ReducedModel:
+    """Take an effect out of a fit, at the same linearisation.
+
+    Args:
+        fit: the fit.
+        columns: (R, P) its `model_columns`.
+        effect: name of the effect, which is in its model.
+    """
+    out = np.zeros(columns.shape[1], dtype=np.bool_)
+    out[fit.model.slices()[fit.model.names.index(effect)]] = True
+    s, scale = fit.solution, scales_of(fit.model)
+    return eliminate_columns(
+        columns, fit.white, s.theta / scale, s.prior / scale, out, s.beta, fit.whitening.rank
+    )
+
+
+def by_pose(fit: Fit, white: Floats) -> Floats:
+    """(poses,) sums of squared whitened residuals (R,)."""
+    squares = np.sum(white.reshape(len(fit.pose), -1) ** 2, axis=1)
+    return np.asarray(np.bincount(fit.pose, weights=squares), dtype=float)
+
+
+def left_out_by_pose(fit: Fit) -> Floats:
+    """(poses,) squared whitened residual of each pose, predicted without it."""
+    return by_pose(fit, fit.whitening.whiten(fit.left_out).reshape(-1))
