@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,9 @@ from hilcal.identify import fit_document
 from hilcal.identify.fit import Fit, fit
 from hilcal.model import Model
 from hilcal.types import Floats
+
+SOURCES = "effects_from"
+"""Key among the options of a revision: the files that its effects are from."""
 
 
 def to_record(
@@ -51,6 +55,7 @@ def to_record(
             "readings": found.mode,
             "scaling": found.scaling,
             "effects": {e.name: dict(e.options) for e in effects},
+            **_sources(found.model),
         },
         data_hash=data_hash,
         program_version=__version__,
@@ -135,14 +140,30 @@ def chain(records: tuple[RevisionRecord, ...]) -> tuple[RevisionRecord, ...]:
     return records[max(first, 0) :]
 
 
-def usual_mode(readings: Readings) -> Mode:
-    """Deflections where every loaded reading has an unloaded one in its pose and cycle."""
-    unloaded = readings.unloaded
-    if unloaded.all():
-        return "absolute"
-    key = np.stack([readings.pose, readings.cycle], axis=1)
-    _, group = np.unique(key, axis=0, return_inverse=True)
-    group = group.reshape(-1)
-    has = np.zeros(int(group.max()) + 1, dtype=bool)
-    has[group[unloaded]] = True
-    return "deflection" if has[group[~unloaded]].all() else "absolute"
+def _sources(model: Model) -> dict[str, dict[str, dict[str, str]]]:
+    """File and hash of those effects that are from files; nothing where none is."""
+    files = {name: model.catalogue.file_of(name) for name in model.names}
+    own = {n: {"file": f.path, "sha256": f.sha256} for n, f in files.items() if f is not None}
+    return {SOURCES: own} if own else {}
+
+
+def check_sources(record: RevisionRecord, run: Path, catalogue: Catalogue) -> None:
+    """Refuse a revision whose effects are not at hand as they were when it was fitted.
+
+    Raises:
+        InputError: an effect is not in the catalogue, or its file has changed since.
+    """
+    stored = record.options.get(SOURCES, {})
+    for name in record.effects:
+        then, now = stored.get(name), catalogue.file_of(name)
+        if name not in catalogue.names:
+            where = f"--effects-from {then['file']}" if then else "--effects-from FILE.py"
+            raise InputError(
+                f"{run}: revision {record.number} has the effect {name}, which is not in the "
+                f"catalogue; give the file that defines it: {where}"
+            )
+        if then and now and then["sha256"] != now.sha256:
+            raise InputError(
+                f"{run}: revision {record.number} was fitted with another {name}: {now.path} has "
+                "changed since then; fit again: hilcal identify or refine"
+            )

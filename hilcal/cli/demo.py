@@ -10,7 +10,7 @@ import typer
 from drivers.simulated.rehearsal import NOTHING, RANDOM, Rehearsal, check_choice
 from hilcal.cli.doubting import FIRST, STRENGTH, Doubted, doubted, in_doubt
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
-from hilcal.cli.files import check_record, record_of, record_story
+from hilcal.cli.files import check_record, record_story
 from hilcal.cli.plan_output import POSES
 from hilcal.cli.refining import Row, revisions_json
 from hilcal.cli.rehearsing import Told, first_plan, in_process, on_devices
@@ -27,6 +27,7 @@ from hilcal.refine import refine as refine_model
 from hilcal.report import numbers, text, text_demo, text_refine
 from hilcal.report.build_story import Chapter
 from hilcal.report.progress import Say, working
+from hilcal.revisions import to_record
 from hilcal.robot.catalogue import configs_dir
 
 CELL = "demo_ur10e.toml"
@@ -92,9 +93,9 @@ def demo(
         found = refine_model(model, r.readings, r.mode, say)
     with Campaign.open(output) as campaign:
         if doubt is not None and doubt.plan is not None:
-            campaign.append_revision(record_of(doubt.fit, doubt.diagnosis, None, doubt.hashed))
+            campaign.append_revision(to_record(doubt.fit, doubt.diagnosis, None, doubt.hashed))
         numbered = [
-            campaign.append_revision(record_of(s.fit, s.diagnosis, s.added, hashed, s.removed))
+            campaign.append_revision(to_record(s.fit, s.diagnosis, s.added, hashed, s.removed))
             for s in found.steps
         ]
     rows: list[Row] = [

@@ -2,18 +2,17 @@
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from hilcal.cell import Cell, cell_from_config
-from hilcal.cli.effects_from import SOURCES, check_sources, sources
 from hilcal.cli.terminal import Terminal
 from hilcal.config import CellConfig
 from hilcal.data.campaign import Campaign
 from hilcal.data.readings import Readings
 from hilcal.data.records import content_hash
 from hilcal.data.revision import RevisionRecord
-from hilcal.data.whitening import MODES, SCALINGS, Mode, Scaling
+from hilcal.data.whitening import MODES, SCALINGS, Mode, Scaling, usual_mode
 from hilcal.diagnose.catalogue_sufficiency import look_ahead
 from hilcal.diagnose.verdict import Diagnosis, diagnose
 from hilcal.effects.catalogue import Catalogue, installed
@@ -26,7 +25,14 @@ from hilcal.identify.full_covariance import campaign_readings
 from hilcal.model import Model
 from hilcal.report.build_story import Chapter, build_story
 from hilcal.report.progress import Say, working
-from hilcal.revisions import chain, mode_of, restore, restore_model, to_record, usual_mode
+from hilcal.revisions import (
+    chain,
+    check_sources,
+    mode_of,
+    restore,
+    restore_model,
+    to_record,
+)
 from hilcal.types import Floats
 
 
@@ -74,7 +80,7 @@ class Opened:
         removed: str | None = None,
     ) -> int:
         """Append a fit; returns its revision number."""
-        record = record_of(found, diagnosis, added, content_hash(self.readings), removed)
+        record = to_record(found, diagnosis, added, content_hash(self.readings), removed)
         return self.campaign.append_revision(record)
 
     def restore(self, record: RevisionRecord) -> Fit:
@@ -143,19 +149,6 @@ def open_run(path: Path, catalogue: Catalogue | None = None) -> Iterator[Opened]
         cell = cell_from_config(config, Path(campaign.base_dir))
         readings = campaign_readings(campaign, cell, config)
         yield Opened(path, campaign, config, cell, readings, catalogue or installed())
-
-
-def record_of(
-    found: Fit,
-    diagnosis: Diagnosis | None,
-    added: str | None,
-    data_hash: str,
-    removed: str | None = None,
-) -> RevisionRecord:
-    """Return a fit as it is stored, with the files that its effects are from."""
-    record = to_record(found, diagnosis, added, data_hash, removed)
-    own = sources(found.model)
-    return replace(record, options={**record.options, SOURCES: own}) if own else record
 
 
 def choice(name: str, valid: tuple[Mode, ...], option: str) -> Mode:

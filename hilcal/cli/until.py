@@ -10,7 +10,7 @@ from hilcal.acquire.stopping_rule import Standing
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.data.readings import Readings
-from hilcal.data.whitening import Mode
+from hilcal.data.whitening import Mode, usual_mode
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import HilcalError
 from hilcal.identify.baseline import with_effects
@@ -24,7 +24,6 @@ from hilcal.plan.nominal_model import after, assumed
 from hilcal.plan.predicted import positions_of, rms
 from hilcal.plan.prediction_poses import work_poses
 from hilcal.report import numbers
-from hilcal.revisions import usual_mode
 from hilcal.types import Floats
 
 SHARE = 0.1

@@ -232,3 +232,16 @@ def _group_covariance(v: Floats, loaded: Ints, reference: Ints) -> Floats:
     each = np.arange(count)
     out[:, each, :, each, :] += np.moveaxis(v[loaded], 1, 0)
     return out.reshape(groups, count * m, count * m)
+
+
+def usual_mode(readings: Readings) -> Mode:
+    """Deflections where every loaded reading has an unloaded one in its pose and cycle."""
+    unloaded = readings.unloaded
+    if unloaded.all():
+        return "absolute"
+    key = np.stack([readings.pose, readings.cycle], axis=1)
+    _, group = np.unique(key, axis=0, return_inverse=True)
+    group = group.reshape(-1)
+    has = np.zeros(int(group.max()) + 1, dtype=bool)
+    has[group[unloaded]] = True
+    return "deflection" if has[group[~unloaded]].all() else "absolute"

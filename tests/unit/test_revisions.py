@@ -9,13 +9,14 @@ import pytest
 from drivers.simulated.rehearsal import Rehearsal
 from hilcal.data.records import content_hash
 from hilcal.data.revision import RevisionRecord, from_text, to_text
+from hilcal.data.whitening import usual_mode
 from hilcal.diagnose.verdict import diagnose
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.fit_document import plain, registration, to_json
 from hilcal.refine import add
-from hilcal.revisions import chain, restore, restore_model, to_record, usual_mode
+from hilcal.revisions import chain, restore, restore_model, to_record
 from tests.support.cli_cases import rehearsal
 
 

@@ -1,0 +1,164 @@
+"""A campaign: its readings with their full covariance, and the fits that were stored in it."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from hilcal.cell import Cell, cell_from_config
+from hilcal.config import CellConfig
+from hilcal.data.campaign import Campaign as CampaignFile
+from hilcal.data.readings import Readings
+from hilcal.data.records import content_hash
+from hilcal.data.revision import RevisionRecord
+from hilcal.data.whitening import Mode, usual_mode
+from hilcal.diagnose.verdict import Diagnosis
+from hilcal.effects.catalogue import Catalogue, installed
+from hilcal.errors import InputError
+from hilcal.identify.fit import Fit
+from hilcal.identify.full_covariance import campaign_readings
+from hilcal.model import Model
+from hilcal.refine import Refinement
+from hilcal.revisions import check_sources, mode_of, restore, restore_model, to_record
+from hilcal.types import Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Campaign:
+    """An open campaign file; close it, or use it in a `with` statement.
+
+    Attributes:
+        file: the SQLite file, open for appending revisions.
+        config: the cell's configuration.
+        cell: the cell.
+        readings: all readings, with the covariance of instrument, averaging and repeatability.
+        catalogue: the effects that a model of it can have.
+    """
+
+    file: CampaignFile
+    config: CellConfig
+    cell: Cell
+    readings: Readings
+    catalogue: Catalogue
+
+    @classmethod
+    def open(cls, path: str | Path, catalogue: Catalogue | None = None) -> Self:
+        """Open a campaign file.
+
+        Args:
+            path: the file.
+            catalogue: the effects that a model can have; the installed ones unless given.
+
+        Raises:
+            InputError: not a sound campaign, or without readings.
+        """
+        file = CampaignFile.open(path)
+        try:
+            config = CellConfig.from_json(file.config_json)
+            cell = cell_from_config(config, Path(file.base_dir))
+            readings = campaign_readings(file, cell, config)
+        except BaseException:
+            file.close()
+            raise
+        return cls(file, config, cell, readings, catalogue or installed())
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        return self.file.path
+
+    def close(self) -> None:
+        """Close the file."""
+        self.file.close()
+
+    def __enter__(self) -> Self:
+        """Return the campaign."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close the file."""
+        self.close()
+
+    def latest(self) -> RevisionRecord | None:
+        """Return the latest revision, if there is any."""
+        records = self.file.revisions()
+        return records[-1] if records else None
+
+    def mode(self) -> Mode:
+        """Kind of readings: that of the latest revision, else what the readings allow."""
+        record = self.latest()
+        return usual_mode(self.readings) if record is None else mode_of(record)
+
+    def fit(self, revision: int | None = None) -> Fit:
+        """Return a stored fit, found again from its stored parameters.
+
+        Args:
+            revision: its number; the latest where None.
+
+        Raises:
+            InputError: no such revision, or its readings or effects are not at hand as they were
+                when it was stored.
+        """
+        record = self.latest() if revision is None else self.file.revision(revision)
+        if record is None:
+            raise InputError(f"{self.path}: no revision yet; fit a model and append it first")
+        return self.restore(record)
+
+    def restore(self, record: RevisionRecord) -> Fit:
+        """Return the fit of a stored revision; raises as `fit` does."""
+        check_sources(record, self.path, self.catalogue)
+        return restore(record, self.cell, self.readings, self.catalogue)
+
+    def restore_model(self, record: RevisionRecord) -> tuple[Model, Floats]:
+        """Return model and parameters (P,) of a stored revision; raises as `fit` does."""
+        check_sources(record, self.path, self.catalogue)
+        return restore_model(record, self.cell, self.readings, self.catalogue)
+
+    def append(self, found: Fit | Diagnosis | Refinement) -> int:
+        """Store a fit, a diagnosed fit, or all steps of a refinement; revisions only append.
+
+        Returns:
+            The number of the (last) revision.
+
+        Raises:
+            InputError: it was fitted to other readings than those of this campaign.
+        """
+        number = 0
+        if isinstance(found, Refinement):
+            for step in found.steps:
+                number = self.store(step.fit, step.diagnosis, step.added, step.removed)
+            return number
+        if isinstance(found, Diagnosis):
+            return self.store(found.fit, found)
+        return self.store(found)
+
+    def store(
+        self,
+        found: Fit,
+        diagnosis: Diagnosis | None = None,
+        added: str | None = None,
+        removed: str | None = None,
+    ) -> int:
+        """Store a fit, with what was changed in the model since the revision before.
+
+        Args:
+            found: the fit.
+            diagnosis: of it.
+            added: the effect that was added.
+            removed: the effect that was taken out.
+
+        Returns:
+            The number of the revision.
+
+        Raises:
+            InputError: it was fitted to other readings than those of this campaign.
+        """
+        hashed = content_hash(found.readings)
+        if hashed != content_hash(self.readings):
+            raise InputError(f"{self.path}: the fit is of other readings than this campaign's")
+        return self.file.append_revision(to_record(found, diagnosis, added, hashed, removed))

@@ -1,0 +1,86 @@
+"""A campaign as a value for scripts: readings with full covariance, fits in and out."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.simulated.rehearsal import rehearse
+from hilcal.campaign import Campaign
+from hilcal.config import load_config
+from hilcal.data.campaign import Campaign as CampaignFile
+from hilcal.errors import InputError
+from hilcal.identify.baseline import baseline
+from hilcal.identify.fit import fit
+from hilcal.refine import refine
+from hilcal.robot.catalogue import configs_dir
+
+CELL = configs_dir() / "cells" / "demo_ur10e.toml"
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A campaign file without revisions."""
+    config = load_config(CELL)
+    readings = rehearse(config, "joint_tilt_compliance", 3, 10).readings
+    path = tmp_path_factory.mktemp("campaign") / "run.hilcal"
+    with CampaignFile.create(path, config.to_json(), str(CELL.parent), "test") as file:
+        file.append_readings(readings)
+    return path
+
+
+@pytest.fixture
+def path(stored: Path, tmp_path: Path) -> Path:
+    """The same for one test."""
+    copy = tmp_path / "run.hilcal"
+    copy.write_bytes(stored.read_bytes())
+    return copy
+
+
+def test_a_fit_that_was_appended_comes_back(path: Path) -> None:
+    with Campaign.open(path) as run:
+        assert run.latest() is None
+        assert run.mode() == "deflection"
+        found = fit(baseline(run.cell, run.readings, run.mode()), run.readings, run.mode())
+        assert run.append(found) == 1
+    with Campaign.open(path) as run:
+        again = run.fit()
+        assert again.model.names == found.model.names
+        np.testing.assert_allclose(again.theta, found.theta, rtol=1e-6, atol=1e-12)
+        assert again.parameters[-1].name == found.parameters[-1].name
+
+
+def test_a_refinement_is_appended_step_by_step(path: Path) -> None:
+    with Campaign.open(path) as run:
+        done = refine(baseline(run.cell, run.readings, run.mode()), run.readings, run.mode())
+        number = run.append(done)
+        assert number == len(done.steps) > 1
+        records = run.file.revisions()
+        assert [r.added for r in records] == [s.added for s in done.steps]
+        assert "joint_tilt_compliance" in records[-1].effects
+        first = run.fit(1)
+        assert first.model.names == done.steps[0].fit.model.names
+
+
+def test_a_campaign_without_revisions_says_so(path: Path) -> None:
+    with Campaign.open(path) as run, pytest.raises(InputError, match="no revision yet"):
+        run.fit()
+
+
+def test_a_fit_of_other_readings_is_refused(path: Path) -> None:
+    with Campaign.open(path) as run:
+        moved = replace(run.readings, value=run.readings.value + 1e-6)
+        other = fit(baseline(run.cell, moved, run.mode()), moved, run.mode())
+        with pytest.raises(InputError, match="other readings"):
+            run.append(other)
+        assert run.latest() is None
+
+
+def test_a_file_that_cannot_be_used_is_closed_again(tmp_path: Path) -> None:
+    config = load_config(CELL)
+    path = tmp_path / "empty.hilcal"
+    CampaignFile.create(path, config.to_json(), str(CELL.parent), "test").close()
+    with pytest.raises(InputError, match="no readings"):
+        Campaign.open(path)
+    path.unlink()
