@@ -15,9 +15,8 @@ from hilcal.effects import template
 from hilcal.effects.catalogue import BUILT_IN, Catalogue, installed
 from hilcal.effects.check import NAME
 from hilcal.effects.example import ROBOT, example_cell, example_states
-from hilcal.effects.option_help import option_defaults, option_help
 from hilcal.effects.protocol import Effect
-from hilcal.effects.written import written
+from hilcal.effects.written import option_defaults, written
 from hilcal.errors import InputError
 from hilcal.identify.fit_document import plain
 from hilcal.report import text
@@ -66,7 +65,7 @@ def _options_table(made: list[Effect], defaults: dict[str, dict[str, object]]) -
     out.columns[0].no_wrap = out.columns[1].no_wrap = True
     seen: dict[tuple[str, str], str] = {}
     for e in made:
-        for option, meaning in option_help(type(e)).items():
+        for option, meaning in e.option_help.items():
             first = seen.setdefault((option, meaning), e.name)
             told = meaning if first == e.name else f"as for {first}"
             default = written(defaults[e.name][option])
@@ -81,9 +80,9 @@ def _document(e: Effect, defaults: dict[str, object], catalogue: Catalogue) -> d
         "law": e.summary,
         "elastic": e.elastic,
         "needs": list(e.needs),
-        "options": list(e.option_names),
+        "options": list(e.option_help),
         "defaults": plain(defaults),
-        "option_help": option_help(type(e)),
+        "option_help": dict(e.option_help),
         "parameters": shown,
         "source": _source(type(e), catalogue),
     }

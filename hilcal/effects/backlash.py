@@ -1,5 +1,7 @@
 """`backlash`: the gear's play is taken up on the side to which the torque pushes."""
 
+from typing import ClassVar
+
 import numpy as np
 
 from hilcal.data.readings import States
@@ -10,16 +12,15 @@ from hilcal.types import Floats
 
 
 class Backlash(PerJoint):
-    """dq_j = b_j sign(τ_j), crossing smoothly: b_j tanh(τ_j/τ0_j) [rad].
-
-    Options:
-        crossing: τ0_j as a share of the joint's rated torque, more than 0; unless given, 0.01.
-    """
+    """dq_j = b_j sign(τ_j), crossing smoothly: b_j tanh(τ_j/τ0_j) [rad]."""
 
     name = "backlash"
     summary = "dq_j = b_j sign(τ_j): the joint's play is taken up to the side of the torque"
     elastic = True
-    option_names = (*PerJoint.option_names, "crossing")
+    option_help: ClassVar = {
+        **PerJoint.option_help,
+        "crossing": "τ0_j as a share of the joint's rated torque, more than 0; unless given, 0.01.",
+    }
 
     def setup(self, states: States) -> None:
         """Read how wide the crossing is."""

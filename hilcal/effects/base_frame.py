@@ -1,22 +1,20 @@
 """`base_frame`: the registration of the tracker to the base is off."""
 
+from typing import ClassVar
+
 import numpy as np
 
-from hilcal.effects.options import prior_of_lengths_and_turns
+from hilcal.effects.options import PRIOR_HELP, prior_of_lengths_and_turns
 from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
 from hilcal.types import Floats
 
 
 class BaseFrame(Effect):
-    """Twist of the base relative to its registration, base axes [m, rad].
-
-    Options:
-        prior_m, prior_rad: standard deviations of what is known of it already.
-    """
+    """Twist of the base relative to its registration, base axes [m, rad]."""
 
     name = "base_frame"
     summary = "registration of the tracker to the arm's base is off"
-    option_names = ("prior_m", "prior_rad")
+    option_help: ClassVar = PRIOR_HELP
     role = "registration"
 
     @property

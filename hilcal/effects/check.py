@@ -1,6 +1,7 @@
 """`check_effect`: does an effect keep to the protocol? Tried on states of an example arm."""
 
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, get_args
 
@@ -10,6 +11,7 @@ from hilcal.cell import Cell
 from hilcal.data.readings import States
 from hilcal.effects.example import example_cell, example_situation, example_states
 from hilcal.effects.failure import failure_of
+from hilcal.effects.options import PRIOR_HELP
 from hilcal.effects.protocol import (
     FRAME_ROLES,
     Columns,
@@ -43,6 +45,8 @@ NEEDS = (
 AGREES = 1e-3
 """Share of the largest value by which a derivative may differ from the difference quotient. A
 guess: central differences of steps of `STEP` agree to about 1e-6 for all built-in effects."""
+ROUNDING = 1e-9
+"""Share of the largest value that rounding may change; a guess, far above 1e-16."""
 STEP = 1e-4
 """Steps of difference quotients, in ordinary magnitudes."""
 _FIELDS = Deviation.__slots__
@@ -85,30 +89,41 @@ def _class_problem(kind: type[Effect]) -> str | None:
     """Return what is wrong with the attributes of a class."""
     if missing := sorted(getattr(kind, "__abstractmethods__", ())):
         return f"lacks {' and '.join(missing)}"
-    name, summary = getattr(kind, "name", None), getattr(kind, "summary", None)
-    if not isinstance(name, str) or not NAME.fullmatch(name):
-        return f"has name = {name!r}; valid: lower-case letters, digits and _, a letter first"
-    if not isinstance(summary, str) or not summary.strip() or "\n" in summary:
-        return f"has summary = {summary!r}; valid: the law in one line"
-    elastic: object = kind.elastic
-    if not isinstance(elastic, bool):
-        return f"has elastic = {elastic!r}; valid: True, False"
-    for key, valid in (("needs", NEEDS), ("option_names", None)):
-        found: object = getattr(kind, key)
-        texts = isinstance(found, tuple) and all(isinstance(text, str) for text in found)
-        if not texts or (valid and not _columns_of(kind.needs) <= set(valid)):
-            of = f"some of {', '.join(valid)}" if valid else "names"
-            return f"has {key} = {found!r}; valid: a tuple of {of}"
-    if kind.role not in get_args(Role):
-        return f"has role = {kind.role!r}; valid: {', '.join(get_args(Role))}"
-    if kind.role in FRAME_ROLES and not {"prior_m", "prior_rad"} <= set(kind.option_names):
-        return f"has the role {kind.role}; add prior_m and prior_rad to option_names"
+    if kind.deviation is not Effect.deviation:
+        return "overrides deviation; give columns, in whose parameters the law is linear"
+    name = "lower-case letters, digits and _, a letter first"
+    rules: tuple[tuple[str, str, Callable[[Any], bool]], ...] = (
+        ("name", name, lambda v: isinstance(v, str) and bool(NAME.fullmatch(v))),
+        ("summary", "the law in one line", lambda v: _is_text(v) and "\n" not in v),
+        ("elastic", "True, False", lambda v: isinstance(v, bool)),
+        (
+            "needs",
+            f"a tuple of some of {', '.join(NEEDS)}",
+            lambda v: isinstance(v, tuple) and _columns_of(v) <= set(NEEDS),
+        ),
+        (
+            "option_help",
+            "the meaning of each option by its name",
+            lambda v: isinstance(v, dict) and all(map(_is_text, (*v, *v.values()))),
+        ),
+        ("role", ", ".join(get_args(Role)), lambda v: v in get_args(Role)),
+    )
+    for key, valid, good in rules:
+        found = getattr(kind, key, None)
+        if not good(found):
+            return f"has {key} = {found!r}; valid: {valid}"
+    if kind.role in FRAME_ROLES and not set(PRIOR_HELP) <= set(kind.option_help):
+        return f"has the role {kind.role}; add {' and '.join(PRIOR_HELP)} to option_help"
     return None
+
+
+def _is_text(value: object) -> bool:
+    return isinstance(value, str) and bool(value.strip())
 
 
 def _columns_of(needs: tuple[str, ...]) -> set[str]:
     """Return the columns that needs name, each alone or as one of several, "a or b"."""
-    return {column for need in needs for column in need.split(" or ")}
+    return {column for need in needs for column in str(need).split(" or ")}
 
 
 def _problem(kind: type[Effect], cell: Cell) -> str | None:
@@ -122,7 +137,7 @@ def _problem(kind: type[Effect], cell: Cell) -> str | None:
     return (
         _columns(effect, s)
         or _results(effect, theta, s)
-        or _parts(effect, theta, s)
+        or _states(effect, theta, s)
         or _elastic(effect, theta, s)
         or _load(effect, theta, s, scale)
         or _compliance(effect, theta, s)
@@ -136,15 +151,11 @@ def _parameters(effect: Effect) -> str | None:
     if not isinstance(found, tuple) or not found:
         return f"parameters are {found!r}; expected a tuple of one Parameter or more"
     for p in found:
-        if not isinstance(p, Parameter):
+        if not isinstance(p, Parameter) or not (_is_text(p.name) and _is_text(p.unit)):
             return f"parameters hold {p!r}; expected Parameter(name, unit, scale, meaning)"
-        texts = all(isinstance(t, str) for t in (p.name, p.unit, p.meaning))
-        if not texts or not p.name:
-            return f"parameters hold {p!r}; expected texts as name, unit and meaning"
-        scale: object = p.scale
-        if isinstance(scale, bool) or not isinstance(scale, int | float) or not 0 < scale < np.inf:
+        if not isinstance(p.scale, int | float) or not 0 < p.scale < np.inf:
             return (
-                f"parameters {p.name}: scale = {scale!r}; expected an ordinary magnitude, more "
+                f"parameters {p.name}: scale = {p.scale!r}; expected an ordinary magnitude, more "
                 "than 0"
             )
     names = [p.name for p in found]
@@ -179,14 +190,14 @@ def _columns(effect: Effect, s: Situation) -> str | None:
 def _results(effect: Effect, theta: Floats, s: Situation) -> str | None:
     """Return what is wrong with types, shapes and values of what the other methods return."""
     (count, n), size = s.angle.shape, len(theta)
+    step, prior = np.zeros((count, 2, n + 1, 6)), effect.prior_std()
     change: object = effect.load_change(theta)
+    response: object = effect.response(theta, s, step)
     if change is not None and not isinstance(change, LoadChange):
         return f"load_change returns {type(change).__name__}; expected a LoadChange or None"
-    step, prior = np.zeros((count, 2, n + 1, 6)), effect.prior_std()
-    response: object = effect.response(theta, s, step)
     if not isinstance(response, Response):
         return f"response returns {type(response).__name__}; expected a Response"
-    optional: list[tuple[str, Any, tuple[int, ...]]] = [
+    optional: tuple[tuple[str, Any, tuple[int, ...]], ...] = (
         ("response has dq", response.dq, (count, 2, n)),
         ("response has twist", response.twist, (count, 2, n + 1, 6)),
         ("wrench_change is", effect.wrench_change(theta, s), (count, 6)),
@@ -194,12 +205,11 @@ def _results(effect: Effect, theta: Floats, s: Situation) -> str | None:
         ("compliance is", effect.compliance(theta), (n,)),
         ("groups is", effect.groups(), (size,)),
         ("prior_std is", None if prior is None else prior > 0, (size,)),
-    ]
+    )
     for what, found, shape in optional:
         if found is not None and (wrong := _array(what, found, shape)):
             return wrong
-    again = type(effect)(s.cell, s.states, effect.options)
-    if again.parameters != effect.parameters:
+    if type(effect)(s.cell, s.states, effect.options).parameters != effect.parameters:
         return "its options do not build it again; keep in self.options what setup chooses"
     return None
 
@@ -214,21 +224,18 @@ def _array(what: str, found: object, *shapes: tuple[int, ...]) -> str | None:
     return None if np.isfinite(found).all() else f"{what} of which some are not finite"
 
 
-def _parts(effect: Effect, theta: Floats, s: Situation) -> str | None:
-    """Return whether a deviation is other than columns times theta, state by state."""
-    own, expected = effect.deviation(theta, s), Effect.deviation(effect, theta, s)
-    if not all(_same(_field(own, key), _field(expected, key)) for key in _FIELDS):
-        return (
-            "deviation is not columns times parameters; leave it out, or make the law linear in "
-            "them"
-        )
+def _states(effect: Effect, theta: Floats, s: Situation) -> str | None:
+    """Return whether the deviation of a state depends on the other states."""
     few = slice(0, len(s.states) // 3)
+    own = effect.deviation(theta, s)
     alone = effect.deviation(theta, example_situation(s.cell, s.states[few]))
-    if not all(_same(_field(alone, key), _field(own, key)[few]) for key in _FIELDS):
-        return (
-            "columns of a state depend on the other states; take what is of all of them, as a "
-            "reference, in setup(self, states)"
-        )
+    for key in _FIELDS:
+        a, b = _field(alone, key), _field(own, key)[few]
+        if not np.allclose(a, b, rtol=0.0, atol=ROUNDING * np.abs(a).max()):
+            return (
+                "columns of a state depend on the other states; take what is of all of them, as a "
+                "reference, in setup(self, states)"
+            )
     return None
 
 
@@ -319,9 +326,3 @@ def _differs(method: str, of_what: str, found: Floats, expected: Floats) -> str 
 def _field(deviation: Deviation, key: str) -> Floats:
     found: Floats | None = getattr(deviation, key)
     return np.zeros(1) if found is None else found
-
-
-def _same(a: Floats, b: Floats) -> bool:
-    """Whether two arrays agree but for rounding."""
-    size = float(max(np.abs(a).max(), np.abs(b).max()))
-    return bool(np.all(np.abs(a - b) <= 1e-9 * size))

@@ -1,5 +1,7 @@
 """`creep`: a joint goes on giving way while the load hangs."""
 
+from typing import ClassVar
+
 import numpy as np
 
 from hilcal.cell import Cell
@@ -19,11 +21,6 @@ class Creep(PerJoint):
     c_j is the joint's compliance: the model's `joint_compliance`, or where the model has
     none a typical one from the joint's rated torque.
 
-    Options:
-        joints: which joints share a k: "common", all of them, "each" its own, or groups as
-            2/3/4-6 (2+5 for joints apart); joints that are not named do not creep. Unless given,
-            common.
-
     `form`, "common" or "each", is an older name of `joints`.
     """
 
@@ -32,6 +29,11 @@ class Creep(PerJoint):
     elastic = True
     needs = ("load_time",)
     usual_joints = COMMON
+    option_help: ClassVar = {
+        "joints": 'which joints share a k: "common", all of them, "each" its own, or groups as '
+        "2/3/4-6 (2+5 for joints apart); joints that are not named do not creep. Unless given, "
+        "common."
+    }
 
     def __init__(self, cell: Cell, states: States, options: Options | None = None) -> None:
         """Build the effect; raises InputError as every effect does."""

@@ -1,6 +1,7 @@
 """What the errors of a force sensor share: its axes, and which states it said anything of."""
 
 from abc import abstractmethod
+from typing import ClassVar
 
 import numpy as np
 
@@ -27,7 +28,10 @@ class ForceSensorEffect(Effect):
     Errors of several kinds each act on the recorded wrench; their products are left out.
     """
 
-    option_names = ("rotvec_rad",)
+    option_help: ClassVar = {
+        "rotvec_rad": "the sensor's axes as configured in flange axes, a rotation vector; unless "
+        "given, the flange's own."
+    }
 
     def setup(self, states: States) -> None:
         """Read the sensor's axes in flange axes."""

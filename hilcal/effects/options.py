@@ -16,6 +16,10 @@ UNKNOWN_RATING = 150.0
 TYPICAL_TWIST = 2e-3
 """Twist of a joint at its rated torque where nothing tells its compliance, rad."""
 
+PRIOR_HELP = dict.fromkeys(
+    ("prior_m", "prior_rad"), "standard deviation of what is known of it already."
+)
+
 
 def number(effect: str, options: Options, key: str) -> float:
     """Read an option that must be a finite number.

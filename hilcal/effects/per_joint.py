@@ -115,15 +115,13 @@ def _label(group: list[int]) -> str:
 
 
 class PerJoint(Effect):
-    """An effect whose parameters belong to joints: each has its own, or some share one.
+    """An effect whose parameters belong to joints: each has its own, or some share one."""
 
-    Options:
-        joints: which joints have a parameter: "each" its own, "common", one for all, or groups
-            as 2/3/4-6, one parameter for joint 2, one for 3 and one for 4 to 6 (2+5 for joints
-            apart); joints that are not named have none. Unless given, each.
-    """
-
-    option_names: ClassVar[tuple[str, ...]] = ("joints",)
+    option_help: ClassVar[Mapping[str, str]] = {
+        "joints": 'which joints have a parameter: "each" its own, "common", one for all, or groups '
+        "as 2/3/4-6, one parameter for joint 2, one for 3 and one for 4 to 6 (2+5 for joints "
+        "apart); joints that are not named have none. Unless given, each."
+    }
     usual_joints: ClassVar[str] = EACH
 
     def setup(self, states: States) -> None:

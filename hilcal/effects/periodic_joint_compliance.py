@@ -1,5 +1,7 @@
 """`periodic_joint_compliance`: a gear is softer in some positions than in others."""
 
+from typing import ClassVar
+
 import numpy as np
 
 from hilcal.data.readings import States
@@ -17,15 +19,16 @@ class PeriodicJointCompliance(PerJoint):
 
     Joints that share parameters have the same phase at their zeros.
 
-    Options:
-        orders: periods k per turn of the joint, a list of whole numbers, 1 to 1000; unless
-            given, [2]: the two-lobed wave generator of a strain wave gear.
     """
 
     name = "periodic_joint_compliance"
     summary = "dq_j = τ_j (a_j cos 2q_j + b_j sin 2q_j): compliance changes with the joint angle"
     elastic = True
-    option_names = (*PerJoint.option_names, "orders")
+    option_help: ClassVar = {
+        **PerJoint.option_help,
+        "orders": "periods k per turn of the joint, a list of whole numbers, 1 to 1000; unless "
+        "given, [2]: the two-lobed wave generator of a strain wave gear.",
+    }
 
     def setup(self, states: States) -> None:
         """Read the orders."""

@@ -7,6 +7,7 @@ elastic `response`. One that acts through the load has no columns: it gives `loa
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Literal, Self
 
@@ -138,7 +139,7 @@ class Effect(ABC):
         elastic: the deviation depends on the transmitted wrenches.
         needs: columns of `States` without which the effect cannot be computed; "a or b"
             where one of two will do.
-        option_names: names of the options that the constructor takes.
+        option_help: the options that the constructor takes: name and meaning.
         role: which models have the effect without being told:
             "registration": every model while the tracker-to-base registration is unknown; its
                 six parameters are a twist of the base, in base axes.
@@ -154,7 +155,7 @@ class Effect(ABC):
     summary: ClassVar[str]
     elastic: ClassVar[bool] = False
     needs: ClassVar[tuple[str, ...]] = ()
-    option_names: ClassVar[tuple[str, ...]] = ()
+    option_help: ClassVar[Mapping[str, str]] = {}
     role: ClassVar[Role] = "effect"
 
     def __init__(self, cell: Cell, states: States, options: Options | None = None) -> None:
@@ -166,8 +167,8 @@ class Effect(ABC):
         self.cell = cell
         self.options: dict[str, object] = dict(options or {})
         for key in self.options:
-            if key not in self.option_names:
-                valid = ", ".join(self.option_names) or "none"
+            if key not in self.option_help:
+                valid = ", ".join(self.option_help) or "none"
                 raise InputError(f"effect {self.name}: unknown option {key!r}; valid: {valid}")
         missing = [need for need in self.needs if not _has(states, need)]
         if missing:

@@ -9,12 +9,7 @@ from hilcal.types import Floats
 
 
 class SensorMisalignment(ForceSensorEffect):
-    """The sensor stands turned by δ: acting = R exp([δ]×) Rᵀ w, force and moment, exactly [rad].
-
-    Options:
-        rotvec_rad: the sensor's axes as configured in flange axes, a rotation vector; unless
-            given, the flange's own.
-    """
+    """The sensor stands turned by δ: acting = R exp([δ]×) Rᵀ w, force and moment, exactly [rad]."""
 
     name = "sensor_misalignment"
     summary = "acting = R exp(δ) Rᵀ wrench: the force sensor's axes are turned by δ"

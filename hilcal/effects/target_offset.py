@@ -1,25 +1,25 @@
 """`target_offset`: the tracked target sits elsewhere than configured."""
 
+from typing import ClassVar
+
 import numpy as np
 
 from hilcal.data.readings import States
-from hilcal.effects.options import Options, prior_of_lengths_and_turns
+from hilcal.effects.options import PRIOR_HELP, Options, prior_of_lengths_and_turns
 from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
 from hilcal.errors import InputError
 from hilcal.types import Floats
 
 
 class TargetOffset(Effect):
-    """Displacement of the target in flange axes [m]; with `rotation`, its turn too [rad].
-
-    Options:
-        rotation: True where the readings are poses, so that the target's axes matter.
-        prior_m, prior_rad: standard deviations of what is known of it already.
-    """
+    """Displacement of the target in flange axes [m]; with `rotation`, its rotation too [rad]."""
 
     name = "target_offset"
     summary = "the tracked target sits elsewhere on the flange than configured"
-    option_names = ("rotation", "prior_m", "prior_rad")
+    option_help: ClassVar = {
+        "rotation": "True where the readings are poses, so that the target's axes matter.",
+        **PRIOR_HELP,
+    }
     role = "target"
 
     def setup(self, states: States) -> None:

@@ -1,5 +1,7 @@
 """`thermal_growth`: the links grow with the temperature."""
 
+from typing import ClassVar
+
 import numpy as np
 
 from hilcal.data.readings import States
@@ -20,17 +22,17 @@ class ThermalGrowth(Effect):
     T is one temperature for the whole arm; slot k moves along L_k, by L_kᵀ p_k α ΔT in its
     own axes.
 
-    Options:
-        reference_degC: T_ref, at which the links are as long as configured; unless given, 20.
-        temperature: "air", or "joints" for the mean of the joints' temperatures; unless
-            given, air where the readings have it.
-        links: "common", one α (default), or "each", one for each of L_0..L_n.
     """
 
     name = "thermal_growth"
     summary = "every link grows by α ΔT of its length, ΔT from 20 °C"
     needs = ("air_temperature or joint_temperature",)
-    option_names = ("reference_degC", "temperature", "links")
+    option_help: ClassVar = {
+        "reference_degC": "T_ref, at which the links are as long as configured; unless given, 20.",
+        "temperature": '"air", or "joints" for the mean of the joints\' temperatures; unless '
+        "given, air where the readings have it.",
+        "links": '"common", one α (default), or "each", one for each of L_0..L_n.',
+    }
 
     def setup(self, states: States) -> None:
         """Choose reference and thermometer."""

@@ -1,5 +1,7 @@
 """`thermal_joint_drift`: the joints' zeros wander as they warm up."""
 
+from typing import ClassVar
+
 import numpy as np
 
 from hilcal.data.readings import States
@@ -9,17 +11,16 @@ from hilcal.effects.protocol import Columns, Parameter, Situation
 
 
 class ThermalJointDrift(PerJoint):
-    """dq_j = κ_j ΔT_j, ΔT_j = T_j − T_ref,j with the joint's own temperature [rad/K].
-
-    Options:
-        reference_degC: T_ref, one number or a list of one per joint; unless given, each
-            joint's temperature at the first reading in time.
-    """
+    """dq_j = κ_j ΔT_j, ΔT_j = T_j − T_ref,j with the joint's own temperature [rad/K]."""
 
     name = "thermal_joint_drift"
     summary = "dq_j = κ_j ΔT_j: the zero of each joint wanders with its temperature"
     needs = ("joint_temperature",)
-    option_names = (*PerJoint.option_names, "reference_degC")
+    option_help: ClassVar = {
+        **PerJoint.option_help,
+        "reference_degC": "T_ref, one number or a list of one per joint; unless given, each "
+        "joint's temperature at the first reading in time.",
+    }
 
     def setup(self, states: States) -> None:
         """Take the temperatures at the first reading as the reference unless told otherwise."""

@@ -1,5 +1,7 @@
 """`tracker_drift`: the tracker's station moves while the campaign runs."""
 
+from typing import ClassVar
+
 import numpy as np
 
 from hilcal.data.readings import States
@@ -10,17 +12,17 @@ from hilcal.types import Floats
 
 
 class TrackerDrift(Effect):
-    """Station twist that grows linearly with time, sensor axes [m/s, rad/s].
-
-    Options:
-        reference_s: the time at which the station stands as registered; unless given, the
-            time of the first reading.
-    """
+    """Station twist that grows linearly with time, sensor axes [m/s, rad/s]."""
 
     name = "tracker_drift"
     summary = "the tracker's station moves linearly in time"
     needs = ("time",)
-    option_names = ("reference_s", "span_s")
+    option_help: ClassVar = {
+        "reference_s": "the time at which the station stands as registered; unless given, the "
+        "time of the first reading.",
+        "span_s": "the time over which a drift of ordinary size is reached; unless given, that of "
+        "the readings.",
+    }
 
     def setup(self, states: States) -> None:
         """Take the time of the first reading as the reference unless told otherwise."""

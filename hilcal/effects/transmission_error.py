@@ -1,5 +1,7 @@
 """`transmission_error`: gears and encoders err periodically with the joint angle."""
 
+from typing import ClassVar
+
 import numpy as np
 
 from hilcal.data.readings import States
@@ -19,15 +21,15 @@ class TransmissionError(PerJoint):
 
     The evidence decides how strong each harmonic of each joint is, and drops the needless
     ones; K only bounds the search. Joints that share parameters have the same phase at their zeros.
-
-    Options:
-        harmonics: K, the harmonics tried per joint, 1 to 1000; unless given, one for every five
-            distinct poses, at least 4 and at most 120.
     """
 
     name = "transmission_error"
     summary = "dq_j = Σ a_jk cos k q_j + b_jk sin k q_j: gear and encoder error"
-    option_names = (*PerJoint.option_names, "harmonics")
+    option_help: ClassVar = {
+        **PerJoint.option_help,
+        "harmonics": "K, the harmonics tried per joint, 1 to 1000; unless given, one for every "
+        "five distinct poses, at least 4 and at most 120.",
+    }
 
     def setup(self, states: States) -> None:
         """Read or choose the number of harmonics."""

@@ -8,12 +8,7 @@ from hilcal.types import Floats
 
 
 class WrenchBias(ForceSensorEffect):
-    """Recorded = true + b, so that acting = w − R b; b at the load point, sensor axes [N, N·m].
-
-    Options:
-        rotvec_rad: the sensor's axes in flange axes, a rotation vector; unless given, the
-            flange's own.
-    """
+    """Recorded = true + b, so that acting = w − R b; b at the load point, sensor axes [N, N·m]."""
 
     name = "wrench_bias"
     summary = "wrench read = true + b: the force sensor has a constant offset, in its own axes"

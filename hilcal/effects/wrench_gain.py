@@ -13,10 +13,6 @@ class WrenchGain(ForceSensorEffect):
 
     acting = R diag(1/(1 + g)) Rᵀ w = w − R diag(g/(1 + g)) Rᵀ w. A common gain of all axes
     is the same as a common factor on all compliances, but for what the weights do.
-
-    Options:
-        rotvec_rad: the sensor's axes in flange axes, a rotation vector; unless given, the
-            flange's own.
     """
 
     name = "wrench_gain"

@@ -4,6 +4,7 @@ import math
 import re
 from collections.abc import Iterator
 
+from hilcal.cell import Cell
 from hilcal.data.readings import States
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.options import Options
@@ -91,6 +92,19 @@ def chosen_options(effect: Effect, states: States, m: int) -> dict[str, object]:
         if not key.startswith("prior_")
         and (key not in usual or written(usual[key]) != written(value))
     }
+
+
+def option_defaults(kind: type[Effect], cell: Cell, states: States) -> dict[str, object]:
+    """Return the value of each option unless given; None where it follows from the readings."""
+    if not kind.option_help:
+        return {}
+    whole = kind(cell, states).options
+    try:
+        part = kind(cell, states[len(states) // 3 :]).options
+    except InputError:  # fewer readings will not do
+        part = {}
+    same = {name: written(whole.get(name)) == written(part.get(name)) for name in whole}
+    return {name: whole[name] if same.get(name) else None for name in kind.option_help}
 
 
 def _options(text: str, where: str) -> dict[str, object]:

@@ -34,7 +34,7 @@ def test_an_unknown_option_is_refused_with_the_valid_ones(name):
     cell = CELLS["ur10e"]
     with pytest.raises(InputError, match=f"{name}: unknown option 'colour'") as caught:
         make(name, cell, some_states(cell), {"colour": 1})
-    valid = effect_class(name).option_names or ("none",)
+    valid = effect_class(name).option_help or ("none",)
     assert all(option in str(caught.value) for option in valid)
 
 

@@ -127,7 +127,7 @@ BAD: dict[str, tuple[str, str]] = {
     "not linear": (
         CLASS + "\n    def deviation(self, theta, s):\n"
         "        return super().deviation(theta**2, s)\n",
-        ": effect mine: deviation is not columns times parameters",
+        ": class Mine overrides deviation; give columns",
     ),
 }
 

@@ -5,8 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hilcal.effects.catalogue import BUILT_IN, installed
-from hilcal.effects.option_help import option_defaults, option_help
-from hilcal.effects.written import chosen_options, read_effects_text, write_effect
+from hilcal.effects.written import chosen_options, option_defaults, read_effects_text, write_effect
 from hilcal.errors import InputError
 from tests.support.effect_cases import CELLS, VARIANTS, make, some_states
 
@@ -141,11 +140,9 @@ def test_priors_and_what_the_readings_choose_are_no_choice():
 def test_options_are_explained_and_defaults_are_valid(kind):
     cell = CELLS["ur10e"]
     states = some_states(cell)
-    told = option_help(kind)
-    assert tuple(told) == kind.option_names
-    assert all(told[name] for name in told if name != "span_s")
+    assert all(kind.option_help.values())
     defaults = option_defaults(kind, cell, states)
-    assert tuple(defaults) == kind.option_names
+    assert tuple(defaults) == tuple(kind.option_help)
     known = {name: value for name, value in defaults.items() if value is not None}
     usual = kind(cell, states)
     assert kind(cell, states, known).parameters == usual.parameters
@@ -153,12 +150,9 @@ def test_options_are_explained_and_defaults_are_valid(kind):
 
 
 def test_help_is_that_of_the_class_before_that_of_its_base():
-    assert "Unless given, each." in option_help(installed()["hysteresis"])["joints"]
-    assert "given, common." in option_help(installed()["creep"])["joints"]
-    help_of = option_help(installed()["backlash"])
-    assert help_of["crossing"].endswith("more than 0; unless given, 0.01.")
-    frame = option_help(installed()["base_frame"])
-    assert frame["prior_m"] == frame["prior_rad"] != ""
+    assert "Unless given, each." in installed()["hysteresis"].option_help["joints"]
+    assert "given, common." in installed()["creep"].option_help["joints"]
+    assert {"joints", "crossing"} == set(installed()["backlash"].option_help)
 
 
 def test_a_default_that_follows_from_the_readings_is_not_told():
