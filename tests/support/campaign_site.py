@@ -18,8 +18,8 @@ from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig, load_config
 from hilcal.config.write import to_toml
 from hilcal.data.plan import Plan
-from hilcal.plan.spread import spread_plan
 from hilcal.robot.catalogue import configs_dir
+from tests.support.spread_plan import spread_plan
 
 if TYPE_CHECKING:
     from tests.support.campaign_run import Run

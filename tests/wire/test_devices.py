@@ -23,8 +23,8 @@ from hilcal.acquire.rig import Rig
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig, load_config
 from hilcal.errors import DeviceError, InputError
-from hilcal.plan.spread import spread_plan
 from hilcal.robot.catalogue import configs_dir
+from tests.support.spread_plan import spread_plan
 
 SMALL = 0.05  # rad
 SLOW = 0.2  # rad/s

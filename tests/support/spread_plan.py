@@ -1,0 +1,29 @@
+"""A short plan of evenly drawn poses, unloaded first and then load by load."""
+
+import numpy as np
+
+from hilcal.cell import Cell
+from hilcal.config import CellConfig
+from hilcal.data.plan import Plan
+from hilcal.plan.draw import draw
+from hilcal.plan.feasible import Space
+from hilcal.plan.order import Chosen, Ordering, order_plan
+
+
+def spread_plan(
+    cell: Cell, config: CellConfig, count: int, rng: np.random.Generator, repeats: int = 2
+) -> Plan:
+    """Return a plan of `count` poses in the shortest order; every pose bears every load."""
+    space = Space(cell, config)
+    drawn = draw(space, 30 * (count + 1), rng, least=count + 1)
+    q = drawn.q[drawn.allowed.all(axis=1)]
+    central = np.argsort(np.linalg.norm(q - np.median(q, axis=0), axis=1))[:8]
+    reached = [(int(space.passable(q[k], q).sum()), int(k)) for k in central]
+    home = max(reached)[1]
+    poses = np.delete(q, home, axis=0)
+    poses = poses[space.passable(q[home], poses)][:count]
+    assert len(poses) == count
+    names = [f"p{k + 1}" for k in range(count)]
+    chosen = [Chosen(name, space.loads) for name in names]
+    how = Ordering(slack=0.0, unloaded="first", repeats=repeats)
+    return order_plan(cell, config, names, poses, q[home], chosen, space.passable, rng, how).plan
