@@ -31,11 +31,11 @@ from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.fit import Fit
 from hilcal.plan.next import Next, measure_next
 from hilcal.plan.planner import Request
-from hilcal.plan.summary import about, story
+from hilcal.plan.summary import about, summarise
 from hilcal.report import numbers as words_of
 from hilcal.report.progress import Say, working
 from hilcal.report.text_next import next_report
-from hilcal.report.text_plan import story_report
+from hilcal.report.text_plan import plan_report
 from hilcal.revisions import chain
 from hilcal.types import Floats
 
@@ -82,13 +82,13 @@ def next_(
         found = measure_next(
             numbers, config, doubt.fit, doubt.suspects, Request(poses), rng, say, place
         )
-        told = story(found.planned, config, rng, say, compare=not quick)
-        say("going through it in thought")
-        made = checked(numbers, config, plan_of(found, doubt.suspects), told)
+        summary = summarise(found.planned, config, rng, say, compare=not quick)
+        say("checking every motion in a dry run")
+        made = checked(numbers, config, plan_of(found, doubt.suspects), summary)
     write(t, numbers, config, made, output, csv, record)
     t.show(f"In doubt: {words_of.names(doubt.suspects, 'or')}.\n")
-    t.show(next_report(found, made.told.poses, made.told.readings))
-    t.show(story_report(made.told))
+    t.show(next_report(found, made.summary.poses, made.summary.readings))
+    t.show(plan_report(made.summary))
     t.show(f"The plan is in {output}. Measure it into the same campaign with:")
     t.show(f"  hilcal run {cell or 'CELL.toml'} -o {run} --append --plan {output}")
     t.document(

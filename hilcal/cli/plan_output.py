@@ -14,7 +14,7 @@ from hilcal.config import CellConfig
 from hilcal.data.plan import Plan
 from hilcal.data.plan_csv import plan_csv
 from hilcal.errors import InputError
-from hilcal.plan.story import PlanStory
+from hilcal.plan.summary import PlanSummary
 from hilcal.report.progress import working
 
 POSES = 20
@@ -35,12 +35,12 @@ Csv = Annotated[
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Made:
-    """A plan that may be run, and what is told of it."""
+class CheckedPlan:
+    """A plan whose dry run passed, and its summary."""
 
     plan: Plan
     dry: DryRun
-    told: PlanStory
+    summary: PlanSummary
 
 
 def generator(seed: int) -> np.random.Generator:
@@ -54,17 +54,16 @@ def generator(seed: int) -> np.random.Generator:
     return np.random.default_rng(seed)
 
 
-def checked(cell: Cell, config: CellConfig, plan: Plan, told: PlanStory) -> Made:
-    """Go through a plan in thought; what is to be said of that comes first.
+def checked(cell: Cell, config: CellConfig, plan: Plan, summary: PlanSummary) -> CheckedPlan:
+    """Check a plan in a dry run, whose remarks come first in the summary.
 
     Raises:
         InputError: a plan that may not be run.
     """
     dry = dry_run(cell, config, plan)
     refuse(dry, "the plan")
-    return Made(
-        plan, dry, replace(told, remarks=tuple(dict.fromkeys((*dry.remarks, *told.remarks))))
-    )
+    remarks = tuple(dict.fromkeys((*dry.remarks, *summary.remarks)))
+    return CheckedPlan(plan, dry, replace(summary, remarks=remarks))
 
 
 def refuse(dry: DryRun, what: str) -> None:
@@ -83,7 +82,7 @@ def write(
     t: Terminal,
     cell: Cell,
     config: CellConfig,
-    made: Made,
+    made: CheckedPlan,
     output: Path,
     csv: Path | None,
     record: Path | None,
@@ -98,7 +97,7 @@ def write(
 
         with working(t.progress) as say:
             say(f"recording {record}")
-            record_plan(cell, config, made.plan, made.told, record)
+            record_plan(cell, config, made.plan, made.summary, record)
 
 
 def _write(path: Path, text: str) -> None:

@@ -13,8 +13,8 @@ from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import check_record, open_run
 from hilcal.cli.plan_output import (
     POSES,
+    CheckedPlan,
     Csv,
-    Made,
     Output,
     Poses,
     Quick,
@@ -32,10 +32,10 @@ from hilcal.errors import DeviceError, InputError
 from hilcal.identify.fit import Fit
 from hilcal.plan.choice import CRITERIA
 from hilcal.plan.planner import Request, make
-from hilcal.plan.summary import about, remarks, story
+from hilcal.plan.summary import about, remarks, summarise
 from hilcal.report import text_run
 from hilcal.report.progress import Say, working
-from hilcal.report.text_plan import story_report
+from hilcal.report.text_plan import plan_report
 
 CellFile = Annotated[Path, typer.Argument(metavar="CELL.toml", help="The cell.")]
 PlanFile = Annotated[
@@ -83,11 +83,11 @@ def plan(
         rng = generator(seed)
         chosen = make(numbers, config, wanted, rng, known, say, catalogue)
         plan_ = replace(chosen.ordered.plan, about=about(chosen))
-        told = story(chosen, config, rng, say, compare=not quick)
-        say("going through it in thought")
-        made = checked(numbers, config, plan_, told)
+        summary = summarise(chosen, config, rng, say, compare=not quick)
+        say("checking every motion in a dry run")
+        made = checked(numbers, config, plan_, summary)
     write(t, numbers, config, made, output, csv, record)
-    t.show(story_report(made.told))
+    t.show(plan_report(made.summary))
     t.show(f"The plan is in {output}: a file that you may edit. Every limit was checked.")
     t.document({**plan_json(made), "plan": str(output)})
 
@@ -155,28 +155,14 @@ def make_plan(
     return replace(chosen.ordered.plan, about={**about(chosen), "remarks": list(remarks(chosen))})
 
 
-def plan_json(made: Made) -> dict[str, object]:
-    """Return what the JSON document says of a plan."""
-    told, dry = made.told, made.dry
-    known = asdict(told)
+def plan_json(made: CheckedPlan) -> dict[str, object]:
+    """Return the JSON document of a plan."""
     return {
-        "poses": told.poses,
-        "readings": told.readings,
-        "criterion": told.criterion,
-        "efficiency": told.efficiency,
-        "predicted_std": {p.name: p.std for p in told.predicted},
-        "position_std_m": told.position_std_m,
+        **made.summary.to_dict(),
         "loads": list(made.plan.loads),
-        "readings_by_load": told.loads,
-        "load_changes": dry.load_changes,
-        "motions": dry.motions,
-        "duration_s": dry.duration,
-        "parameters": known["predicted"],
-        "criteria": known["bought"],
-        "curve": known["curve"],
-        "detectable": known["seen"],
-        "order": known["order"],
-        "remarks": list(told.remarks),
+        "load_changes": made.dry.load_changes,
+        "motions": made.dry.motions,
+        "duration_s": made.dry.duration,
     }
 
 

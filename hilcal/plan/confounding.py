@@ -30,8 +30,8 @@ class Confounding:
         drift: rate of the stated drift in one coordinate, m/s.
         error_m: rms error of a deflection from that drift, m.
         bias_m: mean error, m.
-        told: the smallest rate, in one coordinate, that the readings at the reference pose tell:
-            one standard uncertainty, m/s; None where they cannot tell it.
+        drift_std: standard uncertainty of a drift rate estimated from the readings at the reference
+            pose, in one coordinate, m/s; None where they do not determine it.
     """
 
     deflections: int
@@ -42,19 +42,19 @@ class Confounding:
     drift: float
     error_m: float
     bias_m: float
-    told: float | None
+    drift_std: float | None
 
     @property
     def returned_m(self) -> float | None:
-        """Rms error of a deflection, m, of any linear drift that the reference readings tell.
+        """Rms error of a deflection, m, after a correction by the drift estimated at the reference.
 
         With the deflections themselves, which a fit uses as well, it is smaller.
         """
-        return None if self.told is None else self.told * self.lag_rms_s
+        return None if self.drift_std is None else self.drift_std * self.lag_rms_s
 
     def about(self) -> dict[str, object]:
         """Return it for a plan's file."""
-        left, told = self.returned_m, self.told
+        left, rate = self.returned_m, self.drift_std
         return {
             "deflections": self.deflections,
             "correlation": round(self.correlation, 4),
@@ -65,7 +65,7 @@ class Confounding:
             "error_m": self.error_m,
             "bias_m": self.bias_m,
             "error_with_returns_m": left,
-            "drift_std_m_per_h": None if told is None else 3600.0 * told,
+            "drift_std_m_per_h": None if rate is None else 3600.0 * rate,
         }
 
 
@@ -122,7 +122,7 @@ def confounding(
         drift=drift,
         error_m=drift * rms,
         bias_m=drift * float(lag.mean()) if len(lag) else 0.0,
-        told=slope,
+        drift_std=slope,
     )
 
 

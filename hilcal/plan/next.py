@@ -23,6 +23,7 @@ from hilcal.plan.feasible import Space
 from hilcal.plan.information import Problem, readings_of
 from hilcal.plan.order import Chosen, Ordering, order_plan
 from hilcal.plan.planner import Planned, Request, Say, make
+from hilcal.plan.predicted import predicted
 from hilcal.plan.t_optimality import Pair
 from hilcal.robot.chain import evaluate
 from hilcal.types import Floats
@@ -226,7 +227,8 @@ def _from_reference(
         information=information,
         cost=float(counts @ of.units.cost),
     )
-    return replace(made, ordered=ordered, design=design)
+    knows = predicted(of, counts.astype(float), work=made.work)
+    return replace(made, ordered=ordered, design=design, predicted=knows)
 
 
 def _where(made: Planned, pair: Pair, then: Floats) -> tuple[dict[str, float], float]:

@@ -31,6 +31,7 @@ from hilcal.plan.noise_model import reading_covariance
 from hilcal.plan.nominal_model import after, assumed
 from hilcal.plan.optimum import Design
 from hilcal.plan.order import Chosen, Ordered, Ordering, order_plan
+from hilcal.plan.predicted import Predicted, predicted
 from hilcal.plan.prediction_poses import WorkPoses, work_poses
 from hilcal.plan.timing import pace
 from hilcal.types import Bools, Floats, Ints
@@ -81,6 +82,7 @@ class Planned:
         drawn: the candidates.
         budget: readings of the design.
         criterion: name of the criterion.
+        predicted: standard uncertainties that a fit to the readings will have.
     """
 
     ordered: Ordered
@@ -93,6 +95,7 @@ class Planned:
     drawn: Drawn
     budget: float
     criterion: str
+    predicted: Predicted
 
     @property
     def counts(self) -> Floats:
@@ -129,12 +132,12 @@ def make(
             which constraint or parameter it is.
     """
     criterion = request.criterion or config.planning.criterion
-    say("drawing poses that the cell allows")
+    say("drawing candidate poses")
     space = Space(cell, config)
     drawn = draw(space, config.planning.candidates, rng, least=2)
     home, poses = _reference(space, drawn, rng)
     drawn = replace(drawn, q=drawn.q[poses], allowed=drawn.allowed[poses])
-    say("working out what each of them tells")
+    say("computing the information of each pose")
     model = assumed(cell, config, 3, catalogue) if known is None else after(known, config)
     of = problem(model, config, drawn.q, drawn.allowed)
     work = work_poses(model, config, drawn.q, space.clear)
@@ -168,11 +171,14 @@ def make(
             f"{loads.budget:g} readings are best taken at {visited} poses, the reference among "
             f"them; an unknown registration needs at least {MIN_POSES}: raise the readings"
         )
-    say("putting them in order")
+    say("ordering the readings")
     counts = np.zeros(len(usable), dtype=np.int64)
     counts[np.flatnonzero(usable)] = design.counts
     ordered = _ordered(space, of, home, counts, rng, request.unloaded)
-    return Planned(ordered, design, loads, of, asked, usable, work, drawn, loads.budget, criterion)
+    knows = predicted(of, counts.astype(float), work=work)
+    return Planned(
+        ordered, design, loads, of, asked, usable, work, drawn, loads.budget, criterion, knows
+    )
 
 
 def _budget(request: Request, of: Problem) -> float:

@@ -1,6 +1,10 @@
-"""What a plan promises, worked out for people: from a chosen plan to plain numbers."""
+"""The summary of a plan: predicted precision, criterion comparison, sample-size curve, cost.
+
+One value, computed once; terminal, JSON and viewer read it directly, the plan's file holds `about`.
+"""
 
 from collections.abc import Iterator
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -16,123 +20,264 @@ from hilcal.plan.confounding import Confounding
 from hilcal.plan.information import Problem
 from hilcal.plan.planner import Planned, Say
 from hilcal.plan.predicted import Predicted, predicted
-from hilcal.plan.story import Bought, Enough, OrderStory, PlanStory, Promised, Seen
+from hilcal.plan.timing import Duration
 from hilcal.regression.evidence import VISIBLE
 from hilcal.regression.schur import schur_complement
 from hilcal.types import Floats
 
 COMPARED = ("D", "A", "E", "K", "test")
+"""Criteria of the comparison: all but T-optimality, which needs suspects."""
 SHARES = (0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
-"""Sizes of the plans of the curve, by the plan's own."""
+"""Budgets of the sample-size curve by the plan's own. A choice."""
 LOOSE = 3e-3
+"""Relative gap of the continuous optima of the curve. A choice: below what a plot resolves."""
 DRAWS = 5
+"""Random directions of an effect whose median is its minimum detectable strength. A choice."""
 _SEED = 20240611
 
 
-def story(
-    made: Planned, config: CellConfig, rng: np.random.Generator, say: Say, *, compare: bool = True
-) -> PlanStory:
-    """Return what people are told of a plan.
+@dataclass(frozen=True, slots=True)
+class PredictedParameter:
+    """Predicted standard uncertainty of a parameter.
+
+    Attributes:
+        name: e.g. "joint_compliance.j2".
+        std: in `unit`, SI.
+        value: estimated or ordinary magnitude, SI; None where there is none.
+        unit: SI.
+    """
+
+    name: str
+    std: float
+    value: float | None
+    unit: str
+
+
+@dataclass(frozen=True, slots=True)
+class CriterionResult:
+    """The design that a criterion chooses for the same number of readings.
+
+    The observability indices are those of Sun & Hollerbach (2008), of the whitened Jacobian by
+    the parameters in ordinary magnitudes with the singular values σ.
+
+    Attributes:
+        criterion: its name.
+        position_std_m: standard uncertainty of the position at the prediction poses, m.
+        position_open_m: the same with all potential terms estimated as well.
+        joint_share: largest relative standard uncertainty of a joint compliance; None without.
+        o1: (Π σ)^(1/P) / √N, which D maximises; σ² are the eigenvalues of the Schur complement
+            of the model's parameters without prior.
+        o2: σ_min / σ_max, which K maximises; of the model alone.
+        o3: σ_min, which E maximises.
+        efficiency: certified lower bound of the efficiency by its own criterion; None without.
+    """
+
+    criterion: str
+    position_std_m: float | None
+    position_open_m: float | None
+    joint_share: float | None
+    o1: float
+    o2: float
+    o3: float
+    efficiency: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class CurvePoint:
+    """A point of the sample-size curve.
+
+    Attributes:
+        poses: number of poses beside the reference.
+        position_std_m: standard uncertainty of the position at the prediction poses, m.
+        efficiency: certified efficiency with so many poses; None without.
+    """
+
+    poses: int
+    position_std_m: float
+    efficiency: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class DetectableEffect:
+    """Minimum detectable strength of an effect outside of the model.
+
+    Attributes:
+        effect: its name.
+        least_m: rms displacement of the target, m, whose whitened residual after fitting the
+            model is one sigma; None where the model absorbs the effect.
+    """
+
+    effect: str
+    least_m: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class PlanSummary:
+    """Cost, predicted precision and efficiency of a plan.
+
+    Attributes:
+        poses: number of poses beside the reference.
+        readings: of all, those at the reference included.
+        loads: readings by load, "none" among them, in the order in which they are hung.
+        duration: of the campaign.
+        criterion: name of the criterion.
+        efficiency: certified lower bound of the efficiency; None without a certificate.
+        parameters: predicted precision by parameter.
+        position_std_m: RMS standard uncertainty at the prediction poses, m; None without.
+        position: what is predicted there, e.g. "deflection under 5kg at 100 poses".
+        criteria: criterion comparison, the plan's own among them.
+        curve: sample-size curve, fewest poses first.
+        detectable: minimum detectable effects.
+        longer: share of time beyond the shortest order.
+        confounding: of the plan's order with a linear drift; None where it is not known.
+        shortest: confounding of the shortest order.
+        remarks: assumptions and omissions, one sentence each.
+    """
+
+    poses: int
+    readings: int
+    loads: dict[str, int]
+    duration: Duration
+    criterion: str
+    efficiency: float | None
+    parameters: tuple[PredictedParameter, ...]
+    position_std_m: float | None
+    position: str = ""
+    criteria: tuple[CriterionResult, ...] = ()
+    curve: tuple[CurvePoint, ...] = ()
+    detectable: tuple[DetectableEffect, ...] = ()
+    longer: float = 0.0
+    confounding: Confounding | None = None
+    shortest: Confounding | None = None
+    remarks: tuple[str, ...] = ()
+
+    @property
+    def load_changes(self) -> int:
+        """How often a load is changed by hand, the removal of the last one included."""
+        return len(self.loads) if len(self.loads) > 1 else 0
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the JSON document."""
+        known, own, shortest = asdict(self), self.confounding, self.shortest
+        order = None
+        if own is not None and shortest is not None:
+            order = {
+                "longer": self.longer,
+                "lost": own.correlation**2,
+                "lost_shortest": shortest.correlation**2,
+                **{key: getattr(own, key) for key in ("drift", "error_m", "bias_m")},
+                "told": own.drift_std,
+            }
+        same = ("poses", "readings", "criterion", "efficiency", "position_std_m", "parameters")
+        return {
+            **{key: known[key] for key in same},
+            "predicted_std": {p.name: p.std for p in self.parameters},
+            "readings_by_load": self.loads,
+            "criteria": known["criteria"],
+            "curve": known["curve"],
+            "detectable": known["detectable"],
+            "order": order,
+            "remarks": list(self.remarks),
+        }
+
+
+def summarise(
+    planned: Planned,
+    config: CellConfig,
+    rng: np.random.Generator,
+    say: Say,
+    *,
+    compare: bool = True,
+) -> PlanSummary:
+    """Return the summary of a plan.
 
     Args:
-        made: the plan.
+        planned: the plan.
         config: the cell's configuration.
-        rng: generator, for the plans of the other criteria.
-        say: told what is being done.
-        compare: whether to find out what other criteria and other numbers of poses buy.
+        rng: generator, for the designs of the other criteria.
+        say: progress callback.
+        compare: whether to compute the criterion comparison and the sample-size curve.
     """
-    plan, of = made.ordered.plan, made.problem
-    knows = predicted(of, made.counts, work=made.work)
-    loads = {name: sum(s.load == name for s in plan.steps) for name in plan.loads}
-    poses = len({s.pose for s in plan.steps} - {REFERENCE})
-    bought: tuple[Bought, ...] = ()
-    curve: tuple[Enough, ...] = ()
+    plan, knows = planned.ordered.plan, planned.predicted
     if compare:
-        say("looking at what other criteria and other numbers of poses buy")
-        bought = tuple(_bought(made, rng))
-        curve = tuple(_curve(made))
-    time = made.ordered.duration
-    return PlanStory(
-        poses=poses,
+        say("comparing criteria and numbers of poses")
+    return PlanSummary(
+        poses=len({s.pose for s in plan.steps} - {REFERENCE}),
         readings=len(plan.steps),
-        loads=loads,
-        load_changes=_changes(plan.loads),
-        motion_s=time.motion,
-        readings_s=time.readings,
-        load_changes_s=time.load_changes,
-        criterion=made.criterion,
-        efficiency=made.design.efficiency,
-        predicted=tuple(
-            Promised(name, float(std), float(value) or None, unit)
+        loads={name: sum(s.load == name for s in plan.steps) for name in plan.loads},
+        duration=planned.ordered.duration,
+        criterion=planned.criterion,
+        efficiency=planned.design.efficiency,
+        parameters=tuple(
+            PredictedParameter(name, float(std), float(value) or None, unit)
             for name, std, value, unit in zip(
                 knows.names, knows.std, knows.values, knows.units, strict=True
             )
             # deflections do not determine where a frame is
-            if np.isfinite(std) or not name.startswith(_prefixes(of, *FRAME_ROLES))
+            if np.isfinite(std) or not name.startswith(_prefixes(planned.problem, *FRAME_ROLES))
         ),
         position_std_m=_finite(knows.position),
-        bought=bought,
-        curve=curve,
-        seen=tuple(_seen(made, config)),
-        order=_order(made.ordered.confounding, made.ordered.confounding_shortest, made),
-        remarks=remarks(made),
+        position=planned.work.what,
+        criteria=tuple(_criteria(planned, rng)) if compare else (),
+        curve=tuple(_curve(planned)) if compare else (),
+        detectable=tuple(_detectable(planned, config)),
+        longer=planned.ordered.longer,
+        confounding=planned.ordered.confounding,
+        shortest=planned.ordered.confounding_shortest,
+        remarks=remarks(planned),
     )
 
 
-def remarks(made: Planned) -> tuple[str, ...]:
-    """Return what people should know of a plan."""
-    left = tuple(
-        f'load "{name}" is not hung: the same time tells {100 * gain:.0f} % more without it'
-        for name, gain in made.loads.left_out
+def remarks(planned: Planned) -> tuple[str, ...]:
+    """Return assumptions and omissions of a plan, one sentence each."""
+    omitted = tuple(
+        f'load "{name}" is left out: without it the plan is {100 * gain:.0f} % more efficient in '
+        "the same time"
+        for name, gain in planned.loads.left_out
     )
-    return tuple(dict.fromkeys((*made.drawn.remarks, *made.problem.notes, *left)))
+    return tuple(dict.fromkeys((*planned.drawn.remarks, *planned.problem.notes, *omitted)))
 
 
-def about(made: Planned) -> dict[str, object]:
-    """Return what a plan's file says of how it was made."""
-    knows = predicted(made.problem, made.counts, work=made.work)
+def about(planned: Planned) -> dict[str, object]:
+    """Return what a plan's file holds of its origin."""
+    knows = planned.predicted
     return {
-        **made.ordered.plan.about,
+        **planned.ordered.plan.about,
         "made_by": "optimal design",
-        "criterion": made.criterion,
-        "efficiency": round(made.design.efficiency, 6),
+        "criterion": planned.criterion,
+        "efficiency": round(planned.design.efficiency, 6),
         "predicted_std": {n: _finite(s) for n, s in knows.by_name().items()},
         "position_std_m": _finite(knows.position),
-        "position": made.work.what,
-        "candidates": len(made.drawn.q),
-        "loads_left_out": [name for name, _ in made.loads.left_out],
+        "position": planned.work.what,
+        "candidates": len(planned.drawn.q),
+        "loads_left_out": [name for name, _ in planned.loads.left_out],
     }
-
-
-def _changes(loads: tuple[str, ...]) -> int:
-    """How often another load is hung, and everything taken off at the end."""
-    return len(loads) if len(loads) > 1 else 0
 
 
 def _finite(value: float | None) -> float | None:
     return float(value) if value is not None and np.isfinite(value) else None
 
 
-def _bought(made: Planned, rng: np.random.Generator) -> Iterator[Bought]:
-    """Yield what each criterion buys with as many readings."""
-    of = made.problem
-    for name in dict.fromkeys((*COMPARED, made.criterion)):
-        if name == made.criterion:
-            yield _row(made, name, made.counts, made.design.efficiency)
+def _criteria(planned: Planned, rng: np.random.Generator) -> Iterator[CriterionResult]:
+    """Yield the design of each criterion with as many readings."""
+    of = planned.problem
+    for name in dict.fromkeys((*COMPARED, planned.criterion)):
+        if name == planned.criterion:
+            yield _result(planned, name, planned.counts, planned.design.efficiency)
             continue
         try:
-            whole = robust_question(of, name, made.work, made.budget, rng)
-            design = choose(only(whole, made.usable), made.budget, rng, 1)
+            whole = robust_question(of, name, planned.work, planned.budget, rng)
+            design = choose(only(whole, planned.usable), planned.budget, rng, 1)
         except CannotAnswerError:
             continue
         counts = np.zeros(len(of.units))
-        counts[np.flatnonzero(made.usable)] = design.counts
-        yield _row(made, name, counts, design.efficiency)
+        counts[np.flatnonzero(planned.usable)] = design.counts
+        yield _result(planned, name, counts, design.efficiency)
 
 
-def _row(made: Planned, name: str, counts: Floats, efficiency: float) -> Bought:
-    of, free = made.problem, unknown(made.problem)
-    knows = predicted(of, counts, work=made.work)
+def _result(planned: Planned, name: str, counts: Floats, efficiency: float) -> CriterionResult:
+    of, free = planned.problem, unknown(planned.problem)
+    knows = predicted(of, counts, work=planned.work)
     taken = np.flatnonzero(counts)
     known = of.units.information(counts[taken], taken)
     left = schur_complement(of.prior + known, free)
@@ -140,7 +285,7 @@ def _row(made: Planned, name: str, counts: Floats, efficiency: float) -> Bought:
     alone = np.sqrt(np.maximum(np.linalg.eigvalsh(known[np.ix_(free, free)]), 0.0))
     readings = float(counts @ of.units.cost)
     volume = float(np.exp(np.mean(np.log(np.maximum(sigma, 1e-300)))))
-    return Bought(
+    return CriterionResult(
         criterion=name,
         position_std_m=_finite(knows.position),
         position_open_m=_finite(knows.position_open),
@@ -158,7 +303,7 @@ def _prefixes(of: Problem, *roles: Role) -> tuple[str, ...]:
 
 
 def _joint_share(knows: Predicted, joints: tuple[str, ...]) -> float | None:
-    """Largest standard uncertainty of a joint's compliance, by its value."""
+    """Largest relative standard uncertainty of a joint compliance."""
     shares = [
         std / abs(value)
         for name, std, value in zip(knows.names, knows.std, knows.values, strict=True)
@@ -167,37 +312,36 @@ def _joint_share(knows: Predicted, joints: tuple[str, ...]) -> float | None:
     return _finite(max(shares)) if shares else None
 
 
-def _curve(made: Planned) -> Iterator[Enough]:
-    """Yield what fewer and more readings buy, at the continuous optimum."""
-    of = made.problem
-    asked, usable = only(made.asked, made.usable), np.flatnonzero(made.usable)
-    own = float(made.counts.sum())
-    last = None
-    told = 0
+def _curve(planned: Planned) -> Iterator[CurvePoint]:
+    """Yield the sample-size curve, of continuous optima."""
+    of = planned.problem
+    asked, usable = only(planned.asked, planned.usable), np.flatnonzero(planned.usable)
+    own = float(planned.counts.sum())
+    last, before = None, 0
     for share in SHARES:
-        budget, poses = share * made.budget, max(1, round(share * own))
-        if budget < asked.units.cost.max() or poses == told:
+        budget, poses = share * planned.budget, max(1, round(share * own))
+        if budget < asked.units.cost.max() or poses == before:
             continue
-        told = poses
+        before = poses
         last = relax(
             asked.units, asked.criterion, budget, asked.prior, names=asked.names,
             tolerance=LOOSE, start=last,
         )  # fmt: skip
         whole = of.prior + of.units.information(last.weight, usable[last.index])
-        position = _finite(predicted(of, information=whole, work=made.work).position)
+        position = _finite(predicted(of, information=whole, work=planned.work).position)
         if position is not None:
-            yield Enough(poses, position)
+            yield CurvePoint(poses, position)
 
 
-def _seen(made: Planned, config: CellConfig) -> Iterator[Seen]:
-    """Yield how strong each effect outside of the model has to be to stand out by one sigma.
+def _detectable(planned: Planned, config: CellConfig) -> Iterator[DetectableEffect]:
+    """Yield the minimum detectable strength of each effect outside of the model.
 
     Of some directions of the effect's parameters the median: rms of the displacement, over the
     plan's poses and loads, divided by the root of the non-centrality beyond the model.
     """
-    of, size = made.problem, made.problem.model_size
-    taken = np.flatnonzero(made.counts)
-    information = of.measured + of.units.information(made.counts[taken], taken)
+    of, size = planned.problem, planned.problem.model_size
+    taken = np.flatnonzero(planned.counts)
+    information = of.measured + of.units.information(planned.counts[taken], taken)
     model = of.prior[:size, :size] - of.measured[:size, :size]
     information[:size, :size] += model
     poses = sorted({of.what[k][0] for k in taken})
@@ -222,16 +366,4 @@ def _seen(made: Planned, config: CellConfig) -> Iterator[Seen]:
             apart = float(beta @ left @ beta)
             size_m = float(np.sqrt(3.0 * np.mean((moved[:, where] @ beta) ** 2)))
             least.append(size_m / np.sqrt(apart) if apart > VISIBLE * len(where) else np.inf)
-        yield Seen(effect.name, _finite(float(np.median(least))))
-
-
-def _order(own: Confounding, shortest: Confounding, made: Planned) -> OrderStory:
-    return OrderStory(
-        longer=made.ordered.longer,
-        lost=own.correlation**2,
-        lost_shortest=shortest.correlation**2,
-        drift=own.drift,
-        error_m=own.error_m,
-        bias_m=own.bias_m,
-        told=own.told,
-    )
+        yield DetectableEffect(effect.name, _finite(float(np.median(least))))

@@ -1,5 +1,6 @@
 """A plan and its recording, for the tests of what the viewer gets."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,15 @@ from rerun.chunk import RrdReader
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig, load_config
 from hilcal.data.plan import REFERENCE, UNLOADED, Plan, Step
-from hilcal.plan.story import Bought, Enough, OrderStory, PlanStory, Promised, Seen
+from hilcal.plan.confounding import Confounding
+from hilcal.plan.summary import (
+    CriterionResult,
+    CurvePoint,
+    DetectableEffect,
+    PlanSummary,
+    PredictedParameter,
+)
+from hilcal.plan.timing import Duration
 from hilcal.report.viewer.plan_stream import record_plan
 from hilcal.robot.chain import evaluate
 
@@ -40,33 +49,34 @@ PLAN = Plan(
         Step(REFERENCE, UNLOADED, 2),
     ),
 )
-STORY = PlanStory(
+ORDER = Confounding(4, 0.14, "fz", 0.0, 1000.0, 5e-9, 5e-6, 0.0, None)
+SUMMARY = PlanSummary(
     poses=3,
     readings=10,
     loads={UNLOADED: 6, "10kg": 2, "pull x": 2},
-    load_changes=3,
-    motion_s=60.0,
-    readings_s=90.0,
-    load_changes_s=180.0,
+    duration=Duration(60.0, 90.0, 180.0),
     criterion="D",
     efficiency=0.98768,
-    predicted=(
-        Promised("joint_compliance.j1", 4e-8, 4e-6, "rad/(N·m)"),
-        Promised("joint_compliance.j2", 6e-7, 6e-6, "rad/(N·m)"),
-        Promised("target_offset.x", 2.2e-5, 0.0, "m"),
-        Promised("base_frame.x", 1.2e-5, None, "m"),
+    parameters=(
+        PredictedParameter("joint_compliance.j1", 4e-8, 4e-6, "rad/(N·m)"),
+        PredictedParameter("joint_compliance.j2", 6e-7, 6e-6, "rad/(N·m)"),
+        PredictedParameter("target_offset.x", 2.2e-5, 0.0, "m"),
+        PredictedParameter("base_frame.x", 1.2e-5, None, "m"),
     ),
     position_std_m=12e-6,
-    bought=(
-        Bought("D", 12e-6, 24e-6, 0.038, 132.0, 0.02, 4.0, 0.98768),
-        Bought("test", 9e-6, 30e-6, None, 66.0, 0.01, 2.0, None),
+    position="deflection under each load at 100 feasible poses",
+    criteria=(
+        CriterionResult("D", 12e-6, 24e-6, 0.038, 132.0, 0.02, 4.0, 0.98768),
+        CriterionResult("test", 9e-6, 30e-6, None, 66.0, 0.01, 2.0, None),
     ),
-    curve=(Enough(2, 24e-6), Enough(3, 12e-6), Enough(6, 8e-6)),
-    seen=(Seen("hysteresis", 6e-6), Seen("tracker_drift", None)),
-    order=OrderStory(0.03, 0.02, 0.4, 5e-9, 5e-6, 0.0, None),
+    curve=(CurvePoint(2, 24e-6), CurvePoint(3, 12e-6), CurvePoint(6, 8e-6)),
+    detectable=(DetectableEffect("hysteresis", 6e-6), DetectableEffect("tracker_drift", None)),
+    longer=0.03,
+    confounding=ORDER,
+    shortest=replace(ORDER, correlation=0.63),
     remarks=("only 3 candidates are left of load 10kg.",),
 )
-BARE = PlanStory(3, 10, {UNLOADED: 10}, 0, 1.0, 2.0, 0.0, "made by hand", None, (), None)
+BARE = PlanSummary(3, 10, {UNLOADED: 10}, Duration(1.0, 2.0, 0.0), "made by hand", None, (), None)
 
 
 @pytest.fixture(autouse=True)
@@ -104,7 +114,7 @@ def shadowed() -> tuple[Cell, CellConfig]:
 @pytest.fixture(scope="module")
 def recording(shadowed, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("plan") / "plan.rrd"
-    record_plan(*shadowed, PLAN, STORY, path)
+    record_plan(*shadowed, PLAN, SUMMARY, path)
     return path
 
 

@@ -1,121 +1,68 @@
-"""The flat view of what is read when, and what all flat views of a plan are drawn with."""
-
-from collections.abc import Sequence
+"""The charts of a plan: the minute of every reading by load, and the sample-size curve."""
 
 import numpy as np
 import rerun as rr
 
+from hilcal.plan.summary import PlanSummary
+from hilcal.report import numbers
+from hilcal.report.text_plan import load_name
 from hilcal.report.viewer import plan_style, style
 from hilcal.report.viewer.plan_digest import PlanDigest
-from hilcal.types import Floats
+from hilcal.types import Ints
 
-WIDTH, HEIGHT = 220.0, 80.0  # of the flat pictures, their own units; y points down
-LONG = 500.0  # width of the schedule
-LINE: style.Color = (90, 92, 100)
-_TICKS = (1.0, 2.0, 5.0)
-Place = tuple[float, float]
-
-
-def step_charts(rec: rr.RecordingStream, d: PlanDigest) -> None:
-    """Send the present step's place in the schedule, as columns on `step`."""
-    x = _minutes(d)
-    lines = np.stack([np.stack([x, 0 * x], 1), np.stack([x, 0 * x + HEIGHT], 1)], 1)
-    rec.send_columns(
-        "schedule/now",
-        indexes=[rr.TimeColumn("step", sequence=d.numbers)],
-        columns=rr.LineStrips2D.columns(
-            strips=list(lines),
-            colors=np.tile(np.array(style.PREDICTED, dtype=np.uint8), (len(d), 1)),
-        ),
-    )
+_DOT = 3.5
 
 
 def schedule(rec: rr.RecordingStream, d: PlanDigest) -> None:
-    """Log a dot per reading: its load is its row, its minute its place."""
+    """Send the minute of each reading along `step`, one series per load; load changes are jumps."""
     colors = plan_style.load_colors(d.loads)
-    x, y = _minutes(d), row(d.load, len(d.loads))
-    rec.log(
-        "schedule/readings",
-        rr.Points2D(
-            np.stack([x, y], 1), colors=colors[d.load], radii=rr.Radius.ui_points(_dot(len(d)))
-        ),
-        static=True,
-    )
-    lost = np.flatnonzero(d.unseen)
-    rec.log(
-        "schedule/unseen",
-        rr.Boxes2D(
-            centers=np.stack([x[lost], y[lost]], 1),
-            half_sizes=np.full((len(lost), 2), 3.0),
-            colors=plan_style.sight_colors(d.sight[lost]),
-            radii=rr.Radius.ui_points(1.0),
-        ),
-        static=True,
-    )
-    rows = row(np.arange(len(d.loads)), len(d.loads))
-    rec.log(
-        "schedule/rows",
-        rr.LineStrips2D(
-            [[(0.0, r), (LONG, r)] for r in rows],
-            colors=[(*LINE, 110)],
-            radii=rr.Radius.ui_points(0.5),
-            draw_order=-5.0,
-        ),
-        static=True,
-    )
-    words = [
-        f"{plan_style.load_words(name)}: {int((d.load == k).sum())}"
-        for k, name in enumerate(d.loads)
-    ]
-    write(rec, "schedule/loads", [(-0.08 * LONG, r - 6.0) for r in rows], words)
-    last = float(d.time[-1]) / 60.0
-    marks = ticks(last, 8)
-    places = [(LONG * t / _end(d), HEIGHT + 1.0) for t in marks]
-    write(rec, "schedule/minutes", places, [f"{t:g} min" for t in marks])
+    for k, name in enumerate(d.loads):
+        _dots(rec, d, f"load{k}", load_name(name), np.flatnonzero(d.load == k), tuple(colors[k]))
+    if d.unseen.any():
+        lost = np.flatnonzero(d.unseen)
+        _dots(rec, d, "unseen", "not seen by the tracker", lost, style.RED, "cross")
 
 
-def _end(d: PlanDigest) -> float:
-    """Return the end of the schedule's axis, min."""
-    return max(1.02 * float(d.time[-1]) / 60.0, 1e-9)
-
-
-def _minutes(d: PlanDigest) -> Floats:
-    return np.asarray(LONG * d.time / 60.0 / _end(d))
-
-
-def row(index: object, count: int) -> Floats:
-    """Return the heights of rows by their numbers."""
-    return np.asarray((np.asarray(index, dtype=float) + 0.5) * HEIGHT / max(count, 3))
-
-
-def _dot(count: int) -> float:
-    return 3.0 if count <= 150 else 2.0
-
-
-def ticks(top: float, most: int) -> list[float]:
-    """Return multiples of 1, 2 or 5 times a power of ten from 0 to `top`, at most so many."""
-    power = 10.0 ** np.floor(np.log10(max(top, 1e-12) / most))
-    steps = (f * power * scale for scale in (1.0, 10.0) for f in _TICKS)
-    step = next(s for s in steps if top / s <= most)
-    return [float(k * step) for k in range(int(top / step + 1e-9) + 1)]
-
-
-def write(
+def _dots(
     rec: rr.RecordingStream,
-    path: str,
-    places: Sequence[Place],
-    texts: Sequence[str],
-    color: style.Color = plan_style.TEXT,
+    d: PlanDigest,
+    entity: str,
+    name: str,
+    steps: Ints,
+    color: style.Color,
+    marker: str = "circle",
 ) -> None:
-    """Log texts in colours that can be read in both themes."""
-    rec.log(
-        path,
-        rr.Points2D(
-            list(places),
-            labels=[style.safe(t) for t in texts],
-            radii=rr.Radius.ui_points(0.1),
-            colors=[color],
-            show_labels=True,
-        ),
-        static=True,
+    points = rr.SeriesPoints(
+        names=[f"{style.safe(name)}: {len(steps)}"],
+        colors=[color],
+        markers=[marker],  # type: ignore[list-item]
+        marker_sizes=[_DOT if marker == "circle" else 2.0 * _DOT],
     )
+    rec.log(f"schedule/{entity}", points, static=True)
+    rec.send_columns(
+        f"schedule/{entity}",
+        indexes=[rr.TimeColumn("step", sequence=d.numbers[steps])],
+        columns=rr.Scalars.columns(scalars=d.time[steps] / 60.0),
+    )
+
+
+def curve_unit(s: PlanSummary) -> tuple[str, float]:
+    """Return the unit of the sample-size curve and its factor."""
+    return numbers.unit_for("m", [p.position_std_m for p in s.curve])
+
+
+def curve(rec: rr.RecordingStream, s: PlanSummary) -> None:
+    """Log the sample-size curve as bars; the plan's own number of poses is a series of its own."""
+    poses = np.array([p.poses for p in s.curve], dtype=float)
+    height = curve_unit(s)[1] * np.array([p.position_std_m for p in s.curve])
+    width = 0.6 * float(np.diff(poses).min(initial=poses.max(initial=1.0)))
+    own = poses == s.poses
+    for name, bars, color in (("other", ~own, style.GREY), ("plan", own, style.MEASURED)):
+        if bars.any():
+            chart = rr.BarChart(
+                height[bars],
+                abscissa=poses[bars],
+                widths=np.full(int(bars.sum()), width),
+                color=color,
+            )
+            rec.log(f"curve/{name}", chart, static=True)

@@ -13,7 +13,7 @@ from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.data.plan import Plan
 from hilcal.errors import InputError
-from hilcal.plan.story import PlanStory
+from hilcal.plan.summary import PlanSummary
 from hilcal.plan.timing import pace, timeline
 from hilcal.robot import chain as chains
 from hilcal.robot.body import body_poses
@@ -32,7 +32,7 @@ class PlanDigest:
     Attributes:
         cell: the cell.
         plan: poses and steps.
-        story: what the plan promises.
+        summary: cost, predicted precision and efficiency.
         shapes: of arm, tool, obstacles and loads, as collisions are checked.
         tracker: (3,) where it stands; None where that is not known.
         loads: names of the loads, in the order in which they are hung.
@@ -51,7 +51,7 @@ class PlanDigest:
 
     cell: Cell
     plan: Plan
-    story: PlanStory
+    summary: PlanSummary
     shapes: Clearance
     tracker: Floats | None
     loads: tuple[str, ...]
@@ -104,7 +104,7 @@ class PlanDigest:
         return tuple(pairwise(starts))
 
 
-def plan_digest(cell: Cell, config: CellConfig, plan: Plan, story: PlanStory) -> PlanDigest:
+def plan_digest(cell: Cell, config: CellConfig, plan: Plan, summary: PlanSummary) -> PlanDigest:
     """Derive what the views need.
 
     Raises:
@@ -128,7 +128,7 @@ def plan_digest(cell: Cell, config: CellConfig, plan: Plan, story: PlanStory) ->
     return PlanDigest(
         cell=cell,
         plan=plan,
-        story=story,
+        summary=summary,
         shapes=shapes,
         tracker=None if view is None else view.tracker,
         loads=loads,

@@ -4,7 +4,7 @@ import numpy as np
 import rerun.blueprint as rrb
 
 from hilcal.report import numbers
-from hilcal.report.viewer import plan_charts, plan_promises, plan_scene
+from hilcal.report.viewer import plan_charts, plan_scene
 from hilcal.report.viewer.plan_digest import PlanDigest
 from hilcal.types import Floats
 
@@ -13,14 +13,11 @@ _FPS = 2.0
 _DARK = rrb.Background(color=(22, 24, 29), kind=rrb.BackgroundKind.SolidColor)
 STEPS = "Plan step by step: a bead per pose and load, beam green = seen"
 TRACKER = "From the tracker"
-SCHEDULE = "Schedule: which load is read when"
-CURVE = "How many poses are enough: predicted position ±"
-PARAMETERS = "Predicted ± in % of size"
-BOUGHT = "What each criterion buys: ± small, O large"
+SCHEDULE = "Schedule: minute of each reading by step, colour by load"
 
 
 def blueprint(d: PlanDigest) -> rrb.Blueprint:
-    """Left: 3-D over the schedule. Right: the plan in words over what it promises."""
+    """Left: 3-D over the schedule. Right: the plan in words over curve and tables."""
     scenes = [_steps(d)]
     if d.tracker is not None:
         scenes.append(_from_tracker(d, d.tracker))
@@ -33,8 +30,12 @@ def blueprint(d: PlanDigest) -> rrb.Blueprint:
         )
     ]
     shares = [11.0]
-    if d.story.curve:
-        right.append(_flat("curve", CURVE))
+    if d.summary.curve:
+        right.append(
+            rrb.BarChartView(
+                origin="curve", name=curve_title(d), plot_legend=rrb.PlotLegend(visible=False)
+            )
+        )
         shares.append(7.0)
     details = _details(d)
     if details:
@@ -50,22 +51,18 @@ def blueprint(d: PlanDigest) -> rrb.Blueprint:
     )
 
 
-def parameters_title(d: PlanDigest) -> str:
-    """Return the title of the parameters' view, with how many it shows."""
-    shown, all_ = len(plan_promises.shown_parameters(d.story)), len(d.story.predicted)
-    return f"{PARAMETERS} ({shown} of {all_})" if shown < all_ else PARAMETERS
+def curve_title(d: PlanDigest) -> str:
+    """Return the title of the sample-size curve, with its unit."""
+    unit = plan_charts.curve_unit(d.summary)[0]
+    return f"Position ± [{unit}] by number of poses; blue: this plan"
 
 
 def _details(d: PlanDigest) -> list[rrb.View]:
     out: list[rrb.View] = []
-    if plan_promises.shown_parameters(d.story):
-        out.append(_flat("parameters", parameters_title(d)))
-    if d.story.bought:
-        out.append(_flat("bought", BOUGHT))
-    if d.story.predicted:
+    if d.summary.criteria:
+        out.append(rrb.TextDocumentView(origin="words/criteria", name="Criteria"))
+    if d.summary.parameters:
         out.append(rrb.TextDocumentView(origin="words/parameters", name="Parameters"))
-    if d.story.bought:
-        out.append(rrb.TextDocumentView(origin="words/bought", name="Criteria"))
     return out
 
 
@@ -106,21 +103,7 @@ def _view3d(name: str, contents: list[str], eye: Floats, look: Floats) -> rrb.Sp
     )
 
 
-def _schedule() -> rrb.Spatial2DView:
-    w, h = plan_charts.LONG, plan_charts.HEIGHT
-    return rrb.Spatial2DView(
-        origin="schedule",
-        name=SCHEDULE,
-        background=_DARK,
-        visual_bounds=rrb.VisualBounds2D(x_range=(-0.16 * w, 1.02 * w), y_range=(-5.0, h + 16.0)),
-    )
-
-
-def _flat(origin: str, name: str) -> rrb.Spatial2DView:
-    w, h = plan_charts.WIDTH, plan_charts.HEIGHT
-    return rrb.Spatial2DView(
-        origin=origin,
-        name=name,
-        background=_DARK,
-        visual_bounds=rrb.VisualBounds2D(x_range=(-0.09 * w, 1.05 * w), y_range=(-13.0, h + 13.0)),
+def _schedule() -> rrb.TimeSeriesView:
+    return rrb.TimeSeriesView(
+        origin="schedule", name=SCHEDULE, plot_legend=rrb.PlotLegend(visible=True)
     )

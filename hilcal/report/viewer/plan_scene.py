@@ -3,6 +3,7 @@
 import numpy as np
 import rerun as rr
 
+from hilcal.report.text_plan import load_name
 from hilcal.report.viewer import arm_shapes, plan_cell, plan_style, style
 from hilcal.report.viewer.digest import quaternions_of
 from hilcal.report.viewer.plan_digest import SEEN, PlanDigest
@@ -78,7 +79,7 @@ def _label(rec: rr.RecordingStream, d: PlanDigest, time: list[rr.TimeColumn]) ->
     above = d.target + np.array([0.0, 0.0, _LABEL_ABOVE])
     above[:, 2] += d.rank.max(initial=0) * plan_cell.BEAD_GAP * d.reach
     words = [
-        style.safe(f"{k}: {s.pose}, {plan_style.load_words(s.load)}{_sight_words(d, k - 1)}")
+        style.safe(f"{k}: {s.pose}, {load_name(s.load)}{_sight_words(d, k - 1)}")
         for k, s in enumerate(d.plan.steps, start=1)
     ]
     rec.send_columns(

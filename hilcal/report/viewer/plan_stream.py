@@ -9,12 +9,11 @@ import rerun as rr
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.data.plan import Plan
-from hilcal.plan.story import PlanStory
+from hilcal.plan.summary import PlanSummary
 from hilcal.report.viewer import (
     plan_cell,
     plan_charts,
     plan_layout,
-    plan_promises,
     plan_scene,
     plan_words,
     style,
@@ -23,7 +22,9 @@ from hilcal.report.viewer.plan_digest import PlanDigest, plan_digest
 from hilcal.report.viewer.stream import flush, opened, require_folder, write
 
 
-def record_plan(cell: Cell, config: CellConfig, plan: Plan, story: PlanStory, path: Path) -> None:
+def record_plan(
+    cell: Cell, config: CellConfig, plan: Plan, summary: PlanSummary, path: Path
+) -> None:
     """Write a plan as a recording file, whole or not at all; an existing file is replaced.
 
     The timeline `step` goes through the readings in order, from 1: the arm in its pose, what
@@ -34,7 +35,7 @@ def record_plan(cell: Cell, config: CellConfig, plan: Plan, story: PlanStory, pa
         cell: the cell.
         config: its loads, obstacles, limits and sight.
         plan: poses and steps.
-        story: what the plan promises.
+        summary: cost, predicted precision and efficiency.
         path: of the recording, ".rrd".
 
     Raises:
@@ -43,27 +44,27 @@ def record_plan(cell: Cell, config: CellConfig, plan: Plan, story: PlanStory, pa
     """
     path = Path(path)
     require_folder(path)
-    d = plan_digest(cell, config, plan, story)
-    rec = opened(_recording_id(config, plan, story))
-    write(rec, plan_layout.blueprint(d), lambda: _tell(rec, d), path)
+    d = plan_digest(cell, config, plan, summary)
+    rec = opened(_recording_id(config, plan, summary))
+    write(rec, plan_layout.blueprint(d), lambda: _log(rec, d), path)
 
 
-def _tell(rec: rr.RecordingStream, d: PlanDigest) -> None:
+def _log(rec: rr.RecordingStream, d: PlanDigest) -> None:
     rec.send_recording_name(f"hilcal plan: {style.safe(d.cell.arm.name)}, {len(d)} readings")
     plan_cell.static_scene(rec, d)
-    plan_charts.schedule(rec, d)
-    plan_promises.promises(rec, d.story)
     for name, text in (
-        ("plan", plan_words.summary(d)),
+        ("plan", plan_words.overview(d)),
         ("guide", plan_words.GUIDE),
-        ("parameters", plan_words.parameters(d.story)),
-        ("bought", plan_words.bought(d.story)),
+        ("parameters", plan_words.parameters(d.summary)),
+        ("criteria", plan_words.criteria(d.summary)),
     ):
         document = rr.TextDocument(text, media_type="text/markdown")
         rec.log(f"words/{name}", document, static=True)
+    if d.summary.curve:
+        plan_charts.curve(rec, d.summary)
     flush(rec)
     plan_scene.step_scene(rec, d)
-    plan_charts.step_charts(rec, d)
+    plan_charts.schedule(rec, d)
     cards = [plan_words.step_card(d, k) for k in range(len(d))]
     rec.send_columns(
         "words/step",
@@ -73,7 +74,7 @@ def _tell(rec: rr.RecordingStream, d: PlanDigest) -> None:
     flush(rec)
 
 
-def _recording_id(config: CellConfig, plan: Plan, story: PlanStory) -> str:
-    """Return an identifier that depends on what is told, and on nothing else."""
-    told = "\n".join((config.to_json(), plan.to_json(), repr(story)))
-    return str(uuid.UUID(bytes=hashlib.sha256(told.encode()).digest()[:16]))
+def _recording_id(config: CellConfig, plan: Plan, summary: PlanSummary) -> str:
+    """Return an identifier that depends on the content of the recording alone."""
+    content = "\n".join((config.to_json(), plan.to_json(), repr(summary)))
+    return str(uuid.UUID(bytes=hashlib.sha256(content.encode()).digest()[:16]))

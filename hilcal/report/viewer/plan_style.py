@@ -14,7 +14,6 @@ SIGHT_COLORS = np.array([style.NOISE, style.AMBER, style.RED, style.GREY], dtype
 SIGHT_WORDS = ("seen", "turned too far away", "hidden", "sight not checked")
 # Labels stand on a plate in the theme's colour: these have a contrast of about 3 on both.
 TEXT: style.Color = (128, 131, 140)
-OWN_TEXT: style.Color = (40, 135, 200)
 _SIGHT_TEXT = np.array([(0, 158, 115), (190, 125, 0), (225, 60, 95), TEXT], dtype=np.uint8)
 BARE: style.Color = (225, 226, 230)
 """Of what is unloaded."""
@@ -51,8 +50,3 @@ def sight_colors(sight: Ints) -> Colors:
 def text_colors(sight: Ints) -> Colors:
     """(S, 3) colour of the label of each step."""
     return np.asarray(_SIGHT_TEXT[sight])
-
-
-def load_words(name: str) -> str:
-    """Return a load's name for people."""
-    return "unloaded" if name == UNLOADED else name

@@ -1,56 +1,43 @@
 """A plan in words: markdown that the viewer shows beside the pictures."""
 
+from collections.abc import Iterable, Sequence
+
 import numpy as np
 
 from hilcal.acquire.sight import UNKNOWN as NO_TRACKER
 from hilcal.data.plan import UNLOADED
-from hilcal.plan.story import PlanStory
-from hilcal.report import numbers
-from hilcal.report.text_plan import CRITERIA, certified, enough, order_remark
+from hilcal.plan.summary import PlanSummary
+from hilcal.report import text_plan
 from hilcal.report.text_run import spoken
-from hilcal.report.viewer import plan_style
 from hilcal.report.viewer.plan_digest import SEEN, PlanDigest
-from hilcal.report.viewer.plan_promises import amount, share
 from hilcal.report.viewer.style import escaped
 
-_SEEN = 6
+_DETECTABLE = 6
+"""Effects that are named in the overview."""
 
 
-def summary(d: PlanDigest) -> str:
-    """Return what the plan costs, what it promises and how near it is to the best."""
-    s = d.story
-    whole = spoken(s.motion_s + s.readings_s + s.load_changes_s)
-    lines = [f"# Plan: {s.poses} poses, {s.readings} readings, {whole}"]
+def overview(d: PlanDigest) -> str:
+    """Return cost, efficiency, remarks and order of a plan."""
+    s = d.summary
+    lines = [f"# Plan: {s.poses} poses, {s.readings} readings, {spoken(s.duration.total)}"]
     if s.efficiency is not None:
-        lines += [f"## {escaped(certified(s.efficiency).capitalize())}"]
-    costs = _costs(d)
-    lines += [costs[0], "|---|---|", *costs[1:]]
+        lines += [f"## {escaped(text_plan.certified(s.efficiency).capitalize())}"]
+    rows = [row for row in text_plan.cost_rows(s) if row[0] not in ("certified", "takes about")]
+    lines += [_table(("", ""), rows), f"| tracker | {sight(d)} |"]
     lines += [line for remark in s.remarks for line in ("", f"⚠ {escaped(remark)}")]
     if s.curve:
-        lines += ["", escaped(enough(s.curve))]
-    if s.seen:
+        lines += ["", escaped(text_plan.enough(s.curve))]
+    if s.detectable:
         lines += ["", _effects(s)]
-    if s.order is not None:
-        lines += ["", escaped(order_remark(s.order))]
+    if s.confounding is not None:
+        lines += ["", escaped(text_plan.order_remark(s))]
     return "\n".join(lines)
 
 
-def _costs(d: PlanDigest) -> list[str]:
-    s = d.story
-    loads = ", ".join(f"{escaped(plan_style.load_words(k))} {n}" for k, n in s.loads.items())
-    changes = f"{s.load_changes} load change{'' if s.load_changes == 1 else 's'}"
-    meaning = CRITERIA.get(s.criterion)
-    rows = [
-        f"| readings | {loads} |",
-        f"| takes about | motion {spoken(s.motion_s)}, readings {spoken(s.readings_s)}, "
-        f"{changes} by hand {spoken(s.load_changes_s)} |",
-        f"| made for | {escaped(s.criterion)}{f': {escaped(meaning)}' if meaning else ''} |",
-    ]
-    if s.position_std_m is not None:
-        std = numbers.length(s.position_std_m)
-        rows.append(f"| position | **± {std}** predicted where the robot will work |")
-    rows.append(f"| tracker | {sight(d)} |")
-    return rows
+def _table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a markdown table."""
+    cells = [columns, ["---"] * len(columns), *([escaped(c) for c in row] for row in rows)]
+    return "\n".join(f"| {' | '.join(c or ' ' for c in row)} |" for row in cells)
 
 
 def sight(d: PlanDigest) -> str:
@@ -63,15 +50,12 @@ def sight(d: PlanDigest) -> str:
     return f"✗ **does not see the target in {lost} of {len(d)} readings**"
 
 
-def _effects(s: PlanStory) -> str:
-    told = sorted((x for x in s.seen if x.least_m is not None), key=lambda x: x.least_m or 0.0)
-    words = [f"{escaped(x.effect)} from {numbers.length(x.least_m or 0.0)}" for x in told[:_SEEN]]
-    more = f" and {len(told) - _SEEN} more" if len(told) > _SEEN else ""
-    out = f"Not in the model, and would still show: {', '.join(words)}{more}." if words else ""
-    hidden = [escaped(x.effect) for x in s.seen if x.least_m is None]
-    if hidden:
-        out += f" These readings cannot show {numbers.names(hidden, 'or')}."
-    return out.strip()
+def _effects(s: PlanSummary) -> str:
+    found = text_plan.detectable(s)
+    words = [f"{escaped(effect)} from {least}" for effect, least in found[:_DETECTABLE]]
+    more = f" and {len(found) - _DETECTABLE} more" if len(found) > _DETECTABLE else ""
+    out = f"Detectable outside of the model: {', '.join(words)}{more}. " if words else ""
+    return f"{out}{escaped(text_plan.undetectable(s))}".strip()
 
 
 def step_card(d: PlanDigest, k: int) -> str:
@@ -113,49 +97,16 @@ def _sight(d: PlanDigest, k: int) -> str:
     return f"✗ **The tracker does not see the target** {way}: {escaped(d.why[k])}."
 
 
-def parameters(s: PlanStory) -> str:
-    """Return the table of all parameters with their predicted standard uncertainties."""
-    lines = ["| parameter | predicted ± | of about | ± in % |", "|---|---|---|---|"]
-    for p in s.predicted:
-        about = share_ = " "
-        if p.value is not None:
-            unit, factor = numbers.unit_for(p.unit, [p.value])
-            about = f"{numbers.digits(factor * p.value)} {escaped(unit)}"
-            share_ = f"{numbers.digits(100 * share(p), 2)} %" if p.value else " "
-        lines.append(f"| {escaped(p.name)} | {escaped(amount(p))} | {about} | {share_} |")
-    lines += ["", "Of about: what is known so far, else an ordinary magnitude."]
-    return "\n".join(lines)
+def parameters(s: PlanSummary) -> str:
+    """Return the table of predicted standard uncertainties."""
+    rows = text_plan.parameter_rows(s.parameters)
+    return f"{_table(text_plan.PARAMETER_COLUMNS, rows)}\n\n{text_plan.PARAMETER_NOTE}"
 
 
-def bought(s: PlanStory) -> str:
-    """Return the table of what each criterion buys for the same number of readings."""
-    lines = [
-        "| criterion | position ± | open ± | joint ± | O1 (D) | O2 (K) | O3 (E) | certified |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    for b in s.bought:
-        name = escaped(b.criterion)
-        worst = b.joint_share
-        cells = (
-            f"**{name}, this plan**" if b.criterion == s.criterion else name,
-            "-" if b.position_std_m is None else numbers.length(b.position_std_m),
-            "-" if b.position_open_m is None else numbers.length(b.position_open_m),
-            "-" if worst is None else f"{numbers.digits(100 * worst, 2)} %",
-            numbers.digits(b.o1),
-            numbers.digits(b.o2, 2),
-            numbers.digits(b.o3),
-            "-" if b.efficiency is None else certified(b.efficiency).split(" of ")[0],
-        )
-        lines.append(f"| {' | '.join(cells)} |")
-    lines += [
-        "",
-        "Position: where the robot will work; open: the same where any effect that the plan is "
-        "made against may be there. Joint: the worst known of the joints' parameters, by its "
-        "size. O1 to O3: observability indices, larger is better; O1 and O3 with these effects "
-        "unknown as well. "
-        "Certified: share of the best possible by its own criterion.",
-    ]
-    return "\n".join(lines)
+def criteria(s: PlanSummary) -> str:
+    """Return the table of the criterion comparison."""
+    rows = text_plan.criteria_rows(s)
+    return f"{_table(text_plan.CRITERIA_COLUMNS, rows)}\n\n{text_plan.CRITERIA_NOTE}"
 
 
 GUIDE = """# How to read this
@@ -167,11 +118,12 @@ taken; the bright line is the target's last motion, the faint one its whole way 
 one is the same place under another load. Their colours are those of the schedule below.
 
 **The beam** is green where the tracker sees the target, amber where the reflector is turned too
-far away, red where something is between; such readings have a cage about their bead and a frame
+far away, red where something is between; such readings have a cage about their bead and a cross
 in the schedule. *From the tracker*: what the tracker sees, from where it stands.
 
 **What hangs** below the load point is drawn with the room that is kept for it, a pull as an arrow.
 Thin blue lines bound the workspace.
 
-**Schedule**: one dot per reading, one row per load; gaps are load changes by hand.
+**Schedule**: one dot per reading, its minute over its step, in the colour of its load; jumps are
+load changes by hand.
 """

@@ -259,7 +259,7 @@ def test_the_drift_that_returns_tell_is_that_of_a_fit_to_them() -> None:
     means = np.array([[plan.steps[k].load == load for load in plan.loads] for k in at], float)
     design = np.column_stack([times[at], means])
     std = 15e-6 * np.sqrt(np.linalg.inv(design.T @ design)[0, 0])
-    assert made[0].confounding.told == pytest.approx(std, rel=1e-6)
+    assert made[0].confounding.drift_std == pytest.approx(std, rel=1e-6)
 
 
 def test_information_kept_is_that_of_the_whole_covariance() -> None:

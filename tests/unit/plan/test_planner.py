@@ -17,7 +17,7 @@ from hilcal.data.table import write_table
 from hilcal.plan.choice import CRITERIA, question, worthwhile
 from hilcal.plan.planner import Planned, Request, make
 from hilcal.plan.predicted import predicted
-from hilcal.plan.summary import remarks, story
+from hilcal.plan.summary import remarks, summarise
 from tests.support.cli_cases import CELL, ok, refused, rehearsal
 
 Capsys = pytest.CaptureFixture[str]
@@ -117,7 +117,7 @@ def test_a_load_that_is_there_twice_is_hung_once() -> None:
     left = {name for name, _ in made.loads.left_out}
     assert len(left & {"10kg", "10kg again"}) >= 1
     assert all(gain > 0 for _, gain in made.loads.left_out)
-    assert any("is not hung" in words for words in remarks(made))
+    assert any("is left out" in words for words in remarks(made))
     assert not left & set(made.ordered.plan.loads)
     assert made.budget > 5 * 4  # the time is spent on readings
 
@@ -128,16 +128,16 @@ def test_no_load_is_left_out_where_hanging_one_costs_nothing(usual: Planned) -> 
     assert found.left_out == ()
 
 
-def test_the_story_holds_together(usual: Planned) -> None:
-    told = story(usual, small(), np.random.default_rng(2), lambda words: None)
+def test_the_summary_is_consistent(usual: Planned) -> None:
+    told = summarise(usual, small(), np.random.default_rng(2), lambda words: None)
     assert told.readings == len(usual.ordered.plan.steps) == sum(told.loads.values())
-    assert {b.criterion for b in told.bought} == {"D", "A", "E", "K", "test"}
-    best = {b.criterion: b for b in told.bought}
-    assert best["E"].o3 >= 0.98 * max(b.o3 for b in told.bought)
+    assert {b.criterion for b in told.criteria} == {"D", "A", "E", "K", "test"}
+    best = {b.criterion: b for b in told.criteria}
+    assert best["E"].o3 >= 0.98 * max(b.o3 for b in told.criteria)
     stds = [point.position_std_m for point in told.curve]
     assert stds == sorted(stds, reverse=True)
-    assert {s.effect for s in told.seen} == {"joint_tilt_compliance"}
-    assert all(s.least_m is not None and 1e-7 < s.least_m < 1e-3 for s in told.seen)
+    assert {s.effect for s in told.detectable} == {"joint_tilt_compliance"}
+    assert all(s.least_m is not None and 1e-7 < s.least_m < 1e-3 for s in told.detectable)
 
 
 def cell_file(directory: Path, config: CellConfig) -> Path:

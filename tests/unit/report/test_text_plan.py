@@ -12,51 +12,68 @@ from hilcal.data.plan import REFERENCE, UNLOADED, Plan, Step
 from hilcal.data.plan_csv import plan_csv
 from hilcal.data.readings import Readings
 from hilcal.data.table import read_table
-from hilcal.plan.story import Bought, Enough, OrderStory, PlanStory, Promised, Seen
-from hilcal.report.text_plan import certified, enough, order_remark, story_report
+from hilcal.plan.confounding import Confounding
+from hilcal.plan.summary import (
+    CriterionResult,
+    CurvePoint,
+    DetectableEffect,
+    PlanSummary,
+    PredictedParameter,
+)
+from hilcal.plan.timing import Duration
+from hilcal.report.text_plan import certified, enough, order_remark, plan_report
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
 
-ORDER = OrderStory(0.032, 0.0251, 0.41, 20e-6 / 3600, 5.7e-6, -2e-8, 17e-6 / 3600)
-STORY = PlanStory(
+ORDER = Confounding(60, 0.0251**0.5, "fz", -3.6, 1000.0, 20e-6 / 3600, 5.7e-6, -2e-8, 17e-6 / 3600)
+SUMMARY = PlanSummary(
     poses=18,
     readings=93,
     loads={UNLOADED: 33, "mass-5kg": 20, "mass-10kg": 20, "pull-x-50N": 20},
-    load_changes=4,
-    motion_s=842.0,
-    readings_s=1111.5,
-    load_changes_s=240.0,
+    duration=Duration(842.0, 1111.5, 240.0),
     criterion="D",
     efficiency=0.98768,
-    predicted=(
-        Promised("joint_compliance.j1", 4e-8, 4.2e-6, "rad/(N·m)"),
-        Promised("joint_compliance.j6", 6e-7, 1.6e-5, "rad/(N·m)"),
-        Promised("base_frame.x", 1.2e-5, None, "m"),
-        Promised("target_offset.x", 2.2e-5, 0.0, "m"),
+    parameters=(
+        PredictedParameter("joint_compliance.j1", 4e-8, 4.2e-6, "rad/(N·m)"),
+        PredictedParameter("joint_compliance.j6", 6e-7, 1.6e-5, "rad/(N·m)"),
+        PredictedParameter("base_frame.x", 1.2e-5, None, "m"),
+        PredictedParameter("target_offset.x", 2.2e-5, 0.0, "m"),
     ),
     position_std_m=11.4e-6,
-    bought=(
-        Bought("D", 11.4e-6, 15.1e-6, 0.038, 132.0, 0.021, 4.1, 0.98768),
-        Bought("test", 9.1e-6, None, None, 110.0, 0.016, 3.3, None),
+    position="deflection under mass-5kg at 100 poses",
+    criteria=(
+        CriterionResult("D", 11.4e-6, 15.1e-6, 0.038, 132.0, 0.021, 4.1, 0.98768),
+        CriterionResult("test", 9.1e-6, None, None, 110.0, 0.016, 3.3, None),
     ),
-    curve=(Enough(6, 31e-6), Enough(12, 12e-6), Enough(18, 11.4e-6), Enough(36, 11.2e-6)),
-    seen=(Seen("hysteresis", 6e-6), Seen("joint_tilt", 3e-6), Seen("tracker_drift", None)),
-    order=ORDER,
+    curve=(
+        CurvePoint(6, 31e-6),
+        CurvePoint(12, 12e-6),
+        CurvePoint(18, 11.4e-6),
+        CurvePoint(36, 11.2e-6),
+    ),
+    detectable=(
+        DetectableEffect("hysteresis", 6e-6),
+        DetectableEffect("joint_tilt", 3e-6),
+        DetectableEffect("tracker_drift", None),
+    ),
+    longer=0.032,
+    confounding=ORDER,
+    shortest=replace(ORDER, correlation=0.41**0.5),
     remarks=("only 3 candidates are left of load mass-10kg.",),
 )
 
 
-def _shown(story: PlanStory, width: int) -> str:
+def _shown(summary: PlanSummary, width: int) -> str:
     out = StringIO()
     console = Console(file=out, width=width, force_terminal=False)
-    for part in story_report(story):
+    for part in plan_report(summary):
         console.print(part, markup=False, highlight=False)
     return out.getvalue()
 
 
 @pytest.mark.parametrize("width", [80, 110])
 def test_everything_is_told_and_fits(width: int) -> None:
-    shown = _shown(STORY, width)
+    shown = _shown(SUMMARY, width)
     assert max(map(len, shown.splitlines())) <= width
     assert "…" not in shown  # nothing is cut off
     words = " ".join(shown.split())
@@ -66,12 +83,12 @@ def test_everything_is_told_and_fits(width: int) -> None:
         "37 min",
         "motion 14 min, readings 19 min, 4 load changes by hand 4 min",
         "at least 98.7 % of the best possible",
-        "± 11.4 µm, predicted where the robot will work",
+        "± 11.4 µm, predicted for the deflection under mass-5kg at 100 poses",
         "joint_compliance.j6 0.60 16.0 µrad/(N·m) 3.8 %",
         "base_frame.x 12 µm",
-        "D (this) 11.4 µm 15.1 µm 3.8 % 132 0.021 4.10 ≥ 98.7 %",
+        "D (this) 11.4 µm 15.1 µm 3.8 % 132 0.021 4.10 98.7 %",
         "test 9.10 µm - - 110 0.016 3.30 -",
-        "These readings cannot show tracker_drift.",
+        "These readings cannot detect tracker_drift.",
         "note: only 3 candidates are left of load mass-10kg.",
     ):
         assert told in words
@@ -79,11 +96,11 @@ def test_everything_is_told_and_fits(width: int) -> None:
 
 
 def test_what_is_absent_is_not_told() -> None:
-    bare = PlanStory(1, 2, {UNLOADED: 2}, 0, 1.0, 2.0, 0.0, "made by hand", None, (), None)
+    bare = PlanSummary(1, 2, {UNLOADED: 2}, Duration(1.0, 2.0, 0.0), "made by hand", None, (), None)
     shown = _shown(bare, 80)
     assert "made by hand" in shown
     assert "0 load changes" in shown
-    for word in ("certified", "position", "criterion buys", "enough", "drift", "nan", "None"):
+    for word in ("certified", "position", "Comparison", "enough", "drift", "nan", "None"):
         assert word not in shown
 
 
@@ -96,25 +113,29 @@ def test_a_certificate_is_never_rounded_up(efficiency: float, words: str) -> Non
 
 
 def test_bars_are_as_long_as_what_they_show_and_the_plan_is_marked() -> None:
-    lines = [line for line in _shown(STORY, 80).splitlines() if "█" in line]
+    lines = [line for line in _shown(SUMMARY, 80).splitlines() if "█" in line]
     sizes = [line.count("█") for line in lines]
-    values = [point.position_std_m for point in STORY.curve]
+    values = [point.position_std_m for point in SUMMARY.curve]
     np.testing.assert_allclose(np.array(sizes) / sizes[0], np.array(values) / values[0], atol=0.02)
     assert ["this plan" in line for line in lines] == [False, False, True, False]
 
 
 def test_enough_is_where_more_poses_change_little() -> None:
-    assert enough(STORY.curve) == "From 12 to 36 poses the position gains 7 % only."
-    assert enough(STORY.curve[:2]) == "More than 12 poses would still help."
+    assert enough(SUMMARY.curve) == (
+        "From 12 to 36 poses the position's uncertainty falls by 7 % only."
+    )
+    assert enough(SUMMARY.curve[:2]) == "More than 12 poses still improve the position."
 
 
-def test_the_order_is_told_with_its_cost_and_what_it_saves() -> None:
-    told = order_remark(ORDER)
-    assert "3.2 % longer" in told
-    assert "up to about 3 % of what it knows of a parameter (41 % in the shortest order)" in told
-    assert "20 µm/h would shift deflections by 5.70 µm rms and less than 0.1 µm on average" in told
-    assert "tell a drift to ± 17 µm/h" in told
-    plain = order_remark(replace(ORDER, longer=0.0, bias_m=5e-6, told=None))
+def test_the_order_is_stated_with_its_cost_and_what_it_saves() -> None:
+    words = order_remark(SUMMARY)
+    assert "3.2 % longer" in words
+    assert "up to about 3 % of a parameter's information (41 % in the shortest order)" in words
+    assert "a drift of 20 µm/h shifts deflections by 5.70 µm rms" in words
+    assert "and less than 0.1 µm on average" in words
+    assert "determine it to ± 17 µm/h" in words
+    order = replace(ORDER, bias_m=5e-6, drift_std=None)
+    plain = order_remark(replace(SUMMARY, longer=0.0, confounding=order))
     assert plain.startswith("The order is the shortest one. ")
     assert "5.00 µm on average." in plain
     assert "in the shortest order" not in plain
