@@ -1,19 +1,20 @@
-"""The search for gross errors: which readings, shifted, explain what nothing smooth does.
+"""Data snooping (Baarda): which readings, shifted, explain what nothing smooth does.
 
-With P the projection that frees whitened rows of the model and of generic smooth columns (its
-parts with a prior included as their marginal covariance), and S_k (R, m) the whitened effect of
-a shift of reading k, of a loaded one or of the unloaded one that deflections share,
+With P the projection off the columns of the model and of generic smooth functions (those with a
+prior by their marginal covariance, see `regression.projection`), and S_k (R, m) the whitened
+effect of a shift of reading k, of a loaded one or of the unloaded one that deflections share,
 
     t²_k = (S_kᵀ P r)ᵀ (S_kᵀ P S_k)⁻¹ (S_kᵀ P r)
 
 is χ²_m for a good reading, whatever its leverage. The reading with the largest t² is taken out,
 its columns join P, and so on: a gross error cannot hide others, nor make good readings look bad.
+
+Source: Baarda, *A testing procedure for use in geodetic networks* (1968).
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg as sl
 from scipy.stats import binom
 
 from hilcal.data.readings import Readings
@@ -22,6 +23,7 @@ from hilcal.identify.gauss_newton import Solution
 from hilcal.identify.outliers import bulk, limit
 from hilcal.identify.smooth_nuisance import generic_columns
 from hilcal.model import Model
+from hilcal.regression.projection import projection
 from hilcal.types import Bools, Floats, Ints
 
 SMALLEST = 3e-3
@@ -56,7 +58,7 @@ def find_gross(
     Where there are more than twice as many, or too many of them are shared unloaded readings,
     they are no accident, and none is returned.
     """
-    e, q = _free(model, solution, readings, w)
+    e, q = _projection(model, solution, readings, w)
     c = _candidates(w)
     g, a = c.gradients(e[:, None])[:, :, 0], c.information(q)
     whole = np.trace(a, axis1=1, axis2=2)
@@ -98,22 +100,15 @@ def find_gross(
     return Suspected(rows, found)
 
 
-def _free(
+def _projection(
     model: Model, solution: Solution, readings: Readings, w: Whitening
 ) -> tuple[Floats, Floats]:
-    """Residual (R,) and Q (R, K) with P = I − Q Qᵀ."""
-    factor, _ = sl.cho_factor(
-        solution.equations.gram + np.diag(solution.beta * solution.equations.basis.prior_precision),
-        lower=True,
-    )
-    own = sl.solve_triangular(factor, solution.rows.T, lower=True).T
+    """Residual (R,) and Q (R, K) with P = I − Q Qᵀ, off the model and generic smooth columns."""
+    own = solution.projection()
     x = generic_columns(model, solution.prediction, readings, w)
-    free = x - own @ (own.T @ x)
-    # P − P X (I + Xᵀ P X)⁻¹ Xᵀ P, and the residual is P of the data already.
-    root = np.linalg.cholesky(np.eye(x.shape[1]) + x.T @ free)
-    more = sl.solve_triangular(root, free.T, lower=True).T
-    e = solution.white - more @ sl.solve_triangular(root, x.T @ solution.white, lower=True)
-    return e, np.concatenate([own, more], axis=1)
+    p = projection(np.hstack([own.rows, x]), np.append(own.ridge, np.ones(x.shape[1])))
+    z = np.append(solution.coordinates(), np.zeros(x.shape[1]))
+    return p.residual(solution.white, z), p.root()
 
 
 def _inverse_root(a: Floats, whole: float) -> Floats:

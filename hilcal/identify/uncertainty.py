@@ -9,7 +9,7 @@ space:
     Var(θ_p) = (G − 1)/G Σ_g (θ_p without g − mean)²
 
 Parameters of shrunk families are less certain by what is not known of their strength; see
-`strength_spread`.
+`hyperparameter_uncertainty`.
 
 Source: Efron and Tibshirani, *An Introduction to the Bootstrap*, chapter 11.
 """
@@ -105,10 +105,8 @@ def _of_strength(model: Model, w: Whitening, solution: Solution, covariance: Flo
     if w.scaling == "none" or not len(dropped) or not solution.rows.shape[1]:
         return factor
     columns = whitened_jacobian(model, solution.prediction, solution.theta, w, dropped)
-    basis, equations = solution.equations.basis, solution.equations
-    h = equations.gram + np.diag(beta * basis.prior_precision)
-    more = with_dropped(basis.transform, h, solution.rows, columns, groups[dropped], beta)
-    return factor * more
+    transform = solution.equations.basis.transform
+    return factor * with_dropped(transform, solution.projection(), columns, groups[dropped], beta)
 
 
 def _identifiable(solution: Solution, scale: Floats, std: Floats) -> Bools:

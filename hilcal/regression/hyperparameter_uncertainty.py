@@ -10,12 +10,11 @@ with L and b the precision and the right-hand side of the group alone, V_τ = (L
 m_τ = V_τ b. p(τ) is half-Cauchy; its scale is the spread at which noise alone is as large as the
 group, so that "nothing there" and "something there" have equal chances. Other groups are kept.
 
-Groups that were dropped may be there all the same, as strong as the noise hides. They take their
-part of the uncertainty with a prior of that size:
+Parameters of groups that were dropped may differ from zero, by as much as the noise hides. They are
+integrated out with a prior of that size: with M the projection off their columns D with its ridge
+β Λ (`projection`), A the columns of the others and Λ_z the ridge of these,
 
-    Cov(z) = (H − C (G + β Λ)⁻¹ Cᵀ)⁻¹
-
-with H the normal equations of what is left, G = DᵀD and C = AᵀD of the dropped columns D.
+    Cov(z) = (Aᵀ M A + Λ_z)⁻¹
 
 Sources: Kass and Steffey, *Approximate Bayesian inference in conditionally independent
 hierarchical models*, J. Am. Stat. Assoc. 84 (1989) 717-726; Polson and Scott, *On the half-Cauchy
@@ -24,7 +23,7 @@ prior for a global scale parameter*, Bayesian Analysis 7 (2012) 887-902.
 
 import numpy as np
 
-from hilcal.regression.schur import schur_complement
+from hilcal.regression.projection import Projection, projection
 from hilcal.types import Floats, Ints
 
 GRID = np.logspace(-2.0, 3.0, 101)
@@ -75,33 +74,27 @@ def _of_group(covariance: Floats, theta: Floats, prior: float) -> Floats:
 
 
 def with_dropped(
-    transform: Floats, h: Floats, rows: Floats, columns: Floats, groups: Ints, beta: float
+    transform: Floats, p: Projection, columns: Floats, groups: Ints, beta: float
 ) -> Floats:
     """Return the factors (P,), at least 1, by which groups that were dropped widen all others.
 
     Args:
         transform: (P, K) parameters per coordinate z.
-        h: (K, K) normal equations of z.
-        rows: (R, K) whitened derivatives A by z.
+        p: the model by its coordinates z.
         columns: (R, Q) whitened derivatives D by the dropped parameters.
         groups: (Q,) their groups.
         beta: noise factor that priors are weighed against.
     """
-    cross = rows.T @ columns
-    inverse = np.linalg.inv(h)
-    gram = columns.T @ columns
-    free = np.maximum(np.diag(gram) - np.einsum("kq,kl,lq->q", cross, inverse, cross), 0.0)
-    count = np.bincount(groups)
-    reach = np.bincount(groups, weights=free) / np.maximum(count, 1)
-    # Columns that the others stand for altogether tell nothing of themselves: left out.
-    seen = reach[groups] > ROUNDING * np.maximum(np.diag(gram), 1e-300)
+    free = np.maximum(np.diag(p.information(columns)), 0.0)
+    norm2 = np.sum(columns**2, axis=0)
+    reach = np.bincount(groups, weights=free) / np.maximum(np.bincount(groups), 1)
+    # Columns that the others explain altogether have no information of their own: left out.
+    seen = reach[groups] > ROUNDING * np.maximum(norm2, 1e-300)
     if not seen.any():
         return np.ones(len(transform))
-    inner = gram[np.ix_(seen, seen)] + np.diag(beta * reach[groups][seen] / HIDDEN)
-    cross = cross[:, seen]
-    joint = np.block([[h, cross], [cross.T, inner]])
-    wide = np.linalg.inv(schur_complement(joint, np.arange(len(h))))
-    before = np.einsum("pk,kl,pl->p", transform, inverse, transform)
+    dropped = projection(columns[:, seen], beta * reach[groups][seen] / HIDDEN)
+    wide = np.linalg.inv(dropped.information(p.rows) + np.diag(p.ridge))
+    before = np.einsum("pk,pk->p", transform, p.solve(transform.T).T)
     after = np.einsum("pk,kl,pl->p", transform, wide, transform)
     there = before > 0
     return np.sqrt(np.where(there, np.maximum(after / np.where(there, before, 1.0), 1.0), 1.0))

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from hilcal.regression.hyperparameter_uncertainty import HIDDEN, widened, with_dropped
+from hilcal.regression.projection import projection
 
 LEARNT = 0.7
 
@@ -79,7 +80,7 @@ def test_what_a_dropped_group_could_do_widens_what_it_is_confused_with():
     apart -= kept @ np.linalg.lstsq(kept, apart, rcond=None)[0]
     dropped, groups = np.hstack([like_first, apart]), np.array([0, 1])
     h = kept.T @ kept
-    factor = with_dropped(np.eye(3), h, kept, dropped, groups, 1.0)
+    factor = with_dropped(np.eye(3), projection(kept, np.zeros(3)), dropped, groups, 1.0)
     assert factor[0] > 1.5
     assert np.all(factor[1:] < 1.1)
     # As if the dropped ones were in the model, with a prior of their size.
@@ -93,7 +94,6 @@ def test_what_a_dropped_group_could_do_widens_what_it_is_confused_with():
 
 def test_a_dropped_column_that_others_stand_for_altogether_changes_nothing():
     kept = np.random.default_rng(3).normal(size=(50, 2))
-    factor = with_dropped(
-        np.eye(2), kept.T @ kept, kept, kept @ np.array([[1.0], [2.0]]), np.array([0]), 1.0
-    )
+    p, copy = projection(kept, np.zeros(2)), kept @ np.array([[1.0], [2.0]])
+    factor = with_dropped(np.eye(2), p, copy, np.array([0]), 1.0)
     np.testing.assert_allclose(factor, 1.0)
