@@ -1,7 +1,8 @@
-"""What those who watch a campaign are told."""
+"""Events of a campaign while it is measured, for those who watch it."""
 
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import asdict, dataclass
+from math import isfinite
+from typing import Any, Protocol
 
 from hilcal.data.plan import Step
 
@@ -21,42 +22,80 @@ class Remark:
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
-    """What a model fitted to the readings before says of a new one.
+class LiveResidual:
+    """A new reading against the prediction of a model that was fitted to the readings before it.
 
     Attributes:
-        residual: distance of the reading from the prediction, m; None while there is none.
+        residual: distance of the reading from the prediction, m; None without a model yet.
         sigma: the same in standard deviations of a prediction: 1 where the model is right.
-        learning: whether the model's own uncertainty is the larger part of them, because it
-            is fitted to few readings.
-        deflection: distance of the reading from where the model sees the unloaded arm, m; None
-            for an unloaded reading, and while that is not known.
-        give: standard deviation of that distance, m, from how well the model does so far.
+        uncertain: whether the model's own uncertainty is the larger part of them, because it is
+            fitted to few readings.
+        deflection: distance of the reading from the predicted unloaded position, m; None for an
+            unloaded reading, and without a model.
+        deflection_std: standard deviation of that distance, m.
     """
 
     residual: float | None = None
     sigma: float | None = None
-    learning: bool = False
+    uncertain: bool = False
     deflection: float | None = None
-    give: float = 0.0
+    deflection_std: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
-class Taken:
+class GoalStatus:
+    """How far a campaign is from its goal; without `worst` that is not known yet.
+
+    Attributes:
+        text: the goal as it was given.
+        met: whether it is met.
+        worst: the name of the parameter, or "position", whose uncertainty is worst.
+        std: its standard uncertainty, in `unit`; infinite where it is not identifiable.
+        ratio: std over what is asked for; at most 1 where the goal is met.
+        unit: "%" or SI.
+        model: names of the effects that were fitted.
+        fitted: "deflection" or "absolute", the kind of readings that was fitted.
+    """
+
+    text: str
+    met: bool = False
+    worst: str | None = None
+    std: float | None = None
+    ratio: float | None = None
+    unit: str | None = None
+    model: tuple[str, ...] | None = None
+    fitted: str | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as JSON; a number that is not finite becomes null."""
+        out = asdict(self)
+        return {k: None if isinstance(v, float) and not isfinite(v) else v for k, v in out.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class GoalMet:
+    """Event: the goal is met after so many readings of those that were planned."""
+
+    status: GoalStatus
+    readings: int
+    planned: int
+
+
+@dataclass(frozen=True, slots=True)
+class ReadingStored:
     """A reading has been stored.
 
     Attributes:
         step: its step.
         done: readings that are stored now, in the whole campaign.
         total: readings of the plan.
-        left_real: real seconds that the rest takes, from how long it took so far.
+        left_real: real seconds that the rest will take, from the time taken so far.
         left_cell: the same in cell seconds; differs in a simulated cell only.
         deflection: distance from the unloaded reading of the same pose and cycle, m; None for
             an unloaded reading, and where there is none yet.
-        judged: what a model says of the reading; empty where none is asked.
+        live: the reading against a model; empty without one.
         settling: how long the readings took to settle, cell seconds.
-        goal: how far the campaign's goal is, in words; empty without one, and while that is
-            not known.
+        goal: status of the campaign's goal; None without one.
     """
 
     step: Step
@@ -65,14 +104,14 @@ class Taken:
     left_real: float
     left_cell: float
     deflection: float | None = None
-    judged: Judged = Judged()
+    live: LiveResidual = LiveResidual()
     settling: float = 0.0
-    goal: str = ""
+    goal: GoalStatus | None = None
 
 
 class Watcher(Protocol):
-    """One who watches a campaign."""
+    """Receives the events of a campaign."""
 
     def tell(self, event: object) -> None:
-        """Take note of a `Phase`, a `Remark` or a `Taken`; returns soon."""
+        """Receive a `Phase`, a `Remark`, a `ReadingStored` or a `GoalMet`; returns soon."""
         ...

@@ -11,8 +11,8 @@ from hilcal.acquire.dry_run import DryRun, dry_run
 from hilcal.acquire.progress import Phase, Remark, Watcher
 from hilcal.acquire.rig import Rig
 from hilcal.acquire.route import route
-from hilcal.acquire.session import Judge, Session
-from hilcal.acquire.stopping_rule import Rule
+from hilcal.acquire.session import LiveModel, Session
+from hilcal.acquire.stopping_rule import StoppingRule
 from hilcal.acquire.store import Store
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
@@ -32,9 +32,9 @@ def run(
     store: Store,
     clock: Clock,
     watcher: Watcher,
-    judge: Judge | None = None,
+    live: LiveModel | None = None,
     wall: Callable[[], float] = time.time,
-    goal: Rule | None = None,
+    goal: StoppingRule | None = None,
 ) -> None:
     """Measure what is missing of a plan, or as much of it as a goal needs.
 
@@ -48,10 +48,10 @@ def run(
         plan: the whole plan; steps that the store has are left out.
         store: where readings go.
         clock: the cell's time.
-        watcher: who is told of the progress.
-        judge: says how far a reading is from what a model says; None for nothing.
+        watcher: receives the events.
+        live: compares each reading with a model; None for no comparison.
         wall: the time of day, s; it carries the campaign's time over a pause.
-        goal: says when the readings are enough; then the arm goes home and the load is taken
+        goal: decides when the readings are enough; then the arm goes home, the load is taken
             off, and the rest is not measured.
 
     Raises:
@@ -69,7 +69,7 @@ def run(
     for text in whole.remarks:
         watcher.tell(Remark(text))
     stops = route(left, cell.arm, config.limits.joint_margin_rad)
-    session = Session(rig, cell, config, plan, store, clock, watcher, judge, wall, goal)
+    session = Session(rig, cell, config, plan, store, clock, watcher, live, wall, goal)
     try:
         session.walk(stops)
     except BaseException as error:

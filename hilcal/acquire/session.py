@@ -17,12 +17,12 @@ from hilcal.acquire.guard import Guard
 from hilcal.acquire.loads import Hook, payload
 from hilcal.acquire.measure import Measured, Taker
 from hilcal.acquire.motion import Mover
-from hilcal.acquire.progress import Judged, Phase, Remark, Taken, Watcher
+from hilcal.acquire.progress import LiveResidual, Phase, ReadingStored, Remark, Watcher
 from hilcal.acquire.reading_record import detail, feeling_of, plain, row
 from hilcal.acquire.rig import Rig
 from hilcal.acquire.route import Stop
 from hilcal.acquire.session_state import Memory
-from hilcal.acquire.stopping_rule import Aim, Rule, ending
+from hilcal.acquire.stopping_rule import GoalCheck, StoppingRule, way_home
 from hilcal.acquire.store import Store
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
@@ -31,8 +31,8 @@ from hilcal.data.readings import Readings
 from hilcal.errors import DeviceError, HilcalError
 from hilcal.types import Floats
 
-Judge = Callable[[Readings], Judged]
-"""Returns how far the last of all readings is from what a model says, m and sigma."""
+LiveModel = Callable[[Readings], LiveResidual]
+"""Returns the last reading against a model fitted to those before it."""
 
 
 class Session:
@@ -47,16 +47,16 @@ class Session:
         store: Store,
         clock: Clock,
         watcher: Watcher,
-        judge: Judge | None = None,
+        live: LiveModel | None = None,
         wall: Callable[[], float] = time.time,
-        goal: Rule | None = None,
+        goal: StoppingRule | None = None,
     ) -> None:
         """Read what earlier sessions stored; no device is used yet."""
         self.in_control = False
         self._rig, self._cell, self._config, self._plan = rig, cell, config, plan
-        self._store, self._clock, self._watcher, self._judge = store, clock, watcher, judge
+        self._store, self._clock, self._watcher, self._live = store, clock, watcher, live
         self._wall = wall
-        self._aim = Aim(goal, plan, store, watcher, self._event)
+        self._goal = GoalCheck(goal, plan, store, watcher, self._event)
         window = clock.real(config.acquire.force_window_s)
         self._meter: ForceMeter | None = None
         if rig.force is not None and config.force_sensor is not None:
@@ -111,8 +111,8 @@ class Session:
         self._begin(stops[:2])
         pace = Pace(self._clock)
         behind, ahead = list(stops[:2]), stops[2:]
-        if self._aim.come_to_be_met(last=False):  # an earlier session was stopped on its way home
-            ahead = ending(self._cell, self._config, self._plan, behind, self._store.done())
+        if self._goal.newly_met(last=False):  # an earlier session was stopped on its way home
+            ahead = way_home(self._cell, self._config, self._plan, behind, self._store.done())
         while ahead:
             stop, *rest = ahead
             ahead = tuple(rest)
@@ -125,9 +125,9 @@ class Session:
             if stop.step is not None:
                 reading, settling = self._reading(stop, stop.step)
                 pace.read()
-                if self._aim.come_to_be_met(last=all(s.step is None for s in ahead)):
+                if self._goal.newly_met(last=all(s.step is None for s in ahead)):
                     done = self._store.done()
-                    ahead = ending(self._cell, self._config, self._plan, behind, done)
+                    ahead = way_home(self._cell, self._config, self._plan, behind, done)
                 left = pace.left(
                     sum(s.step is not None for s in ahead),
                     sum(s.change_to is not None for s in ahead),
@@ -283,21 +283,21 @@ class Session:
         self, step: Step, reading: Readings, total: int, left: float, settling: float
     ) -> None:
         deflection = self._memory.deflection(step, reading.value[0, :3])
-        judged = Judged()
-        if self._judge is not None and (readings := self._store.readings()) is not None:
+        live = LiveResidual()
+        if self._live is not None and (readings := self._store.readings()) is not None:
             with suppress(HilcalError):  # too early for a model; nothing depends on it
-                judged = self._judge(readings)
+                live = self._live(readings)
         self._watcher.tell(
-            Taken(
+            ReadingStored(
                 step,
                 self._done,
                 total,
                 self._clock.real(left),
                 left,
                 deflection,
-                judged,
+                live,
                 settling,
-                self._aim.standing.words,
+                self._goal.status,
             )
         )
 

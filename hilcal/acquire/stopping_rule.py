@@ -1,13 +1,12 @@
-"""A campaign that ends as soon as its goal is met: how far that is, and the way home."""
+"""Ending a campaign as soon as its goal is met: the status of the goal, and the way home."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
 
 from hilcal.acquire.dry_run import route_problems
-from hilcal.acquire.progress import Remark, Watcher
+from hilcal.acquire.progress import GoalMet, GoalStatus, Watcher
 from hilcal.acquire.route import Stop, home
 from hilcal.acquire.store import Store
 from hilcal.cell import Cell
@@ -16,82 +15,66 @@ from hilcal.data.plan import UNLOADED, Plan, Step
 from hilcal.data.readings import Readings
 
 
-@dataclass(frozen=True, slots=True)
-class Standing:
-    """How far a campaign is from its goal.
-
-    Attributes:
-        met: whether it is met.
-        words: the present value, e.g. "joint std 4.1 % (j6)"; empty where it is not known.
-        figures: the same as JSON, for an event.
-    """
-
-    met: bool = False
-    words: str = ""
-    figures: dict[str, Any] = field(default_factory=dict)
-
-
-class Rule(Protocol):
+class StoppingRule(Protocol):
     """Judges the readings of a campaign by its goal."""
 
-    def __call__(self, readings: Readings, last: bool) -> Standing:
+    def __call__(self, readings: Readings, last: bool) -> GoalStatus:
         """Return how far the goal is.
 
         Args:
-            readings: all of them so far.
-            last: whether the plan has no others; else the answer may be one of a little before,
-                so that judging does not hold up the campaign.
+            readings: all readings so far.
+            last: whether the plan has no others; otherwise the answer may be that of a few
+                readings before, so that judging does not delay the campaign.
         """
         ...
 
 
-class Aim:
-    """The goal of a campaign while it is measured; none where there is no rule.
+class GoalCheck:
+    """Applies a stopping rule after each reading; does nothing where there is none.
 
     Attributes:
-        standing: how far it was when it was last looked at.
+        status: that of the last check; None before any.
     """
 
     def __init__(
         self,
-        rule: Rule | None,
+        rule: StoppingRule | None,
         plan: Plan,
         store: Store,
         watcher: Watcher,
         event: Callable[[str, dict[str, Any]], None],
     ) -> None:
-        """Look at nothing yet; `event` stores what became of it."""
-        self.standing = Standing()
+        """Check nothing yet; `event` stores the result in the campaign."""
+        self.status: GoalStatus | None = None
         self._rule, self._plan, self._store = rule, plan, store
         self._watcher, self._event = watcher, event
 
-    def come_to_be_met(self, last: bool) -> bool:
-        """Look how far it is; returns whether it has just been met.
+    def newly_met(self, last: bool) -> bool:
+        """Apply the rule; returns whether the goal has just been met.
 
-        That is stored and told, and at the end of the plan that it is not.
+        The result is stored and reported when the goal is met, and stored at the plan's end.
         """
-        if self._rule is None or self.standing.met:
+        if self._rule is None or (self.status is not None and self.status.met):
             return False
         readings = self._store.readings()
         if readings is None:
             return False
-        now = self.standing = self._rule(readings, last)
+        now = self.status = self._rule(readings, last)
         count, planned = len(readings), len(self._plan.steps)
         if now.met or last:
-            self._event("goal", {**now.figures, "readings": count, "planned": planned})
+            self._event("goal", {**now.to_dict(), "readings": count, "planned": planned})
         if now.met:
-            words = f"goal met: {now.words} after {count} of {planned} readings"
-            self._watcher.tell(Remark(words))
+            self._watcher.tell(GoalMet(now, count, planned))
         return now.met
 
 
-def ending(
+def way_home(
     cell: Cell, config: CellConfig, plan: Plan, behind: Sequence[Stop], done: frozenset[Step]
 ) -> tuple[Stop, ...]:
     """Return the way to the reference pose, where the load is taken off and the drift is read.
 
-    The arm goes straight where that is clear; else back the way it came, which is, until it is
-    clear from there. The reading is the next return to the reference pose that the plan holds.
+    The arm goes straight where that is clear; else back the way it came, which is clear, until
+    the straight way is. The reading is the next return to the reference pose that the plan holds.
 
     Args:
         cell: the cell.

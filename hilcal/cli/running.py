@@ -20,7 +20,6 @@ from hilcal.acquire.rig import Rig
 from hilcal.acquire.run import run as run_plan
 from hilcal.cell import Cell
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
-from hilcal.cli.live import LiveModel
 from hilcal.cli.plan_output import POSES, refuse
 from hilcal.cli.planning import (
     CellFile,
@@ -31,13 +30,15 @@ from hilcal.cli.planning import (
     refuse_unready,
 )
 from hilcal.cli.terminal import Json, Terminal, terminal
-from hilcal.cli.until import Until
 from hilcal.config import CellConfig
 from hilcal.data.campaign import Campaign
 from hilcal.data.covariance import COVERS, INSTRUMENT
 from hilcal.data.plan import Plan, load_plan
 from hilcal.data.run_log import PLAN, RunLog
+from hilcal.diagnose.live_model import LiveModel
 from hilcal.errors import CannotAnswerError, DeviceError, InputError
+from hilcal.plan.goal_rule import GoalRule
+from hilcal.report.goal_words import missed_words, status_words
 from hilcal.report.live_run import watching
 from hilcal.report.progress import Say, working
 
@@ -78,7 +79,7 @@ def run(
     """Measure a campaign: every step of the plan, each reading stored before the next motion."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     config, numbers = read_cell(cell)
-    goal = None if until is None else Until(until, numbers, config, catalogue)
+    goal = None if until is None else GoalRule(until, numbers, config, catalogue)
     base_dir = cell.absolute().parent
     with ExitStack() as stack:
         if resume:
@@ -120,15 +121,15 @@ def run(
     document: dict[str, object] = {"campaign": str(output), "readings": measured}
     document["planned"] = planned
     if goal is not None:
-        document["goal"] = goal.standing.figures
-        if goal.standing.met:
-            t.show(f'The goal "{goal.goal.text}" is met: {goal.standing.words}.')
+        document["goal"] = goal.status.to_dict()
+        if goal.status.met:
+            t.show(f'The goal "{goal.goal.text}" is met: {status_words(goal.status)}.')
     of = "" if measured == planned else f" of {planned}"
     t.show(f"{measured}{of} readings are in {output}. Go on with: hilcal refine {output}")
     t.document(document)
-    if goal is not None and not goal.standing.met:
+    if goal is not None and not goal.status.met:
         on = f"hilcal plan {cell} --after {output}"
-        raise CannotAnswerError(f"{goal.missed(measured)}; plan on with: {on}")
+        raise CannotAnswerError(f"{missed_words(goal.status, measured)}; plan on with: {on}")
 
 
 def _append(
@@ -164,7 +165,7 @@ def create(
 
 
 def measure(
-    t: Terminal, config: CellConfig, cell: Cell, campaign: Campaign, goal: Until | None = None
+    t: Terminal, config: CellConfig, cell: Cell, campaign: Campaign, goal: GoalRule | None = None
 ) -> int:
     """Measure what is missing in a campaign; returns how many readings it then holds.
 
@@ -191,8 +192,8 @@ def measure(
         watcher: Watcher = stack.enter_context(watching(t.progress, len(log.plan.steps)))
         log.event("devices", {"answers": [answer_json(answer) for answer in answers]})
         clock = Clock(config.simulation.clock)
-        judge = LiveModel(cell, config)
-        run_plan(rig, cell, config, log.plan, log, clock, watcher, judge=judge, goal=goal)
+        live = LiveModel(cell, config)
+        run_plan(rig, cell, config, log.plan, log, clock, watcher, live=live, goal=goal)
     return campaign.n_readings
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hilcal.acquire.progress import GoalStatus
 from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit
@@ -25,26 +26,6 @@ _SHAPE = re.compile(
     r"\s*(?P<what>[\w.]+)\s+std\s*(?:<=|<|≤)\s*(?P<number>[-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*"
     r"(?P<unit>\S.*?)?\s*"
 )
-
-
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """How far a goal is.
-
-    Attributes:
-        met: whether it is met.
-        ratio: the worst standard uncertainty over what is asked for; at most 1 where met,
-            infinite where something is not identifiable.
-        worst: the name of what is worst.
-        std: its standard uncertainty, in `unit`.
-        unit: "%" or SI.
-    """
-
-    met: bool
-    ratio: float
-    worst: str
-    std: float
-    unit: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +90,7 @@ class Goal:
         stds: Mapping[str, float],
         values: Mapping[str, float],
         position: float | None = None,
-    ) -> Verdict:
+    ) -> GoalStatus:
         """Judge standard uncertainties.
 
         Args:
@@ -128,18 +109,21 @@ class Goal:
                     "work_min_m and work_max_m, tell it"
                 )
             ratio = _ratio(float(position), self.limit)
-            return Verdict(bool(ratio <= 1.0), ratio, "position", float(position), "m")
-        worst = Verdict(True, -1.0, "", 0.0, "")
+            return self._status(ratio, "position", float(position), "m")
+        status, worst = GoalStatus(self.text, True), -1.0
         for name in self.names(stds):
             std = float(stds[name])
             if self.relative:
                 size = abs(float(values[name]))
                 std = std / size if size > 0 else float(np.inf)
             ratio = _ratio(std, self.limit)
-            if ratio > worst.ratio:
+            if ratio > worst:
                 shown = (100 * std, "%") if self.relative else (std, self.unit)
-                worst = Verdict(bool(ratio <= 1.0), ratio, name, *shown)
-        return worst
+                status, worst = self._status(ratio, name, *shown), ratio
+        return status
+
+    def _status(self, ratio: float, worst: str, std: float, unit: str) -> GoalStatus:
+        return GoalStatus(self.text, bool(ratio <= 1.0), worst, std, ratio, unit)
 
 
 def parse_goal(text: str) -> Goal:

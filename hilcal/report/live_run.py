@@ -9,8 +9,9 @@ from rich.console import Console, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
 from rich.text import Text
 
-from hilcal.acquire.progress import Phase, Remark, Taken
+from hilcal.acquire.progress import GoalMet, Phase, ReadingStored, Remark
 from hilcal.report import numbers
+from hilcal.report.goal_words import met_words, status_words
 from hilcal.report.text_run import spoken
 
 
@@ -27,7 +28,9 @@ class _Lines:
             self._print(event.text)
         elif isinstance(event, Remark):
             self._print(f"note: {event.text}")
-        elif isinstance(event, Taken):
+        elif isinstance(event, GoalMet):
+            self._print(f"note: {met_words(event)}")
+        elif isinstance(event, ReadingStored):
             left = f", {spoken(event.left_real)} left" if event.left_real > 0 else ""
             self._print(f"{event.done}/{event.total} {event.step}{figures(event)}{left}")
 
@@ -47,9 +50,10 @@ class _Bar:
         """Take note."""
         if isinstance(event, Phase):
             self.progress.update(self.task, phase=event.text)
-        elif isinstance(event, Remark):
-            self.progress.console.print(f"note: {event.text}", markup=False, highlight=False)
-        elif isinstance(event, Taken):
+        elif isinstance(event, Remark | GoalMet):
+            text = event.text if isinstance(event, Remark) else met_words(event)
+            self.progress.console.print(f"note: {text}", markup=False, highlight=False)
+        elif isinstance(event, ReadingStored):
             left = f"{spoken(event.left_real)} left" if event.left_real > 0 else ""
             last = f"{event.step}{figures(event)}"
             self.progress.update(self.task, completed=event.done, left=left, last=last)
@@ -82,23 +86,23 @@ def watching(console: Console, total: int) -> Iterator[_Lines | _Bar]:
         yield _Bar(progress, task)
 
 
-def figures(event: Taken) -> str:
+def figures(event: ReadingStored) -> str:
     """Return deflection and residual of a reading for people.
 
-    A deflection against a model, where the unloaded reading comes later, is marked by ≈.
+    A deflection from a predicted unloaded position is marked by ≈.
     """
     parts = []
-    judged = event.judged
+    live = event.live
     if event.deflection is not None:
         parts.append(f"deflection {numbers.length(event.deflection)}")
-    elif judged.deflection is not None:
-        unit, factor = numbers.unit_for("m", [judged.deflection])
-        value, give = numbers.with_std(factor * judged.deflection, factor * judged.give)
-        parts.append(f"deflection ≈ {value} ± {give} {unit}")
-    if judged.residual is not None:
-        sigma = "" if judged.sigma is None else f"{judged.sigma:.1f} σ"
-        words = ", ".join(w for w in (sigma, "few readings yet" if judged.learning else "") if w)
-        parts.append(f"residual {numbers.length(judged.residual)}" + (f" ({words})" * bool(words)))
-    if event.goal:
-        parts.append(event.goal)
+    elif live.deflection is not None:
+        unit, factor = numbers.unit_for("m", [live.deflection])
+        value, std = numbers.with_std(factor * live.deflection, factor * live.deflection_std)
+        parts.append(f"deflection ≈ {value} ± {std} {unit}")
+    if live.residual is not None:
+        sigma = "" if live.sigma is None else f"{live.sigma:.1f} σ"
+        words = ", ".join(w for w in (sigma, "few readings yet" if live.uncertain else "") if w)
+        parts.append(f"residual {numbers.length(live.residual)}" + (f" ({words})" * bool(words)))
+    if event.goal is not None and (words := status_words(event.goal)):
+        parts.append(words)
     return f": {', '.join(parts)}" if parts else ""

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 import hilcal.cli.running as running
-import hilcal.cli.until as until
+import hilcal.plan.goal_rule as goal_rule
 from hilcal.acquire.connect import Answer
-from hilcal.cli.until import Until
 from hilcal.config import CellConfig, Repeatability
 from hilcal.config.write import to_toml
 from hilcal.data.campaign import Campaign as CampaignFile
@@ -19,7 +18,9 @@ from hilcal.data.run_log import RunLog
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import fit
+from hilcal.plan.goal_rule import GoalRule
 from hilcal.plan.nominal_model import nominal_states
+from hilcal.report.goal_words import status_words
 from hilcal.robot import chain as chains
 from tests.support.campaigns import Campaign, campaign, configuration, noiseless, plan, with_noise
 from tests.support.cli_cases import ok, refused, run
@@ -37,9 +38,9 @@ def config_of(**planning: Any) -> CellConfig:
     return config.model_copy(update={"planning": changed, "repeatability": still})
 
 
-def rule(text: str, c: Campaign, **planning: Any) -> Until:
+def rule(text: str, c: Campaign, **planning: Any) -> GoalRule:
     """A rule for which fits take no time."""
-    return Until(text, c.cell, config_of(**planning), now=lambda: 0.0)
+    return GoalRule(text, c.cell, config_of(**planning), now=lambda: 0.0)
 
 
 # what is judged
@@ -53,21 +54,21 @@ def test_it_is_what_identify_states(mode: Any) -> None:
     share = 100 * np.max(found.uncertainty.std[rows] / np.abs(found.theta[rows]))
     for factor, met in ((1.001, True), (0.999, False)):
         text = f"joint std < {factor * share} %"
-        standing = rule(text, c, readings=mode)(c.readings, last=False)
-        assert standing.met is met
-        assert standing.figures["std"] == pytest.approx(share)
-        assert standing.figures["fitted"] == mode
-        assert standing.figures["ratio"] == pytest.approx(1 / factor)
-        assert f"joint std {share:.0f} % (j6)" == standing.words
+        status = rule(text, c, readings=mode)(c.readings, last=False)
+        assert status.met is met
+        assert status.std == pytest.approx(share)
+        assert status.fitted == mode
+        assert status.ratio == pytest.approx(1 / factor)
+        assert f"joint std {share:.0f} % (j6)" == status_words(status)
 
 
 def test_readings_that_lack_their_unloaded_ones_are_fitted_as_they_are() -> None:
     """So it is in the middle of a plan that takes half of the unloaded readings at the end."""
     c = campaign(mode="deflection", poses=8)
     kept = c.readings[~((c.readings.pose > 4) & c.readings.unloaded)]
-    standing = rule("joint std < 90 %", c)(kept, last=False)
-    assert standing.figures["fitted"] == "absolute"
-    assert standing.met
+    status = rule("joint std < 90 %", c)(kept, last=False)
+    assert status.fitted == "absolute"
+    assert status.met
 
 
 def test_the_position_is_as_sure_as_it_says() -> None:
@@ -81,13 +82,13 @@ def test_the_position_is_as_sure_as_it_says() -> None:
     for k in range(40):
         readings = with_noise(clean, rng)
         if k % 5 == 0:
-            stated.append(told(readings, last=False).figures["std"])
+            stated.append(told(readings, last=False).std)
         model = baseline(c.cell, readings, "absolute")
         found = fit(model, readings, "absolute")
         seen.append(model.predict(states, found.theta).observation.position)
     scatter = np.sqrt(np.mean(np.sum(np.var(seen, axis=0, ddof=1), axis=1)))
     assert np.median(stated) == pytest.approx(scatter, rel=0.2)
-    assert told.standing.words.startswith("position std ")
+    assert status_words(told.status).startswith("position std ")
 
 
 def test_what_cannot_be_fitted_yet_is_not_met() -> None:
@@ -95,10 +96,10 @@ def test_what_cannot_be_fitted_yet_is_not_met() -> None:
     free = c.readings[c.readings.unloaded]
     told = rule("joint std < 1000 %", c)
     for readings in (free[:1], free[:2], free, c.readings[:3]):
-        standing = told(readings, last=False)
-        assert not standing.met
-        assert (standing.figures["ratio"], standing.figures["std"]) == (None, None)
-        assert standing.words == ""
+        status = told(readings, last=False)
+        assert not status.met
+        assert (status.ratio, status.std) == (None, None)
+        assert status_words(status) == ""
     assert told(c.readings, last=False).met
 
 
@@ -119,15 +120,15 @@ def test_fits_take_a_tenth_of_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """A fit takes 2 s, a reading 1 s: one in about twenty is judged, and the last one."""
     c = campaign(mode="deflection", poses=8)
     at, fitted = [0.0], []
-    real = until.fit
+    real = goal_rule.fit
 
     def slow(*arguments: Any) -> Any:
         at[0] += 2.0
         fitted.append(len(arguments[1]))
         return real(*arguments)
 
-    monkeypatch.setattr(until, "fit", slow)
-    told = Until("joint std < 1 %", c.cell, config_of(), now=lambda: at[0])
+    monkeypatch.setattr(goal_rule, "fit", slow)
+    told = GoalRule("joint std < 1 %", c.cell, config_of(), now=lambda: at[0])
     order = np.argsort(~c.readings.unloaded, kind="stable")
     readings = c.readings[order]
     for count in range(9, len(readings) + 1):
@@ -141,10 +142,10 @@ def test_an_unloaded_reading_by_itself_is_no_news(monkeypatch: pytest.MonkeyPatc
     told = rule("joint std < 1 %", c)
     loaded = c.readings[c.readings.pose < 7]
     told(loaded, last=False)
-    monkeypatch.setattr(until, "fit", None)  # not called
+    monkeypatch.setattr(goal_rule, "fit", None)  # not called
     more = c.readings[(c.readings.pose < 7) | c.readings.unloaded]
     order = np.argsort((more.pose == 7) & more.unloaded, kind="stable")
-    assert told(more[order], last=False).figures["std"] > 0
+    assert told(more[order], last=False).std > 0
 
 
 # goals that cannot be
@@ -217,7 +218,7 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Site:
     answers = tuple(Answer(d.report().device, "fake", d.report()) for d in devices)
     monkeypatch.setattr(running, "connect", lambda config: (rig, answers))
     monkeypatch.setattr(running, "Clock", lambda scale: made.bench.clock)
-    monkeypatch.setattr(until, "SHARE", 1e9)  # judge after every reading, however slow that is
+    monkeypatch.setattr(goal_rule, "SHARE", 1e9)  # judge after every reading, however slow that is
     return made
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hilcal.acquire.progress import Judged, Remark, Taken
+from hilcal.acquire.progress import LiveResidual, ReadingStored, Remark
 from hilcal.acquire.repeatability import Visit, repeatability
 from hilcal.config import ForceSensor, Load, Repeatability, Tool
 from hilcal.data.plan import Step
@@ -165,7 +165,7 @@ def test_nothing_moves_between_measuring_and_storing() -> None:
 def test_progress() -> None:
     b, plan = Bench(), usual_plan()
     measure(b, plan)
-    taken = b.notes.of(Taken)
+    taken = b.notes.of(ReadingStored)
     assert [t.done for t in taken] == list(range(1, len(plan.steps) + 1))
     assert {t.total for t in taken} == {len(plan.steps)}
     assert taken[-1].left_real == 0.0
@@ -187,17 +187,17 @@ def test_the_judge_sees_all_readings_and_may_not_know() -> None:
     b = Bench()
     seen: list[int] = []
 
-    def judge(readings: Readings) -> Judged:
+    def judge(readings: Readings) -> LiveResidual:
         seen.append(len(readings))
         if len(readings) == 2:
             raise CannotAnswerError("too few readings")
-        return Judged(1e-5, 0.5) if len(readings) > 3 else Judged()
+        return LiveResidual(1e-5, 0.5) if len(readings) > 3 else LiveResidual()
 
-    measure(b, judge=judge)
+    measure(b, live=judge)
     assert seen == list(range(1, len(usual_plan().steps) + 1))
-    taken = b.notes.of(Taken)
-    assert [t.judged.residual for t in taken[:4]] == [None, None, None, 1e-5]
-    assert taken[-1].judged.sigma == 0.5
+    taken = b.notes.of(ReadingStored)
+    assert [t.live.residual for t in taken[:4]] == [None, None, None, 1e-5]
+    assert taken[-1].live.sigma == 0.5
 
 
 def test_drift_of_the_reference_pose_is_told() -> None:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hilcal.acquire.progress import Taken
+from hilcal.acquire.progress import ReadingStored
 from hilcal.config import Acquire, ForceSensor, Limits, Load
 from hilcal.errors import DeviceError, InputError
 from tests.support.fake_bench import POSES, Bench, plan_of, usual_plan
@@ -223,11 +223,11 @@ def test_drift_that_ends_is_waited_for() -> None:
 
     b.world.position = position  # type: ignore[method-assign]
     measure(b)
-    taken = b.notes.of(Taken)
+    taken = b.notes.of(ReadingStored)
     assert min(t.settling for t in taken) > 1.0
     quiet = Bench()
     measure(quiet)
-    assert max(t.settling for t in quiet.notes.of(Taken)) < 1.0
+    assert max(t.settling for t in quiet.notes.of(ReadingStored)) < 1.0
     away = b.store.readings().value - quiet.store.readings().value  # type: ignore[union-attr]
     assert np.abs(away).max() < 6 * STD
 

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 
 from hilcal.acquire.dry_run import route_problems
-from hilcal.acquire.progress import Remark, Taken
+from hilcal.acquire.progress import GoalMet, GoalStatus, ReadingStored, Remark
 from hilcal.acquire.route import Stop
-from hilcal.acquire.stopping_rule import Standing, ending
+from hilcal.acquire.stopping_rule import way_home
 from hilcal.config import Limits, Obstacle
 from hilcal.data.plan import Plan, Step
 from hilcal.data.readings import Readings
 from hilcal.errors import DeviceError
+from hilcal.report.goal_words import met_words
 from hilcal.robot.chain import evaluate
 from tests.support.fake_bench import POSES, Bench, plan_of, usual_plan
 from tests.support.fake_world import Killed
@@ -29,10 +30,10 @@ class Enough:
     count: int
     asked: list[tuple[int, bool]] = field(default_factory=list)
 
-    def __call__(self, readings: Readings, last: bool) -> Standing:
+    def __call__(self, readings: Readings, last: bool) -> GoalStatus:
         self.asked.append((len(readings), last))
         met = 0 < self.count <= len(readings)
-        return Standing(met, f"std {len(readings)} %", {"met": met})
+        return GoalStatus("j2 std < 5 %", met, "j2", float(len(readings)), unit="%")
 
 
 def steps(b: Bench) -> list[Step]:
@@ -65,20 +66,22 @@ def test_a_goal_that_is_met_under_a_load() -> None:
     ]  # fmt: skip
     goal = b.store.last("goal")
     assert (goal["met"], goal["readings"], goal["planned"]) == (True, 7, len(plan.steps))
-    assert "goal met: std 7 % after 7 of 15 readings" in remarks(b)
+    (event,) = b.notes.of(GoalMet)
+    assert (event.status.std, event.readings, event.planned) == (7.0, 7, 15)
+    assert met_words(event) == "goal met: j2 std 7.0 % after 7 of 15 readings"
 
 
 def test_progress_tells_the_goal_and_what_is_left_of_the_way() -> None:
     b = Bench()
     measure(b, goal=Enough(7))
-    taken = b.notes.of(Taken)
-    assert [t.goal for t in taken[:3]] == ["std 1 %", "std 2 %", "std 3 %"]
+    taken = b.notes.of(ReadingStored)
+    assert [t.goal.std for t in taken[:3]] == [1.0, 2.0, 3.0]
     change, reading = 20.0, 10.0  # the person, and about what else is done
     assert taken[6].left_cell < change + 2 * reading < taken[5].left_cell
     assert taken[-1].left_cell == 0.0
     plain = Bench()
     measure(plain)
-    assert {t.goal for t in plain.notes.of(Taken)} == {""}
+    assert {t.goal for t in plain.notes.of(ReadingStored)} == {None}
 
 
 @pytest.mark.parametrize(
@@ -120,12 +123,12 @@ def test_the_way_home_is_clear() -> None:
     assert "post" in route_problems(b.cell, config, (p2, home))[0]
     assert route_problems(b.cell, config, (home, via, p2)) == []
     plan = plan_of(("p2", "none", 0), ("p2", "3kg", 0), poses=q)
-    way = ending(b.cell, config, plan, [home, via, p2], frozenset())
+    way = way_home(b.cell, config, plan, [home, via, p2], frozenset())
     assert [(s.name, s.hanging, s.change_to) for s in way] == [
         ("via", "3kg", None), ("reference", "3kg", "none"),
     ]  # fmt: skip
     assert route_problems(b.cell, config, (p2, *way)) == []
-    free = ending(b.cell, b.config, plan, [home, via, p2], frozenset())
+    free = way_home(b.cell, b.config, plan, [home, via, p2], frozenset())
     assert [s.name for s in free] == ["reference"]
 
 
@@ -166,7 +169,7 @@ def test_a_goal_that_is_never_met() -> None:
     assert b.store.kinds().count("goal") == 1
     told = b.store.last("goal")
     assert (told["met"], told["readings"], told["planned"]) == (False, 15, 15)
-    assert not any("goal" in text for text in remarks(b))
+    assert not b.notes.of(GoalMet)
 
 
 # interrupted on the way home

@@ -1,12 +1,12 @@
-"""`run --until`: a goal, judged while measuring by a fit to what is there."""
+"""The stopping rule of a campaign: its goal, judged by a fit to the readings so far."""
 
-import re
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
-from hilcal.acquire.stopping_rule import Standing
+from hilcal.acquire.progress import GoalStatus
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.data.readings import Readings
@@ -15,34 +15,35 @@ from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import HilcalError
 from hilcal.identify.baseline import with_effects
 from hilcal.identify.fit import Fit, fit
-from hilcal.identify.fit_document import finite
 from hilcal.identify.full_covariance import with_joint_scatter
 from hilcal.identify.gauss_newton import scales_of
 from hilcal.plan.feasible import Space
-from hilcal.plan.goal import Goal, Verdict, figures, parse_goal
+from hilcal.plan.goal import Goal, figures, parse_goal
 from hilcal.plan.nominal_model import after, assumed
 from hilcal.plan.predicted import positions_of, rms
 from hilcal.plan.prediction_poses import work_poses
-from hilcal.report import numbers
 from hilcal.types import Floats
 
 SHARE = 0.1
 """Share of the time that may be spent on fits while measuring."""
 
 
-class Until:
-    """Judges a campaign by its goal, with a fit as `hilcal identify` would make it.
+class GoalRule:
+    """Judges a campaign by its goal, with the fit that `hilcal identify` would make.
 
-    It is the baseline, or the effects of `[planning] model`, fitted to deflections where every
-    loaded reading has its unloaded one, else to the readings as they are; `[planning] readings
-    = "absolute"` fits them so in any case. Standard uncertainties are those that are stated
-    there.
+    The model is the baseline, or the effects of `[planning] model`, fitted to deflections where
+    every loaded reading has its unloaded one, else to the readings as they are; `[planning]
+    readings = "absolute"` fits them so in any case.
 
     The goal counts as met by a fit that converged. Where the residual is more than noise, the
-    uncertainty is itself an estimate: who looks after every reading will once see it small by
-    chance. So then two fits in a row have to agree, but for the last one of a plan.
+    stated uncertainty is itself an estimate, and a check after every reading will once find it
+    small by chance: then two fits in a row have to meet the goal, except at the plan's end.
 
-    Fits take at most a tenth of the time, so that none holds up the campaign.
+    Fits take at most a tenth of the time (`SHARE`), so that none delays the campaign.
+
+    Attributes:
+        goal: the goal.
+        status: that of the last fit.
     """
 
     def __init__(
@@ -53,7 +54,7 @@ class Until:
         catalogue: Catalogue | None = None,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Read a goal, and refuse it where nothing of the cell's model is meant.
+        """Read a goal, and check it against the cell's model.
 
         Args:
             text: the goal, e.g. "joint std < 2 %".
@@ -66,7 +67,7 @@ class Until:
             InputError: not a goal (lists the valid forms), or not one for this cell.
         """
         self.goal: Goal = parse_goal(text)
-        self.standing = self._state(None, met=False)
+        self.status = GoalStatus(text)
         self._cell, self._config, self._now = cell, config, now
         self._catalogue = catalogue or installed()
         self._scatter = config.repeatability.per_joint(cell.arm.n)
@@ -77,27 +78,27 @@ class Until:
         if self.goal.of_position:
             planning = config.planning
             if not planning.work_q_rad and planning.work_min_m is None:
-                self.goal.met({}, {})  # says where it is told
+                self.goal.met({}, {})  # raises: names the missing keys
             some = work_poses(model, config, np.zeros((0, cell.arm.n)), Space(cell, config).clear)
             self._work_q = tuple(dict.fromkeys(tuple(q) for q in some.q.tolist()))
-        self._good = False  # whether the fit before said so
+        self._good = False  # whether the fit before met the goal
         self._ended = self._took = -np.inf
 
-    def __call__(self, readings: Readings, last: bool) -> Standing:
-        """Return how far the goal is, see `acquire.until.Rule`."""
+    def __call__(self, readings: Readings, last: bool) -> GoalStatus:
+        """Return the status of the goal, see `acquire.stopping_rule.StoppingRule`."""
         begun = self._now()
         if last or (begun - self._ended >= self._took / SHARE and self._news(readings)):
-            judged = self._judge(readings)
-            good = sure = False
-            if judged is not None:
-                verdict, found = judged
-                good = verdict.met and found.solution.converged
-                sure = last or self._good or not found.uncertainty.inflated
-            self.standing = self._state(judged, met=good and sure)
-            self._good = good
+            found = self._fit(readings)
+            if found is None:
+                self.status, self._good = GoalStatus(self.goal.text), False
+            else:
+                status, fitted = found
+                good = status.met and fitted.solution.converged
+                sure = last or self._good or not fitted.uncertainty.inflated
+                self.status, self._good = replace(status, met=good and sure), good
             self._ended = self._now()
             self._took = self._ended - begun
-        return self.standing
+        return self.status
 
     def _mode(self, readings: Readings) -> Mode:
         wanted = self._config.planning.readings
@@ -111,7 +112,7 @@ class Until:
         same = (readings.pose == readings.pose[-1]) & (readings.cycle == readings.cycle[-1])
         return bool((same & ~free).any())
 
-    def _judge(self, readings: Readings) -> tuple[Verdict, Fit] | None:
+    def _fit(self, readings: Readings) -> tuple[GoalStatus, Fit] | None:
         """Fit and judge; None where that cannot be done yet."""
         try:
             readings = with_joint_scatter(self._cell, readings, self._scatter)
@@ -125,7 +126,8 @@ class Until:
             held = dict(zip(std, found.solution.prior == 0, strict=True))
             std = {name: s for name, s in std.items() if not held[name]}
             position = self._position(found) if self._work_q else None
-            return self.goal.met(std, value, position), found
+            status = self.goal.met(std, value, position)
+            return replace(status, model=found.model.names, fitted=found.mode), found
         except (HilcalError, np.linalg.LinAlgError):
             return None
 
@@ -149,37 +151,3 @@ class Until:
         covariance = root @ solution.equations.inverse(solution.beta) @ root.T
         live = model.live
         return rms(positions_of(work, covariance[np.ix_(live, live)], basis.null[live]))
-
-    def _state(self, judged: tuple[Verdict, Fit] | None, *, met: bool) -> Standing:
-        content: dict[str, object] = {"text": self.goal.text, "met": met}
-        if judged is None:
-            unknown = dict.fromkeys(("ratio", "worst", "std", "unit", "model", "fitted"))
-            return Standing(met, "", {**content, **unknown})
-        v, found = judged
-        content |= {"ratio": finite(v.ratio), "worst": v.worst, "std": finite(v.std)}
-        content |= {"unit": v.unit, "model": list(found.model.names), "fitted": found.mode}
-        return Standing(met, self._words(v), content)
-
-    def _words(self, v: Verdict) -> str:
-        """The present value, e.g. "joint std 4.1 % (j6)"."""
-        match = re.match(r"[\w.]+", self.goal.text.strip())
-        what = self.goal.what if match is None else match[0]
-        which = "" if v.worst in (what, self.goal.what) else f" ({v.worst.split('.')[-1]})"
-        if not np.isfinite(v.std):
-            return f"{what} std unknown{which}"
-        if v.unit == "%":
-            return f"{what} std {numbers.digits(v.std, 2)} %{which}"
-        unit, factor = numbers.unit_for(v.unit, (v.std,))
-        return f"{what} std {numbers.digits(factor * v.std, 2)} {unit}{which}"
-
-    def missed(self, count: int) -> str:
-        """Return in one line by how much the goal was missed after so many readings."""
-        head = f'goal "{self.goal.text}" is not met after all {count} readings'
-        ratio = self.standing.figures.get("ratio")
-        if not self.standing.words:
-            return f"{head}: the model cannot be fitted to them"
-        if not isinstance(ratio, float):
-            return f"{head}: {self.standing.words}"
-        if ratio <= 1.0:
-            return f"{head}: {self.standing.words}, but the fit did not converge"
-        return f"{head}: {self.standing.words}, {ratio:.2g} times what is asked for"

@@ -1,10 +1,10 @@
-"""What a model fitted to the readings so far says of the last one."""
+"""Each new reading against a model fitted to the readings before it, while measuring."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilcal.acquire.progress import Judged
+from hilcal.acquire.progress import LiveResidual
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.data.readings import Readings
@@ -21,11 +21,11 @@ from hilcal.model import Model
 from hilcal.types import Floats
 
 LEAST = 8
-"""Distinct poses before a registration is worth believing."""
+"""Distinct poses from which a registration is estimated; a guess."""
 GROWTH = 1.15
-"""The model is fitted again when there are so many times as many readings."""
+"""The model is fitted again after so many times as many readings; a guess."""
 ORDINARY = 3.0
-"""What the data do not tell of a parameter is unknown to so many ordinary magnitudes."""
+"""Prior standard deviation of every parameter, in units of its ordinary magnitude; a guess."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,11 +52,10 @@ class _Known:
 class LiveModel:
     """Predicts each reading from those before it, by the frames and joint compliance.
 
-    The residual is what this baseline model gets wrong of the newest reading, which took no
-    part in its fit; sigma counts the model's own uncertainty, J C Jᵀ, beside the reading's
-    covariance. Where the unloaded reading of a pose comes later than a loaded one, the deflection
-    is told against where the model sees the unloaded arm. All is for the eye of the operator, so
-    the fit is renewed now and then only.
+    The newest reading took no part in the fit; its residual is divided by the reading's covariance
+    plus that of the prediction, J C Jᵀ. Where the unloaded reading of a pose comes later than a
+    loaded one, the deflection is taken from the predicted unloaded position. The result serves the
+    operator only, so the model is fitted again only when the readings have grown by `GROWTH`.
     """
 
     def __init__(self, cell: Cell, config: CellConfig) -> None:
@@ -65,18 +64,18 @@ class LiveModel:
         self._scatter = config.repeatability.per_joint(cell.arm.n)
         self._known: _Known | None = None
 
-    def __call__(self, readings: Readings) -> Judged:
-        """Judge the last reading by those before it; empty while they are too few.
+    def __call__(self, readings: Readings) -> LiveResidual:
+        """Compare the last reading with those before it; empty while they are too few.
 
-        Sigma is sqrt(rᵀ (V + J C Jᵀ)⁻¹ r / m): about 1 where the model is right.
+        sigma is sqrt(rᵀ (V + J C Jᵀ)⁻¹ r / m): about 1 where the model is right.
         """
         readings = with_joint_scatter(self._cell, readings, self._scatter)
         before, last = readings[:-1], readings[-1:]
         try:
             known = self._renewed(before)
-            return Judged() if known is None else _judged(known, last)
+            return LiveResidual() if known is None else _compared(known, last)
         except HilcalError:
-            return Judged()
+            return LiveResidual()
 
     def _renewed(self, readings: Readings) -> _Known | None:
         """Return the model, fitted anew where much has come since."""
@@ -97,30 +96,30 @@ class LiveModel:
 
 
 def _covariance(model: Model, found: Solution, rows: Floats) -> Floats:
-    """(P, P) covariance of the parameters; what the data do not tell is wide, not zero."""
+    """(P, P) posterior covariance of the parameters with the prior of `ORDINARY` magnitudes."""
     scale = ORDINARY * scales_of(model)
     a = np.zeros((len(rows), model.size))
     a[:, found.live] = rows * scale[found.live]
     return np.asarray(scale[:, None] * np.linalg.inv(a.T @ a + np.eye(model.size)) * scale)
 
 
-def _judged(known: _Known, last: Readings) -> Judged:
-    """Judge one reading by a fitted model."""
+def _compared(known: _Known, last: Readings) -> LiveResidual:
+    """Compare one reading with a fitted model."""
     loaded = bool(np.any(last.states.wrench))
     own, off = _spread(known, last), _residual(known, last)
     sigma = float(np.sqrt(mahalanobis2(off, last.covariance + own)[0] / last.m))
-    learning = bool(np.trace(own[0, :3, :3]) > np.trace(last.covariance[0, :3, :3]))
+    uncertain = bool(np.trace(own[0, :3, :3]) > np.trace(last.covariance[0, :3, :3]))
     residual_m = float(np.linalg.norm(off[0, :3]))
     if not loaded:
-        return Judged(residual_m, sigma, learning)
+        return LiveResidual(residual_m, sigma, uncertain)
     rest = replace(last, states=replace(last.states, wrench=np.zeros_like(last.states.wrench)))
-    give = float(np.sqrt(known.rms**2 + np.trace(_spread(known, rest)[0, :3, :3])))
+    deflection_std = float(np.sqrt(known.rms**2 + np.trace(_spread(known, rest)[0, :3, :3])))
     deflection = float(np.linalg.norm(_residual(known, rest)[0, :3]))
-    return Judged(residual_m, sigma, learning, deflection, give)
+    return LiveResidual(residual_m, sigma, uncertain, deflection, deflection_std)
 
 
 def _residual(known: _Known, last: Readings) -> Floats:
-    """(1, m) what the model gets wrong of a reading."""
+    """(1, m) residual of a reading."""
     w = whitening(last, "absolute", "gc")
     return residual(last, known.model.predict(last.states, known.theta), w)
 

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from hilcal.acquire.progress import Judged, Taken
-from hilcal.cli.live import LiveModel
+from hilcal.acquire.progress import LiveResidual, ReadingStored
 from hilcal.config import CellConfig
 from hilcal.data.plan import Step
 from hilcal.data.readings import Readings
+from hilcal.diagnose.live_model import LiveModel
 from hilcal.report.live_run import figures
 from tests.support.campaigns import campaign, cell_of, configuration
 
@@ -20,7 +20,7 @@ def quiet() -> CellConfig:
     return config.model_copy(update={"repeatability": scatter})
 
 
-def told(seed: int) -> list[tuple[Judged, Readings, float]]:
+def told(seed: int) -> list[tuple[LiveResidual, Readings, float]]:
     """Each reading's judgement, itself, and its true deflection against the reference.
 
     Load by load, half of the unloaded readings after all of them, as in a plan against drift.
@@ -44,8 +44,8 @@ def test_sigma_is_about_one_from_the_first_reading_on_where_the_model_is_right()
         seen = [(j, r) for j, r, _ in told(seed) if j.sigma is not None]
         known = [j for j, _ in seen]
         first_loads += [j.sigma for j, r in seen if not r.unloaded[0]][:12]
-        assert not any(j.learning for j in known[-12:])
-        unsure += sum(j.learning for j in known[:12])
+        assert not any(j.uncertain for j in known[-12:])
+        unsure += sum(j.uncertain for j in known[:12])
         early += [j.sigma for j in known[:12]]
         late += [j.sigma for j in known[-12:]]
     # 60 readings of 3 elements: the mean square scatters by sqrt(2/180) = 0.1 and somewhat more,
@@ -64,7 +64,7 @@ def test_a_deflection_is_told_for_every_load_once_there_is_a_model():
             if reading.unloaded[0]:
                 assert judged.deflection is None
             elif begun:
-                off.append((judged.deflection - true) / judged.give)
+                off.append((judged.deflection - true) / judged.deflection_std)
     assert len(off) == len(SEEDS) * 20 * 4
     # Lengths err by less than the vectors do, of which `give` is the standard deviation.
     assert 0.2 < np.sqrt(np.mean(np.square(off))) < 1.2
@@ -72,18 +72,21 @@ def test_a_deflection_is_told_for_every_load_once_there_is_a_model():
 
 def test_nothing_is_told_before_there_are_poses_to_learn_from():
     judged = [j for j, _, _ in told(0)[:7]]
-    assert judged == [Judged()] * len(judged)
+    assert judged == [LiveResidual()] * len(judged)
 
 
 def test_words_tell_what_is_measured_from_what_is_inferred():
     def words(**more):
-        return figures(Taken(Step("p1", "5kg", 0), 1, 2, 0.0, 0.0, **more))
+        return figures(ReadingStored(Step("p1", "5kg", 0), 1, 2, 0.0, 0.0, **more))
 
     assert words() == ""
-    seen = Judged(50e-6, 1.04, False, 4.2138e-3, 52e-6)
-    assert words(deflection=4.2e-3, judged=seen) == ": deflection 4.20 mm, residual 50.0 µm (1.0 σ)"
+    seen = LiveResidual(50e-6, 1.04, False, 4.2138e-3, 52e-6)
+    assert words(deflection=4.2e-3, live=seen) == ": deflection 4.20 mm, residual 50.0 µm (1.0 σ)"
     expected = ": deflection ≈ 4.214 ± 0.052 mm, residual 50.0 µm (1.0 σ)"
-    assert words(judged=seen) == expected
-    learning = Judged(2e-3, 0.8, True)
-    assert words(judged=learning) == ": residual 2.00 mm (0.8 σ, few readings yet)"
-    assert words(judged=Judged(deflection=3e-4, give=2e-5)) == ": deflection ≈ 300 ± 20 µm"
+    assert words(live=seen) == expected
+    learning = LiveResidual(2e-3, 0.8, True)
+    assert words(live=learning) == ": residual 2.00 mm (0.8 σ, few readings yet)"
+    assert (
+        words(live=LiveResidual(deflection=3e-4, deflection_std=2e-5))
+        == ": deflection ≈ 300 ± 20 µm"
+    )
