@@ -8,10 +8,10 @@ the status: 0 skipped samples, 1 over range, 2 invalid measurement, 3 raw values
 import numpy as np
 
 from drivers.force_sensor import checked_config, open_streaming
-from drivers.force_stream import Sensor
+from drivers.force_stream import SensorFormat
 from drivers.frame_losses import ByDeviceClock
 from drivers.frames import FrameFormat, crc_x25
-from hilcal.acquire.devices import ForceSensor
+from hilcal.acquire.devices import ForceSensorDevice
 from hilcal.config import CellConfig
 from hilcal.types import Floats
 
@@ -35,7 +35,7 @@ def _overload(wrench: Floats, status: int) -> str:
     return ""
 
 
-SENSOR = Sensor(
+SENSOR = SensorFormat(
     name="Bota sensor",
     frame=FrameFormat(b"\xaa", 37, _checksum),
     body=np.dtype(
@@ -47,7 +47,7 @@ SENSOR = Sensor(
 )
 
 
-def open_force_sensor(config: CellConfig) -> ForceSensor:
+def open_force_sensor(config: CellConfig) -> ForceSensorDevice:
     """Open the port of [force_sensor] and wait for the first frame.
 
     Raises:

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import serial
 
-from drivers.force_stream import DEVICE, ForceStream, Sensor
+from drivers.force_stream import DEVICE, ForceStream, SensorFormat
 from drivers.serial_line import close_port, drain, line_failures, open_port
 from hilcal.acquire.devices import Losses, Report, WrenchSample
 from hilcal.config import CellConfig
@@ -16,7 +16,7 @@ OLD_S = 0.05
 
 
 class StreamingSensor:
-    """A force sensor that sends by itself; see `hilcal.acquire.devices.ForceSensor`."""
+    """A force sensor that sends by itself; see `hilcal.acquire.devices.ForceSensorDevice`."""
 
     def __init__(
         self,
@@ -74,7 +74,7 @@ class StreamingSensor:
             close_port(self._port)
 
 
-def open_streaming(section: Section, baud: int, sensor: Sensor) -> StreamingSensor:
+def open_streaming(section: Section, baud: int, sensor: SensorFormat) -> StreamingSensor:
     """Open the port of a sensor that streams from power-on, and wait for the first frame.
 
     Args:

@@ -36,7 +36,7 @@ RING = 4096
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sensor:
+class SensorFormat:
     """What a sensor puts on its line.
 
     Attributes:
@@ -60,7 +60,7 @@ class Sensor:
 class ForceStream:
     """Reads a sensor that is sending, until `stop`; it uses the port and does not close it."""
 
-    def __init__(self, port: serial.Serial, sensor: Sensor) -> None:
+    def __init__(self, port: serial.Serial, sensor: SensorFormat) -> None:
         """Start to read."""
         self._port, self._sensor = port, sensor
         self._path = str(port.port)
@@ -92,7 +92,7 @@ class ForceStream:
             raise DeviceError(self._silence())
 
     def latest(self) -> WrenchSample:
-        """Return the newest frame; see `hilcal.acquire.devices.ForceSensor`."""
+        """Return the newest frame; see `hilcal.acquire.devices.ForceSensorDevice`."""
         self._check()
         with self._lock:
             at = (self._kept - 1) % RING
@@ -102,7 +102,7 @@ class ForceStream:
         return WrenchSample(int(stamp), wrench, np.zeros((6, 6)), 1, temperature)
 
     def average(self, seconds: float) -> WrenchSample:
-        """Return the mean over the next seconds; see `hilcal.acquire.devices.ForceSensor`."""
+        """Return the mean over the next seconds; see `hilcal.acquire.devices.ForceSensorDevice`."""
         if not np.isfinite(seconds) or seconds < 0.0:
             raise ValueError(f"seconds = {seconds}; valid: 0 or more")
         self._check()

@@ -13,12 +13,12 @@ import numpy as np
 import serial
 
 from drivers.force_sensor import StreamingSensor, checked_config
-from drivers.force_stream import DEVICE, ForceStream, Sensor
+from drivers.force_stream import DEVICE, ForceStream, SensorFormat
 from drivers.frame_losses import ByArrival
 from drivers.frames import FrameFormat, crc_modbus
 from drivers.modbus_rtu import NoAnswerError, RefusedError, read_registers, write_register
 from drivers.serial_line import close_port, drain, line_failures, open_port
-from hilcal.acquire.devices import ForceSensor
+from hilcal.acquire.devices import ForceSensorDevice
 from hilcal.config import CellConfig
 from hilcal.errors import DeviceError
 from hilcal.types import Floats
@@ -51,7 +51,7 @@ def _overload(wrench: Floats, status: int) -> str:
     )
 
 
-SENSOR = Sensor(
+SENSOR = SensorFormat(
     name="Robotiq FT 300",
     frame=FrameFormat(b"\x20\x4e", 16, _checksum),
     body=np.dtype([("wrench", "<i2", 6)]),
@@ -61,7 +61,7 @@ SENSOR = Sensor(
 )
 
 
-def open_force_sensor(config: CellConfig) -> ForceSensor:
+def open_force_sensor(config: CellConfig) -> ForceSensorDevice:
     """Open the port of [force_sensor], ask who is there, and start the stream.
 
     Raises:

@@ -15,7 +15,7 @@ from pydantic import Field
 
 from drivers import geocom_codes as geo
 from drivers.geocom_line import ANSWER_S, DEVICE, Link
-from drivers.geocom_reading import Polar, numbers, usable
+from drivers.geocom_reading import PolarReading, numbers, usable
 from hilcal.acquire.clock import Clock
 from hilcal.acquire.devices import Report, TargetLostError, TrackerSample
 from hilcal.config import CellConfig
@@ -52,7 +52,7 @@ class Options(Section):
 
 
 class GeoComTracker:
-    """A GeoCOM instrument as a `hilcal.acquire.devices.Tracker` of positions (m = 3)."""
+    """A GeoCOM instrument as a `hilcal.acquire.devices.TrackerDevice` of positions (m = 3)."""
 
     def __init__(self, link: Link, config: TrackerConfig, options: Options, clock: Clock) -> None:
         """Take over an open link; asks nothing yet."""
@@ -156,7 +156,7 @@ class GeoComTracker:
         """Give the port back. Never raises, may be called twice."""
         self._link.close()
 
-    def _measure(self) -> Polar:
+    def _measure(self) -> PolarReading:
         """One plausible measurement with a distance of its own."""
         measuring = self._clock.real(MEASURING_S)
         until = time.monotonic() + DEADLINE_S + measuring
@@ -173,7 +173,7 @@ class GeoComTracker:
             )
         return polar
 
-    def _full(self, until: float, measuring: float) -> Polar | None:
+    def _full(self, until: float, measuring: float) -> PolarReading | None:
         """Measurement with the standard deviation of the angles; None if it is unknown."""
         started = self._link.ask(geo.DO_MEASURE, (_DISTANCE, _CORRECTED), until=until)
         if started.code in geo.UNKNOWN:
@@ -199,9 +199,9 @@ class GeoComTracker:
                 "before again, not a new one; is another program using it?"
             )
         self._last_ms = ms
-        return Polar(answer.host_ns, hz, v, distance, std, (cross, length), ms, warning)
+        return PolarReading(answer.host_ns, hz, v, distance, std, (cross, length), ms, warning)
 
-    def _simple(self, until: float, measuring: float) -> Polar:
+    def _simple(self, until: float, measuring: float) -> PolarReading:
         """Measurement without a word on its accuracy, as older instruments know it."""
         answer = self._link.ask(
             geo.MEASURE_DISTANCE_ANGLE,
@@ -212,15 +212,15 @@ class GeoComTracker:
         )
         warning = usable(answer)
         hz, v, distance, _ = numbers(answer, 4)
-        return Polar(answer.host_ns, hz, v, distance, warning=warning)
+        return PolarReading(answer.host_ns, hz, v, distance, warning=warning)
 
-    def _spread(self, polar: Polar) -> tuple[float, float]:
+    def _spread(self, polar: PolarReading) -> tuple[float, float]:
         """Standard deviations along and across the beam, m."""
         known, d = self._config, polar.distance
         across = known.transverse_std_m + known.transverse_std_per_m * d
         return known.range_std_m + known.range_std_per_m * d, max(across, polar.angle_std * d)
 
-    def _sight(self, polar: Polar) -> list[tuple[str, str]]:
+    def _sight(self, polar: PolarReading) -> list[tuple[str, str]]:
         """Facts about a measurement for people."""
         along, across = self._spread(polar)
         facts = [

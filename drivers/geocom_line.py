@@ -35,7 +35,7 @@ _MISMATCH, _CLIENT_CHECKSUM = 3093, 3102
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class Reply:
     """A reply whose checksum and transaction were right.
 
     Attributes:
@@ -112,7 +112,7 @@ class Link:
         *,
         until: float,
         seconds: float = ANSWER_S,
-    ) -> Answer:
+    ) -> Reply:
         """Send a request until it is answered without damage.
 
         Args:
@@ -160,7 +160,7 @@ class Link:
         parsers: Sequence[Callable[[str], Any]],
         seconds: float,
         until: float,
-    ) -> tuple[Answer | None, str]:
+    ) -> tuple[Reply | None, str]:
         """One exchange; a good answer, or the complaint about what came instead."""
         with line_failures(DEVICE, self._path):
             self._port.timeout = max(0.05, min(seconds, until - time.monotonic()))
@@ -178,7 +178,7 @@ class Link:
             ):
                 found = response.params
                 several = found if isinstance(found, tuple) else (found,)
-                return Answer(code, () if found is None else several, host_ns), words(code)
+                return Reply(code, () if found is None else several, host_ns), words(code)
             drain(self._port, _QUIET_S, min(_DRAIN_S, max(0.0, until - time.monotonic())))
             self._connection.reset()
         if self._connection.failure is not None or reply is None:

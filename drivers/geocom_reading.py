@@ -6,13 +6,13 @@ from typing import NoReturn
 import numpy as np
 
 from drivers import geocom_codes as geo
-from drivers.geocom_line import DEVICE, Answer
+from drivers.geocom_line import DEVICE, Reply
 from hilcal.errors import DeviceError
 from hilcal.types import Floats
 
 
 @dataclass(frozen=True, slots=True)
-class Polar:
+class PolarReading:
     """One measurement as the instrument gives it.
 
     Attributes:
@@ -36,7 +36,7 @@ class Polar:
     warning: str = ""
 
 
-def usable(answer: Answer) -> str:
+def usable(answer: Reply) -> str:
     """Return the remark of a usable measurement, empty for none.
 
     Raises:
@@ -50,7 +50,7 @@ def usable(answer: Answer) -> str:
     raise geo.failure("measuring", answer.code)
 
 
-def numbers(answer: Answer, count: int) -> Floats:
+def numbers(answer: Reply, count: int) -> Floats:
     """Return the (count,) numbers of a measurement.
 
     Raises:

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 from drivers.force_sensor import checked_config, open_streaming
-from drivers.force_stream import Sensor
+from drivers.force_stream import SensorFormat
 from drivers.frame_losses import ByDeviceClock
 from drivers.frames import FrameFormat
-from hilcal.acquire.devices import ForceSensor
+from hilcal.acquire.devices import ForceSensorDevice
 from hilcal.config import CellConfig
 from hilcal.errors import InputError
 from hilcal.types import Floats
@@ -33,7 +33,7 @@ def _checksum(frame: bytes) -> bytes:
     return (sum(frame) & 0xFFFF).to_bytes(2, "big")
 
 
-def _sensor(counts_per_N: float, counts_per_Nm: float, rate: float) -> Sensor:
+def _sensor(counts_per_N: float, counts_per_Nm: float, rate: float) -> SensorFormat:
     unit = 1.0 / np.repeat((counts_per_N, counts_per_Nm), 3)
 
     def overload(wrench: Floats, status: int) -> str:
@@ -44,10 +44,10 @@ def _sensor(counts_per_N: float, counts_per_Nm: float, rate: float) -> Sensor:
         return ""
 
     frame = FrameFormat(b"\xaa\x07\x08\x10", 22, _checksum, weak=True)
-    return Sensor(NAME, frame, _BODY, unit, lambda: ByDeviceClock(1.0 / rate, 16), overload)
+    return SensorFormat(NAME, frame, _BODY, unit, lambda: ByDeviceClock(1.0 / rate, 16), overload)
 
 
-def open_force_sensor(config: CellConfig) -> ForceSensor:
+def open_force_sensor(config: CellConfig) -> ForceSensorDevice:
     """Open the port of [force_sensor] and wait for the first frame.
 
     Raises:

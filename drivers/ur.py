@@ -18,7 +18,7 @@ from drivers.ur_link.brakes import Brakes
 from drivers.ur_link.control import Control, take
 from drivers.ur_link.failure import CHECK_LINK, CONTROL, HOLD_ON, failure
 from drivers.ur_link.lines import LinkError
-from drivers.ur_link.motion import Motion, deceleration, stands
+from drivers.ur_link.motion import MotionInProgress, deceleration, stands
 from drivers.ur_link.options import UrOptions
 from drivers.ur_link.reading import OPTIONAL, OUTPUTS, N, Reading
 from drivers.ur_link.receiver import PATIENCE_S, STALE_S, Receiver
@@ -40,14 +40,14 @@ _MAX_Q, _MAX_SPEED, _MAX_ACCELERATION = 6.34, 3.2, 40.0
 
 
 class UrArm:
-    """An arm of Universal Robots; see `hilcal.acquire.devices.Arm`."""
+    """An arm of Universal Robots; see `hilcal.acquire.devices.ArmDevice`."""
 
     def __init__(
         self,
         config: CellConfig,
         host: str,
         hz: float,
-        controller: probe.Controller,
+        controller: probe.ControllerFacts,
         no_dashboard: str,
         receiver: Receiver,
     ) -> None:
@@ -59,7 +59,7 @@ class UrArm:
         self._has_dashboard = controller.version[0] < POLYSCOPE_X
         self._brakes = Brakes(host, receiver, self._has_dashboard)
         self._control: Control | None = None
-        self._motion: Motion | None = None
+        self._motion: MotionInProgress | None = None
         self._brake = deceleration(config.motion.speed_rad_s)
         self._fault = ""
         self._was_ours = False
@@ -171,7 +171,9 @@ class UrArm:
             raise failure(self._host, "the motion before has not ended")
         reading = self._read()
         self._check_state(reading, 0.0)
-        motion = Motion(reading.sample.q, q, speed, acceleration, self._arrival, self._clock)
+        motion = MotionInProgress(
+            reading.sample.q, q, speed, acceleration, self._arrival, self._clock
+        )
         self._motion, self._brake = motion, motion.brake
         try:
             taken = control.move(q, speed, acceleration, motion.brake)

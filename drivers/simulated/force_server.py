@@ -22,7 +22,7 @@ from drivers.simulated.force.bota import Bota
 from drivers.simulated.force.ft300 import Ft300
 from drivers.simulated.force.gauge import Gauge
 from drivers.simulated.force.hex import Hex
-from drivers.simulated.force.sensor import Sensor
+from drivers.simulated.force.sensor import SensorProtocol
 from drivers.simulated.parent import end_with_parent
 from drivers.simulated.pty_port import PtyPort
 
@@ -47,7 +47,7 @@ class Stream:
         lost: frames that came too late to be sent.
     """
 
-    sensor: Sensor
+    sensor: SensorProtocol
     gauge: Gauge
     port: PtyPort
     stalled: bool = False

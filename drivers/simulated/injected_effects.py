@@ -8,9 +8,9 @@ import numpy as np
 from drivers.simulated.conditions import joint_temperature
 from drivers.simulated.draw import Draw, joint_compliance, typical_torque
 from drivers.simulated.rigid import rotation_vector
-from drivers.simulated.tracker import TrackerNoise
+from drivers.simulated.tracker import SimulatedNoise
 from drivers.simulated.truth import Truth
-from drivers.simulated.world import Sight, World, stand
+from drivers.simulated.world import IdealReading, World, stand
 from hilcal.cell import Cell
 from hilcal.data.readings import States
 from hilcal.errors import InputError
@@ -69,7 +69,7 @@ def nothing_hidden(
     cell: Cell,
     rng: np.random.Generator,
     *,
-    noise: TrackerNoise | None = None,
+    noise: SimulatedNoise | None = None,
     joint_std: float | Floats = 2e-5,
 ) -> World:
     """Return a world whose arm has joint compliance and nothing else that is wrong.
@@ -93,7 +93,7 @@ def nothing_hidden(
         physics=truth,
         registration=registration,
         station=station,
-        noise=noise or TrackerNoise(),
+        noise=noise or SimulatedNoise(),
         joint_std=np.broadcast_to(np.asarray(joint_std, dtype=float), (cell.arm.n,)).copy(),
     )
 
@@ -241,7 +241,7 @@ def _whitening(covariance: Floats, pairs: tuple[Ints, Ints] | None) -> Floats:
     return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
 
 
-def _change(after: Sight, before: Sight, m: int) -> Floats:
+def _change(after: IdealReading, before: IdealReading, m: int) -> Floats:
     """Return by how much the readings changed, (N, m); rotations as a small rotation."""
     shift = after.position - before.position
     if m == 3:

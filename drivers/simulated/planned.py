@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from drivers.simulated.rehearsal import Visit
+from drivers.simulated.rehearsal import CampaignStates
 from drivers.simulated.temperatures import warm_up
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
@@ -13,7 +13,9 @@ _LOADING = 60.0  # s, to change a load
 _MEASURING = 5.0  # s, to settle and to measure
 
 
-def planned_states(cell: Cell, config: CellConfig, plan: Plan, begun: float = 0.0) -> Visit:
+def planned_states(
+    cell: Cell, config: CellConfig, plan: Plan, begun: float = 0.0
+) -> CampaignStates:
     """Return the N states of a plan's steps in order, with times as they will about be.
 
     A joint's approach side is the direction of its last motion; the first step is reached by
@@ -49,4 +51,4 @@ def planned_states(cell: Cell, config: CellConfig, plan: Plan, begun: float = 0.
         approach=side,
     )
     pose = np.array([plan.pose_names.index(step.pose) for step in plan.steps])
-    return Visit(states, pose, load, np.array([step.cycle for step in plan.steps]))
+    return CampaignStates(states, pose, load, np.array([step.cycle for step in plan.steps]))

@@ -7,7 +7,7 @@ import numpy as np
 
 from drivers.simulated.campaign import rehearsal_states, simulate
 from drivers.simulated.injected_effects import DEFLECTION_EFFECTS, EFFECTS, hide, nothing_hidden
-from drivers.simulated.tracker import TrackerNoise
+from drivers.simulated.tracker import SimulatedNoise
 from drivers.simulated.world import World
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
@@ -86,7 +86,7 @@ class Secret:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Visit:
+class CampaignStates:
     """States of a campaign, in order, and which pose, load and cycle they belong to."""
 
     states: States
@@ -112,11 +112,11 @@ def rehearse(config: CellConfig, choice: str, seed: int, n_poses: int = POSES) -
         InputError: an unknown choice; lists the valid ones. No loads in the configuration.
     """
     rng = np.random.default_rng(seed)
-    visits: list[Visit] = []
+    visits: list[CampaignStates] = []
 
-    def visit(cell: Cell) -> Visit:
+    def visit(cell: Cell) -> CampaignStates:
         pulls = [(load.name, load.wrench(cell.gravity)) for load in config.loads]
-        visits.append(Visit(*rehearsal_states(cell, n_poses, pulls, rng)))
+        visits.append(CampaignStates(*rehearsal_states(cell, n_poses, pulls, rng)))
         return visits[0]
 
     s = conceal(config, choice, rng, visit, measurement_noise(config))
@@ -126,12 +126,12 @@ def rehearse(config: CellConfig, choice: str, seed: int, n_poses: int = POSES) -
     return Rehearsal(s.config, s.cell, s.mode, s.world, s.hidden, s.strength_sigma, readings)
 
 
-def measurement_noise(config: CellConfig, samples: int = 1) -> TrackerNoise:
+def measurement_noise(config: CellConfig, samples: int = 1) -> SimulatedNoise:
     """Return the tracker's noise of the configuration, of the mean of so many measurements."""
     t = config.tracker
     share = config.acquire.systematic_share if samples > 1 else 0.0
     less = float(np.sqrt(share + (1.0 - share) / samples))
-    return TrackerNoise(
+    return SimulatedNoise(
         (less * t.range_std_m, less * t.range_std_per_m),
         (less * t.transverse_std_m, less * t.transverse_std_per_m),
         less * t.orientation_std_rad,
@@ -158,8 +158,8 @@ def conceal(
     config: CellConfig,
     choice: str,
     rng: np.random.Generator,
-    visit: Callable[[Cell], Visit],
-    noise: TrackerNoise,
+    visit: Callable[[Cell], CampaignStates],
+    noise: SimulatedNoise,
 ) -> Secret:
     """Make a simulated cell and hide an effect in it at the configured strength.
 

@@ -9,7 +9,7 @@ from hilcal.types import Floats
 
 
 @dataclass(frozen=True, slots=True)
-class TrackerNoise:
+class SimulatedNoise:
     """Standard deviations of one reading at distance d from the station.
 
         sigma_range = a + b d,   sigma_transverse = c + e d

@@ -10,7 +10,7 @@ from drivers.simulated.elasticity import Elasticity, elasticity
 from drivers.simulated.mechanics import Equilibrium, equilibrium
 from drivers.simulated.misreading import Misreading
 from drivers.simulated.rigid import displacement, inverse, moved_by, rotation_vector, turned
-from drivers.simulated.tracker import TrackerNoise
+from drivers.simulated.tracker import SimulatedNoise
 from drivers.simulated.truth import Truth
 from hilcal.cell import Cell
 from hilcal.data.readings import States
@@ -19,7 +19,7 @@ from hilcal.types import Floats, Ints
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sight:
+class IdealReading:
     """What the tracker would read of N states without any noise.
 
     Attributes:
@@ -57,7 +57,7 @@ class World:
     physics: Truth
     registration: Floats
     station: Floats
-    noise: TrackerNoise
+    noise: SimulatedNoise
     joint_std: Floats
     joint_reference: float = 22.0
     _tree: ElasticTree = field(init=False, repr=False)
@@ -157,7 +157,7 @@ class World:
         """Return the (N, n) torque that weight and load exert at each drive, N·m."""
         return self.rest(states).torque[:, self.drives]
 
-    def sight(self, states: States, slip: Floats | None = None) -> Sight:
+    def sight(self, states: States, slip: Floats | None = None) -> IdealReading:
         """Return what the tracker would read of N states without noise of its own.
 
         T_sensor_target = exp(t [drift]) T_sensor_base exp([base_frame]) T_base_flange
@@ -189,9 +189,9 @@ class World:
         if np.any(hidden.tracker_scale):
             position = position * (1.0 + hidden.tracker_scale)
             jac[:, :3] *= 1.0 + hidden.tracker_scale
-        return Sight(position, rotation, jac)
+        return IdealReading(position, rotation, jac)
 
-    def covariance(self, sight: Sight, m: int = 3) -> Floats:
+    def covariance(self, sight: IdealReading, m: int = 3) -> Floats:
         """Return the (N, m, m) covariance of readings: tracker + J Sigma_q Jᵀ, sensor axes."""
         turn = self.station[:3, :3].T
         cov = self.noise.covariance(self._from_station(sight.position), m)

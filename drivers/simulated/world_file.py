@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from drivers.simulated.tracker import TrackerNoise
+from drivers.simulated.tracker import SimulatedNoise
 from drivers.simulated.truth import Truth
 from drivers.simulated.world import World
 from hilcal.cell import Cell, cell_from_config
@@ -86,7 +86,7 @@ def read_world(path: Path) -> tuple[World, CellConfig]:
             physics=Truth(**{f.name: _array(data["physics"][f.name]) for f in fields(Truth)}),
             registration=_array(data["registration"]),
             station=_array(data["station"]),
-            noise=TrackerNoise(
+            noise=SimulatedNoise(
                 range_std=(float(noise["range_std"][0]), float(noise["range_std"][1])),
                 transverse_std=(
                     float(noise["transverse_std"][0]),

@@ -22,7 +22,7 @@ LATE_S = 0.8 / WATCHDOG_HZ
 """A longer pause between two kicks may have set off the watchdog, s."""
 
 
-class Control:
+class ControlInterface:
     """The control interface, its watchdog and the lease of a motion."""
 
     def __init__(self, link: Any, lease: float) -> None:
@@ -83,7 +83,7 @@ class Control:
             raise RuntimeError("the controller takes no watchdog")
 
 
-def serve(line: Line, control: Control) -> None:
+def serve(line: Line, control: ControlInterface) -> None:
     """Answer requests and kick the watchdog, until `bye` or the end of the parent."""
     while True:
         request = line.next(control.due)
@@ -112,7 +112,7 @@ def main() -> None:
         )
         # From the upload of its program to the watchdog nothing would end it but this process.
         with outliving(TAKING_S):
-            control = Control(Interface(host, float(hz), flags), float(lease))
+            control = ControlInterface(Interface(host, float(hz), flags), float(lease))
     except Exception as error:  # whatever it is, the parent has to know
         line.answer(0, error=words(error))
         return

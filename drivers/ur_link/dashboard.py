@@ -13,7 +13,7 @@ NOT_UNDERSTOOD = "could not understand"
 
 
 @dataclass(frozen=True, slots=True)
-class Robot:
+class RobotFacts:
     """What the dashboard tells about the robot.
 
     Attributes:
@@ -50,7 +50,7 @@ def ask(host: str, commands: tuple[str, ...], seconds: float) -> list[str]:
         return out
 
 
-def describe(host: str, seconds: float) -> Robot:
+def describe(host: str, seconds: float) -> RobotFacts:
     """Ask for everything worth knowing.
 
     Raises:
@@ -67,7 +67,7 @@ def describe(host: str, seconds: float) -> Robot:
     )
     answers = ["" if NOT_UNDERSTOOD in a.lower() else a for a in ask(host, commands, seconds)]
     model, serial, version, mode, safety, remote, program = answers
-    return Robot(
+    return RobotFacts(
         model=model,
         serial=serial,
         version=version,

@@ -40,7 +40,7 @@ def stands(reading: Reading) -> bool:
     return float(np.abs(reading.sample.qd).max()) < STANDS_RAD_S
 
 
-class Motion:
+class MotionInProgress:
     """A commanded motion, and how much of its time it has used.
 
     Attributes:

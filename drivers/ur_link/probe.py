@@ -20,7 +20,7 @@ _STREAM_HZ = 125.0
 
 
 @dataclass(frozen=True, slots=True)
-class Controller:
+class ControllerFacts:
     """What a controller says of itself.
 
     Attributes:
@@ -32,7 +32,7 @@ class Controller:
     outputs: tuple[str, ...]
 
 
-def controller(host: str, outputs: tuple[str, ...], seconds: float) -> Controller:
+def controller(host: str, outputs: tuple[str, ...], seconds: float) -> ControllerFacts:
     """Return the controller's version, and which of `outputs` it has.
 
     Raises:
@@ -47,7 +47,7 @@ def controller(host: str, outputs: tuple[str, ...], seconds: float) -> Controlle
         if len(kinds) != len(outputs):
             raise LinkError("the RTDE server (port 30004) answers with a wrong number of outputs")
         known = tuple(n for n, k in zip(outputs, kinds, strict=True) if k != NOT_FOUND)
-        return Controller(version, known)
+        return ControllerFacts(version, known)
 
 
 def check_stream(host: str, seconds: float) -> None:

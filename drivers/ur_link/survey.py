@@ -4,7 +4,7 @@ import math
 
 from drivers.ur_link import dashboard, states
 from drivers.ur_link.lines import LinkError
-from drivers.ur_link.probe import Controller
+from drivers.ur_link.probe import ControllerFacts
 from drivers.ur_link.reading import Reading
 from drivers.ur_link.receiver import Receiver
 from hilcal.acquire.devices import Report
@@ -14,7 +14,12 @@ _ASK_S = 1.5
 
 
 def survey(
-    host: str, model: str, hz: float, controller: Controller, receiver: Receiver, no_dashboard: str
+    host: str,
+    model: str,
+    hz: float,
+    controller: ControllerFacts,
+    receiver: Receiver,
+    no_dashboard: str,
 ) -> Report:
     """Ask everything that can be asked without moving.
 
@@ -58,7 +63,7 @@ def survey(
     return Report("arm", name, tuple(facts), tuple(problems))
 
 
-def _facts(robot: dashboard.Robot) -> list[tuple[str, str]]:
+def _facts(robot: dashboard.RobotFacts) -> list[tuple[str, str]]:
     remote = {True: "yes", False: "no (local mode)", None: "not known to this controller"}
     return [
         ("model", robot.model),
@@ -69,7 +74,7 @@ def _facts(robot: dashboard.Robot) -> list[tuple[str, str]]:
     ]
 
 
-def _problems(robot: dashboard.Robot, model: str) -> list[str]:
+def _problems(robot: dashboard.RobotFacts, model: str) -> list[str]:
     out = []
     if robot.remote is False:
         out.append("it is in local mode; switch it to remote control on the pendant")

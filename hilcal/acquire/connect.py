@@ -17,7 +17,7 @@ Factory = Callable[[CellConfig], Any]
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class ConnectionResult:
     """What became of one device.
 
     Attributes:
@@ -80,7 +80,7 @@ def driver(group: str, name: str, key: str) -> Factory:
     return factory
 
 
-def connect(config: CellConfig) -> tuple[Rig | None, tuple[Answer, ...]]:
+def connect(config: CellConfig) -> tuple[Rig | None, tuple[ConnectionResult, ...]]:
     """Open every device at once; nothing moves.
 
     Returns:
@@ -151,13 +151,13 @@ def _why(error: Exception) -> str | HilcalError:
     return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
-def _answer(one: _Wanted, made: Any, why: str | HilcalError) -> Answer:
+def _answer(one: _Wanted, made: Any, why: str | HilcalError) -> ConnectionResult:
     name = one.driver or ""
     try:
         if made is not None:
-            return Answer(one.device, name, made.report())
+            return ConnectionResult(one.device, name, made.report())
     except Exception as error:  # as above
         why = _why(error)
     words = str(why)
     told = words if words.startswith(one.device) else f"{one.device}: {words}"
-    return Answer(one.device, name, None, told)
+    return ConnectionResult(one.device, name, None, told)

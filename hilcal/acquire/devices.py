@@ -19,7 +19,7 @@ OPERATORS = "hilcal.operators"
 
 
 class TargetLostError(DeviceError):
-    """The tracker does not see its target; worth another try after `Tracker.find_target`."""
+    """The tracker does not see its target; worth another try after `TrackerDevice.find_target`."""
 
 
 class WrongLoadError(DeviceError):
@@ -84,7 +84,7 @@ class ArmSample:
     safety: str
 
 
-class Arm(Protocol):
+class ArmDevice(Protocol):
     """An arm that moves in joint space.
 
     Without `take_control` nothing can move. Any failure of the arm or of its link raises
@@ -168,7 +168,7 @@ class TrackerSample:
     warning: str = ""
 
 
-class Tracker(Protocol):
+class TrackerDevice(Protocol):
     """An instrument that measures the position (or pose) of one target."""
 
     def report(self) -> Report:
@@ -234,7 +234,7 @@ class Losses:
     skipped: int
 
 
-class ForceSensor(Protocol):
+class ForceSensorDevice(Protocol):
     """A six-component wrench sensor that streams."""
 
     def report(self) -> Report:
@@ -266,7 +266,7 @@ class ForceSensor(Protocol):
         ...
 
 
-class Operator(Protocol):
+class OperatorDevice(Protocol):
     """The person who hangs the loads."""
 
     def report(self) -> Report:

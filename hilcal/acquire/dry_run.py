@@ -8,7 +8,7 @@ import numpy as np
 from hilcal.acquire import workspace
 from hilcal.acquire.clearance import Clearance, clearance_of
 from hilcal.acquire.route import Stop, duration, home, route
-from hilcal.acquire.sight import UNKNOWN, Sight, sight_of
+from hilcal.acquire.sight import UNKNOWN, LineOfSight, sight_of
 from hilcal.cell import Cell, tracker_place
 from hilcal.config import CellConfig
 from hilcal.data.plan import REFERENCE, UNLOADED, Plan, Step
@@ -141,7 +141,7 @@ _Problems = dict[tuple[str, ...], str]
 """By (kind, where): a path's problem is not told again where one of its ends has it."""
 
 
-def _at_stop(shapes: Clearance, sight: Sight | None, stop: Stop) -> _Problems:
+def _at_stop(shapes: Clearance, sight: LineOfSight | None, stop: Stop) -> _Problems:
     arm, margin = shapes.cell.arm, shapes.config.limits.joint_margin_rad
     where = f"pose {stop.name}"
     out: _Problems = {}

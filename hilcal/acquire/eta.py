@@ -8,7 +8,7 @@ LOADING_S = 60.0
 """How long a person is taken to need for a change of the load until one was seen, s."""
 
 
-class Pace:
+class Eta:
     """Measures readings with the motions to them, and changes of the load, in cell seconds."""
 
     def __init__(self, clock: Clock) -> None:

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilcal.acquire.devices import ForceSensor, WrenchSample
+from hilcal.acquire.devices import ForceSensorDevice, WrenchSample
 from hilcal.acquire.tool_load import (
     PARAMETERS,
     ToolLoad,
@@ -31,7 +31,7 @@ _FLOOR = np.diag([1e-3**2] * 3 + [1e-4**2] * 3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Frame:
+class SensorFrame:
     """Where the sensor is at one pose of the arm, base axes.
 
     Attributes:
@@ -44,7 +44,7 @@ class Frame:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Feeling:
+class TaredWrench:
     """One mean wrench against the zero of its session, and the pose where it was felt.
 
     Attributes:
@@ -67,7 +67,9 @@ class ForceMeter:
     configured one stays in them, the same in all sessions.
     """
 
-    def __init__(self, sensor: ForceSensor, settings: Settings, cell: Cell, window: float) -> None:
+    def __init__(
+        self, sensor: ForceSensorDevice, settings: Settings, cell: Cell, window: float
+    ) -> None:
         """Use an open sensor.
 
         Args:
@@ -107,16 +109,16 @@ class ForceMeter:
             sample = self.sensor.average(self._seconds)
         return sample
 
-    def feeling(self, sample: WrenchSample, q: Floats) -> Feeling:
+    def tared(self, sample: WrenchSample, q: Floats) -> TaredWrench:
         """Return a mean wrench against the zero, at joint angles (n,)."""
         covariance = sample.covariance / max(sample.frames, 1) + _FLOOR
-        return Feeling(sample.wrench - self.zero, covariance, np.asarray(q))
+        return TaredWrench(sample.wrench - self.zero, covariance, np.asarray(q))
 
-    def frame(self, q: Floats) -> Frame:
+    def frame(self, q: Floats) -> SensorFrame:
         """Return where the sensor is at joint angles (n,)."""
         chain = chains.evaluate(self._cell.arm, np.asarray(q)[None])
         arm = chain.point(self._cell.load_point) - chain.point(self._origin)
-        return Frame(chain.rotation[-1][0] @ self._axes, arm[0])
+        return SensorFrame(chain.rotation[-1][0] @ self._axes, arm[0])
 
     def to_flange(self, point: Floats) -> Floats:
         """Return a point (3,) of the sensor's axes in flange axes, m."""
@@ -131,7 +133,7 @@ class ForceMeter:
         if not self._identified:
             self.tool = replace(zero, bias=np.zeros(6))
 
-    def identify(self, unloaded: list[Feeling]) -> ToolLoad | None:
+    def identify(self, unloaded: list[TaredWrench]) -> ToolLoad | None:
         """Find the real tool from unloaded readings; None where they are too few.
 
         Raises:
@@ -148,25 +150,25 @@ class ForceMeter:
         self._identified = True
         return self.tool
 
-    def load_wrench(self, feeling: Feeling) -> Floats:
+    def load_wrench(self, tared: TaredWrench) -> Floats:
         """Return the (6,) wrench of the load at the load point, base axes, N and N·m."""
-        frame = self.frame(feeling.q)
-        return shift(self.tool.load_wrench(feeling.wrench, frame.rotation), frame.arm)
+        frame = self.frame(tared.q)
+        return shift(self.tool.load_wrench(tared.wrench, frame.rotation), frame.arm)
 
-    def verify(self, load: Load | None, feeling: Feeling, operator: Operator) -> tuple[bool, str]:
+    def verify(self, load: Load | None, tared: TaredWrench, operator: Operator) -> tuple[bool, str]:
         """Whether a load is what hangs, within the operator's tolerance; and the finding.
 
         Compared at the load point, where a dead weight and a pull have no moment.
         """
-        gravity, frame = self._cell.gravity, self.frame(feeling.q)
+        gravity, frame = self._cell.gravity, self.frame(tared.q)
         expected = np.zeros(6) if load is None else load.wrench(gravity)
         moved = np.eye(6)
         moved[3:, :3] = -se3.skew(frame.arm)
-        at_sensor = self.tool.load_covariance(feeling.covariance, frame.rotation)
+        at_sensor = self.tool.load_covariance(tared.covariance, frame.rotation)
         std = np.sqrt(np.diagonal(moved @ at_sensor @ moved.T))
         return compare(
             expected,
-            self.load_wrench(feeling),
+            self.load_wrench(tared),
             std,
             operator.tolerance_N,
             operator.tolerance_share,

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from hilcal.acquire.clock import Clock
-from hilcal.acquire.devices import Arm, Operator, WrongLoadError
+from hilcal.acquire.devices import ArmDevice, OperatorDevice, WrongLoadError
 from hilcal.acquire.force import ForceMeter
 from hilcal.acquire.motion import Mover
 from hilcal.acquire.progress import Phase, Remark, Watcher
@@ -39,8 +39,8 @@ class Hook:
 
     def __init__(
         self,
-        arm: Arm,
-        operator: Operator,
+        arm: ArmDevice,
+        operator: OperatorDevice,
         meter: ForceMeter | None,
         mover: Mover,
         cell: Cell,
@@ -108,8 +108,8 @@ class Hook:
         for pause in (self._config.acquire.settle_s, SWINGING_S):
             self._mover.wait(pause)
             sample = self._mover.look()
-            feeling = self._meter.feeling(self._meter.average(), sample.q)
-            good, text = self._meter.verify(load, feeling, self._config.operator)
+            tared = self._meter.tared(self._meter.average(), sample.q)
+            good, text = self._meter.verify(load, tared, self._config.operator)
             if good:
                 return ""
         return text
@@ -125,8 +125,8 @@ class Hook:
             return ""
         self._doubted = True
         sample = self._mover.look()
-        feeling = self._meter.feeling(self._meter.average(), sample.q)
-        force = self._meter.load_wrench(feeling)[:3]
+        tared = self._meter.tared(self._meter.average(), sample.q)
+        force = self._meter.load_wrench(tared)[:3]
         felt = float(np.linalg.norm(force))
         if felt <= self._config.operator.tolerance_N:
             return ""

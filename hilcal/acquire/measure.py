@@ -9,7 +9,7 @@ from hilcal.acquire.clock import Clock
 from hilcal.acquire.devices import (
     ArmSample,
     TargetLostError,
-    Tracker,
+    TrackerDevice,
     TrackerSample,
     WrenchSample,
 )
@@ -54,13 +54,13 @@ class Measured:
     remarks: tuple[str, ...]
 
 
-class Taker:
+class Measurer:
     """Takes readings of an arm that stands at its goal."""
 
     def __init__(
         self,
         mover: Mover,
-        tracker: Tracker,
+        tracker: TrackerDevice,
         meter: ForceMeter | None,
         config: CellConfig,
         clock: Clock,
@@ -70,7 +70,7 @@ class Taker:
         self._mover, self._tracker, self._meter = mover, tracker, meter
         self._config, self._clock, self._watcher = config, clock, watcher
 
-    def take(self, name: str) -> Measured:
+    def measure(self, name: str) -> Measured:
         """Measure at the present pose, called `name`.
 
         Raises:
@@ -82,7 +82,7 @@ class Taker:
         while True:
             try:
                 settling = self._settle(name)
-                measured, why = self._measure(settling, tuple(remarks))
+                measured, why = self._averaged(settling, tuple(remarks))
             except TargetLostError as error:
                 searches = self._search(error, name, searches)
                 remarks.append(f"target lost and found again: {error}")
@@ -123,7 +123,7 @@ class Taker:
     def _window(self) -> SettleWindow:
         return SettleWindow(self._config.acquire.samples, self._clock.scale)
 
-    def _measure(self, settling: float, remarks: tuple[str, ...]) -> tuple[Measured | None, str]:
+    def _averaged(self, settling: float, remarks: tuple[str, ...]) -> tuple[Measured | None, str]:
         """Average over the window; None and the reason where that cannot be a reading."""
         before = self._mover.look()
         tracker: list[TrackerSample] = []

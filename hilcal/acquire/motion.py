@@ -3,7 +3,7 @@
 import numpy as np
 
 from hilcal.acquire.clock import Clock
-from hilcal.acquire.devices import Arm, ArmSample
+from hilcal.acquire.devices import ArmDevice, ArmSample
 from hilcal.acquire.force import ForceMeter
 from hilcal.acquire.guard import NORMAL, Guard
 from hilcal.acquire.route import duration
@@ -29,7 +29,12 @@ class Mover:
     """
 
     def __init__(
-        self, arm: Arm, meter: ForceMeter | None, guard: Guard, config: CellConfig, clock: Clock
+        self,
+        arm: ArmDevice,
+        meter: ForceMeter | None,
+        guard: Guard,
+        config: CellConfig,
+        clock: Clock,
     ) -> None:
         """Use an open arm."""
         self.goal: Floats | None = None

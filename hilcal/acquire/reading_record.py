@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 
 from hilcal.acquire.devices import ArmSample, Losses, TrackerSample, WrenchSample
-from hilcal.acquire.force import Feeling
+from hilcal.acquire.force import TaredWrench
 from hilcal.acquire.measure import Measured
 from hilcal.data.plan import Step
 from hilcal.data.readings import Readings, States
 from hilcal.types import Floats
 
 
-def row(
+def reading_of(
     step: Step,
     q: Floats,
     measured: Measured,
@@ -59,7 +59,7 @@ def row(
 def detail(
     step: Step,
     measured: Measured,
-    feeling: Feeling | None,
+    tared: TaredWrench | None,
     zero: Floats | None,
     session: dict[str, Any],
 ) -> dict[str, Any]:
@@ -68,7 +68,7 @@ def detail(
     Args:
         step: which one.
         measured: what was measured.
-        feeling: the mean wrench against the session's zero; None without a force sensor.
+        tared: the mean wrench against the session's zero; None without a force sensor.
         zero: (6,) that zero.
         session: further keys of the session: times, losses, sides.
     """
@@ -83,31 +83,31 @@ def detail(
         "q_actual": measured.q.tolist(),
         "settling_s": measured.settling,
         "remarks": list(measured.remarks),
-        "arm_before": plain(measured.before),
-        "arm_after": plain(measured.after),
-        "tracker": [plain(sample) for sample in measured.tracker],
-        "force": plain(measured.force),
+        "arm_before": sample_json(measured.before),
+        "arm_after": sample_json(measured.after),
+        "tracker": [sample_json(sample) for sample in measured.tracker],
+        "force": sample_json(measured.force),
     }
-    if feeling is not None and zero is not None:
+    if tared is not None and zero is not None:
         out["felt"] = {
-            "wrench": feeling.wrench.tolist(),
-            "covariance": feeling.covariance.tolist(),
+            "wrench": tared.wrench.tolist(),
+            "covariance": tared.covariance.tolist(),
             "zero": zero.tolist(),
         }
     return out | session
 
 
-def feeling_of(stored: dict[str, Any]) -> Feeling | None:
+def stored_wrench(stored: dict[str, Any]) -> TaredWrench | None:
     """Return the mean wrench in a stored detail; None without one."""
     felt = stored.get("felt")
     if felt is None:
         return None
-    return Feeling(
+    return TaredWrench(
         np.array(felt["wrench"]), np.array(felt["covariance"]), np.array(stored["q_actual"])
     )
 
 
-def plain(sample: ArmSample | TrackerSample | WrenchSample | Losses | None) -> Any:
+def sample_json(sample: ArmSample | TrackerSample | WrenchSample | Losses | None) -> Any:
     """Return a sample as a JSON object with the names of its fields; arrays as lists."""
     if sample is None:
         return None

@@ -9,7 +9,7 @@ from hilcal.types import Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Visit:
+class UnloadedVisit:
     """One unloaded reading.
 
     Attributes:
@@ -26,7 +26,7 @@ class Visit:
 
 
 @dataclass(frozen=True, slots=True)
-class Repeatability:
+class RepeatabilityEstimate:
     """The scatter from one arrival to the next.
 
     Attributes:
@@ -56,7 +56,7 @@ class Repeatability:
         )
 
 
-def repeatability(visits: Sequence[Visit]) -> Repeatability | None:
+def repeatability(visits: Sequence[UnloadedVisit]) -> RepeatabilityEstimate | None:
     """Estimate it from unloaded readings; None where no pose has two.
 
     With S = Σ |x − x̄|² over the readings of a pose that was visited k times,
@@ -82,7 +82,7 @@ def repeatability(visits: Sequence[Visit]) -> Repeatability | None:
     if not poses:
         return None
     left = max(spread - instrument, 0.0)
-    return Repeatability(
+    return RepeatabilityEstimate(
         poses=poses,
         dof=dof,
         scatter=float(np.sqrt(spread / dof)),

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from hilcal.acquire.devices import Arm, ForceSensor, Operator, Tracker
+from hilcal.acquire.devices import ArmDevice, ForceSensorDevice, OperatorDevice, TrackerDevice
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -16,10 +16,10 @@ class Rig:
         operator: the person who hangs the loads.
     """
 
-    arm: Arm
-    tracker: Tracker
-    force: ForceSensor | None
-    operator: Operator
+    arm: ArmDevice
+    tracker: TrackerDevice
+    force: ForceSensorDevice | None
+    operator: OperatorDevice
 
     def close(self) -> None:
         """Close everything, the arm first. Never raises, may be called twice."""

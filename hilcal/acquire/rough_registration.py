@@ -15,7 +15,7 @@ PLAUSIBLE_M = 0.1
 """A reading so far from where the nominal arm holds the target is not believed, m."""
 
 
-class RoughFrame:
+class RoughRegistration:
     """The registration T_sensor_base as far as it is known while a campaign is measured.
 
     Good enough to notice that the tracker follows something else, and to judge a drift by the

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from hilcal.acquire.clock import Clock
-from hilcal.acquire.devices import Arm
+from hilcal.acquire.devices import ArmDevice
 from hilcal.acquire.dry_run import DryRun, dry_run
 from hilcal.acquire.progress import Phase, Remark, Watcher
 from hilcal.acquire.rig import Rig
@@ -92,7 +92,7 @@ def refuse(checked: DryRun) -> None:
         )
 
 
-def _stop(arm: Arm) -> str:
+def _stop(arm: ArmDevice) -> str:
     """Stop the arm; returns why it may not stand, empty where it does."""
     for _ in range(_STOPS):
         try:

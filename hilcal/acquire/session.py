@@ -11,17 +11,17 @@ import numpy as np
 from hilcal.acquire.clock import Clock
 from hilcal.acquire.drift import Shift
 from hilcal.acquire.dry_run import route_problems
-from hilcal.acquire.eta import Pace
-from hilcal.acquire.force import Feeling, ForceMeter
+from hilcal.acquire.eta import Eta
+from hilcal.acquire.force import ForceMeter, TaredWrench
 from hilcal.acquire.guard import Guard
 from hilcal.acquire.loads import Hook, payload
-from hilcal.acquire.measure import Measured, Taker
+from hilcal.acquire.measure import Measured, Measurer
 from hilcal.acquire.motion import Mover
 from hilcal.acquire.progress import LiveResidual, Phase, ReadingStored, Remark, Watcher
-from hilcal.acquire.reading_record import detail, feeling_of, plain, row
+from hilcal.acquire.reading_record import detail, reading_of, sample_json, stored_wrench
 from hilcal.acquire.rig import Rig
 from hilcal.acquire.route import Stop
-from hilcal.acquire.session_state import Memory
+from hilcal.acquire.session_state import SessionState
 from hilcal.acquire.stopping_rule import GoalCheck, StoppingRule, way_home
 from hilcal.acquire.store import Store
 from hilcal.cell import Cell
@@ -63,12 +63,12 @@ class Session:
             self._meter = ForceMeter(rig.force, config.force_sensor, cell, window)
         self._guard = Guard(cell, config)
         self._mover = Mover(rig.arm, self._meter, self._guard, config, clock)
-        self._taker = Taker(self._mover, rig.tracker, self._meter, config, clock, watcher)
+        self._measurer = Measurer(self._mover, rig.tracker, self._meter, config, clock, watcher)
         self._hook = Hook(
             rig.arm, rig.operator, self._meter, self._mover, cell, config, clock, watcher
         )
         self._joint_std = config.repeatability.per_joint(cell.arm.n)
-        self._memory = Memory(cell, self._joint_std)
+        self._state = SessionState(cell, self._joint_std)
         self._identified = 0
         self._temperatures: bool | None = None
         self._done = 0
@@ -92,7 +92,7 @@ class Session:
         for old, value in zip(details, stored.value, strict=True):
             step = Step(old["pose"], old["load"], old["cycle"])
             q, covariance = np.array(old["q_actual"]), np.array(old["tracker_covariance"])
-            self._memory.add(step, q, value, covariance, feeling_of(old))
+            self._state.add(step, q, value, covariance, stored_wrench(old))
         felt = details[-1].get("felt")
         if self._meter is not None and felt is not None:
             self._meter.zero = np.array(felt["zero"])
@@ -109,7 +109,7 @@ class Session:
         total = len(self._plan.steps)
         self._event("start", {"missing": sum(s.step is not None for s in stops)})
         self._begin(stops[:2])
-        pace = Pace(self._clock)
+        pace = Eta(self._clock)
         behind, ahead = list(stops[:2]), stops[2:]
         if self._goal.newly_met(last=False):  # an earlier session was stopped on its way home
             ahead = way_home(self._cell, self._config, self._plan, behind, self._store.done())
@@ -171,10 +171,10 @@ class Session:
         sample = self._meter.average()
         q = self._mover.look().q
         self._meter.set_zero(sample, q)
-        self._event("tare", {"force": plain(sample), "q": q.tolist()})
+        self._event("tare", {"force": sample_json(sample), "q": q.tolist()})
 
     def _change(self, name: str) -> None:
-        if name != UNLOADED and len(self._memory.feelings) > self._identified:
+        if name != UNLOADED and len(self._state.tared_wrenches) > self._identified:
             self._identify()
         self._hook.change(name)
         self._event("load", {"hanging": name})
@@ -185,9 +185,9 @@ class Session:
         """Find the tool from all unloaded readings so far."""
         if self._meter is None:
             return
-        self._identified = len(self._memory.feelings)
+        self._identified = len(self._state.tared_wrenches)
         try:
-            tool = self._meter.identify(self._memory.feelings)
+            tool = self._meter.identify(self._state.tared_wrenches)
         except HilcalError as error:
             self._watcher.tell(Remark(f"the tool is not identified: {error}"))
             return
@@ -212,20 +212,20 @@ class Session:
     def _reading(self, stop: Stop, step: Step) -> tuple[Readings, float]:
         """Measure and store; the arm has arrived."""
         self._watcher.tell(Phase(f"measuring {step}"))
-        measured = self._taker.take(stop.name)
-        wrong = self._memory.frame.implausible(measured.q, measured.mean.value[:3])
+        measured = self._measurer.measure(stop.name)
+        wrong = self._state.registration.implausible(measured.q, measured.mean.value[:3])
         if wrong is not None:
             raise DeviceError(wrong)
-        feeling = None
+        tared = None
         if self._meter is not None and measured.force is not None:
-            feeling = self._meter.feeling(measured.force, measured.q)
+            tared = self._meter.tared(measured.force, measured.q)
         now = self._clock.now()
         elapsed = self._elapsed + now - self._begun
-        reading = row(
+        reading = reading_of(
             step,
             stop.q,
             measured,
-            self._wrench(step, feeling),
+            self._wrench(step, tared),
             elapsed,
             now - self._hook.since,
             self._mover.side,
@@ -236,20 +236,20 @@ class Session:
             "wall_s": self._wall(),
             "time_s": elapsed,
             "side": self._mover.side.tolist(),
-            "losses": None if self._rig.force is None else plain(self._rig.force.losses()),
+            "losses": None if self._rig.force is None else sample_json(self._rig.force.losses()),
         }
         zero = None if self._meter is None else self._meter.zero
-        self._store.record(reading, step, detail(step, measured, feeling, zero, session))
+        self._store.record(reading, step, detail(step, measured, tared, zero, session))
         self._done += 1
         for text in measured.remarks:
             self._watcher.tell(Remark(f"{step}: {text}"))
         mean = measured.mean
-        shift = self._memory.add(step, measured.q, mean.value, mean.covariance, feeling)
+        shift = self._state.add(step, measured.q, mean.value, mean.covariance, tared)
         if shift is not None:
             self._tell_drift(step, shift)
         return reading, measured.settling
 
-    def _wrench(self, step: Step, feeling: Feeling | None) -> Floats:
+    def _wrench(self, step: Step, tared: TaredWrench | None) -> Floats:
         """(6,) wrench of the load at the load point, base axes: told or measured."""
         load = self._hook.load(step.load)
         if load is None:
@@ -257,8 +257,8 @@ class Session:
         sensor = self._config.force_sensor
         pull = any((*load.force_N, *load.moment_Nm))
         wanted = sensor is not None and (sensor.use == "all" or (sensor.use == "pulls" and pull))
-        if wanted and self._meter is not None and feeling is not None:
-            return self._meter.load_wrench(feeling)
+        if wanted and self._meter is not None and tared is not None:
+            return self._meter.load_wrench(tared)
         return load.wrench(self._cell.gravity)
 
     def _temperature(self, measured: Measured) -> Floats | None:
@@ -282,7 +282,7 @@ class Session:
     def _tell(
         self, step: Step, reading: Readings, total: int, left: float, settling: float
     ) -> None:
-        deflection = self._memory.deflection(step, reading.value[0, :3])
+        deflection = self._state.deflection(step, reading.value[0, :3])
         live = LiveResidual()
         if self._live is not None and (readings := self._store.readings()) is not None:
             with suppress(HilcalError):  # too early for a model; nothing depends on it
@@ -302,7 +302,7 @@ class Session:
         )
 
     def _finish(self) -> None:
-        found = self._memory.repeatability()
+        found = self._state.repeatability()
         if found is not None:
             self._event("repeatability", asdict(found))
             self._watcher.tell(Remark(found.words(self._joint_std)))

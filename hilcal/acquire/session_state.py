@@ -3,9 +3,9 @@
 import numpy as np
 
 from hilcal.acquire.drift import Drift, Shift
-from hilcal.acquire.force import Feeling
-from hilcal.acquire.repeatability import Repeatability, Visit, repeatability
-from hilcal.acquire.rough_registration import RoughFrame
+from hilcal.acquire.force import TaredWrench
+from hilcal.acquire.repeatability import RepeatabilityEstimate, UnloadedVisit, repeatability
+from hilcal.acquire.rough_registration import RoughRegistration
 from hilcal.cell import Cell
 from hilcal.data.plan import UNLOADED, Step
 from hilcal.robot import chain as chains
@@ -13,25 +13,25 @@ from hilcal.robot.chain import joint_jacobian
 from hilcal.types import Floats
 
 
-class Memory:
+class SessionState:
     """Everything that is carried from reading to reading, and from session to session.
 
     Attributes:
-        frame: where the tracker roughly stands.
-        feelings: the unloaded wrenches, from which the tool is identified.
+        registration: where the tracker roughly stands.
+        tared_wrenches: the unloaded wrenches, from which the tool is identified.
     """
 
     def __init__(self, cell: Cell, joint_std: Floats) -> None:
         """Start empty; `joint_std` (n,) is the arm's repeatability as configured, rad."""
-        self.frame = RoughFrame(cell)
-        self.feelings: list[Feeling] = []
+        self.registration = RoughRegistration(cell)
+        self.tared_wrenches: list[TaredWrench] = []
         self._cell, self._joint_std = cell, joint_std
         self._unloaded: dict[tuple[str, int], Floats] = {}
-        self._visits: list[Visit] = []
+        self._visits: list[UnloadedVisit] = []
         self._drift = Drift()
 
     def add(
-        self, step: Step, q: Floats, value: Floats, covariance: Floats, feeling: Feeling | None
+        self, step: Step, q: Floats, value: Floats, covariance: Floats, tared: TaredWrench | None
     ) -> Shift | None:
         """Take note of a reading; returns its shift where it is a return to the reference.
 
@@ -40,20 +40,20 @@ class Memory:
             q: (n,) actual joint angles, rad.
             value: (m,) sensor axes.
             covariance: (m, m) of the instrument alone.
-            feeling: the mean wrench; None without a force sensor.
+            tared: the mean wrench; None without a force sensor.
         """
         position = value[:3]
-        scatter = self.frame.repeatability(q, self._joint_std)
-        self.frame.add(q, position)
+        scatter = self.registration.repeatability(q, self._joint_std)
+        self.registration.add(q, position)
         if step.load != UNLOADED:
             return None
-        if feeling is not None:
-            self.feelings.append(feeling)
+        if tared is not None:
+            self.tared_wrenches.append(tared)
         self._unloaded[step.pose, step.cycle] = position
         chain = chains.evaluate(self._cell.arm, q[None])
         jac = joint_jacobian(chain, chain.point(self._cell.target[:3, 3]))[0, :3]
         instrument = covariance[:3, :3]
-        self._visits.append(Visit(step.pose, position, instrument, float(np.sum(jac**2))))
+        self._visits.append(UnloadedVisit(step.pose, position, instrument, float(np.sum(jac**2))))
         return self._drift.add(step, position, instrument + scatter)
 
     def deflection(self, step: Step, position: Floats) -> float | None:
@@ -63,6 +63,6 @@ class Memory:
             return None
         return float(np.linalg.norm(position - before))
 
-    def repeatability(self) -> Repeatability | None:
+    def repeatability(self) -> RepeatabilityEstimate | None:
         """Return the scatter of the unloaded readings; None where no pose has two."""
         return repeatability(self._visits)

@@ -21,7 +21,7 @@ _SHY = 1.5  # the beam ends so many radii of tool and beam before the target
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sight:
+class LineOfSight:
     """The tracker's view of the target.
 
     Attributes:
@@ -91,10 +91,10 @@ class Sight:
         return Segment("beam", start, end, max(radius, 1e-4), near.union(stands, {FLOOR}))
 
 
-def sight_of(clearance: Clearance) -> Sight | None:
+def sight_of(clearance: Clearance) -> LineOfSight | None:
     """Return the tracker's view; None where its place is not known."""
     place = tracker_place(clearance.cell, clearance.config)
-    return None if place is None else Sight(clearance, place)
+    return None if place is None else LineOfSight(clearance, place)
 
 
 def _holds(thing: Obstacle, point: Floats, margin: float) -> bool:

@@ -13,7 +13,7 @@ from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import check_record, record_story
 from hilcal.cli.plan_output import POSES
 from hilcal.cli.refining import Row, revisions_json
-from hilcal.cli.rehearsing import Told, first_plan, in_process, on_devices
+from hilcal.cli.rehearsing import RehearsalSettings, first_plan, in_process, on_devices
 from hilcal.cli.terminal import Json, Record, Terminal, terminal
 from hilcal.config import load_config
 from hilcal.data.campaign import Campaign, may_write
@@ -73,7 +73,7 @@ def demo(
         weaker = config.simulation.model_copy(update={"strength_sigma": STRENGTH})
         config = config.model_copy(update={"simulation": weaker})
     there = output.exists()
-    told = Told(config, choice, number, output, path.parent, catalogue)
+    told = RehearsalSettings(config, choice, number, output, path.parent, catalogue)
     doubt: Doubted | None = None
     with working(t.progress) as say:
         plan = _plan(told, poses, ambiguous, say)
@@ -139,7 +139,7 @@ def demo(
     )
 
 
-def _plan(told: Told, poses: int, ambiguous: bool, say: Say) -> Plan:
+def _plan(told: RehearsalSettings, poses: int, ambiguous: bool, say: Say) -> Plan:
     """Return the first plan; a small one under some of the loads where there is to be doubt."""
     if not ambiguous:
         return first_plan(told, told.config, poses, say)

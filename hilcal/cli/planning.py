@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from hilcal.acquire.connect import Answer, connect
+from hilcal.acquire.connect import ConnectionResult, connect
 from hilcal.acquire.dry_run import dry_run
 from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
@@ -166,7 +166,7 @@ def plan_json(made: CheckedPlan) -> dict[str, object]:
     }
 
 
-def answer_json(answer: Answer) -> dict[str, object]:
+def answer_json(answer: ConnectionResult) -> dict[str, object]:
     """Return what became of a device as a JSON document says it."""
     report = answer.report
     return {
@@ -179,7 +179,7 @@ def answer_json(answer: Answer) -> dict[str, object]:
     }
 
 
-def refuse_unready(answers: tuple[Answer, ...]) -> None:
+def refuse_unready(answers: tuple[ConnectionResult, ...]) -> None:
     """Refuse to run with devices that are not ready.
 
     Raises:

@@ -33,7 +33,7 @@ BREAK = 600.0
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class RehearsalSettings:
     """What a rehearsal is of.
 
     Attributes:
@@ -57,7 +57,7 @@ Further = Callable[[Plan], Rehearsal]
 """Measures one further plan in the same cell, into the same campaign; returns all readings."""
 
 
-def first_plan(told: Told, config: CellConfig, poses: int, say: Say) -> Plan:
+def first_plan(told: RehearsalSettings, config: CellConfig, poses: int, say: Say) -> Plan:
     """Plan a campaign, as the program that is not told what is hidden would.
 
     Args:
@@ -74,7 +74,9 @@ def first_plan(told: Told, config: CellConfig, poses: int, say: Say) -> Plan:
 
 
 @contextmanager
-def on_devices(t: Terminal, told: Told, plan: Plan) -> Iterator[tuple[Rehearsal, Further]]:
+def on_devices(
+    t: Terminal, told: RehearsalSettings, plan: Plan
+) -> Iterator[tuple[Rehearsal, Further]]:
     """Run a plan on simulated devices; they stay for further plans as long as the block lasts.
 
     The drivers are the real ones; what they talk to are the simulated devices of one world, each
@@ -110,7 +112,9 @@ def on_devices(t: Terminal, told: Told, plan: Plan) -> Iterator[tuple[Rehearsal,
 
 
 @contextmanager
-def in_process(t: Terminal, told: Told, plan: Plan) -> Iterator[tuple[Rehearsal, Further]]:
+def in_process(
+    t: Terminal, told: RehearsalSettings, plan: Plan
+) -> Iterator[tuple[Rehearsal, Further]]:
     """Draw the readings of a plan from the simulated world without any device.
 
     They are written bit by bit, as a real campaign grows.

@@ -13,7 +13,7 @@ import typer
 from drivers.simulated.on_the_wire import secret_of, simulated_cell
 from drivers.simulated.rehearsal import NOTHING
 from hilcal.acquire.clock import Clock
-from hilcal.acquire.connect import Answer, connect
+from hilcal.acquire.connect import ConnectionResult, connect
 from hilcal.acquire.dry_run import dry_run
 from hilcal.acquire.progress import Watcher
 from hilcal.acquire.rig import Rig
@@ -203,7 +203,7 @@ def _is_home(log: RunLog) -> bool:
     return bool(events) and events[-1]["kind"] == "finished"
 
 
-def _sighted(rig: Rig, answer: Answer, say: Say) -> Answer:
+def _sighted(rig: Rig, answer: ConnectionResult, say: Say) -> ConnectionResult:
     """Let a tracker that has lost its target search for it; only its telescope turns."""
     if answer.device != "tracker" or not answer.problems:
         return answer

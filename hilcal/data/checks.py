@@ -3,7 +3,7 @@
 import numpy as np
 
 from hilcal.data.columns import POSITION, ROTATION, WRENCH
-from hilcal.data.csvfile import Columns
+from hilcal.data.csvfile import CsvTable
 from hilcal.errors import InputError
 from hilcal.robot.arm import Arm
 from hilcal.types import Floats, Ints
@@ -16,7 +16,7 @@ _TRACKING = 0.1  # rad; actual and commanded joints of an arm at rest are closer
 _G = 9.80665
 
 
-def check_joints(table: Columns, names: tuple[str, ...], q: Floats, arm: Arm) -> None:
+def check_joints(table: CsvTable, names: tuple[str, ...], q: Floats, arm: Arm) -> None:
     """Refuse commanded joints beyond the arm's limits; (N, n), rad.
 
     Raises:
@@ -34,7 +34,7 @@ def check_joints(table: Columns, names: tuple[str, ...], q: Floats, arm: Arm) ->
     )
 
 
-def check_actual_joints(table: Columns, names: tuple[str, ...], actual: Floats, q: Floats) -> None:
+def check_actual_joints(table: CsvTable, names: tuple[str, ...], actual: Floats, q: Floats) -> None:
     """Refuse encoder readings that are not near the commanded joints; (N, n), rad.
 
     Raises:
@@ -49,7 +49,7 @@ def check_actual_joints(table: Columns, names: tuple[str, ...], actual: Floats, 
         )
 
 
-def check_positions(table: Columns, position: Floats, q: Floats, arm: Arm) -> None:
+def check_positions(table: CsvTable, position: Floats, q: Floats, arm: Arm) -> None:
     """Refuse positions (N, 3) that cannot be metres.
 
     No reading is further than 100 m from its instrument; all lie within a few reaches of each
@@ -86,7 +86,7 @@ def _millimetres(distance: float) -> str:
     return " (looks like millimetres)" if 10.0 < distance < 1e3 * MAX_DISTANCE else ""
 
 
-def check_rotations(table: Columns, rotation: Floats) -> None:
+def check_rotations(table: CsvTable, rotation: Floats) -> None:
     """Refuse rotation vectors (N, 3) of more than a turn.
 
     Raises:
@@ -101,7 +101,7 @@ def check_rotations(table: Columns, rotation: Floats) -> None:
         )
 
 
-def check_covariances(table: Columns, covariance: Floats) -> None:
+def check_covariances(table: CsvTable, covariance: Floats) -> None:
     """Refuse covariances (N, m, m) that no error can have.
 
     A covariance is positive semi-definite; tested on the correlation matrix D V D with
@@ -140,7 +140,7 @@ def check_covariances(table: Columns, covariance: Floats) -> None:
         )
 
 
-def check_wrenches(table: Columns, wrench: Floats, load: Ints, names: list[str], arm: Arm) -> None:
+def check_wrenches(table: CsvTable, wrench: Floats, load: Ints, names: list[str], arm: Arm) -> None:
     """Refuse a wrench (N, 6) on an unloaded reading, or one that would break the arm.
 
     Raises:
@@ -159,7 +159,7 @@ def check_wrenches(table: Columns, wrench: Floats, load: Ints, names: list[str],
             raise InputError(f"{table.at(i, WRENCH[j])}: {wrench[i, j]:g}: {why}")
 
 
-def check_names(table: Columns) -> None:
+def check_names(table: CsvTable) -> None:
     """Refuse empty or unprintable poses and loads, and other spellings of `none`.
 
     Raises:
@@ -180,7 +180,7 @@ def check_names(table: Columns) -> None:
         raise InputError(f"{table.at(i, 'load')}: '{odd[0]}' must be spelled 'none'")
 
 
-def check_same_pose(table: Columns, pose: Ints, names: list[str], q: Floats) -> None:
+def check_same_pose(table: CsvTable, pose: Ints, names: list[str], q: Floats) -> None:
     """Refuse a pose whose commanded joints (N, n) differ between its rows.
 
     Raises:

@@ -39,7 +39,7 @@ class Dialect:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Columns:
+class CsvTable:
     """A parsed file.
 
     Attributes:
@@ -81,7 +81,7 @@ def read_columns(
     path: str | Path,
     choose: Callable[[list[str]], tuple[Sequence[str], Sequence[str]]],
     dialect: Dialect | None = None,
-) -> Columns:
+) -> CsvTable:
     """Read a delimited text file in blocks, in time and memory linear in its rows.
 
     Args:
@@ -140,7 +140,7 @@ def _parse(
     text: Sequence[str],
     number: Sequence[str],
     dialect: Dialect,
-) -> Columns:
+) -> CsvTable:
     at = {column: header.index(column) for column in (*text, *number)}
     rows: list[int] = []
     texts: dict[str, list[str]] = {column: [] for column in text}
@@ -162,7 +162,7 @@ def _parse(
     if not rows:
         raise InputError(f"{name}: a header but no readings")
     joined = {column: np.concatenate(parts) for column, parts in numbers.items()}
-    return Columns(name, tuple(header), np.array(rows, dtype=np.int64), texts, joined)
+    return CsvTable(name, tuple(header), np.array(rows, dtype=np.int64), texts, joined)
 
 
 def _numbers(

@@ -12,7 +12,7 @@ import numpy as np
 
 from hilcal.data import checks
 from hilcal.data.covariance import TrackerNoise, tracker_covariance
-from hilcal.data.csvfile import Columns, Dialect, read_columns
+from hilcal.data.csvfile import CsvTable, Dialect, read_columns
 from hilcal.data.readings import Readings, States
 from hilcal.errors import InputError
 from hilcal.robot import se3
@@ -133,9 +133,9 @@ def _choose(path: str, header: list[str], arm: Arm) -> tuple[tuple[str, ...], tu
     return (), COLUMNS
 
 
-def _check(table: Columns, whole: Bools, arm: Arm) -> None:
+def _check(table: CsvTable, whole: Bools, arm: Arm) -> None:
     """Refuse what cannot be in the units of this format."""
-    good = Columns(
+    good = CsvTable(
         table.path,
         table.header,
         table.rows[whole],
@@ -212,7 +212,7 @@ def _disagreeing(q: Floats, value: Floats, usable: Bools, lever: float) -> Bools
 
 
 def _readings(
-    table: Columns, keep: Ints, q: Floats, value: Floats, spread: Floats, approach: Floats
+    table: CsvTable, keep: Ints, q: Floats, value: Floats, spread: Floats, approach: Floats
 ) -> Readings:
     position = 1e-3 * value[:, :3]
     angles = np.deg2rad(value[:, 3:])

@@ -9,7 +9,7 @@ import numpy as np
 
 from hilcal.data import checks, columns
 from hilcal.data.covariance import TrackerNoise, tracker_covariance
-from hilcal.data.csvfile import Columns, read_columns
+from hilcal.data.csvfile import CsvTable, read_columns
 from hilcal.data.readings import Readings, States
 from hilcal.errors import InputError
 from hilcal.robot.arm import Arm
@@ -84,7 +84,7 @@ def _index(names: list[str]) -> tuple[Ints, list[str]]:
     return np.fromiter((order[n] for n in names), dtype=np.int64, count=len(names)), list(order)
 
 
-def _states(table: Columns, arm: Arm) -> States:
+def _states(table: CsvTable, arm: Arm) -> States:
     number, n = table.number, arm.n
     q = table.matrix(columns.joint_columns(n))
     checks.check_joints(table, columns.joint_columns(n), q, arm)
@@ -116,11 +116,11 @@ def _states(table: Columns, arm: Arm) -> States:
     )
 
 
-def _group(table: Columns, names: Sequence[str]) -> Floats | None:
+def _group(table: CsvTable, names: Sequence[str]) -> Floats | None:
     return table.matrix(names) if names[0] in table.number else None
 
 
-def _in_range(table: Columns, names: Sequence[str], low: float, high: float, unit: str) -> None:
+def _in_range(table: CsvTable, names: Sequence[str], low: float, high: float, unit: str) -> None:
     value = table.matrix(names)
     table.refuse(
         (value < low) | (value > high),
@@ -129,7 +129,7 @@ def _in_range(table: Columns, names: Sequence[str], low: float, high: float, uni
     )
 
 
-def _cycles(table: Columns) -> Ints:
+def _cycles(table: CsvTable) -> Ints:
     if "cycle" not in table.number:
         return np.zeros(len(table.rows), dtype=np.int64)
     cycle = table.matrix(("cycle",))
@@ -139,7 +139,7 @@ def _cycles(table: Columns) -> Ints:
 
 
 def _covariances(
-    table: Columns,
+    table: CsvTable,
     value: Floats,
     noise: TrackerNoise | None,
     station: Floats | Sequence[float] | None,

@@ -7,7 +7,7 @@ import numpy as np
 
 from hilcal.acquire import workspace
 from hilcal.acquire.clearance import Clearance, clearance_of
-from hilcal.acquire.sight import UNKNOWN, Sight, sight_of
+from hilcal.acquire.sight import UNKNOWN, LineOfSight, sight_of
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.data.plan import UNLOADED
@@ -56,7 +56,7 @@ class Space:
     cell: Cell
     config: CellConfig
     shapes: Clearance = field(init=False)
-    sight: Sight | None = field(init=False)
+    sight: LineOfSight | None = field(init=False)
 
     def __post_init__(self) -> None:
         """Build the shapes once; without a workspace the mounting plane is the floor."""

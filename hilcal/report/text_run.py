@@ -7,7 +7,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from hilcal.acquire.connect import Answer
+from hilcal.acquire.connect import ConnectionResult
 from hilcal.acquire.dry_run import DryRun
 
 
@@ -19,7 +19,9 @@ def spoken(seconds: float) -> str:
     return f"{minutes} min" if minutes < 100 else f"{minutes // 60} h {minutes % 60:02d} min"
 
 
-def check_report(answers: tuple[Answer, ...], dry: DryRun | None) -> Iterator[RenderableType]:
+def check_report(
+    answers: tuple[ConnectionResult, ...], dry: DryRun | None
+) -> Iterator[RenderableType]:
     """Yield who answered, in which state, and every problem."""
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
     for head in ("device", "driver", "", "who answers, and what it says"):

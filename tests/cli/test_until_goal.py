@@ -9,7 +9,7 @@ import pytest
 
 import hilcal.cli.running as running
 import hilcal.plan.goal_rule as goal_rule
-from hilcal.acquire.connect import Answer
+from hilcal.acquire.connect import ConnectionResult
 from hilcal.config import CellConfig, Repeatability
 from hilcal.config.write import to_toml
 from hilcal.data.campaign import Campaign as CampaignFile
@@ -215,7 +215,7 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Site:
     made = Site(tmp_path)
     rig = made.bench.rig
     devices = [d for d in (rig.arm, rig.tracker, rig.force, rig.operator) if d is not None]
-    answers = tuple(Answer(d.report().device, "fake", d.report()) for d in devices)
+    answers = tuple(ConnectionResult(d.report().device, "fake", d.report()) for d in devices)
     monkeypatch.setattr(running, "connect", lambda config: (rig, answers))
     monkeypatch.setattr(running, "Clock", lambda scale: made.bench.clock)
     monkeypatch.setattr(goal_rule, "SHARE", 1e9)  # judge after every reading, however slow that is

@@ -7,7 +7,7 @@ import numpy as np
 
 from drivers.simulated.campaign import rehearsal_states, simulate
 from drivers.simulated.injected_effects import hide, nothing_hidden
-from drivers.simulated.tracker import TrackerNoise
+from drivers.simulated.tracker import SimulatedNoise
 from drivers.simulated.world import World
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig, load_config
@@ -70,7 +70,7 @@ def world_of(cell: Cell, rng: np.random.Generator) -> World:
     """A world with joint compliance alone, tracker and repeatability as configured."""
     config = configuration()
     t = config.tracker
-    noise = TrackerNoise(
+    noise = SimulatedNoise(
         (t.range_std_m, t.range_std_per_m),
         (t.transverse_std_m, t.transverse_std_per_m),
         t.orientation_std_rad,

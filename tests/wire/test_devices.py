@@ -17,8 +17,8 @@ import pytest
 from drivers.simulated.on_the_wire import secret_of, simulated_cell
 from hilcal.acquire.average import average
 from hilcal.acquire.clock import Clock
-from hilcal.acquire.connect import Answer, connect
-from hilcal.acquire.devices import ForceSensor
+from hilcal.acquire.connect import ConnectionResult, connect
+from hilcal.acquire.devices import ForceSensorDevice
 from hilcal.acquire.rig import Rig
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig, load_config
@@ -53,7 +53,7 @@ def there(
 
 
 @pytest.fixture(scope="module")
-def opened(there: tuple[CellConfig, Cell]) -> Iterator[tuple[Rig, tuple[Answer, ...]]]:
+def opened(there: tuple[CellConfig, Cell]) -> Iterator[tuple[Rig, tuple[ConnectionResult, ...]]]:
     rig, answers = connect(there[0])
     assert rig is not None, [answer.failure for answer in answers]
     yield rig, answers
@@ -62,7 +62,7 @@ def opened(there: tuple[CellConfig, Cell]) -> Iterator[tuple[Rig, tuple[Answer, 
 
 
 @pytest.fixture(scope="module")
-def rig(opened: tuple[Rig, tuple[Answer, ...]]) -> Rig:
+def rig(opened: tuple[Rig, tuple[ConnectionResult, ...]]) -> Rig:
     return opened[0]
 
 
@@ -74,7 +74,7 @@ def ready(rig: Rig, there: tuple[CellConfig, Cell]) -> Rig:
 
 
 @pytest.fixture(scope="module")
-def force(rig: Rig) -> ForceSensor:
+def force(rig: Rig) -> ForceSensorDevice:
     if rig.force is None:
         pytest.skip("the cell has no [force_sensor]")
     return rig.force
@@ -88,7 +88,7 @@ def _wait(rig: Rig, longest: float) -> None:
 
 
 def test_every_device_says_who_it_is_and_hinders_nothing(
-    opened: tuple[Rig, tuple[Answer, ...]],
+    opened: tuple[Rig, tuple[ConnectionResult, ...]],
 ) -> None:
     for answer in opened[1]:
         assert answer.report is not None
@@ -209,7 +209,7 @@ def test_the_tracker_sees_the_arm_move(ready: Rig) -> None:
     assert np.linalg.norm(back - before) < 1e-3
 
 
-def test_the_force_sensor_streams_without_a_loss(force: ForceSensor) -> None:
+def test_the_force_sensor_streams_without_a_loss(force: ForceSensorDevice) -> None:
     before = force.losses()
     sample = force.average(1.0)
     after = force.losses()

@@ -44,7 +44,7 @@ def world(tmp_path):
 def test_the_simulated_person_hangs_what_is_asked_for_and_takes_it_off(world):
     socket, asked = world
     made = simulated(socket, hand_s=0)
-    person: devices.Operator = open_simulated(made)
+    person: devices.OperatorDevice = open_simulated(made)
     person.hang(made.loads[0], "")
     person.hang(None, "that was 5kg")
     person.close()

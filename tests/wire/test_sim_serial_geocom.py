@@ -12,7 +12,7 @@ from geocompy.geo import GeoCom
 from geocompy.geo.gctypes import GeoComCode
 from scipy import stats
 
-from drivers.simulated.geocom.optics import Beam, Polar
+from drivers.simulated.geocom.optics import Beam, PolarPoint
 from drivers.simulated.geocom.protocol import crc16_arc
 from tests.support.sim_serial_cases import Instrument, tracker
 
@@ -182,7 +182,7 @@ def test_angles_alone_are_as_noisy(station: Instrument) -> None:
     count = 150
     with Line(station) as line:
         angles = np.array([[float(x) for x in line.ask(2107, "1")[1:]] for _ in range(count)])
-    true = Polar.of(np.array(TARGET))
+    true = PolarPoint.of(np.array(TARGET))
     std = (7.5e-6 + 3e-6 * DISTANCE) / DISTANCE
     error = (angles - [true.hz, true.v]) / [std / np.sin(true.v), std]
     low, high = stats.chi2.ppf([1e-6, 1 - 1e-6], count)
@@ -193,7 +193,7 @@ def test_angles_alone_are_as_noisy(station: Instrument) -> None:
 def test_straight_above_and_below(point: tuple[float, float, float]) -> None:
     beam, rng = Beam((0.0, 0.0), (1e-4, 0.0)), np.random.default_rng(1)
     for _ in range(100):
-        seen = beam.observe(Polar.of(np.array(point)), rng)
+        seen = beam.observe(PolarPoint.of(np.array(point)), rng)
         assert 0.0 <= seen.hz < 2 * np.pi
         assert 0.0 <= seen.v <= np.pi
         np.testing.assert_allclose(cartesian(seen.hz, seen.v, seen.distance), point, atol=2e-3)
@@ -231,7 +231,7 @@ def test_reads_the_target_of_the_moment_when_it_has_measured(station: Instrument
         station.truth(target=np.array([-0.1, -0.1, 0.9]))
         code, _, v, distance = line.ask(2108, "60000", "1")
         assert (code, float(distance)) == ("0", float(values[2]))
-        assert float(v) == pytest.approx(Polar.of(np.array([-0.1, -0.1, 0.9])).v, abs=1e-3)
+        assert float(v) == pytest.approx(PolarPoint.of(np.array([-0.1, -0.1, 0.9])).v, abs=1e-3)
 
 
 def test_does_not_wait_longer_than_asked(station: Instrument) -> None:

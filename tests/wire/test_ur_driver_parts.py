@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from drivers.simulated.ur.motion import line
 from drivers.ur_link import states
-from drivers.ur_link.motion import MARGIN_S, Motion, deceleration, duration
+from drivers.ur_link.motion import MARGIN_S, MotionInProgress, deceleration, duration
 from drivers.ur_link.reading import OUTPUTS, N, ReadingError, read
 from drivers.ur_link.worker import Worker, WorkerError
 
@@ -75,7 +75,7 @@ def test_motion_is_overdue_only_after_its_time_and_margin(monkeypatch):
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
     goal = np.full(N, 1.0)
     at_rest = reading(actual_qd=[0.0] * 6, speed_scaling=1.0, target_speed_fraction=1.0)
-    motion = Motion(np.zeros(N), goal, 0.5, 0.5, 5e-4, clock=1.0)  # takes 3 s
+    motion = MotionInProgress(np.zeros(N), goal, 0.5, 0.5, 5e-4, clock=1.0)  # takes 3 s
     now[0] += 1.5 * 3.0 + MARGIN_S - 0.01
     assert motion.overdue(at_rest) is None
     now[0] += 0.02

@@ -5,7 +5,7 @@ from typing import Any, Protocol
 from hilcal.types import Floats
 
 
-class Sensor(Protocol):
+class SensorProtocol(Protocol):
     """A sensor's wire protocol.
 
     Attributes:

@@ -8,7 +8,7 @@ from hilcal.types import Floats
 
 
 @dataclass(frozen=True, slots=True)
-class Polar:
+class PolarPoint:
     """A direction and a slope distance: x = d sinV sinHz, y = d sinV cosHz, z = d cosV.
 
     Attributes:
@@ -22,14 +22,14 @@ class Polar:
     distance: float
 
     @staticmethod
-    def of(point: Floats) -> "Polar":
+    def of(point: Floats) -> "PolarPoint":
         """Return the polar coordinates of a point (3,), m."""
         x, y, z = map(float, point)
         level = float(np.hypot(x, y))
         hz, v = np.arctan2(x, y) % (2 * np.pi), np.arctan2(level, z)
-        return Polar(float(hz), float(v), float(np.hypot(level, z)))
+        return PolarPoint(float(hz), float(v), float(np.hypot(level, z)))
 
-    def angle_to(self, other: "Polar") -> float:
+    def angle_to(self, other: "PolarPoint") -> float:
         """Return the angle between two directions, rad."""
         return float(np.arccos(np.clip(self.direction() @ other.direction(), -1.0, 1.0)))
 
@@ -58,7 +58,7 @@ class Beam:
         """Return sigma_transverse / d, rad."""
         return self.transverse_std[0] / distance + self.transverse_std[1]
 
-    def observe(self, true: Polar, rng: np.random.Generator) -> Polar:
+    def observe(self, true: PolarPoint, rng: np.random.Generator) -> PolarPoint:
         """Return one measurement of a target; every call draws anew."""
         across = self.angle_std(true.distance)
         draw = rng.standard_normal(3)
@@ -68,4 +68,4 @@ class Beam:
         if not 0.0 <= v <= np.pi:  # over the zenith or the nadir
             hz, v = hz + np.pi, (-v if v < 0.0 else 2 * np.pi - v)
         along = self.range_std[0] + self.range_std[1] * true.distance
-        return Polar(float(hz % (2 * np.pi)), float(v), float(true.distance + draw[2] * along))
+        return PolarPoint(float(hz % (2 * np.pi)), float(v), float(true.distance + draw[2] * along))

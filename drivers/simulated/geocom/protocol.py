@@ -27,7 +27,7 @@ def crc16_arc(data: bytes) -> int:
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class GeocomRequest:
     """One request, taken apart.
 
     Attributes:
@@ -45,20 +45,20 @@ class Request:
     error: int = OK
 
 
-def parse(line: str) -> Request | None:
+def parse(line: str) -> GeocomRequest | None:
     """Take a line apart; None where it is no request at all."""
     if not line.startswith("%R1Q,"):
         return None
     match = _REQUEST.fullmatch(line)
     if match is None:
-        return Request(-1, 0, (), False, CANNOT_DECODE)
+        return GeocomRequest(-1, 0, (), False, CANNOT_DECODE)
     rpc, transaction, crc, rest = match.groups()
     parameters = tuple(rest.split(",")) if rest else ()
     error = OK
     if crc is not None:
         bare = f"%R1Q,{rpc},{transaction}:{rest}"
         error = OK if int(crc) == crc16_arc(bare.encode("ascii", "replace")) else BAD_CHECKSUM
-    return Request(int(rpc), int(transaction or 0), parameters, crc is not None, error)
+    return GeocomRequest(int(rpc), int(transaction or 0), parameters, crc is not None, error)
 
 
 def reply(

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from drivers.simulated.blackboard import Blackboard, settled_truth
-from drivers.simulated.geocom.optics import Beam, Polar
+from drivers.simulated.geocom.optics import Beam, PolarPoint
 
 AIM_S = 0.3
 """World time of a search, a fine adjustment, a lock-in or a turn, s."""
@@ -65,7 +65,7 @@ class Station:
     settings: dict[int, str] = field(
         default_factory=lambda: {2020: "2", 17019: "0", 17021: "0", 17008: "0"}
     )
-    pointing: Polar = field(default_factory=lambda: Polar(0.0, np.pi / 2, 0.0))
+    pointing: PolarPoint = field(default_factory=lambda: PolarPoint(0.0, np.pi / 2, 0.0))
     distance: float = 0.0
     distance_ms: int = 0
     ranging: float | None = None
@@ -75,20 +75,20 @@ class Station:
     )
     measured: int = 0
 
-    def target(self) -> Polar | None:
+    def target(self) -> PolarPoint | None:
         """Return where the target truly is at this moment; None where none can be seen."""
         if self.broken:
             return None
         point = settled_truth(self.board)["target"]
         if not np.all(np.isfinite(point)) or not np.any(point):
             return None  # the world has not begun
-        return Polar.of(point)
+        return PolarPoint.of(point)
 
-    def held(self) -> Polar | None:
+    def held(self) -> PolarPoint | None:
         """Return where the held target truly is; None without lock or sight."""
         return self.target() if self.locked else None
 
-    def look(self) -> Polar | None:
+    def look(self) -> PolarPoint | None:
         """Measure the held target once and turn the telescope to it; None without one."""
         true = self.held()
         if true is None:
@@ -132,7 +132,7 @@ class Station:
 
     def turn(self, hz: float, v: float) -> None:
         """Point elsewhere; the lock ends unless the target is in the field of view there."""
-        self.pointing = Polar(hz % (2 * np.pi), v, 0.0)
+        self.pointing = PolarPoint(hz % (2 * np.pi), v, 0.0)
         true = self.target()
         if true is None or true.angle_to(self.pointing) > FIELD_OF_VIEW:
             self.locked = False

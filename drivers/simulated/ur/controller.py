@@ -22,7 +22,7 @@ _POWER_UP = 0.3  # s of real time for each step of powering up; real arms take s
 _MOST_OFTEN = 0.004  # s of real time between two writes to the blackboard
 
 
-class Answer(Enum):
+class OrderResult(Enum):
     """What became of an order."""
 
     DONE = "done"
@@ -112,17 +112,17 @@ class Controller:
         if was is not arm.runtime:
             self.publish()
 
-    def play(self) -> Answer:
+    def play(self) -> OrderResult:
         """Go on with a paused program, and with the motion that was cut short."""
         arm = self.arm
         if arm.runtime is not Runtime.PAUSED or self._program is None or not arm.able:
-            return Answer.REFUSED
+            return OrderResult.REFUSED
         arm.runtime = Runtime.PLAYING
         arm.note("program resumed")
         if self._interrupted is not None:
             arm.trajectory.start(*self._interrupted, arm.clock.now)
             self._interrupted = None
-        return Answer.DONE
+        return OrderResult.DONE
 
     def protective_stop(self, why: str) -> None:
         """Stop at once and pause the program, until somebody unlocks it."""
@@ -138,17 +138,17 @@ class Controller:
         arm.trajectory.stop(SAFETY_STOP, arm.clock.now)
         self.step()
 
-    def unlock(self) -> Answer:
+    def unlock(self) -> OrderResult:
         """Release a protective stop; the program stays paused."""
         arm = self.arm
         if arm.safety_mode is SafetyMode.ROBOT_EMERGENCY_STOP:
-            return Answer.REFUSED
+            return OrderResult.REFUSED
         if arm.safety_mode is SafetyMode.PROTECTIVE_STOP:
             if time.monotonic() - self._stopped_at < self.unlock_after:
-                return Answer.TOO_EARLY
+                return OrderResult.TOO_EARLY
             arm.safety_mode = SafetyMode.NORMAL
             arm.note("protective stop unlocked")
-        return Answer.DONE
+        return OrderResult.DONE
 
     def emergency_stop(self) -> None:
         """Stop at once, end the program, cut the power."""
@@ -166,20 +166,20 @@ class Controller:
             self.arm.safety_mode = SafetyMode.NORMAL
             self.arm.note("emergency stop released")
 
-    def power(self, mode: RobotMode) -> Answer:
+    def power(self, mode: RobotMode) -> OrderResult:
         """Go towards a power mode: on (idle), brakes released (running), or off."""
         arm = self.arm
         if mode is RobotMode.POWER_OFF:
             self.stop_program("power off")
             arm.robot_mode, self._powering = mode, None
-            return Answer.DONE
+            return OrderResult.DONE
         if arm.safety_mode is not SafetyMode.NORMAL:
-            return Answer.REFUSED
+            return OrderResult.REFUSED
         if arm.robot_mode < mode:
             if arm.robot_mode is RobotMode.POWER_OFF:
                 arm.robot_mode = RobotMode.POWER_ON
             self._powering = time.monotonic() + _POWER_UP, mode
-        return Answer.DONE
+        return OrderResult.DONE
 
     def set_remote(self, remote: bool) -> None:
         """Turn remote control on or off; turning it off ends the network's program."""

@@ -7,7 +7,7 @@ local mode as reported in Universal_Robots_ROS_Driver issue 125.
 import asyncio
 from collections.abc import Callable
 
-from drivers.simulated.ur.controller import Answer, Controller
+from drivers.simulated.ur.controller import Controller, OrderResult
 from drivers.simulated.ur.rtde_link import Faults
 from drivers.simulated.ur.state import RobotMode, Runtime
 
@@ -123,7 +123,7 @@ class Dashboard:
 
     def _unlock(self) -> str:
         answer = self._controller.unlock()
-        if answer is Answer.TOO_EARLY:
+        if answer is OrderResult.TOO_EARLY:
             return EARLY
         return _said(answer, "Protective stop releasing", "unlock protective stop")
 
@@ -131,5 +131,5 @@ class Dashboard:
         return _said(self._controller.power(mode), done, command)
 
 
-def _said(answer: Answer, done: str, command: str) -> str:
-    return done if answer is Answer.DONE else f"Failed to execute: {command}"
+def _said(answer: OrderResult, done: str, command: str) -> str:
+    return done if answer is OrderResult.DONE else f"Failed to execute: {command}"

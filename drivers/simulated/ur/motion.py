@@ -13,7 +13,7 @@ _NOTHING = 1e-9  # rad: no motion
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Segment:
+class LinearMotion:
     """A motion along a line; s is the way of the leading joint.
 
     q(s) = origin + direction * s, s' piecewise linear.
@@ -51,7 +51,7 @@ class Segment:
         return self.at(self.duration)[0]
 
 
-def line(origin: Floats, goal: Floats, speed: float, acceleration: float) -> Segment | None:
+def line(origin: Floats, goal: Floats, speed: float, acceleration: float) -> LinearMotion | None:
     """Return the motion from rest to rest; None where there is none to make.
 
     v = min(speed, sqrt(a d)), ramps of v / a, and d / v - v / a in between.
@@ -65,7 +65,7 @@ def line(origin: Floats, goal: Floats, speed: float, acceleration: float) -> Seg
     ramp = top / acceleration
     cruise = max(0.0, length / top - ramp)
     pieces = ((ramp, 0.0, acceleration), (cruise, top, 0.0), (ramp, top, -acceleration))
-    return Segment(origin, way / length, pieces)
+    return LinearMotion(origin, way / length, pieces)
 
 
 class Trajectory:
@@ -89,7 +89,7 @@ class Trajectory:
         self.rest_time = now
         self.rate = 1.0
         self._now = now
-        self._segment: Segment | None = None
+        self._segment: LinearMotion | None = None
         self._time = 0.0  # along the segment
         self._stopping = False
         self._next: tuple[Floats, float, float] | None = None
@@ -145,7 +145,7 @@ class Trajectory:
             return  # a stop is never made slower
         origin = self._segment.origin + self._segment.direction * way
         pieces = ((speed / deceleration, speed, -deceleration),)
-        self._segment = Segment(origin, self._segment.direction, pieces)
+        self._segment = LinearMotion(origin, self._segment.direction, pieces)
         self._time, self._stopping = 0.0, True
 
     def advance(self, now: float) -> None:

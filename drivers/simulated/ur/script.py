@@ -25,7 +25,7 @@ _JOINT_LIMIT = 2.0 * np.pi + 1e-6  # rad
 _STEP = 0.002  # s, the controller's cycle
 
 
-class Command(IntEnum):
+class ScriptCommand(IntEnum):
     """Commands that are emulated."""
 
     MOVE_J = 1
@@ -115,7 +115,7 @@ class ControlScript:
             self._realtime(number)
             self._signal(_READY)
         elif not self._executing:
-            if number == Command.STOP_SCRIPT:
+            if number == ScriptCommand.STOP_SCRIPT:
                 self._signal(0)
                 return False
             self._executing = True
@@ -127,12 +127,12 @@ class ControlScript:
         """Carry out one command; yields while it takes time."""
         arm, motion, now = self._arm, self._arm.trajectory, self._arm.clock.now
         match number:
-            case Command.MOVE_J | Command.MOVE_L_FK | Command.MOVE_PATH:
+            case ScriptCommand.MOVE_J | ScriptCommand.MOVE_L_FK | ScriptCommand.MOVE_PATH:
                 if arm.refuses_motion:
                     raise ValueError("the motion is refused")
                 given = self._doubles(0, 8)
                 goals = [(given[:6], float(given[6]), float(given[7]))]
-                if number == Command.MOVE_PATH:
+                if number == ScriptCommand.MOVE_PATH:
                     goals = list(self._path)
                 for goal, speed, acceleration in goals:
                     if not (0.0 < speed < np.inf and 0.0 < acceleration < np.inf):
@@ -142,54 +142,56 @@ class ControlScript:
                         raise ProtectiveStop
                     motion.start(goal, speed, acceleration, arm.clock.now)
                     arm.note(f"move to {np.round(goal, 6).tolist()}")
-                    if self._int(1) and number != Command.MOVE_PATH:
+                    if self._int(1) and number != ScriptCommand.MOVE_PATH:
                         self._async = True
                         self._progress(0)
                         return
                     while motion.moving:
                         yield
-            case Command.STOP_J | Command.STOP_L:
+            case ScriptCommand.STOP_J | ScriptCommand.STOP_L:
                 rate = float(self._doubles(0, 1)[0])
                 # stopL's deceleration is the tool's, m/s²; the joints' is taken as the usual one
-                motion.stop(max(rate, 0.05) if number == Command.STOP_J else PROGRAM_STOP, now)
+                motion.stop(
+                    max(rate, 0.05) if number == ScriptCommand.STOP_J else PROGRAM_STOP, now
+                )
                 arm.note(f"stop command, {rate:g}")
                 while motion.moving and not self._int(1):
                     yield
-            case Command.SET_PAYLOAD | Command.SET_TARGET_PAYLOAD:
+            case ScriptCommand.SET_PAYLOAD | ScriptCommand.SET_TARGET_PAYLOAD:
                 given = self._doubles(0, 4)
                 arm.payload = float(given[0])
-                if number == Command.SET_TARGET_PAYLOAD or np.any(given[1:]):
+                if number == ScriptCommand.SET_TARGET_PAYLOAD or np.any(given[1:]):
                     arm.payload_com = given[1:]
                 arm.note(f"payload {arm.payload:g} kg at {arm.payload_com.tolist()}")
-            case Command.SET_TCP:
+            case ScriptCommand.SET_TCP:
                 arm.tcp = self._doubles(0, 6)
-            case Command.TCP_OFFSET:
+            case ScriptCommand.TCP_OFFSET:
                 self._answer(arm.tcp)
-            case Command.FK:
+            case ScriptCommand.FK:
                 self._answer(pose(arm.kinematics.flange(motion.q) @ transform(arm.tcp)))
-            case Command.FK_OF:
+            case ScriptCommand.FK_OF:
                 flange = arm.kinematics.flange(self._doubles(0, 6))
                 self._answer(pose(flange @ transform(self._doubles(6, 6))))
-            case Command.IS_STEADY:
+            case ScriptCommand.IS_STEADY:
                 steady = not motion.moving and now - motion.rest_time > _STEADY
                 arm.registers.out_int[self._base + 1] = int(steady)
-            case Command.JOINTS_SAFE:
+            case ScriptCommand.JOINTS_SAFE:
                 safe = np.all(np.abs(self._doubles(0, 6)) <= _JOINT_LIMIT)
                 arm.registers.out_int[self._base + 1] = int(safe)
-            case Command.WATCHDOG:
+            case ScriptCommand.WATCHDOG:
                 self.watchdog = float(self._doubles(0, 1)[0])
                 arm.note(f"watchdog {self.watchdog:g} Hz")
-            case Command.PROTECTIVE_STOP:
+            case ScriptCommand.PROTECTIVE_STOP:
                 raise ProtectiveStop
             case _:
                 raise ValueError(f"command {number} is not emulated")
 
     def _realtime(self, number: int) -> None:
-        if number == Command.JOINT_TORQUES:
+        if number == ScriptCommand.JOINT_TORQUES:
             arm = self._arm
             torque = arm.kinematics.weight_torque(arm.trajectory.q, arm.payload, arm.payload_com)
             self._answer(torque)
-        elif number == Command.GET_STEPTIME:
+        elif number == ScriptCommand.GET_STEPTIME:
             self._answer(np.array([_STEP]))
         else:
             raise ValueError(f"command {number} is not emulated")

@@ -8,7 +8,7 @@ import numpy as np
 
 from hilcal.acquire.clearance import Clearance, clearance_of
 from hilcal.acquire.route import Stop, route
-from hilcal.acquire.sight import Sight, sight_of
+from hilcal.acquire.sight import LineOfSight, sight_of
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.data.plan import Plan
@@ -147,7 +147,7 @@ def plan_digest(cell: Cell, config: CellConfig, plan: Plan, summary: PlanSummary
 
 
 def _sight(
-    view: Sight | None, q: Floats, load: Ints, loads: Sequence[str]
+    view: LineOfSight | None, q: Floats, load: Ints, loads: Sequence[str]
 ) -> tuple[Ints, tuple[str, ...]]:
     """(S,) whether the target is seen, and why not."""
     count = len(q)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hilcal.acquire.progress import LiveResidual, ReadingStored, Remark
-from hilcal.acquire.repeatability import Visit, repeatability
+from hilcal.acquire.repeatability import UnloadedVisit, repeatability
 from hilcal.config import ForceSensor, Load, Repeatability, Tool
 from hilcal.data.plan import Step
 from hilcal.data.readings import Readings
@@ -263,12 +263,12 @@ def test_repeatability_law() -> None:
             gain = {"a": 2.0, "b": 0.5}[pose]
             for _ in range(4):
                 position = rng.normal(0.0, np.sqrt((1.0 + 4.0 * gain) / 3.0), 3)
-                visits.append(Visit(pose, position, np.eye(3) / 3.0, gain))
+                visits.append(UnloadedVisit(pose, position, np.eye(3) / 3.0, gain))
         found = repeatability(visits)
         assert found is not None
         squares.append(found.joint_std**2)
     assert np.mean(squares) == pytest.approx(4.0, rel=0.1)
-    assert repeatability([Visit("a", np.zeros(3), np.eye(3), 1.0)]) is None
+    assert repeatability([UnloadedVisit("a", np.zeros(3), np.eye(3), 1.0)]) is None
 
 
 def test_a_cell_without_a_tool() -> None:

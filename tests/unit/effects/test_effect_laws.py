@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from drivers.simulated.tracker import TrackerNoise
+from drivers.simulated.tracker import SimulatedNoise
 from drivers.simulated.truth import Truth
 from drivers.simulated.world import World
 from hilcal.cell import Cell
@@ -43,7 +43,7 @@ def both(names: tuple[str, ...], cell: Cell, states: States, scale: float) -> Bo
     truth = Truth.rigid(cell.arm)
     for name in names:
         truth = truth.with_effect(name, truth_of(name, cell, rng, scale))
-    world = World(cell, truth, cell.registration, np.eye(4), TrackerNoise(), np.zeros(cell.arm.n))
+    world = World(cell, truth, cell.registration, np.eye(4), SimulatedNoise(), np.zeros(cell.arm.n))
     model = Model(cell, tuple(make(n, cell, states, options_of(n)) for n in names))
     theta = np.concatenate([true_parameters(world, n) for n in names])
     return Both(world, model, theta)

@@ -6,7 +6,7 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from drivers.simulated.injected_effects import nothing_hidden
-from drivers.simulated.tracker import TrackerNoise
+from drivers.simulated.tracker import SimulatedNoise
 from hilcal.data.readings import States
 from tests.support.example_cell import ur10e_cell
 
@@ -43,7 +43,7 @@ def test_repeatability_correlates_position_and_rotation():
 
 @pytest.mark.parametrize("position", [[2.5, 1.0, -0.4], [0.0, 0.0, 2.0], [-1.0, 0.0, 0.3]])
 def test_covariance_is_an_ellipsoid_along_the_line_of_sight(position):
-    noise = TrackerNoise(range_std=(1e-6, 1e-6), transverse_std=(2e-6, 5e-6))
+    noise = SimulatedNoise(range_std=(1e-6, 1e-6), transverse_std=(2e-6, 5e-6))
     point = np.array([position])
     distance = np.linalg.norm(position)
     value, vector = np.linalg.eigh(noise.covariance(point, 3)[0])
@@ -55,10 +55,10 @@ def test_covariance_is_an_ellipsoid_along_the_line_of_sight(position):
 @pytest.mark.parametrize("position", [[2.5, 1.0, -0.4], [0.0, 0.0, 2.0]])
 def test_angles_keep_the_range_and_the_range_keeps_the_angles(position):
     point, rng = np.array([position]), np.random.default_rng(0)
-    only_angles = TrackerNoise(range_std=(0.0, 0.0), transverse_std=(0.05, 0.0))
+    only_angles = SimulatedNoise(range_std=(0.0, 0.0), transverse_std=(0.05, 0.0))
     seen = only_angles.observe(np.repeat(point, 50, axis=0), rng)
     np.testing.assert_allclose(np.linalg.norm(seen, axis=1), np.linalg.norm(position), rtol=1e-12)
     assert np.ptp(seen, axis=0).max() > 0.05
-    only_range = TrackerNoise(range_std=(0.05, 0.0), transverse_std=(0.0, 0.0))
+    only_range = SimulatedNoise(range_std=(0.05, 0.0), transverse_std=(0.0, 0.0))
     seen = only_range.observe(np.repeat(point, 50, axis=0), rng)
     np.testing.assert_allclose(np.cross(seen, position), 0.0, atol=1e-12)
