@@ -12,14 +12,23 @@ from hilcal.data.readings import Readings
 from hilcal.data.records import content_hash
 from hilcal.data.revision import RevisionRecord
 from hilcal.data.whitening import Mode, usual_mode
-from hilcal.diagnose.verdict import Diagnosis
+from hilcal.diagnose.diagnosis import Diagnosis, History
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit
 from hilcal.identify.full_covariance import campaign_readings
 from hilcal.model import Model
 from hilcal.refine import Refinement
-from hilcal.revisions import check_sources, mode_of, restore, restore_model, to_record
+from hilcal.report.diagnosis_document import to_json
+from hilcal.revisions import (
+    chain,
+    check_sources,
+    history,
+    mode_of,
+    restore,
+    restore_model,
+    to_record,
+)
 from hilcal.types import Floats
 
 
@@ -119,6 +128,14 @@ class Campaign:
         check_sources(record, self.path, self.catalogue)
         return restore_model(record, self.cell, self.readings, self.catalogue)
 
+    def history(self, revision: int | None = None) -> History:
+        """Return how the model of a revision was reached, which `diagnose` takes.
+
+        Args:
+            revision: its number; the latest where None.
+        """
+        return history(chain(self.file.revisions()[:revision]))
+
     def append(self, found: Fit | Diagnosis | Refinement) -> int:
         """Store a fit, a diagnosed fit, or all steps of a refinement; revisions only append.
 
@@ -161,4 +178,5 @@ class Campaign:
         hashed = content_hash(found.readings)
         if hashed != content_hash(self.readings):
             raise InputError(f"{self.path}: the fit is of other readings than this campaign's")
-        return self.file.append_revision(to_record(found, diagnosis, added, hashed, removed))
+        document = None if diagnosis is None else to_json(diagnosis)
+        return self.file.append_revision(to_record(found, document, added, hashed, removed))

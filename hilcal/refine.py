@@ -1,13 +1,15 @@
 """Diagnose and change the model, until it is adequate or something must be measured."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode
-from hilcal.diagnose.rivals import Alternative, Rivals
-from hilcal.diagnose.stepwise import add, exchange, predicts_better, remove
-from hilcal.diagnose.verdict import Diagnosis, Verdict, diagnose
+from hilcal.diagnose.diagnosis import Diagnosis, History, Verdict
+from hilcal.diagnose.evidence import Evidence
+from hilcal.diagnose.rivals import Alternative
+from hilcal.diagnose.stepwise import Refits, add, exchange, predicts_better, remove
+from hilcal.diagnose.verdict import NOTHING, judge
 from hilcal.identify.fit import Fit, fit
 from hilcal.model import Model
 
@@ -15,7 +17,8 @@ __all__ = ["Refinement", "Step", "add", "predicts_better", "refine", "remove"]
 
 MOST_REVISIONS = 15
 FAR = 0.1
-"""Share of an effect's evidence by which others must be better while the model is not adequate."""
+"""Share of an effect's evidence by which others must be better while the model is not adequate;
+a guess."""
 
 Say = Callable[[str], None]
 
@@ -26,7 +29,7 @@ class Step:
 
     Attributes:
         fit: the fit.
-        diagnosis: of it.
+        diagnosis: of it, with all that the refinement learnt of it.
         added: the effect that was added to the revision before.
         removed: the effect that was removed from it.
     """
@@ -39,75 +42,97 @@ class Step:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Refinement:
-    """The steps of a refinement, and why it stopped.
-
-    Attributes:
-        steps: from the starting model to the last one.
-        verdict: of the last model; `ambiguous` where an added effect could as well have been
-            another.
-        message: the reason in a sentence.
-        rejected: effects that were tried and did not lower the error on poses left out.
-    """
+    """The steps of a refinement, from the starting model to the last one."""
 
     steps: tuple[Step, ...]
-    verdict: Verdict
-    message: str
-    rejected: tuple[str, ...]
+
+    @property
+    def fit(self) -> Fit:
+        """The last fit."""
+        return self.steps[-1].fit
+
+    @property
+    def diagnosis(self) -> Diagnosis:
+        """The diagnosis of the last fit: the verdict of the refinement."""
+        return self.steps[-1].diagnosis
+
+    @property
+    def verdict(self) -> Verdict:
+        """Its verdict."""
+        return self.diagnosis.verdict
+
+    @property
+    def rejected(self) -> tuple[str, ...]:
+        """Effects whose addition was tried and did not lower the error on poses left out."""
+        return self.diagnosis.history.rejected
 
 
-def refine(model: Model, readings: Readings, mode: Mode, say: Say | None = None) -> Refinement:
-    """Fit, diagnose, add the leading suspect, and repeat.
+def refine(
+    model: Model,
+    readings: Readings,
+    mode: Mode,
+    say: Say = lambda text: None,
+    history: History = NOTHING,
+) -> Refinement:
+    """Fit, diagnose, add the first suspect, and repeat.
 
-    An effect stays only if the error on poses left out falls. Where the leading suspect
-    cannot be told from others it is added all the same, since any of them lowers the error.
-    When nothing more is found, every addition is reconsidered in the light of the later ones:
-    one that has become needless is removed, one whose part another effect plays better is
-    exchanged, and the final verdict names the doubts that are left.
+    An effect stays only if the error on poses left out falls. Where the readings do not separate
+    the first suspect from others it is added all the same, since any of them lowers the error.
+    When no suspect is left, every addition is reconsidered: a redundant one is removed, one that
+    others replace better is exchanged for them. Effects that were tried or taken out enter the
+    history by which `verdict.judge` judges each step.
 
     Args:
-        model: the starting model.
+        model: the starting model; its effects are never taken out.
         readings: all readings.
         mode: "deflection" or "absolute".
-        say: told what is being done, for people who wait.
+        say: takes progress, one line each.
+        history: how the starting model was reached, where it was not given.
     """
-    tell = say or (lambda text: None)
-    tell(f"fitting {_names(model)}")
-    current = fit(model, readings, mode)
-    tell("diagnosing")
-    work = _Work([Step(current, diagnose(current), None)], model.names, tell)
-    doubts: list[str] = []
+    say(f"fitting {' + '.join(model.names) or 'the bare arm'}")
+    path = Path(fit(model, readings, mode), say, history)
     changed = True
     while changed:
-        work.extend()
-        doubts.clear()
-        changed = work.reconsider(doubts)
-    last = work.steps[-1].diagnosis
-    verdict, message = last.verdict, last.message
-    if verdict in ("missing_effect", "ambiguous") and work.rejected:
-        verdict = "unknown_effect"
-        message = (
-            f"{', '.join(work.rejected)} would explain part of the misfit, but does not lower the "
-            f"error on poses left out; {message}"
-        )
-    if doubts and verdict == "adequate":
-        verdict = "ambiguous"
-        message = f"{message}; but {'; '.join(doubts)}: measure what separates them"
-    return Refinement(tuple(work.steps), verdict, message, tuple(work.rejected))
+        path.extend()
+        changed = path.reconsider()
+    return Refinement(tuple(path.steps))
 
 
-class _Work:
+class Path:
     """The revisions so far, and what was tried."""
 
-    def __init__(self, steps: list[Step], given: tuple[str, ...], tell: Say) -> None:
-        """Begin with a first step; effects that are `given` are never taken out again."""
-        self.steps = steps
-        self.rejected: list[str] = []
-        self._out: set[str] = set()
-        self._given, self._tell = given, tell
+    def __init__(self, first: Fit, say: Say = lambda text: None, before: History = NOTHING) -> None:
+        """Begin with a fit, the effects of which stay.
+
+        Args:
+            first: the fit.
+            say: takes progress, one line each.
+            before: how its model was reached.
+        """
+        self.steps: list[Step] = []
+        self._given, self._before, self._say = first.model.names, before, say
+        self._rejected, self._removed = [*before.rejected], [*before.removed]
+        self._refits = Refits()
+        say("diagnosing")
+        self.append(first, None)
 
     @property
     def _room(self) -> bool:
         return len(self.steps) < MOST_REVISIONS
+
+    def _history(self, of: Fit) -> History:
+        names = of.model.names
+        return History(
+            added=tuple(n for n in names if n not in self._given or n in self._before.added),
+            removed=tuple(self._removed),
+            rejected=tuple(n for n in self._rejected if n not in names),
+        )
+
+    def append(self, found: Fit, added: str | None, removed: str | None = None) -> None:
+        """Judge a fit and append it."""
+        self._evidence = Evidence(found, self._refits.add, self._say)
+        diagnosis = judge(self._evidence, self._history(found))
+        self.steps.append(Step(found, diagnosis, added, removed))
 
     def extend(self) -> None:
         """Add suspects while any lowers the error on poses left out."""
@@ -115,80 +140,78 @@ class _Work:
             pass
 
     def _add_one(self) -> bool:
-        last = self.steps[-1]
-        for name in last.diagnosis.significant:
-            if name in self.rejected or name in self._out:
-                continue
-            self._tell(f"adding {name}")
-            trial = add(last.fit, name)
-            if predicts_better(last.fit, trial):
-                self._tell(f"added {name}; diagnosing")
-                self.steps.append(Step(trial, diagnose(trial), name))
-                return True
-            self.rejected.append(name)
-        return False
+        """Try the suspects, best first; returns whether one was added.
 
-    def reconsider(self, doubts: list[str]) -> bool:
-        """Judge every addition anew; returns whether one was removed or exchanged.
-
-        Args:
-            doubts: takes the additions that could as well be other effects.
+        The step is judged anew where suspects were rejected.
         """
+        last, found = self.steps[-1], None
+        before = len(self._rejected)
+        for name in last.diagnosis.significant:
+            if name in self._removed:
+                continue
+            self._say(f"adding {name}")
+            trial = self._refits.add(last.fit, name)
+            if predicts_better(last.fit, trial):
+                found = trial, name
+                break
+            self._rejected.append(name)
+        if len(self._rejected) > before:
+            diagnosis = judge(self._evidence, self._history(last.fit))
+            self.steps[-1] = replace(last, diagnosis=diagnosis)
+        if found is None:
+            return False
+        self._say(f"added {found[1]}; diagnosing")
+        self.append(*found)
+        return True
+
+    def reconsider(self) -> bool:
+        """Judge every addition anew; returns whether one was removed or exchanged."""
         last = self.steps[-1]
         names = [n for n in last.fit.model.names if n not in self._given]
         if not names or not self._room:
             return False
-        self._tell(f"reconsidering {', '.join(names)}")
-        rivals = Rivals(last.fit)
+        self._say(f"reconsidering {', '.join(names)}")
+        others = {a.effect: a for a in last.diagnosis.alternatives}
         for name in names:
-            if name in last.diagnosis.needless:
+            if name in last.diagnosis.redundant:
                 without = remove(last.fit, name)
                 if not predicts_better(without, last.fit):
                     self._change(without, None, name)
                     return True
-            other = rivals.of(name, self._out)
-            if self._better(last, other) and self._exchange(last, other):
+            if self._better(last, others[name]) and self._exchange(last, others[name]):
                 return True
-            doubt = " or ".join(n for n in other.same_as if n not in self._out)
-            if other.as_good and len(other.others) > 1:
-                doubt = f"{doubt} or {' and '.join(other.others)}".removeprefix(" or ")
-            if doubt:
-                doubts.append(f"{name} could as well be {doubt}")
         return False
 
     def _better(self, last: Step, other: Alternative) -> bool:
-        """Whether others are worth a trial: while something unknown is left, far better ones."""
-        known = last.diagnosis.verdict == "adequate"
+        """Whether others are worth a trial: far better ones while the residual is not noise."""
+        known = last.diagnosis.residual_is_noise
         return other.better and (known or other.log_evidence > (1.0 + FAR) * other.own)
 
     def _exchange(self, last: Step, other: Alternative) -> bool:
         """Put others in the place of an effect, unless the error on poses left out rises.
 
-        While something unknown is left, which the evidence takes for noise, it must surely fall.
+        While the residual is not noise, although the evidence takes it for noise, the error must
+        fall beyond chance.
         """
-        self._tell(f"trying {' + '.join(other.others)} in place of {other.effect}")
+        self._say(f"trying {' + '.join(other.others)} in place of {other.effect}")
         first, *rest = other.others
         trials = [exchange(last.fit, other.effect, first)]
         for name in rest:
-            trials.append(add(trials[-1], name))
+            trials.append(self._refits.add(trials[-1], name))
         found = trials[-1]
-        if last.diagnosis.verdict == "adequate":
+        if last.diagnosis.residual_is_noise:
             if found.holdout.rms_sigma > last.fit.holdout.rms_sigma:
                 return False
         elif not predicts_better(last.fit, found):
             return False
         self._change(trials[0], first, other.effect)
         for name, trial in zip(rest, trials[1:], strict=True):
-            self._tell(f"added {name}; diagnosing")
-            self.steps.append(Step(trial, diagnose(trial), name))
+            self._say(f"added {name}; diagnosing")
+            self.append(trial, name)
         return True
 
     def _change(self, trial: Fit, added: str | None, removed: str) -> None:
-        self._out.add(removed)
+        self._removed.append(removed)
         what = f"removed {removed}" if added is None else f"{added} in place of {removed}"
-        self._tell(f"{what}; diagnosing")
-        self.steps.append(Step(trial, diagnose(trial), added, removed))
-
-
-def _names(model: Model) -> str:
-    return " + ".join(model.names) or "the bare arm"
+        self._say(f"{what}; diagnosing")
+        self.append(trial, added, removed)

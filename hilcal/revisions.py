@@ -13,8 +13,7 @@ from hilcal.data.readings import Readings
 from hilcal.data.records import content_hash
 from hilcal.data.revision import RevisionRecord
 from hilcal.data.whitening import MODES, SCALINGS, Mode, Scaling
-from hilcal.diagnose import diagnosis_document
-from hilcal.diagnose.verdict import Diagnosis
+from hilcal.diagnose.diagnosis import History
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError
 from hilcal.identify import fit_document
@@ -28,7 +27,7 @@ SOURCES = "effects_from"
 
 def to_record(
     found: Fit,
-    diagnosis: Diagnosis | None,
+    diagnosis: Mapping[str, object] | None,
     added: str | None,
     data_hash: str,
     removed: str | None = None,
@@ -37,7 +36,7 @@ def to_record(
 
     Args:
         found: the fit.
-        diagnosis: of it, where it was diagnosed.
+        diagnosis: its document, see `report.diagnosis_document`, where it was diagnosed.
         added: the effect that made it from the revision before; without any change a new chain
             starts.
         data_hash: `content_hash` of its readings.
@@ -46,7 +45,7 @@ def to_record(
     effects, cell = found.model.effects, found.model.cell
     result: dict[str, object] = {"identify": fit_document.to_json(found)}
     if diagnosis is not None:
-        result["diagnose"] = fit_document.plain(diagnosis_document.to_json(diagnosis))
+        result["diagnose"] = fit_document.plain(diagnosis)
     return RevisionRecord(
         effects=found.model.names,
         added=added,
@@ -138,6 +137,24 @@ def chain(records: tuple[RevisionRecord, ...]) -> tuple[RevisionRecord, ...]:
     while first > 0 and records[first].follows:
         first -= 1
     return records[max(first, 0) :]
+
+
+def history(records: tuple[RevisionRecord, ...]) -> History:
+    """Return how the model of the last of these revisions was reached.
+
+    Args:
+        records: revisions that were made from each other, oldest first; see `chain`.
+    """
+    if not records:
+        return History()
+    last = records[-1]
+    added = {r.added for r in records}
+    stored: Mapping[str, Any] = last.result_json.get("diagnose", {})
+    return History(
+        added=tuple(name for name in last.effects if name in added),
+        removed=tuple(r.removed for r in records if r.removed is not None),
+        rejected=tuple(stored.get("rejected", ())),
+    )
 
 
 def _sources(model: Model) -> dict[str, dict[str, dict[str, str]]]:

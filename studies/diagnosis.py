@@ -14,13 +14,14 @@ import numpy as np
 from hilcal.cell import Cell
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode
-from hilcal.diagnose.catalogue_sufficiency import look_ahead
-from hilcal.diagnose.verdict import Diagnosis, diagnose
+from hilcal.diagnose.diagnosis import Diagnosis
+from hilcal.diagnose.verdict import diagnose
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.full_prediction import everything
 from hilcal.refine import Refinement, refine
+from hilcal.report.verdict_words import message
 from hilcal.types import Floats
 
 Kind = Literal["hidden", "nothing", "noise", "pairs", "outside"]
@@ -90,12 +91,12 @@ where nothing is in doubt or to be had."""
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """What the program says of a model.
+    """The diagnosis of a model, as far as a case keeps it.
 
     Attributes:
         verdict: in a word.
-        lead: the first effect that is named; the first suspect where none is.
-        same_as: what it is not told from.
+        lead: the first suspect.
+        same_as: the suspects that the readings do not separate from it.
         variables: those that the residual follows most.
         carriers: those that carry what can be predicted of it.
         message: the verdict in a sentence.
@@ -223,6 +224,8 @@ def _run(asked: Asked, sample: Sample, more: More | None, refined: bool) -> Outc
     if refined and asked.kind not in ("nothing", "noise"):
         r = refine(model, sample.readings, asked.mode)
         diagnosis, result = r.steps[0].diagnosis, _refined(r, sample)
+        if diagnosis.history.rejected:  # what `diagnose` cannot know
+            diagnosis = diagnose(diagnosis.fit)
     else:
         diagnosis, result = diagnose(fit(model, sample.readings, asked.mode)), None
     again = None
@@ -232,22 +235,22 @@ def _run(asked: Asked, sample: Sample, more: More | None, refined: bool) -> Outc
             known = baseline(sample.cell, readings, asked.mode)
             later = diagnose(fit(known, readings, asked.mode))
         again = judgement(later)
-    return Outcome(asked, judgement(look_ahead(diagnosis)), result, again, sample.variables)
+    return Outcome(asked, judgement(diagnosis), result, again, sample.variables)
 
 
-def judgement(d: Diagnosis, verdict: str | None = None, message: str | None = None) -> Judgement:
-    """Return what a diagnosis says; verdict and message of a refinement where given."""
+def judgement(d: Diagnosis) -> Judgement:
+    """Return what a case keeps of a diagnosis."""
     lead = d.suspects[0] if d.suspects else None
-    if d.significant:
-        lead = next(s for s in d.suspects if s.effect == d.significant[0])
-    kinds = [v.variable for v in d.where if v.variable.split()[0] not in ("pose", "direction")]
+    kinds = [
+        v.variable for v in d.misfit_breakdown if v.variable.split()[0] not in ("pose", "direction")
+    ]
     return Judgement(
-        verdict=verdict or d.verdict,
+        verdict=d.verdict,
         lead="" if lead is None else lead.effect,
         same_as=() if lead is None else lead.same_as,
         variables=tuple(kinds[:LEADING]),
-        carriers=tuple(c.variable for c in d.carriers[:LEADING]),
-        message=message or d.message,
+        carriers=tuple(c.variable for c in d.dependences[:LEADING]),
+        message=message(d),
         variance_factor=d.fit.variance_factor,
     )
 
@@ -256,7 +259,7 @@ def _refined(r: Refinement, sample: Sample) -> Refined:
     last = r.steps[-1]
     floor, real = _floors(last.fit, sample)
     return Refined(
-        judgement=judgement(last.diagnosis, r.verdict, r.message),
+        judgement=judgement(last.diagnosis),
         added=tuple(
             Added(after.added, _same_as(before.diagnosis, after.added))
             for before, after in zip(r.steps, r.steps[1:], strict=False)

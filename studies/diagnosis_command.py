@@ -11,7 +11,7 @@ from hilcal.cli.terminal import Json, terminal
 from hilcal.config import CellConfig, load_config
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import MODES, Mode
-from hilcal.diagnose.verdict import Diagnosis
+from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.errors import InputError
 from hilcal.report.progress import counting
 from hilcal.robot.catalogue import configs_dir, robot_names

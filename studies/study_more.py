@@ -10,7 +10,8 @@ from drivers.simulated.temperatures import air, joints
 from hilcal.config import CellConfig
 from hilcal.config.loads import Load
 from hilcal.data.readings import Readings, States
-from hilcal.diagnose.verdict import Diagnosis
+from hilcal.diagnose.diagnosis import Diagnosis
+from hilcal.diagnose.doubt import in_doubt
 from hilcal.errors import CannotAnswerError
 from hilcal.plan.next import measure_next
 from hilcal.plan.planner import Request
@@ -83,11 +84,9 @@ def measure_more(
 
 
 def suspects(d: Diagnosis) -> tuple[str, ...]:
-    """Return the effects in doubt: the leading one and its rivals, or the best where none leads."""
-    lead = next((s for s in d.suspects if s.effect in d.significant), None)
-    if lead is not None:
-        return (lead.effect, *lead.same_as)[:MOST]
-    return tuple(s.effect for s in d.suspects)[:MOST]
+    """Return the effects in doubt, or those of most evidence where no suspect passes all tests."""
+    best = tuple(s.effect for s in d.suspects)[:MOST]
+    return in_doubt(d, MOST) or d.significant[:1] or best
 
 
 def _joined(a: Readings, b: Readings, poses: tuple[str, ...]) -> Readings:

@@ -1,6 +1,6 @@
 """`demo`: the whole story on a simulated cell with a hidden effect."""
 
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -19,14 +19,15 @@ from hilcal.config import load_config
 from hilcal.data.campaign import Campaign, may_write
 from hilcal.data.plan import Plan
 from hilcal.data.records import content_hash
-from hilcal.diagnose.diagnosis_document import to_json
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.refine import Refinement
 from hilcal.refine import refine as refine_model
 from hilcal.report import numbers, text, text_demo, text_refine
 from hilcal.report.build_story import Chapter
+from hilcal.report.diagnosis_document import to_json
 from hilcal.report.progress import Say, working
+from hilcal.report.verdict_words import message
 from hilcal.revisions import to_record
 from hilcal.robot.catalogue import configs_dir
 
@@ -93,9 +94,12 @@ def demo(
         found = refine_model(model, r.readings, r.mode, say)
     with Campaign.open(output) as campaign:
         if doubt is not None and doubt.plan is not None:
-            campaign.append_revision(to_record(doubt.fit, doubt.diagnosis, None, doubt.hashed))
+            first = to_json(doubt.diagnosis)
+            campaign.append_revision(to_record(doubt.fit, first, None, doubt.hashed))
         numbered = [
-            campaign.append_revision(to_record(s.fit, s.diagnosis, s.added, hashed, s.removed))
+            campaign.append_revision(
+                to_record(s.fit, to_json(s.diagnosis), s.added, hashed, s.removed)
+            )
             for s in found.steps
         ]
     rows: list[Row] = [
@@ -104,15 +108,13 @@ def demo(
     ]
     for row, s in zip(rows, found.steps, strict=True):
         t.show(text_demo.step_report(row.number, row.shown[1], s.diagnosis))
-    rows[-1] = replace(rows[-1], verdict=found.verdict)
     t.show(text.heading("The error, revision by revision"))
     t.show([text_refine.revisions_table([r.shown for r in rows]), text_refine.key()])
     truth = text_demo.compared(found.steps[-1].fit, r.world.truth)
     if truth:
         t.show([text.heading("What was found against what is true"), *text_demo.truth_table(truth)])
     ok, words = _judge(r, found)
-    line = text_refine.verdict_line(found.verdict, found.message, catalogue)
-    t.show([line, "", text.heading(words)])
+    t.show([text_refine.verdict_line(found.diagnosis), "", text.heading(words)])
     chapters = [
         Chapter(k, s.added, s.fit, s.diagnosis, s.removed)
         for k, s in zip(numbered, found.steps, strict=True)
@@ -129,7 +131,7 @@ def demo(
             "found": ok,
             **({} if doubt is None else {"doubt": doubt.document}),
             "verdict": found.verdict,
-            "message": found.message,
+            "message": message(found.diagnosis),
             "rejected": list(found.rejected),
             "revisions": revisions_json(rows),
             "parameters": [asdict(p) for p in truth],

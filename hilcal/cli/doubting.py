@@ -7,12 +7,14 @@ import numpy as np
 from drivers.simulated.injected_effects import HARD_TO_SEPARATE
 from drivers.simulated.rehearsal import Rehearsal
 from hilcal.acquire.dry_run import dry_run
-from hilcal.cli.next import MOST, plan_of, separates
+from hilcal.cli.next import plan_of, separates
 from hilcal.cli.plan_output import refuse
 from hilcal.cli.terminal import Terminal
 from hilcal.data.plan import REFERENCE, Plan
 from hilcal.data.records import content_hash
-from hilcal.diagnose.verdict import Diagnosis, diagnose
+from hilcal.diagnose.diagnosis import Diagnosis
+from hilcal.diagnose.doubt import in_doubt as left_open
+from hilcal.diagnose.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
@@ -21,6 +23,7 @@ from hilcal.plan.planner import Request
 from hilcal.report import numbers, text, text_demo
 from hilcal.report.progress import working
 from hilcal.report.text_next import next_report
+from hilcal.report.verdict_words import message
 
 STRENGTH = 2.0
 """Of what is hidden, in units of the noise: weaker than usual."""
@@ -72,14 +75,13 @@ def doubted(
     with working(t.progress) as say:
         say("fitting and diagnosing the first readings")
         found = fit(baseline(r.cell, r.readings, r.mode, catalogue), r.readings, r.mode)
-        d = diagnose(found)
-    document: dict[str, object] = {"verdict": d.verdict, "message": d.message, "suspects": []}
+        d = diagnose(found, say=say)
+    document: dict[str, object] = {"verdict": d.verdict, "message": message(d), "suspects": []}
     known = (content_hash(r.readings), len(r.readings))
-    leading = [s for s in d.suspects if s.effect in d.significant]
-    if not leading or not leading[0].same_as:
-        t.show("So few readings as these leave no suspects to be told apart; another --seed may.\n")
+    suspects = left_open(d)
+    if not suspects:
+        t.show("So few readings as these leave no suspects to separate; another --seed may.\n")
         return Doubted(found, d, *known, None, document)
-    suspects = (leading[0].effect, *leading[0].same_as)[:MOST]
     t.show(text_demo.step_report(1, text.model_name(found.model.names), d))
     t.show(text.heading(f"Ambiguous between {numbers.names(suspects)}: what would settle it?"))
     with working(t.progress) as say:

@@ -13,8 +13,8 @@ from hilcal.data.readings import Readings
 from hilcal.data.records import content_hash
 from hilcal.data.revision import RevisionRecord
 from hilcal.data.whitening import MODES, SCALINGS, Mode, Scaling, usual_mode
-from hilcal.diagnose.catalogue_sufficiency import look_ahead
-from hilcal.diagnose.verdict import Diagnosis, diagnose
+from hilcal.diagnose.diagnosis import Diagnosis, History
+from hilcal.diagnose.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.effects.options import Options
 from hilcal.effects.written import chosen_options, read_effects_text, write_effect
@@ -24,10 +24,12 @@ from hilcal.identify.fit import Fit, fit
 from hilcal.identify.full_covariance import campaign_readings
 from hilcal.model import Model
 from hilcal.report.build_story import Chapter, build_story
+from hilcal.report.diagnosis_document import to_json
 from hilcal.report.progress import Say, working
 from hilcal.revisions import (
     chain,
     check_sources,
+    history,
     mode_of,
     restore,
     restore_model,
@@ -80,7 +82,8 @@ class Opened:
         removed: str | None = None,
     ) -> int:
         """Append a fit; returns its revision number."""
-        record = to_record(found, diagnosis, added, content_hash(self.readings), removed)
+        document = None if diagnosis is None else to_json(diagnosis)
+        record = to_record(found, document, added, content_hash(self.readings), removed)
         return self.campaign.append_revision(record)
 
     def restore(self, record: RevisionRecord) -> Fit:
@@ -96,6 +99,10 @@ class Opened:
         """Return model and parameters of a stored fit; raises as `restore` does."""
         check_sources(record, self.path, self.catalogue)
         return restore_model(record, self.cell, self.readings, self.catalogue)
+
+    def history(self, number: int | None = None) -> History:
+        """Return how the model of a revision was reached, by default of the latest."""
+        return history(chain(self.campaign.revisions()[:number]))
 
     def latest_fit(self, t: Terminal, say: Say) -> tuple[int, Fit]:
         """Return the latest revision as a fit; without any, make and store the baseline."""
@@ -119,16 +126,13 @@ class Opened:
         if self.latest() is None:
             self.latest_fit(t, say)
         out = []
-        records = chain(self.campaign.revisions())
-        for record in records:
+        for record in chain(self.campaign.revisions()):
             say(f"restoring revision {record.number}")
             found = self.restore(record)
             judged = None
             if found.scaling == "gc":
                 say(f"diagnosing revision {record.number}")
-                judged = diagnose(found)
-                if record is records[-1]:  # to the others, something was added
-                    judged = look_ahead(judged, say)
+                judged = diagnose(found, self.history(record.number), say)
             out.append(Chapter(record.number, record.added, found, judged, record.removed))
         return out
 

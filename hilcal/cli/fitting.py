@@ -17,7 +17,7 @@ from hilcal.cli.files import (
 )
 from hilcal.cli.terminal import Json, Run, terminal
 from hilcal.data.whitening import Scaling
-from hilcal.diagnose.misfit_breakdown import where
+from hilcal.diagnose.misfit_breakdown import misfit_breakdown
 from hilcal.diagnose.projection import projection
 from hilcal.effects.written import write_effect
 from hilcal.errors import InputError
@@ -106,7 +106,7 @@ def compare(run: Run, effects_from: EffectsFrom = None, as_json: Json = False) -
                 "identify again"
             )
         say("looking where it fails")
-        places = where(projection(found))
+        places = misfit_breakdown(projection(found))
     e = everything(found)
     worst = text.worst_poses(e)
     name = text.model_name(titles(found.model, found.readings))

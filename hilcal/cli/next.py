@@ -1,6 +1,6 @@
 """`next`: the measurements that separate the leading suspects."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -23,7 +23,8 @@ from hilcal.cli.planning import plan_json, read_cell
 from hilcal.cli.terminal import Json, Record, Run, Terminal, terminal
 from hilcal.data.plan import REFERENCE, Plan, read_plan
 from hilcal.data.run_log import PLAN
-from hilcal.diagnose.rivals import Rivals
+from hilcal.diagnose.diagnosis import Diagnosis
+from hilcal.diagnose.doubt import MOST, in_doubt
 from hilcal.diagnose.stepwise import remove
 from hilcal.diagnose.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue
@@ -36,18 +37,7 @@ from hilcal.report import numbers as words_of
 from hilcal.report.progress import Say, working
 from hilcal.report.text_next import next_report
 from hilcal.report.text_plan import plan_report
-from hilcal.revisions import chain
 from hilcal.types import Floats
-
-MOST = 4
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Doubt:
-    """Suspects that these readings do not tell apart, and a fit of the model without them."""
-
-    fit: Fit
-    suspects: tuple[str, ...]
 
 
 def next_(
@@ -56,7 +46,7 @@ def next_(
     poses: Poses = POSES,
     suspects: Annotated[
         str | None,
-        typer.Option("--suspects", metavar="A,B", help="Tell these apart, whatever is diagnosed."),
+        typer.Option("--suspects", metavar="A,B", help="Separate these, whatever is diagnosed."),
     ] = None,
     cell: Annotated[
         Path | None,
@@ -69,7 +59,7 @@ def next_(
     effects_from: EffectsFrom = None,
     as_json: Json = False,
 ) -> None:
-    """Plan the measurements that separate the leading suspects; exit 4 where there is no doubt."""
+    """Plan the measurements that separate the leading suspects; exit 4 where none are in doubt."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     check_record(record)
     rng = generator(seed)
@@ -77,16 +67,14 @@ def next_(
         raise InputError(f"--poses {poses}; valid: a whole number from 1")
     with open_run(run, catalogue) as o, working(t.progress) as say:
         config, numbers = (o.config, o.cell) if cell is None else read_cell(cell)
-        doubt = doubt_of(t, o, _named(suspects, catalogue), say)
+        before, effects = _without_suspects(t, o, _named(suspects, catalogue), say)
         place = reference_of(o)
-        found = measure_next(
-            numbers, config, doubt.fit, doubt.suspects, Request(poses), rng, say, place
-        )
+        found = measure_next(numbers, config, before, effects, Request(poses), rng, say, place)
         summary = summarise(found.planned, config, rng, say, compare=not quick)
         say("checking every motion in a dry run")
-        made = checked(numbers, config, plan_of(found, doubt.suspects), summary)
+        made = checked(numbers, config, plan_of(found, effects), summary)
     write(t, numbers, config, made, output, csv, record)
-    t.show(f"In doubt: {words_of.names(doubt.suspects, 'or')}.\n")
+    t.show(f"In doubt: {words_of.names(effects, 'or')}.\n")
     t.show(next_report(found, made.summary.poses, made.summary.readings))
     t.show(plan_report(made.summary))
     t.show(f"The plan is in {output}. Measure it into the same campaign with:")
@@ -95,7 +83,7 @@ def next_(
         {
             **plan_json(made),
             "plan": str(output),
-            "suspects": list(doubt.suspects),
+            "suspects": list(effects),
             **separates(found),
         }
     )
@@ -119,14 +107,13 @@ def plan_of(found: Next, suspects: tuple[str, ...]) -> Plan:
     return replace(found.planned.ordered.plan, about=more)
 
 
-def doubt_of(t: Terminal, o: Opened, named: tuple[str, ...] | None, say: Say) -> Doubt:
-    """Return what is to be told apart: as named, or the leading suspect and its rivals.
-
-    Where the newest revision has none, but an effect that was added on the way could as well
-    have been another, it is these.
+def _without_suspects(
+    t: Terminal, o: Opened, named: tuple[str, ...] | None, say: Say
+) -> tuple[Fit, tuple[str, ...]]:
+    """Return a fit, and the effects to separate that its model does not hold.
 
     Raises:
-        InputError: named suspects that are in the model.
+        InputError: the latest revision is not in scaling gc.
         CannotAnswerError: nothing is in doubt; says what else to do.
     """
     number, newest = o.latest_fit(t, say)
@@ -135,48 +122,45 @@ def doubt_of(t: Terminal, o: Opened, named: tuple[str, ...] | None, say: Say) ->
             f"revision {number} has scaling {newest.scaling}; next needs gc: run hilcal identify "
             "again"
         )
-    if named is not None:
-        for name in named:
-            if name in newest.model.names:
-                say(f"fitting without {name}")
-                newest = remove(newest, name)
-        return Doubt(newest, named)
-    say(f"diagnosing revision {number}")
-    d = diagnose(newest)
-    leading = [s for s in d.suspects if s.effect in d.significant]
-    if leading and leading[0].same_as:
-        return Doubt(newest, (leading[0].effect, *leading[0].same_as)[:MOST])
-    if leading:
-        raise CannotAnswerError(
-            f"nothing to tell apart: {leading[0].effect} is the only leading suspect; add it with: "
-            f"hilcal add {o.path} {leading[0].effect}"
-        )
-    added = {r.added for r in chain(o.campaign.revisions())}
-    if doubtful := [name for name in newest.model.names if name in added]:
-        say(f"reconsidering {', '.join(doubtful)}")
-        others = Rivals(newest)
-        for name in doubtful:
-            if same := others.of(name).same_as:
-                say(f"fitting without {name}")
-                return Doubt(remove(newest, name), (name, *same)[:MOST])
-    raise CannotAnswerError(_settled(o, d.verdict))
+    suspects = named
+    if suspects is None:
+        say(f"diagnosing revision {number}")
+        d = diagnose(newest, o.history(number), say)
+        suspects = in_doubt(d)
+        if not suspects:
+            raise CannotAnswerError(_settled(o, d))
+    for name in suspects:
+        if name in newest.model.names:
+            say(f"fitting without {name}")
+            newest = remove(newest, name)
+    return newest, suspects
 
 
-def _settled(o: Opened, verdict: str) -> str:
-    """Say that nothing is to be told apart, and what else to do."""
-    if verdict == "adequate":
+def _settled(o: Opened, d: Diagnosis) -> str:
+    """Say that no suspects are to be separated, and what else to do."""
+    head = "no suspects to separate:"
+    if d.verdict == "adequate":
         return (
-            "nothing to tell apart: the model is adequate; to sharpen it, plan on with: hilcal "
-            f"plan CELL.toml --after {o.path}, or tell named effects apart with --suspects A,B"
+            f"{head} the model is adequate; to sharpen it, plan on with: hilcal plan CELL.toml "
+            f"--after {o.path}, or separate named effects with --suspects A,B"
         )
-    if verdict == "noise_misjudged":
+    if d.verdict == "noise_misjudged":
         return (
-            f"nothing to tell apart: the noise is misjudged, see hilcal diagnose {o.path}; repeat "
-            "some readings, or state the covariance anew"
+            f"{head} the noise is misjudged, see hilcal diagnose {o.path}; repeat some readings, "
+            "or state the covariance anew"
+        )
+    if d.verdict == "missing_effect":
+        lead = d.suspects[0].effect
+        return f"{head} {lead} alone is missing; add it with: hilcal add {o.path} {lead}"
+    why = "no effect of the catalogue explains the misfit"
+    if d.reason == "insufficient_catalogue":
+        why = (
+            f"all effects of the catalogue together do not explain the misfit, and "
+            f"{d.suspects[0].effect} may only resemble the missing effect"
         )
     return (
-        "nothing to tell apart: no effect of the catalogue explains the misfit, so there is no "
-        f"suspect; see hilcal compare {o.path}, or give an effect of your own by --effects-from"
+        f"{head} {why}; see hilcal diagnose {o.path}, or give an effect of your own by "
+        "--effects-from"
     )
 
 

@@ -6,7 +6,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -25,8 +25,8 @@ from hilcal.cli.files import (
 from hilcal.cli.fitting import Readings, options_json, options_line
 from hilcal.cli.terminal import Json, Record, Run, terminal
 from hilcal.data.revision import change
-from hilcal.diagnose.catalogue_sufficiency import look_ahead
-from hilcal.diagnose.diagnosis_document import to_json
+from hilcal.diagnose.diagnosis import History
+from hilcal.diagnose.verdict import NOTHING
 from hilcal.diagnose.verdict import diagnose as judge
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.options import Options
@@ -40,8 +40,10 @@ from hilcal.refine import refine as refine_model
 from hilcal.refine import remove as remove_effect
 from hilcal.report import numbers, text, text_refine
 from hilcal.report.build_story import Chapter, build_story
+from hilcal.report.diagnosis_document import to_json
 from hilcal.report.progress import working
 from hilcal.report.text_unknown import curves
+from hilcal.report.verdict_words import message
 
 ENDING = 5.0
 
@@ -68,7 +70,7 @@ def diagnose(run: Run, effects_from: EffectsFrom = None, as_json: Json = False) 
     with open_run(run, catalogue) as o, working(t.progress) as say:
         number, found = o.latest_fit(t, say)
         say(f"diagnosing revision {number}")
-        d = look_ahead(judge(found), say)
+        d = judge(found, o.history(number), say)
     t.show(text_refine.diagnosis_report(d))
     t.document({"revision": number, **to_json(d)})
 
@@ -127,8 +129,13 @@ def _change(
             say(f"{'adding' if adds else 'removing'} {named}")
             after = make(before, effect)
             say("diagnosing")
-            d = look_ahead(judge(after), say)
             added, removed = (effect, None) if adds else (None, effect)
+            before_it = o.history(before_number)
+            how = History(
+                added=tuple(n for n in after.model.names if n in (added, *before_it.added)),
+                removed=(*before_it.removed, *([] if removed is None else [removed])),
+            )
+            d = judge(after, how, say)
             number = o.store(after, d, added, removed)
         stored = o.campaign.revision(before_number)
         verdict = str(stored.result_json.get("diagnose", {}).get("verdict", ""))
@@ -138,7 +145,7 @@ def _change(
         ]
         t.show([text_refine.revisions_table([r.shown for r in rows]), text_refine.key()])
         t.show(_fell(before, after, named) if adds else _rose(before, after, effect))
-        t.show(["", text_refine.verdict_line(d.verdict, d.message, catalogue)])
+        t.show(["", text_refine.verdict_line(d)])
         if record is not None:
             with working(t.progress) as say:
                 chapters = o.chapters(t, say)
@@ -147,7 +154,7 @@ def _change(
         {
             "revisions": revisions_json(rows),
             "verdict": d.verdict,
-            "message": d.message,
+            "message": message(d),
             "diagnosis": to_json(d),
         }
     )
@@ -208,37 +215,36 @@ def refine(
             else:
                 say("registering")
                 model = with_effects(o.cell, o.readings, mode, named, named, catalogue)
-            found = refine_model(model, o.readings, mode, say)
+            how = NOTHING if latest is None else o.history()
+            found = refine_model(model, o.readings, mode, say, how)
         rows: list[Row] = []
         for k, step in enumerate(found.steps):
             if k == 0 and latest is not None:
                 number = latest.number
             else:
                 number = o.store(step.fit, step.diagnosis, step.added, step.removed)
-            verdict = step.diagnosis.verdict
-            rows.append(Row(number, step.fit, verdict, step.added, step.removed))
-        rows[-1] = replace(rows[-1], verdict=found.verdict)
+            rows.append(Row(number, step.fit, step.diagnosis.verdict, step.added, step.removed))
         t.show(text_refine.revisions_table([r.shown for r in rows]))
         t.show(text_refine.key())
         t.show(options_line(rows[-1].fit))
-        t.show(text_refine.verdict_line(found.verdict, found.message, catalogue))
+        t.show(text_refine.verdict_line(found.diagnosis))
         if found.rejected:
             t.show(
                 f"Tried and left out, since the error on poses left out did not fall: "
                 f"{', '.join(found.rejected)}."
             )
-        last = found.steps[-1].diagnosis
-        if last.verdict != "adequate" and not last.carriers:
-            t.show(text.follows(last.where))
-        t.show([*curves(last.carriers)])
+        last = found.diagnosis
+        if last.verdict != "adequate" and not last.dependences:
+            t.show(text.follows(last.misfit_breakdown))
+        t.show([*curves(last.dependences)])
         steps = zip(rows, found.steps, strict=True)
         chapters = [Chapter(r.number, r.added, r.fit, s.diagnosis, r.removed) for r, s in steps]
         record_story(t, chapters, record)
     t.document(
         {
             "revisions": revisions_json(rows),
-            "verdict": found.verdict,
-            "message": found.message,
+            "verdict": last.verdict,
+            "message": message(last),
             "rejected": list(found.rejected),
             "diagnosis": to_json(last),
         }

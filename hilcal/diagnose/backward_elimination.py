@@ -1,8 +1,8 @@
-"""Effects of a fitted model that the readings do not ask for.
+"""One step of backward elimination: effects without which the readings are explained as well.
 
-An effect that was added early, in place of another that was found later, is often needless in
-the end. It is judged like a suspect of the model without it, at the same linearisation; needless
-is an effect that passes no test.
+An effect that was added early, in place of another that was found later, is often redundant in
+the end. It is scored like a suspect of the model without it, at the same linearisation; it is
+redundant where its F-test is not significant.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ CHANCE = 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Needless:
+class Redundant:
     """An effect that can be removed.
 
     Attributes:
@@ -28,8 +28,8 @@ class Needless:
     score: Score
 
 
-def needless(fit: Fit) -> tuple[Needless, ...]:
-    """Return the effects of a fit that its readings do not ask for, the least asked for first."""
+def backward_elimination(fit: Fit) -> tuple[Redundant, ...]:
+    """Return the redundant effects of a fit, the least significant first."""
     judged = [e.name for e in fit.model.effects if e.role == "effect"]
     if not judged:
         return ()
@@ -38,7 +38,7 @@ def needless(fit: Fit) -> tuple[Needless, ...]:
     for name in judged:
         result = own_score(leave_out_effect(fit, x, name))
         if result.p_value > CHANCE:
-            found.append(Needless(name, result))
+            found.append(Redundant(name, result))
     return tuple(sorted(found, key=lambda n: -n.score.p_value))
 
 

@@ -1,39 +1,42 @@
-"""Whether the catalogue as a whole explains the misfit, or only the leading suspect a part of it.
+"""Whether all effects of the catalogue together explain the misfit.
 
-An effect that nobody has thought of resembles some that are known: a base that sways with the
-air's temperature looks like a tracker that drifts. The best suspect then explains a good part of
-the misfit, passes every test, and is wrong. So one looks ahead: the model takes all effects that
-the readings ask for, one after the other, by algebra at the linearisation (see `rivals`). If what
-is left is noise, they explain it. If not, effects that act less than linearly may be to blame:
-the best is added by a refit, and the question is asked again. What is left after that, and is not
-noise by what repeats or a generic learner say, no effect of the catalogue explains.
+An effect outside of the catalogue resembles some that are in it: a base that sways with the air's
+temperature looks like a tracker that drifts. The best suspect then explains a good part of the
+misfit, passes every test, and is wrong. Forward selection tests this: the model takes all
+significant effects, one after the other, by algebra at the linearisation (see `rivals`). Where
+the remaining residual is noise, the catalogue is sufficient. Where it is not, the linearisation
+may be too coarse: the best effect is added by a refit, and forward selection is repeated from
+there. A residual that remains after two refits, and that repeats or a generic regression show
+not to be noise, no effect of the catalogue explains.
+
+The algebra alone decides where it leaves noise: then no refit is made.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from scipy.stats import chi2
 
+from hilcal.diagnose.effect_ranking import FALSE_ALARM
 from hilcal.diagnose.noise import pure_error
-from hilcal.diagnose.noise_verdict import MISFIT_ALARM, PREDICTABLE, judge_noise
+from hilcal.diagnose.noise_verdict import MISFIT_ALARM, PREDICTABLE, NoiseVerdict, judge_noise
 from hilcal.diagnose.projection import projection
-from hilcal.diagnose.residual_curves import Predicted
-from hilcal.diagnose.residual_regression import predictable
+from hilcal.diagnose.residual_curves import Dependence
+from hilcal.diagnose.residual_regression import residual_regression
 from hilcal.diagnose.rivals import outside, with_family
 from hilcal.diagnose.score import score
-from hilcal.diagnose.stepwise import add
-from hilcal.diagnose.verdict import FALSE_ALARM, LEAST_SHARE, Beyond, Diagnosis
 from hilcal.identify.fit import Fit
 
-LEFT = 0.02
-"""Share of the misfit that must be left for the lead to be in doubt; a smaller rest comes after."""
+LEAST_REMAINDER = 0.02
+"""Share of the misfit that must remain for the first suspect to be in doubt; set by the study of
+the diagnosis, effects outside of the catalogue against hidden ones."""
 MOST_REFITS = 2
 MOST_TOGETHER = 6
 
 
 @dataclass(frozen=True, slots=True)
-class Rest:
-    """What the effects of the catalogue leave together, at the linearisation of a fit.
+class ForwardSelection:
+    """The residual of a model with all significant effects of the catalogue, by algebra.
 
     Attributes:
         effects: in the order of adding them.
@@ -51,8 +54,29 @@ class Rest:
         return float(chi2.sf(self.square, self.dof)) >= MISFIT_ALARM
 
 
-def rest(fit: Fit) -> Rest:
-    """Add all effects that the readings ask for, the best first, by algebra."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Insufficiency:
+    """What all significant effects of the catalogue together leave of a misfit.
+
+    Attributes:
+        effects: these effects, the best first.
+        refitted: how many of them were added by a refit, the others by algebra.
+        share: of the misfit that remains.
+        variance_factor: of the remaining residual.
+        dependences: variables that carry what is predictable of the refit's residual.
+        noise: whether the stated covariance is to blame for that; it is not.
+    """
+
+    effects: tuple[str, ...]
+    refitted: int
+    share: float
+    variance_factor: float
+    dependences: tuple[Dependence, ...]
+    noise: NoiseVerdict
+
+
+def forward_selection(fit: Fit) -> ForwardSelection:
+    """Add all significant effects by algebra, the one of largest evidence first."""
     p = projection(fit)
     x, slices = outside(fit)
     tested = max(len(slices), 1)
@@ -68,56 +92,43 @@ def rest(fit: Fit) -> Rest:
         added.append(best)
         s, g, yy = with_family(s, g, yy, dof, slices.pop(best), found)
         dof = max(dof - found.effective, 1.0)
-    return Rest(tuple(added), yy, dof)
+    return ForwardSelection(tuple(added), yy, dof)
 
 
-def look_ahead(d: Diagnosis, say: Callable[[str], None] = lambda text: None) -> Diagnosis:
-    """Judge once more where an effect leads: `unknown_effect` where the whole catalogue fails.
-
-    The suspects stay as they are; the carriers become those of what is left.
+def insufficiency(
+    fit: Fit,
+    refit: Callable[[Fit, str], Fit],
+    say: Callable[[str], None] = lambda text: None,
+) -> Insufficiency | None:
+    """Return what the whole catalogue leaves of a misfit; None where that is noise.
 
     Args:
-        d: a diagnosis.
-        say: told what is being done, for people who wait.
+        fit: a fit of which a suspect passes all tests.
+        refit: returns a fit with one more effect.
+        say: takes progress, one line each.
     """
-    if not d.significant:
-        return d
-    current = d.fit
+    current = fit
     names: list[str] = []
-    misfit = d.fit.chi2 - d.fit.dof
+    misfit = fit.chi2 - fit.dof
     while True:
-        left = rest(current)
-        if left.is_noise or left.square - left.dof < LEFT * misfit:
-            return d
-        if not left.effects or len(names) == MOST_REFITS:
+        found = forward_selection(current)
+        remaining = found.square - found.dof
+        if found.is_noise or remaining < LEAST_REMAINDER * misfit:
+            return None
+        if not found.effects or len(names) == MOST_REFITS:
             break
-        say(f"looking ahead: adding {left.effects[0]}")
-        current = add(current, left.effects[0])
-        names.append(left.effects[0])
-    told = predictable(projection(current))
-    noise = judge_noise(current, pure_error(current), told.share > PREDICTABLE)
+        say(f"testing the whole catalogue: adding {found.effects[0]}")
+        current = refit(current, found.effects[0])
+        names.append(found.effects[0])
+    regression = residual_regression(projection(current))
+    noise = judge_noise(current, pure_error(current), regression.share > PREDICTABLE)
     if noise.misjudged or not noise.off:
-        return d
-    beyond = Beyond(
-        (*names, *left.effects),
-        len(names),
-        (left.square - left.dof) / misfit,
-        left.square / left.dof,
-    )
-    message = _doubted(d, beyond, told) + noise.message
-    return replace(
-        d, verdict="unknown_effect", message=message, carriers=told.carriers, beyond=beyond
-    )
-
-
-def _doubted(d: Diagnosis, beyond: Beyond, told: Predicted) -> str:
-    """Say why the lead does not explain the misfit."""
-    lead = next(s for s in d.suspects if s.effect == d.significant[0])
-    carry = [v.variable for v in told.carriers if v.share >= LEAST_SHARE][:2]
-    return (
-        f"{lead.effect} explains {100 * lead.share:.0f} % of the misfit, but all effects of the "
-        f"catalogue together leave {100 * beyond.share:.0f} % of it, "
-        f"{beyond.variance_factor**0.5:.2g} times the stated noise"
-        f"{', which follows ' if carry else ''}{' and '.join(carry)}: {lead.effect} may only "
-        "resemble what is missing"
+        return None
+    return Insufficiency(
+        effects=(*names, *found.effects),
+        refitted=len(names),
+        share=remaining / misfit,
+        variance_factor=found.square / found.dof,
+        dependences=regression.dependences,
+        noise=noise,
     )

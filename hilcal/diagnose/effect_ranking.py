@@ -1,5 +1,11 @@
-"""Which effects of the catalogue could be missing, best first."""
+"""Which effects of the catalogue could be missing, best first.
 
+A suspect passes all tests where the F-test over the whole catalogue rejects that it is absent,
+its evidence is positive, it explains a share of the misfit on poses left out, and the error there
+falls by more than it scatters from pose to pose.
+"""
+
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +18,11 @@ from hilcal.identify.fit import Fit
 from hilcal.types import Floats
 
 SAME_EVIDENCE = 3.0
-"""Two suspects whose evidence differs by less than e³ = 20 : 1 are not told apart."""
+"""Two suspects whose evidence differs by less than e³ = 20 : 1 count as inseparable."""
+FALSE_ALARM = 0.001
+"""Chance of naming any effect where none is missing, over the whole catalogue."""
+LEAST_SHARE = 0.01
+"""An effect that explains less of the misfit on poses left out is not worth adding; a guess."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -24,18 +34,26 @@ class Suspect:
         score: the joint test of the whole family.
         share: share of the misfit it explains.
         holdout_share: the same on poses left out.
-        sure: whether the error there falls by more than it scatters from pose to pose.
+        explains: whether it passes the tests of the fitted readings and of its share.
+        sure: whether the error on poses left out falls by more than it scatters from pose to
+            pose; not so where a refit has shown that it does not fall.
         least: the smallest strength of it that these readings would reveal.
-        same_as: other suspects that these data cannot tell from it.
+        same_as: other suspects that these readings do not separate from it.
     """
 
     effect: str
     score: Score
     share: float
     holdout_share: float
+    explains: bool
     sure: bool
     least: Strength
     same_as: tuple[str, ...] = ()
+
+    @property
+    def passes(self) -> bool:
+        """Whether it passes all tests."""
+        return self.explains and self.sure
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,9 +94,9 @@ def family(fit: Fit, effect: Effect) -> Family:
 
 
 def rank_suspects(
-    p: Projection, effects: tuple[Effect, ...], level: float = 0.001
+    p: Projection, effects: Sequence[Effect], level: float = FALSE_ALARM
 ) -> tuple[Suspect, ...]:
-    """Score all effects; best first by evidence, with those that cannot be told apart named.
+    """Score all effects; best first, see `ranked`.
 
     Args:
         p: the fitted model's part.
@@ -86,7 +104,30 @@ def rank_suspects(
         level: of the test over all of them together.
     """
     found = [_suspect(p, family(p.fit, e), level / len(effects)) for e in effects]
-    found.sort(key=lambda s: (-s.score.log_evidence, s.score.p_value))
+    tested = max(sum(s.score.rank > 0 for s in found), 1)
+    return ranked(
+        replace(
+            s,
+            explains=s.score.p_value * tested < level
+            and s.score.log_evidence > 0
+            and s.holdout_share >= LEAST_SHARE,
+        )
+        for s in found
+    )
+
+
+def ranked(suspects: Iterable[Suspect], rejected: Collection[str] = ()) -> tuple[Suspect, ...]:
+    """Order suspects, and name those that are inseparable.
+
+    First come those that pass all tests, then those that explain the misfit but do not surely
+    lower the error on poses left out, then the others; by evidence in each of these groups.
+
+    Args:
+        suspects: in any order.
+        rejected: names of those whose addition did not lower the error on poses left out.
+    """
+    found = [replace(s, sure=s.sure and s.effect not in rejected) for s in suspects]
+    found.sort(key=lambda s: (-s.passes, -s.explains, -s.score.log_evidence, s.score.p_value))
     return tuple(
         replace(
             s,
@@ -94,6 +135,7 @@ def rank_suspects(
                 o.effect
                 for o in found
                 if o is not s
+                and o.effect not in rejected
                 and min(o.score.log_evidence, s.score.log_evidence) > SAME_EVIDENCE
                 and abs(o.score.log_evidence - s.score.log_evidence) < SAME_EVIDENCE
             ),
@@ -111,6 +153,7 @@ def _suspect(p: Projection, of: Family, level: float) -> Suspect:
         score=result,
         share=p.share(result.gain),
         holdout_share=held.share,
+        explains=False,
         sure=held.sure,
         least=least_strength(
             s,

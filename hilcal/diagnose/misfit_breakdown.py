@@ -1,9 +1,9 @@
-"""Where the model fails: which variables the misfit follows.
+"""Where the model fails: the share of the misfit that follows each recorded variable.
 
 For a variable x, a generic family asks whether *any* joint's angle, or the target's position,
 errs as a smooth function of x: columns φ_k(x) times the motion of each joint and times each
-base axis. The family is scored like a suspect, so its p-value is exact; its share says how much
-of the misfit it predicts on poses left out. It names no cause.
+base axis. The family is scored like a suspect, so its p-value is exact; its share is the part of
+the misfit that it predicts on poses left out. It names no cause.
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ MANY = 4000
 
 
 @dataclass(frozen=True, slots=True)
-class Where:
+class MisfitShare:
     """How far the misfit follows one variable.
 
     Attributes:
@@ -36,7 +36,7 @@ class Where:
     p_value: float
 
 
-def where(p: Projection) -> tuple[Where, ...]:
+def misfit_breakdown(p: Projection) -> tuple[MisfitShare, ...]:
     """Score all variables that vary in these readings; largest share first."""
     fit, w = p.fit, p.fit.whitening
     prediction, model = fit.solution.prediction, fit.model
@@ -62,7 +62,7 @@ def where(p: Projection) -> tuple[Where, ...]:
         x = w.whiten(raw).reshape(-1, raw.shape[2])
         result = p.score(x)
         share = max(p.held_out_share(x, result), 0.0)
-        out.append(Where(name, share, result.p_value))
+        out.append(MisfitShare(name, share, result.p_value))
     out += [*_poses(p, axes[w.reading]), *_axes(p)]
     return tuple(sorted(out, key=lambda v: (-v.share, v.p_value)))
 
@@ -113,7 +113,7 @@ def _powers(x: Floats, centre: float | None = None) -> Floats:
     return np.asarray(scaled[:, None] ** np.arange(1, POLYNOMIAL + 1))
 
 
-def _poses(p: Projection, axes: Floats) -> list[Where]:
+def _poses(p: Projection, axes: Floats) -> list[MisfitShare]:
     """How far the misfit is common to all readings of a pose, where poses have several.
 
     A pose that is left out cannot be predicted from itself, so the share is in-sample, less
@@ -132,10 +132,10 @@ def _poses(p: Projection, axes: Floats) -> list[Where]:
     gain = float(np.sum((u.T @ p.white) ** 2))
     within = (p.yy - gain) / (fit.dof - rank)
     p_value = float(f_distribution.sf(gain / rank / within, rank, fit.dof - rank))
-    return [Where("pose", p.share(gain - rank * within), p_value)]
+    return [MisfitShare("pose", p.share(gain - rank * within), p_value)]
 
 
-def _axes(p: Projection) -> list[Where]:
+def _axes(p: Projection) -> list[MisfitShare]:
     """Directions: towards the base axis, around it, and up."""
     fit, w = p.fit, p.fit.whitening
     o = fit.solution.prediction.observation
@@ -154,7 +154,7 @@ def _axes(p: Projection) -> list[Where]:
     count = len(fit.raw)
     total = sum(max(value - count, 0.0) for value in excess.values())
     return [
-        Where(
+        MisfitShare(
             f"direction {name}",
             0.0 if total == 0 else max(value - count, 0.0) / max(total, 3 * np.sqrt(6 * count)),
             float(chi2.sf(value, count)),

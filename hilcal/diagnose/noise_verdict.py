@@ -1,4 +1,4 @@
-"""Whether the stated noise is to blame, where no effect is: the rule and its sentence.
+"""Whether the stated noise is to blame, where no effect is.
 
 An effect is judged against the scatter as it is (F-tests), so a noise that is misjudged as a
 whole names none. What remains is a χ² that is too large or too small:
@@ -6,11 +6,12 @@ whole names none. What remains is a χ² that is too large or too small:
 - too small: no model makes residuals smaller than the noise; the statement is too large;
 - too large, and repeats scatter as much: the statement is too small;
 - too large, and repeats scatter less: the model misses something;
-- too large, without enough repeats: the noise only where nothing at all predicts the residual,
-  and the sentence says that this cannot be known.
+- too large, without enough repeats: the noise only where nothing at all predicts the residual;
+  it cannot be known without repeats.
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 from scipy.stats import chi2
 
@@ -20,22 +21,40 @@ from hilcal.identify.fit import Fit
 MISFIT_ALARM = 0.0005
 """Chance of calling the variance factor wrong where it is right, each side."""
 PREDICTABLE = 0.1
-"""Share of the misfit that a generic learner must predict for the model to be to blame."""
+"""Share of the misfit that a generic regression must predict for the model to be to blame; a
+guess."""
+
+NoiseReason = Literal["as_stated", "repeats", "too_large", "lack_of_fit", "predictable", "unknown"]
+"""Why the noise is, or is not, to blame:
+
+- as_stated: χ² is what chance allows;
+- repeats: repeated readings scatter as much, or as little, as the residuals;
+- too_large: the residuals are smaller than stated;
+- lack_of_fit: repeated readings scatter less than the residuals;
+- predictable: something predicts the residual on poses left out;
+- unknown: nothing predicts it, and there are too few repeats to know.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseVerdict:
-    """What a variance factor that is off, or not, says of the noise.
+    """Whether the stated covariance is to blame for a variance factor.
 
     Attributes:
-        misjudged: the stated noise is to blame.
-        off: the variance factor is not what chance allows.
-        message: a sentence; empty where nothing is to be said of the noise.
+        reason: what decided.
     """
 
-    misjudged: bool
-    off: bool
-    message: str
+    reason: NoiseReason
+
+    @property
+    def misjudged(self) -> bool:
+        """Whether the stated noise is to blame."""
+        return self.reason in ("repeats", "too_large", "unknown")
+
+    @property
+    def off(self) -> bool:
+        """Whether the variance factor is not what chance allows."""
+        return self.reason != "as_stated"
 
 
 def judge_noise(fit: Fit, repeats: PureError | None, predictable: bool) -> NoiseVerdict:
@@ -43,60 +62,19 @@ def judge_noise(fit: Fit, repeats: PureError | None, predictable: bool) -> Noise
 
     Args:
         fit: the fit.
-        repeats: what repeated readings say.
+        repeats: the scatter of repeated readings.
         predictable: whether anything predicts the residual on poses left out.
     """
     high = float(chi2.sf(fit.chi2, fit.dof)) < MISFIT_ALARM
     low = float(chi2.cdf(fit.chi2, fit.dof)) < MISFIT_ALARM
-    where = _where(repeats)
     if not high and not low:
-        return NoiseVerdict(False, False, where)
-    spread = f"{fit.variance_factor**0.5:.2g} times the stated noise"
-    apart = repeats is not None and not repeats.interval[0] <= 1 <= repeats.interval[1]
+        return NoiseVerdict("as_stated")
+    differ = repeats is not None and not repeats.interval[0] <= 1 <= repeats.interval[1]
     lacking = repeats is not None and repeats.lack_of_fit_p <= MISFIT_ALARM
-    if repeats is not None and apart and (low or not lacking):
-        return NoiseVerdict(
-            True,
-            True,
-            f"Repeated readings scatter {repeats.factor**0.5:.2g} times as much as stated, and "
-            f"the residuals no {'less' if low else 'more'} than the repeats: scale the covariance "
-            f"by {repeats.factor:.2g}; no effect is missing{where}",
-        )
+    if differ and (low or not lacking):
+        return NoiseVerdict("repeats")
     if low:
-        return NoiseVerdict(
-            True, True, f"Residuals are only {spread}: the stated covariance is too large{where}"
-        )
-    if lacking or predictable:
-        beyond = (
-            ""
-            if repeats is None
-            else (
-                f"; repeated readings scatter only {repeats.factor**0.5:.2g} times what is stated"
-            )
-        )
-        return NoiseVerdict(False, True, beyond if lacking else "")
-    few = "without repeated readings" if repeats is None else "with so few repeated readings"
-    return NoiseVerdict(
-        True,
-        True,
-        f"Residuals are {spread} and nothing predicts them; {few} the program cannot know "
-        "whether the noise is larger than stated: repeat some readings",
-    )
-
-
-def _where(repeats: PureError | None) -> str:
-    """Say where the noise differs from what is stated, as the end of a sentence."""
-    if repeats is None or repeats.where is None:
-        return ""
-    w = repeats.where
-    place = {"axis": w.name, "joint": f"along the motion of {w.name}"}.get(
-        w.kind, f"{'of' if w.name == 'unloaded' else 'under'} {_readings(w.name)}"
-    )
-    return (
-        f"; it differs most {place}, where the repeats scatter {w.factor**0.5:.2g} times as much "
-        "as stated"
-    )
-
-
-def _readings(name: str) -> str:
-    return "unloaded readings" if name == "unloaded" else name
+        return NoiseVerdict("too_large")
+    if lacking:
+        return NoiseVerdict("lack_of_fit")
+    return NoiseVerdict("predictable" if predictable else "unknown")

@@ -70,16 +70,16 @@ class Dependence:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Predicted:
+class ResidualRegression:
     """What smooth laws predict of the misfit on poses left out.
 
     Attributes:
         share: of the misfit, within [0, 1].
-        carriers: variables that carry it, largest share first.
+        dependences: variables that carry it, largest share first.
     """
 
     share: float
-    carriers: tuple[Dependence, ...]
+    dependences: tuple[Dependence, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,7 +91,7 @@ class _Laws:
     way: tuple[int, ...]
 
 
-def dependence(p: Projection) -> Predicted:
+def smooth_laws(p: Projection) -> ResidualRegression:
     """Find the laws that predict the misfit of poses left out, and what they depend on."""
     variables, ways = recorded(p), motions(p)
     laws = _laws(p, variables, ways)
@@ -123,7 +123,7 @@ def dependence(p: Projection) -> Predicted:
     rank = w.rank
     misfit = max(without - rank, 3 * np.sqrt(2 * rank))
     share = float(np.clip((without - with_) / misfit, 0.0, 1.0))
-    return Predicted(share, _carriers(p, variables, ways, laws, lost, share))
+    return ResidualRegression(share, _dependences(p, variables, ways, laws, lost, share))
 
 
 def _choose(p: Projection, laws: _Laws, rows: Bools) -> list[int]:
@@ -203,7 +203,7 @@ def _laws(p: Projection, variables: list[Variable], ways: list[Floats]) -> _Laws
     return _Laws(np.stack(columns, axis=1), tuple(of), tuple(by))
 
 
-def _carriers(
+def _dependences(
     p: Projection,
     variables: list[Variable],
     ways: list[Floats],

@@ -1,6 +1,6 @@
 """How much of the misfit is predictable at all, before any cause is known.
 
-Smooth laws of the recorded variables come first (see `dependence`): they know how the arm
+Smooth laws of the recorded variables come first (see `residual_curves`): they know how the arm
 moves, and say what the misfit depends on. Only where they find little, an off-the-shelf learner
 (extremely randomised trees) predicts the residual, in units of its noise, from everything that
 is recorded of the state. Both are judged on poses that took no part in learning: what they
@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from hilcal.diagnose.projection import Projection
-from hilcal.diagnose.residual_curves import Predicted, dependence
+from hilcal.diagnose.residual_curves import ResidualRegression, smooth_laws
 from hilcal.identify.folds import random_folds
 from hilcal.types import Floats
 
@@ -27,15 +27,15 @@ LITTLE = 0.1
 """Share below which smooth laws have found little, and trees are asked as well."""
 
 
-def predictable(p: Projection) -> Predicted:
+def residual_regression(p: Projection) -> ResidualRegression:
     """Share of the misfit that can be predicted on poses left out, and what carries it."""
-    found = dependence(p)
+    found = smooth_laws(p)
     if found.share >= LITTLE:
         return found
-    return replace(found, share=max(found.share, predictable_share(p)))
+    return replace(found, share=max(found.share, tree_share(p)))
 
 
-def predictable_share(p: Projection) -> float:
+def tree_share(p: Projection) -> float:
     """Share of the misfit that trees predict on poses left out, within [0, 1]."""
     from sklearn.ensemble import ExtraTreesRegressor
 

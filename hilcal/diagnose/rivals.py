@@ -34,7 +34,7 @@ class Alternative:
     Attributes:
         effect: the one.
         own: its log evidence against the model without it.
-        same_as: single effects that the readings do not tell from it.
+        same_as: single effects that the readings do not separate from it.
         others: effects that explain together what it does, in the order of adding them.
         log_evidence: of all of them together.
     """
@@ -52,8 +52,13 @@ class Alternative:
 
     @property
     def as_good(self) -> bool:
-        """Whether the readings do not tell the others from the one."""
+        """Whether the others explain as much as the one."""
         return self.log_evidence > self.own - SAME_EVIDENCE
+
+    @property
+    def inseparable(self) -> bool:
+        """Whether the readings do not separate the one from another, or several together."""
+        return bool(self.same_as) or (self.as_good and len(self.others) > 1)
 
 
 def outside(fit: Fit) -> tuple[Floats, dict[str, slice]]:

@@ -1,4 +1,4 @@
-"""How far two suspects can be told apart by the readings at hand.
+"""How well the readings at hand separate two suspects.
 
 Suppose suspect A is the cause, as strong as it is estimated: it adds y = M X_A β to the whitened
 residual, M the projection that the fitted model leaves. What suspect B cannot imitate of it,
@@ -6,7 +6,7 @@ residual, M the projection that the fitted model leaves. What suspect B cannot i
     u = ‖y − M X_B (X_Bᵀ M X_B)⁻¹ X_Bᵀ M y‖² / ‖y‖²,
 
 adds u ‖y‖² to the sum of squares that remains when B is fitted instead. With k times as many
-readings like these it is k times that; apart they are when it reaches `NEEDED`.
+readings like these it is k times that; they are separated when it reaches `NEEDED`.
 """
 
 from dataclasses import dataclass
@@ -22,19 +22,19 @@ NEEDED = 12.0
 """Sum of squares, in σ², by which the right one of two suspects fits better when it is found in
 nine cases of ten at odds of 20 : 1: the difference scatters by twice the root of it."""
 ALIKE = 1e-3
-"""Share below which no number of readings like these tells two effects apart."""
+"""Share below which no number of readings like these separates two effects; a guess."""
 ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
-class Apart:
+class Separability:
     """How a rival differs from a suspect.
 
     Attributes:
         effect: the rival.
         unlike: u, the share of what the suspect does that the rival cannot imitate.
-        times: k, how many times as many readings like these would tell them apart; infinite
-            where none would.
+        times: k, how many times as many readings like these would separate them; infinite
+            where no number would.
     """
 
     effect: str
@@ -43,20 +43,13 @@ class Apart:
 
     @property
     def possible(self) -> bool:
-        """Whether more readings like these would tell them apart."""
+        """Whether more readings like these would separate them."""
         return bool(np.isfinite(self.times))
 
-    @property
-    def words(self) -> str:
-        """What would separate them, in a phrase."""
-        if not self.possible:
-            return f"{self.effect} (no readings of this kind can)"
-        if self.times <= 1.0:
-            return self.effect
-        return f"{self.effect} ({self.times:.2g} times as many readings like these would)"
 
-
-def apart(p: Projection, lead: Suspect, effects: tuple[Effect, ...]) -> tuple[Apart, ...]:
+def separability(
+    p: Projection, lead: Suspect, effects: tuple[Effect, ...]
+) -> tuple[Separability, ...]:
     """Return how each rival in `lead.same_as` differs from the leading suspect.
 
     Args:
@@ -73,7 +66,7 @@ def apart(p: Projection, lead: Suspect, effects: tuple[Effect, ...]) -> tuple[Ap
         rival = p.free(family(p.fit, by_name[name]).white)
         unlike = float(np.sum(_left(rival, y) ** 2)) / max(total, 1e-300)
         times = np.inf if unlike < ALIKE else NEEDED / max(unlike * total, 1e-300)
-        out.append(Apart(name, unlike, times))
+        out.append(Separability(name, unlike, times))
     return tuple(out)
 
 

@@ -36,6 +36,20 @@ def add(before: Fit, effect: str, options: Options | None = None) -> Fit:
     return fit(model, readings, before.mode, before.scaling, start)
 
 
+class Refits:
+    """Fits with one more effect, each made once: judgement and refinement try the same ones."""
+
+    def __init__(self) -> None:
+        """Begin with none."""
+        self._made: dict[tuple[int, str], tuple[Fit, Fit]] = {}
+
+    def add(self, before: Fit, effect: str) -> Fit:
+        """Return what `add` returns."""
+        if (id(before), effect) not in self._made:
+            self._made[id(before), effect] = before, add(before, effect)
+        return self._made[id(before), effect][1]
+
+
 def remove(before: Fit, effect: str) -> Fit:
     """Refit without an effect, from where the fit stands.
 

@@ -10,10 +10,10 @@ import scipy.linalg as sl
 from hilcal.cell import Cell
 from hilcal.data.revision import change
 from hilcal.data.whitening import Mode
+from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.diagnose.effect_ranking import Suspect, candidates
 from hilcal.diagnose.projection import projection
 from hilcal.diagnose.residual_curves import Dependence
-from hilcal.diagnose.verdict import Diagnosis
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit, mahalanobis2
 from hilcal.identify.fit_document import finite
@@ -31,6 +31,7 @@ from hilcal.report.story import (
     StorySuspect,
 )
 from hilcal.report.text_seen import own_units
+from hilcal.report.verdict_words import message
 from hilcal.types import Floats, Ints
 
 CERTAIN = 0.005
@@ -135,7 +136,7 @@ def _revision(c: Chapter, e: Everything, axes: Floats, measured: Floats) -> Stor
         change=change(c.added, c.removed),
         model=c.fit.model.names,
         verdict=UNDIAGNOSED if d is None else d.verdict,
-        message="run hilcal diagnose for a verdict" if d is None else d.message,
+        message="run hilcal diagnose for a verdict" if d is None else message(d),
         residual=residual,
         predicted=measured - residual,
         whitened_norm2=mahalanobis2(e.raw[:, :3], e.whitening.covariance[:, :3, :3]),
@@ -149,7 +150,9 @@ def _revision(c: Chapter, e: Everything, axes: Floats, measured: Floats) -> Stor
         parameters=story_parameters(c.fit),
         regressor=regressor(c.fit, told[0]) if told and not curves else None,
         curves=curves,
-        rivals=() if d is None else tuple(StoryRival(r.effect, r.unlike, r.times) for r in d.apart),
+        rivals=()
+        if d is None
+        else tuple(StoryRival(r.effect, r.unlike, r.times) for r in d.separability),
         limits=() if d is None else _limits(d),
     )
 
@@ -159,18 +162,18 @@ def _told(d: Diagnosis) -> tuple[Suspect, ...]:
 
     None where nothing is wrong.
     """
-    passed = [s for s in d.suspects if s.effect in d.significant]
-    rest = [s for s in d.suspects if s not in passed and s.score.p_value < CERTAIN]
-    return (*passed, *rest) if passed else ()
+    if d.lead is None:
+        return ()
+    return tuple(s for s in d.suspects if s.passes or s.score.p_value < CERTAIN)
 
 
 def _curves(d: Diagnosis) -> tuple[StoryCurve, ...]:
     """Variables that carry the misfit, where the lead explains little of what is predictable."""
-    known = next((s.holdout_share for s in d.suspects if s.effect in d.significant), 0.0)
-    explained = d.beyond is None and known >= LITTLE * d.predictable_share
+    known = 0.0 if d.lead is None else d.lead.holdout_share
+    explained = d.insufficiency is None and known >= LITTLE * d.predictable_share
     if d.verdict == "adequate" or explained:
         return ()
-    return tuple(curve(v) for v in d.carriers if v.share >= LEAST_CARRIED)
+    return tuple(curve(v) for v in d.dependences if v.share >= LEAST_CARRIED)
 
 
 def curve(d: Dependence) -> StoryCurve:
@@ -211,7 +214,7 @@ def _unit_of(d: Dependence) -> tuple[str, float]:
 
 def _limits(d: Diagnosis) -> tuple[StoryLimit, ...]:
     """What could have been seen of the effects that were not found, the best visible first."""
-    rest = [s for s in d.suspects if s.effect not in d.significant]
+    rest = [s for s in d.suspects if not s.passes]
     return tuple(
         StoryLimit(s.effect, s.least.displacement_m, own_units(s.least) if s.least.visible else "")
         for s in sorted(rest, key=lambda s: s.least.displacement_m)

@@ -9,7 +9,7 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from hilcal.diagnose.misfit_breakdown import Where
+from hilcal.diagnose.misfit_breakdown import MisfitShare
 from hilcal.effects.protocol import Effect
 from hilcal.identify.data_snooping_reason import gross_errors
 from hilcal.identify.fit import Fit
@@ -208,7 +208,7 @@ def misses(fit: Fit) -> str:
     )
 
 
-def follows(places: Sequence[Where]) -> str:
+def follows(places: Sequence[MisfitShare]) -> str:
     """Say in a sentence what the misfit follows."""
     found = [p for p in places if p.p_value < CERTAIN and p.share > 0.05]
     sides = [p for p in found if p.variable.startswith("direction") and p.share > 0.5]
@@ -232,7 +232,7 @@ def follows(places: Sequence[Where]) -> str:
     return f"{told}."
 
 
-def where_table(places: Sequence[Where], most: int = 12) -> RenderableType:
+def where_table(places: Sequence[MisfitShare], most: int = 12) -> RenderableType:
     """Return the table of variables that the misfit follows."""
     out = table("where the model fails", "share of the misfit", "p-value")
     for p in places[:most]:

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from rich.console import RenderableType
 from rich.text import Text
 
-from hilcal.diagnose.verdict import Diagnosis
+from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.identify.fit import Fit
 from hilcal.report import numbers, text, text_refine
+from hilcal.report.verdict_words import message
 
 MOST = 24
 
@@ -19,11 +20,11 @@ def step_report(number: int, change: str, d: Diagnosis) -> Iterator[RenderableTy
     yield text.heading(f"Revision {number}: {name}")
     yield text.misses(d.fit)
     if d.verdict != "adequate":
-        yield text.follows(d.where)
+        yield text.follows(d.misfit_breakdown)
     if d.significant:
         yield ""
         yield text_refine.suspects_table(d)
-    yield numbers.sentence(d.message, d.fit.model.catalogue.names)
+    yield numbers.sentence(message(d), d.fit.model.catalogue.names)
     yield ""
 
 

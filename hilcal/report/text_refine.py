@@ -5,16 +5,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from rich.console import RenderableType
 from rich.text import Text
 
-from hilcal.diagnose.verdict import Diagnosis
-from hilcal.effects.catalogue import Catalogue
+from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.identify.fit import Fit
 from hilcal.identify.full_prediction import everything
 from hilcal.report import numbers, text
-from hilcal.report.text_seen import could_have_been_seen, needless_line
+from hilcal.report.text_seen import could_have_been_seen, redundant_line
 from hilcal.report.text_unknown import curves, repeats
+from hilcal.report.verdict_words import message
 
 VERDICTS: Mapping[str, str] = {
-    "adequate": "adequate: what is left is noise",
+    "adequate": "adequate: the residual is noise",
     "missing_effect": "an effect is missing",
     "ambiguous": "ambiguous: these readings do not separate the suspects",
     "unknown_effect": "unknown effect: something is missing that the catalogue does not hold",
@@ -23,18 +23,23 @@ VERDICTS: Mapping[str, str] = {
 SUSPECTS = 6
 
 
-def verdict_line(verdict: str, message: str, catalogue: Catalogue) -> Text:
+def verdict_line(d: Diagnosis) -> Text:
     """Return the verdict with its message; names of the catalogue keep their spelling."""
-    style = "bold green" if verdict == "adequate" else "bold yellow"
-    words = numbers.sentence(message, catalogue.names)
-    return Text.assemble("Verdict: ", (VERDICTS.get(verdict, verdict), style), f".\n{words}")
+    style = "bold green" if d.verdict == "adequate" else "bold yellow"
+    words = numbers.sentence(message(d), d.fit.model.catalogue.names)
+    return Text.assemble("Verdict: ", (VERDICTS[d.verdict], style), f".\n{words}")
 
 
 def suspects_table(d: Diagnosis, most: int = SUSPECTS) -> RenderableType:
     """Return the ranked suspects that chance alone does not explain."""
-    shown = [s for s in d.suspects if s.effect in d.significant or s.score.p_value < text.CERTAIN]
+    shown = [s for s in d.suspects if s.passes or s.score.p_value < text.CERTAIN]
     out = text.table(
-        "missing effect?", "explains", "on poses left out", "p-value", "not told from", left=(0, 4)
+        "missing effect?",
+        "explains",
+        "on poses left out",
+        "p-value",
+        "inseparable from",
+        left=(0, 4),
     )
     for s in shown[:most]:
         out.add_row(
@@ -42,7 +47,7 @@ def suspects_table(d: Diagnosis, most: int = SUSPECTS) -> RenderableType:
             numbers.percent(s.share),
             numbers.percent(max(s.holdout_share, 0.0)),
             numbers.chance(s.score.p_value),
-            numbers.few(s.same_as) if s.effect in d.significant else "",
+            numbers.few(s.same_as) if s.passes else "",
         )
     return out
 
@@ -51,10 +56,10 @@ def diagnosis_report(d: Diagnosis) -> Iterator[RenderableType]:
     """Yield the verdict, where the model fails and the suspects."""
     yield text.heading(f"Model: {text.model_name(d.fit.model.names)}")
     yield text.misses(d.fit)
-    if d.verdict != "adequate" and not d.carriers:
-        yield text.follows(d.where)
+    if d.verdict != "adequate" and not d.dependences:
+        yield text.follows(d.misfit_breakdown)
     yield ""
-    yield verdict_line(d.verdict, d.message, d.fit.model.catalogue)
+    yield verdict_line(d)
     yield ""
     if d.significant:
         yield suspects_table(d)
@@ -64,16 +69,16 @@ def diagnosis_report(d: Diagnosis) -> Iterator[RenderableType]:
             style="dim",
         )
     if d.verdict != "adequate":
-        yield from (text.where_table(d.where), "")
+        yield from (text.where_table(d.misfit_breakdown), "")
     if d.verdict in ("unknown_effect", "noise_misjudged"):
         yield (
-            f"A generic learner that knows nothing of robots predicts "
+            f"A generic regression on all that is recorded predicts "
             f"{numbers.percent(d.predictable_share)} of the misfit."
         )
-        if d.beyond is not None:
-            with_them = numbers.names(d.beyond.effects[: d.beyond.refitted])
-            yield f"What is left{' with ' * bool(with_them)}{with_them}:"
-        yield from curves(d.carriers)
+        if d.insufficiency is not None:
+            refitted = d.insufficiency.effects[: d.insufficiency.refitted]
+            yield f"The residual{' with ' * bool(refitted)}{numbers.names(refitted)}:"
+        yield from curves(d.dependences)
     if d.verdict == "unknown_effect":
         yield Text(
             "An effect of your own: hilcal effects new NAME writes one to begin with, and "
@@ -82,7 +87,7 @@ def diagnosis_report(d: Diagnosis) -> Iterator[RenderableType]:
         )
     if d.pure_error is not None:
         yield from repeats(d.pure_error)
-    yield from needless_line(d)
+    yield from redundant_line(d)
     yield from could_have_been_seen(d)
 
 

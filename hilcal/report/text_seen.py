@@ -5,14 +5,14 @@ from collections.abc import Iterator
 from rich.console import RenderableType
 from rich.text import Text
 
+from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.diagnose.minimum_detectable_effect import Strength
-from hilcal.diagnose.verdict import Diagnosis
 from hilcal.report import numbers, text
 
 
 def could_have_been_seen(d: Diagnosis) -> Iterator[RenderableType]:
     """Yield the table of effects that were not found, the best visible first."""
-    rest = [s for s in d.suspects if s.effect not in d.significant]
+    rest = [s for s in d.suspects if not s.passes]
     seen = sorted((s for s in rest if s.least.visible), key=lambda s: s.least.displacement_m)
     hidden = [s.effect for s in rest if not s.least.visible]
     if seen:
@@ -39,12 +39,12 @@ def own_units(least: Strength) -> str:
     return ", ".join(parts)
 
 
-def needless_line(d: Diagnosis) -> Iterator[str]:
-    """Yield a sentence on effects of the model that the readings do not ask for."""
-    if d.needless:
-        names = ", ".join(d.needless)
-        it = "it" if len(d.needless) == 1 else "them"
+def redundant_line(d: Diagnosis) -> Iterator[str]:
+    """Yield a sentence on effects of the model without which the readings are explained as well."""
+    if d.redundant:
+        names = ", ".join(d.redundant)
+        it = "it" if len(d.redundant) == 1 else "them"
         yield (
-            f"These readings do not ask for {names}: without {it} they are explained as well "
-            f"(hilcal remove RUN {d.needless[0]})."
+            f"These readings are explained as well without {names}; to remove {it}: "
+            f"hilcal remove RUN {d.redundant[0]}."
         )

@@ -1,4 +1,4 @@
-"""What noise and unknown effects look like, for people: repeats, and curves of the misfit."""
+"""The scatter of repeats and curves of an unexplained misfit, for people."""
 
 from collections.abc import Iterator, Sequence
 
@@ -14,7 +14,7 @@ MOST = 2
 
 
 def repeats(e: PureError) -> Iterator[str]:
-    """Yield what repeated readings say of the noise, and where it differs most."""
+    """Yield the scatter of repeated readings, and where it differs most from what is stated."""
     yield (
         f"Repeated readings scatter {e.factor**0.5:.2f} times as much as stated "
         f"({e.dof:.0f} degrees of freedom)."
@@ -27,12 +27,12 @@ def repeats(e: PureError) -> Iterator[str]:
         )
 
 
-def curves(carriers: Sequence[Dependence], most: int = MOST) -> Iterator[RenderableType]:
+def curves(dependences: Sequence[Dependence], most: int = MOST) -> Iterator[RenderableType]:
     """Yield the curve of each leading variable as a row of bars and a table."""
-    for d in carriers[:most]:
+    for d in dependences[:most]:
         yield f"{d.variable} carries {numbers.percent(d.share)}; {moves(d)} errs by:"
         yield from (curve(d), "")
-    if carriers:
+    if dependences:
         yield Text("±: standard uncertainty; the mean over the bins is taken as zero.", style="dim")
 
 

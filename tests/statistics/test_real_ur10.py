@@ -15,6 +15,7 @@ from hilcal.identify.baseline import baseline, with_effects
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.validation import validate
 from hilcal.refine import Refinement, refine
+from hilcal.report.verdict_words import message
 from hilcal.robot.catalogue import configs_dir
 
 pytestmark = pytest.mark.slow
@@ -54,7 +55,7 @@ def test_transmission_error_is_found_and_the_error_falls(name, ipa_ur10):
             f"{name}: + {step.added or 'frames'}: held out {1e3 * step.fit.holdout.mean_m:.3f} mm, "
             f"fitted {1e3 * step.fit.error.mean_m:.3f} mm"
         )
-    print(f"{name}: {r.verdict}: {r.message}")
+    print(f"{name}: {r.verdict}: {message(r.diagnosis)}")
     assert "transmission_error" in [s.added for s in r.steps]
     held = [s.fit.holdout.rms_sigma for s in r.steps]
     assert held == sorted(held, reverse=True)

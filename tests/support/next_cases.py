@@ -12,7 +12,9 @@ from hilcal.config import load_config
 from hilcal.data.appended import fitted_on
 from hilcal.data.plan import Plan
 from hilcal.data.readings import Readings, States
-from hilcal.diagnose.verdict import Diagnosis, diagnose
+from hilcal.diagnose.diagnosis import Diagnosis
+from hilcal.diagnose.doubt import in_doubt
+from hilcal.diagnose.verdict import diagnose
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
 from hilcal.plan.next import Next, measure_next
@@ -39,10 +41,8 @@ class Doubtful:
 
     @property
     def suspects(self) -> tuple[str, ...]:
-        """The leading one that is significant, and what it is not told from."""
-        d = self.diagnosis
-        lead = next((s for s in d.suspects if s.effect in d.significant), None)
-        return () if lead is None else (lead.effect, *lead.same_as)[:4]
+        """The first one that passes all tests, and those that are inseparable from it."""
+        return in_doubt(self.diagnosis) or self.diagnosis.significant[:1]
 
 
 @cache

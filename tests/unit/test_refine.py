@@ -15,6 +15,7 @@ from hilcal.identify.fit import fit
 from hilcal.model import Model
 from hilcal.refine import MOST_REVISIONS, Refinement, add, refine
 from hilcal.regression.paired_test import LEAST_GAIN
+from hilcal.report.verdict_words import message
 from tests.support.campaigns import campaign, cell_of, measured, plan, world_of
 from tests.support.effect_cases import make
 
@@ -42,7 +43,7 @@ def test_a_hidden_effect_is_added_and_the_error_falls_to_the_noise(effect, mode)
     r = refine(baseline(c.cell, c.readings, mode), c.readings, mode, said.append)
     check_steps(r)
     assert effect in r.steps[-1].fit.model.names
-    assert r.verdict in ("adequate", "ambiguous"), r.message
+    assert r.verdict in ("adequate", "ambiguous"), message(r.diagnosis)
     first, last = r.steps[0].fit, r.steps[-1].fit
     assert last.holdout.rms_sigma < 0.6 * first.holdout.rms_sigma
     # On poses left out: the noise, and what the parameters cost.
@@ -61,7 +62,7 @@ def test_two_hidden_effects_are_found_one_after_the_other():
     r = refine(baseline(cell, readings, "absolute"), readings, "absolute")
     check_steps(r)
     assert {s.added for s in r.steps[1:]} == {"hysteresis", "encoder_offset"}
-    assert r.verdict == "adequate", r.message
+    assert r.verdict == "adequate", message(r.diagnosis)
     assert 0.7 < r.steps[-1].fit.variance_factor < 1.35
 
 
@@ -71,7 +72,7 @@ def test_nothing_hidden_adds_nothing():
     assert len(r.steps) == 1
     assert r.verdict == "adequate"
     assert r.rejected == ()
-    assert r.steps[0].diagnosis.message == r.message
+    assert r.diagnosis is r.steps[0].diagnosis
 
 
 def with_pose_errors(readings: Readings, seed: int) -> Readings:
@@ -89,8 +90,7 @@ def test_what_no_effect_predicts_is_never_called_adequate(poses, seed):
     r = refine(baseline(c.cell, readings, "absolute"), readings, "absolute")
     check_steps(r)
     assert r.steps[-1].fit.holdout.rms_sigma > 3
-    assert r.verdict in ("unknown_effect", "noise_misjudged"), r.message
-    assert r.message
+    assert r.verdict in ("unknown_effect", "noise_misjudged"), message(r.diagnosis)
 
 
 def test_shares_on_poses_left_out_are_what_a_refit_reaches_there():
@@ -138,4 +138,4 @@ def test_it_starts_from_any_model():
     r = refine(frames, c.readings, "absolute")
     check_steps(r)
     assert r.steps[1].added == "joint_compliance"
-    assert r.verdict == "adequate", r.message
+    assert r.verdict == "adequate", message(r.diagnosis)

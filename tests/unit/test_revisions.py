@@ -16,6 +16,7 @@ from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.fit_document import plain, registration, to_json
 from hilcal.refine import add
+from hilcal.report.diagnosis_document import to_json as diagnosis_json
 from hilcal.revisions import chain, restore, restore_model, to_record
 from tests.support.cli_cases import rehearsal
 
@@ -32,7 +33,9 @@ def record_of(r: Rehearsal, found: Fit, added: str | None = None) -> RevisionRec
 def test_the_same_fit_comes_back(effect: str) -> None:
     r = rehearsal(effect)
     found = add(baseline_fit(r), effect)
-    text = to_text(to_record(found, diagnose(found), effect, content_hash(r.readings)))
+    text = to_text(
+        to_record(found, diagnosis_json(diagnose(found)), effect, content_hash(r.readings))
+    )
     again = restore(from_text(text, 2), r.cell, r.readings)
     assert again.model.names == found.model.names
     assert [e.options for e in again.model.effects] == [e.options for e in found.model.effects]

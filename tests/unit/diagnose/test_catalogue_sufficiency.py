@@ -1,4 +1,4 @@
-"""Looking ahead: does the catalogue explain the misfit, or does its best only resemble it?"""
+"""Does the whole catalogue explain the misfit, or does its best effect only resemble the cause?"""
 
 from dataclasses import replace
 
@@ -7,13 +7,16 @@ import pytest
 
 from hilcal.config import load_config
 from hilcal.data.whitening import Mode
-from hilcal.diagnose.catalogue_sufficiency import look_ahead, rest
-from hilcal.diagnose.diagnosis_document import to_json
+from hilcal.diagnose.catalogue_sufficiency import forward_selection, insufficiency
+from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.diagnose.effect_ranking import candidates, family
 from hilcal.diagnose.projection import projection
-from hilcal.diagnose.verdict import Diagnosis, diagnose
+from hilcal.diagnose.stepwise import Refits, add
+from hilcal.diagnose.verdict import diagnose
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
+from hilcal.report.diagnosis_document import to_json
+from hilcal.report.verdict_words import message
 from hilcal.robot.catalogue import configs_dir
 from studies.study_cases import study_case
 
@@ -37,32 +40,34 @@ def fitted(
         ("absolute", "coupled joint", "joint 2 torque"),
     ],
 )
-def test_what_only_resembles_an_effect_is_unknown(mode: Mode, law: str, variable: str) -> None:
+def test_a_law_that_only_resembles_an_effect_is_unknown(
+    mode: Mode, law: str, variable: str
+) -> None:
     led = 0
     for seed in range(2):
-        first = diagnose(fitted(mode, law, seed=seed))
-        d = look_ahead(first)
-        led += bool(first.significant)
-        assert d.verdict == "unknown_effect", (seed, d.message)
-        assert variable in [c.variable for c in d.carriers[:2]]
-        if first.significant:
-            assert d.suspects is first.suspects
-            assert d.significant == first.significant
-            check_beyond(d)
+        d = diagnose(fitted(mode, law, seed=seed))
+        assert d.verdict == "unknown_effect", (seed, message(d))
+        assert variable in [c.variable for c in d.dependences[:2]]
+        led += d.lead is not None
+        if d.lead is not None:
+            check_insufficiency(d)
     assert led > 0
 
 
-def check_beyond(d: Diagnosis) -> None:
-    assert d.beyond is not None
-    assert d.significant[0] in d.message
-    assert 0.02 < d.beyond.share < 1.0
-    assert d.beyond.variance_factor > 1.0
-    assert 0 <= d.beyond.refitted <= len(d.beyond.effects)
+def check_insufficiency(d: Diagnosis) -> None:
+    i = d.insufficiency
+    assert d.reason == "insufficient_catalogue"
+    assert i is not None
+    assert d.suspects[0].effect in message(d)
+    assert 0.02 < i.share < 1.0
+    assert i.variance_factor > 1.0
+    assert 0 <= i.refitted <= len(i.effects)
+    assert d.separability == ()
     assert to_json(d)["beyond"] == {
-        "effects": list(d.beyond.effects),
-        "refitted": d.beyond.refitted,
-        "share": d.beyond.share,
-        "variance_factor": d.beyond.variance_factor,
+        "effects": list(i.effects),
+        "refitted": i.refitted,
+        "share": i.share,
+        "variance_factor": i.variance_factor,
     }
 
 
@@ -79,21 +84,42 @@ def check_beyond(d: Diagnosis) -> None:
 )
 def test_effects_of_the_catalogue_explain_all(mode: Mode, effects: tuple[str, ...]) -> None:
     d = diagnose(fitted(mode, *effects))
-    assert d.significant
-    assert look_ahead(d) is d
+    assert d.lead is not None
+    assert d.verdict in ("missing_effect", "ambiguous")
+    assert d.insufficiency is None
 
 
 def test_noise_that_repeats_show_is_not_an_unknown_effect() -> None:
-    d = diagnose(fitted("deflection", "hysteresis", stated=0.5, cycles=2))
-    assert d.significant[0] == "hysteresis"
-    assert not rest(d.fit).is_noise
-    assert look_ahead(d) is d
+    found = fitted("deflection", "hysteresis", stated=0.5, cycles=2)
+    d = diagnose(found)
+    assert d.suspects[0].effect == "hysteresis"
+    assert not forward_selection(found).is_noise
+    assert d.verdict in ("missing_effect", "ambiguous")
 
 
-def test_nothing_is_looked_for_where_nothing_leads() -> None:
-    d = diagnose(fitted("deflection"))
-    assert d.verdict == "adequate"
-    assert look_ahead(d) is d
+def test_no_refit_is_made_where_algebra_leaves_noise_and_at_most_two_elsewhere() -> None:
+    made: list[str] = []
+
+    def counted(before: Fit, effect: str) -> Fit:
+        made.append(effect)
+        return add(before, effect)
+
+    explained = fitted("deflection", "link_compliance")
+    assert forward_selection(explained).is_noise
+    assert insufficiency(explained, counted) is None
+    assert made == []
+    unknown = insufficiency(fitted("absolute", "swaying bench"), counted)
+    assert unknown is not None
+    assert unknown.effects[: unknown.refitted] == tuple(made)
+    assert 1 <= len(made) <= 2
+
+
+def test_the_same_refit_is_made_once() -> None:
+    found, refits = fitted("deflection", "link_compliance"), Refits()
+    first = refits.add(found, "hysteresis")
+    assert refits.add(found, "hysteresis") is first
+    assert refits.add(found, "backlash") is not first
+    assert refits.add(first, "backlash").model.names[-2:] == ("hysteresis", "backlash")
 
 
 def test_a_fit_that_is_not_quite_at_rest_credits_no_effect_with_its_own_step() -> None:

@@ -161,7 +161,7 @@ def test_repeats_that_scatter_as_much_blame_the_noise(mode, factor):
     f = r.fit(with_noise(r.clean, np.random.default_rng(0), factor))
     verdict = judge_noise(f, pure_error(f), False)
     assert verdict.misjudged
-    assert "scale the covariance by" in verdict.message
+    assert verdict.reason == "repeats"
 
 
 def test_repeats_that_scatter_less_blame_the_model():
@@ -170,16 +170,16 @@ def test_repeats_that_scatter_less_blame_the_model():
     verdict = judge_noise(f, pure_error(f), False)
     assert verdict.off
     assert not verdict.misjudged
-    assert "repeated readings scatter only" in verdict.message
+    assert verdict.reason == "lack_of_fit"
 
 
-def test_without_repeats_the_message_says_that_it_cannot_know():
+def test_without_repeats_it_cannot_be_known():
     r = Repeated("absolute", 12, cycles=1, missing=0.0)
     f = r.fit(with_noise(r.clean, np.random.default_rng(0), 2.0))
     assert pure_error(f) is None
     verdict = judge_noise(f, None, False)
     assert verdict.misjudged
-    assert "without repeated readings the program cannot know" in verdict.message
+    assert verdict.reason == "unknown"
     assert not judge_noise(f, None, True).misjudged
 
 

@@ -8,8 +8,8 @@ import pytest
 
 from hilcal.data.readings import States
 from hilcal.diagnose.projection import projection
-from hilcal.diagnose.residual_curves import Dependence, Predicted
-from hilcal.diagnose.residual_regression import predictable
+from hilcal.diagnose.residual_curves import Dependence, ResidualRegression
+from hilcal.diagnose.residual_regression import residual_regression
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import fit
 from tests.support.campaigns import Campaign, campaign, plan
@@ -78,19 +78,21 @@ def hidden(name: str, mode: str, seed: int, strength: float = 3.0, poses: int = 
     return replace(c, readings=replace(c.readings, states=s, value=c.readings.value + moved(a)))
 
 
-def told(c: Campaign) -> Predicted:
-    return predictable(projection(fit(baseline(c.cell, c.readings, c.mode), c.readings, c.mode)))
+def told(c: Campaign) -> ResidualRegression:
+    return residual_regression(
+        projection(fit(baseline(c.cell, c.readings, c.mode), c.readings, c.mode))
+    )
 
 
-def right(name: str, found: Predicted) -> bool:
-    return bool({v.variable for v in found.carriers[:2]} & LAWS[name][2])
+def right(name: str, found: ResidualRegression) -> bool:
+    return bool({v.variable for v in found.dependences[:2]} & LAWS[name][2])
 
 
 @pytest.mark.parametrize(("name", "mode"), HIDDEN)
 def test_its_variable_is_among_the_first_two(name, mode):
     for seed in range(2):
         found = told(hidden(name, mode, seed))
-        assert right(name, found), [v.variable for v in found.carriers]
+        assert right(name, found), [v.variable for v in found.dependences]
         assert found.share > 0.5
 
 
@@ -105,8 +107,8 @@ def test_its_variable_is_among_the_first_two_in_most_campaigns(name, mode):
 
 def test_shares_of_the_variables_add_up_to_the_whole():
     found = told(hidden("dq2 = F sin q1", "absolute", 3))
-    assert {v.variable for v in found.carriers} == {"joint 1 angle", "load"}
-    assert sum(v.share for v in found.carriers) == pytest.approx(found.share, rel=0.05)
+    assert {v.variable for v in found.dependences} == {"joint 1 angle", "load"}
+    assert sum(v.share for v in found.dependences) == pytest.approx(found.share, rel=0.05)
 
 
 @pytest.mark.parametrize("mode", ["absolute", "deflection"])
@@ -116,12 +118,12 @@ def test_noise_is_not_predictable(mode):
         c = replace(c, readings=replace(c.readings, states=warm(c.readings.states, seed)))
         found = told(c)
         assert found.share < 0.05
-        assert found.carriers == ()
+        assert found.dependences == ()
 
 
 def curve_of(name: str, variable: str) -> tuple[Campaign, Dependence]:
     c = hidden(name, "absolute", 1, strength=6.0, poses=40)
-    return c, next(v for v in told(c).carriers if v.variable == variable)
+    return c, next(v for v in told(c).dependences if v.variable == variable)
 
 
 def test_the_curve_is_the_law():

@@ -8,17 +8,17 @@ from scipy.stats import f as f_distribution
 from scipy.stats import ncf
 
 from drivers.simulated.injected_effects import hide
-from hilcal.diagnose.backward_elimination import CHANCE, needless
+from hilcal.diagnose.backward_elimination import CHANCE, backward_elimination
+from hilcal.diagnose.doubt import in_doubt
 from hilcal.diagnose.effect_ranking import candidates, family, rank_suspects
 from hilcal.diagnose.minimum_detectable_effect import POWER, least_strength, noncentrality
 from hilcal.diagnose.projection import projection
 from hilcal.diagnose.rivals import PRICE, Alternative, Rivals
 from hilcal.diagnose.stepwise import add, exchange, remove
-from hilcal.diagnose.verdict import diagnose
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
-from hilcal.refine import Step, _Work
+from hilcal.refine import Path
 from tests.support.campaigns import NOTHING, Campaign, campaign, measured, plan, world_of
 
 
@@ -29,13 +29,12 @@ def fitted(c: Campaign, *effects: str) -> Fit:
     return found
 
 
-def work(c: Campaign, *effects: str) -> _Work:
+def work(c: Campaign, *effects: str) -> Path:
     """Revisions as refine would have made them, had it added these effects."""
-    steps = [Step(found := fitted(c), diagnose(found), None)]
+    path = Path(fitted(c))
     for name in effects:
-        found = add(found, name)
-        steps.append(Step(found, diagnose(found), name))
-    return _Work(steps, steps[0].fit.model.names, lambda text: None)
+        path.append(add(path.steps[-1].fit, name), name)
+    return path
 
 
 # --- needless -------------------------------------------------------------------------------
@@ -55,7 +54,7 @@ def test_what_is_not_there_is_needless_but_for_chance(mode, effects):
     for seed in range(30):
         c = campaign(NOTHING, mode, seed, poses=12, plan_seed=1, registration_known=True)
         found = fitted(c, *effects)
-        judged = {n.effect: n.score.p_value for n in needless(found)}
+        judged = {n.effect: n.score.p_value for n in backward_elimination(found)}
         p_values += [judged.get(name, 0.0) for name in effects]
     assert set(effects) >= set(judged)
     kept = sum(p < CHANCE for p in p_values)
@@ -66,15 +65,15 @@ def test_what_is_not_there_is_needless_but_for_chance(mode, effects):
 
 
 @pytest.mark.parametrize("effect", ["hysteresis", "backlash", "transmission_error"])
-def test_what_is_there_is_not_needless(effect):
+def test_what_is_there_is_not_backward_elimination(effect):
     mode = "absolute" if effect == "transmission_error" else "deflection"
     c = campaign(effect, mode, 3, poses=30, strength=1.0)
-    assert effect not in [n.effect for n in needless(fitted(c, effect))]
+    assert effect not in [n.effect for n in backward_elimination(fitted(c, effect))]
 
 
-def test_the_starting_model_is_never_needless():
+def test_the_starting_model_is_never_backward_elimination():
     c = campaign(NOTHING, "absolute", 1)
-    assert needless(fitted(c)) == ()
+    assert backward_elimination(fitted(c)) == ()
 
 
 # --- reconsidered ---------------------------------------------------------------------------
@@ -83,24 +82,24 @@ def test_the_starting_model_is_never_needless():
 def test_an_early_addition_that_became_needless_is_removed():
     c = campaign("hysteresis", "absolute", 2, poses=20)
     w = work(c, "load_point", "hysteresis")
-    assert w.steps[-1].diagnosis.needless == ("load_point",)
-    assert w.reconsider([])
+    assert w.steps[-1].diagnosis.redundant == ("load_point",)
+    assert w.reconsider()
     last = w.steps[-1]
     assert (last.added, last.removed) == (None, "load_point")
     assert last.fit.model.names == (*w.steps[0].fit.model.names, "hysteresis")
-    assert not w.reconsider([])
+    assert not w.reconsider()
 
 
 def test_a_wrong_choice_is_exchanged_for_the_right_one():
     c = campaign("hysteresis", "absolute", 2, poses=20)
     w = work(c, "transmission_error")
-    assert w.reconsider([])
+    assert w.reconsider()
     last = w.steps[-1]
     assert (last.added, last.removed) == ("hysteresis", "transmission_error")
     assert last.diagnosis.verdict == "adequate"
 
 
-def _two_in_the_guise_of_one() -> _Work:
+def _two_in_the_guise_of_one() -> Path:
     """Two hidden effects, and the large family that stands for both of them."""
     c = campaign("encoder_offset", "absolute", 2, poses=30)
     cell, p = c.cell, plan(30, 1002)
@@ -114,7 +113,7 @@ def _two_in_the_guise_of_one() -> _Work:
 def test_a_large_family_that_took_the_part_of_two_effects_is_exchanged_for_them():
     w = _two_in_the_guise_of_one()
     w.extend()
-    while w.reconsider([]):
+    while w.reconsider():
         w.extend()
     names = w.steps[-1].fit.model.names
     assert {"encoder_offset", "tracker_drift"} <= set(names)
@@ -124,10 +123,11 @@ def test_a_large_family_that_took_the_part_of_two_effects_is_exchanged_for_them(
 def test_an_addition_that_cannot_be_told_from_another_is_a_doubt():
     c = campaign("tracker_scale", "absolute", 1, poses=20, strength=1.0)
     w = work(c, "tracker_scale")
-    other = Rivals(w.steps[-1].fit).of("tracker_scale")
-    doubts: list[str] = []
-    changed = w.reconsider(doubts)
-    assert changed or bool(doubts) == bool(other.same_as)
+    d = w.steps[-1].diagnosis
+    assert Rivals(w.steps[-1].fit).of("tracker_scale").same_as
+    assert not w.reconsider()
+    assert d.reason == "inseparable_addition"
+    assert in_doubt(d)[0] == "tracker_scale"
 
 
 def test_an_effect_that_is_not_there_cannot_be_removed():
@@ -177,7 +177,7 @@ def test_while_something_is_unknown_others_must_be_far_better():
     far = replace(close, log_evidence=230.0)
     assert w._better(last, close)
     assert w._better(last, far)
-    unknown = replace(last, diagnosis=replace(last.diagnosis, verdict="unknown_effect"))
+    unknown = replace(last, diagnosis=replace(last.diagnosis, reason="no_suspect"))
     assert not w._better(unknown, close)
     assert w._better(unknown, far)
     assert not w._better(last, replace(close, log_evidence=201.0))

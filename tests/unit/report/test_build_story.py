@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from drivers.simulated.rehearsal import Rehearsal
+from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.diagnose.residual_curves import Dependence
-from hilcal.diagnose.verdict import Diagnosis, diagnose
+from hilcal.diagnose.verdict import diagnose
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import fit
@@ -119,10 +120,10 @@ def test_an_unknown_effect_has_a_curve_in_units_for_people() -> None:
     lead = r.curves[0]
     assert (lead.variable, lead.x_label) == ("joint 4 angle", "joint 4 angle [°]")
     assert lead.y_label == "error of joint 2 [µrad]"
-    np.testing.assert_allclose(np.deg2rad(lead.x), d.carriers[0].x)
-    np.testing.assert_allclose(lead.y * 1e-6, d.carriers[0].y)
-    np.testing.assert_allclose(lead.error * 1e-6, d.carriers[0].error)
-    assert lead.share == d.carriers[0].share > 0.9
+    np.testing.assert_allclose(np.deg2rad(lead.x), d.dependences[0].x)
+    np.testing.assert_allclose(lead.y * 1e-6, d.dependences[0].y)
+    np.testing.assert_allclose(lead.error * 1e-6, d.dependences[0].error)
+    assert lead.share == d.dependences[0].share > 0.9
 
 
 @pytest.mark.parametrize(("explains", "curves"), [(0.03, 1), (0.6, 0)])
@@ -130,10 +131,8 @@ def test_a_suspect_that_explains_little_leaves_the_picture_to_the_variable(
     explains: float, curves: int
 ) -> None:
     d, _ = judged(hidden("dq2 = sin 3 q4", "absolute", 0, 1.5))
-    lead = replace(d.suspects[1], holdout_share=explains)
-    named = replace(
-        d, verdict="missing_effect", suspects=(d.suspects[0], lead), significant=(lead.effect,)
-    )
+    lead = replace(d.suspects[1], holdout_share=explains, explains=True, sure=True)
+    named = replace(d, reason="one_suspect", suspects=(lead, d.suspects[0]))
     r = build_story([Chapter(1, None, d.fit, named)]).revisions[0]
     assert r.suspects[0].effect == lead.effect
     assert len(r.curves) == curves
@@ -152,7 +151,7 @@ def test_rivals_are_those_of_the_leading_suspect() -> None:
     assert r.verdict == "ambiguous"
     assert r.suspects[0].effect == d.significant[0]
     assert {o.effect for o in r.rivals} == set(r.suspects[0].same_as)
-    assert [o.times for o in r.rivals] == [a.times for a in d.apart]
+    assert [o.times for o in r.rivals] == [a.times for a in d.separability]
 
 
 def test_what_could_have_been_seen_is_told_of_all_that_was_not_found(

@@ -10,7 +10,7 @@ from hilcal.cell import cell_from_config
 from hilcal.cli.demo import CELL
 from hilcal.config import CellConfig, load_config
 from hilcal.data.whitening import MODES, Mode
-from hilcal.diagnose.misfit_breakdown import where
+from hilcal.diagnose.misfit_breakdown import misfit_breakdown
 from hilcal.diagnose.projection import projection
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
@@ -120,7 +120,7 @@ def test_the_variables_of_a_law_are_those_that_a_diagnosis_knows() -> None:
     for mode in MODES:
         c = case(mode=mode)
         f = fit(baseline(c.cell, c.readings, mode), c.readings, mode)
-        known = {w.variable for w in where(projection(f))}
+        known = {w.variable for w in misfit_breakdown(projection(f))}
         for name in laws_shown(mode):
             assert set(invented(name).variables) <= known
 

@@ -3,7 +3,8 @@
 import numpy as np
 
 from hilcal.data.whitening import whitening
-from hilcal.diagnose.verdict import Diagnosis, diagnose
+from hilcal.diagnose.diagnosis import Diagnosis
+from hilcal.diagnose.verdict import diagnose
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import fit
 from studies.study_more import measure_more, suspects

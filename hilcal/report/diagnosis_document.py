@@ -1,24 +1,27 @@
-"""The JSON of a diagnosis."""
+"""A diagnosis as JSON: in documents of commands and in campaign files."""
 
 from collections.abc import Sequence
 
+from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.diagnose.minimum_detectable_effect import Strength
 from hilcal.diagnose.noise import PureError
 from hilcal.diagnose.residual_curves import Dependence
-from hilcal.diagnose.verdict import Diagnosis
+from hilcal.report.verdict_words import message
 
 
 def to_json(d: Diagnosis) -> dict[str, object]:
-    """Keys of the contract, and what repeats say of the noise."""
+    """Return the keys of the contract, and all else that a diagnosis holds."""
     return {
         "model": list(d.fit.model.names),
         "verdict": d.verdict,
-        "message": d.message,
+        "message": message(d),
+        "reason": d.reason,
         "variance_factor": d.fit.variance_factor,
         "variance_factor_interval": list(d.fit.variance_factor_interval),
         "predictable_share": d.predictable_share,
         "where": [
-            {"variable": v.variable, "share": v.share, "p_value": v.p_value} for v in d.where
+            {"variable": v.variable, "share": v.share, "p_value": v.p_value}
+            for v in d.misfit_breakdown
         ],
         "suspects": [
             {
@@ -28,7 +31,7 @@ def to_json(d: Diagnosis) -> dict[str, object]:
                 "holdout_share": s.holdout_share,
                 "delta_bic": s.score.delta_bic,
                 "log_evidence": s.score.log_evidence,
-                "significant": s.effect in d.significant,
+                "significant": s.passes,
                 "same_as": list(s.same_as),
                 "least": least(s.least),
             }
@@ -36,24 +39,30 @@ def to_json(d: Diagnosis) -> dict[str, object]:
         ],
         "apart": [
             {"effect": a.effect, "unlike": a.unlike, "times": a.times if a.possible else None}
-            for a in d.apart
+            for a in d.separability
         ],
         "beyond": None
-        if d.beyond is None
+        if d.insufficiency is None
         else {
-            "effects": list(d.beyond.effects),
-            "refitted": d.beyond.refitted,
-            "share": d.beyond.share,
-            "variance_factor": d.beyond.variance_factor,
+            "effects": list(d.insufficiency.effects),
+            "refitted": d.insufficiency.refitted,
+            "share": d.insufficiency.share,
+            "variance_factor": d.insufficiency.variance_factor,
         },
-        "needless": list(d.needless),
-        "carriers": carriers(d.carriers),
+        "rejected": list(d.history.rejected),
+        "alternatives": [
+            {"effect": a.effect, "same_as": list(a.same_as), "others": list(a.others)}
+            for a in d.alternatives
+            if a.inseparable
+        ],
+        "needless": list(d.redundant),
+        "carriers": carriers(d.dependences),
         "pure_error": None if d.pure_error is None else repeats(d.pure_error),
     }
 
 
 def least(s: Strength) -> dict[str, object] | None:
-    """Smallest strength that would have been revealed, SI; null where none would."""
+    """Return the smallest strength that would have been revealed, SI; null where none would."""
     if not s.visible:
         return None
     return {
@@ -63,7 +72,7 @@ def least(s: Strength) -> dict[str, object] | None:
 
 
 def repeats(e: PureError) -> dict[str, object]:
-    """What repeats say of the noise; `where` is null where it is everywhere the same."""
+    """Return the scatter of repeats; `where` is null where it is everywhere the same."""
     w = e.where
     return {
         "variance_factor": e.factor,
@@ -83,7 +92,7 @@ def repeats(e: PureError) -> dict[str, object]:
 
 
 def carriers(found: Sequence[Dependence]) -> list[dict[str, object]]:
-    """Variables that carry what is predictable, with their curves, SI units."""
+    """Return variables that carry what is predictable, with their curves, SI units."""
     return [
         {
             "variable": v.variable,

@@ -1,0 +1,118 @@
+"""The judgement of a fit: one frozen value that commands, `refine`, plans, studies and files carry.
+
+It holds data only; `hilcal.report.verdict_words` writes its sentence, and
+`hilcal.report.diagnosis_document` its JSON.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from hilcal.diagnose.catalogue_sufficiency import Insufficiency
+from hilcal.diagnose.effect_ranking import Suspect
+from hilcal.diagnose.misfit_breakdown import MisfitShare
+from hilcal.diagnose.noise import PureError
+from hilcal.diagnose.noise_verdict import NoiseVerdict
+from hilcal.diagnose.residual_curves import Dependence
+from hilcal.diagnose.rivals import Alternative
+from hilcal.diagnose.separability import Separability
+from hilcal.identify.fit import Fit
+
+Verdict = Literal["adequate", "missing_effect", "ambiguous", "unknown_effect", "noise_misjudged"]
+Reason = Literal[
+    "residual_is_noise",
+    "one_suspect",
+    "inseparable_suspects",
+    "inseparable_addition",
+    "insufficient_catalogue",
+    "no_suspect",
+    "misjudged_noise",
+]
+VERDICTS: dict[Reason, Verdict] = {
+    "residual_is_noise": "adequate",
+    "one_suspect": "missing_effect",
+    "inseparable_suspects": "ambiguous",
+    "inseparable_addition": "ambiguous",
+    "insufficient_catalogue": "unknown_effect",
+    "no_suspect": "unknown_effect",
+    "misjudged_noise": "noise_misjudged",
+}
+"""The verdict that each reason leads to."""
+
+
+@dataclass(frozen=True, slots=True)
+class History:
+    """How a model was reached, as far as the judgement depends on it.
+
+    Attributes:
+        added: effects of the model that earlier diagnoses chose; another may fit as well.
+        removed: effects that were taken out of the model because others explain more.
+        rejected: effects whose addition was tried by a refit and did not lower the error on
+            poses left out.
+    """
+
+    added: tuple[str, ...] = ()
+    removed: tuple[str, ...] = ()
+    rejected: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Diagnosis:
+    """What is wrong with a fitted model.
+
+    Attributes:
+        fit: the fit.
+        history: how its model was reached.
+        reason: which rule of `verdict.judge` decided.
+        suspects: effects that are not in the model: first those that pass all tests, then those
+            that explain the misfit but do not surely lower the error on poses left out, then
+            the others; by decreasing evidence in each of these three groups.
+        misfit_breakdown: variables that the misfit follows, largest share first.
+        predictable_share: share of the misfit that a generic regression predicts; 0 where there
+            is no misfit.
+        dependences: variables that carry what is predictable, with the curve of each; those of
+            the residual after the refit where the catalogue is insufficient.
+        follows: names of at most two variables that the unexplained misfit follows.
+        pure_error: the scatter of repeated readings, or None without repeats.
+        noise: whether the stated covariance is to blame; None where a suspect passes all tests.
+        redundant: effects of the model without which the readings are explained as well.
+        separability: how each rival of the first suspect differs from it, where one of them is
+            missing.
+        insufficiency: what all effects of the catalogue together leave of the misfit, where
+            that is not noise.
+        alternatives: for each effect of `history.added`, the effects that could replace it.
+    """
+
+    fit: Fit
+    history: History
+    reason: Reason
+    suspects: tuple[Suspect, ...]
+    misfit_breakdown: tuple[MisfitShare, ...]
+    predictable_share: float
+    dependences: tuple[Dependence, ...]
+    follows: tuple[str, ...]
+    pure_error: PureError | None
+    noise: NoiseVerdict | None
+    redundant: tuple[str, ...]
+    separability: tuple[Separability, ...]
+    insufficiency: Insufficiency | None
+    alternatives: tuple[Alternative, ...]
+
+    @property
+    def verdict(self) -> Verdict:
+        """The verdict."""
+        return VERDICTS[self.reason]
+
+    @property
+    def significant(self) -> tuple[str, ...]:
+        """Names of the suspects that pass all tests, best first."""
+        return tuple(s.effect for s in self.suspects if s.passes)
+
+    @property
+    def lead(self) -> Suspect | None:
+        """The first suspect, where it passes all tests."""
+        return self.suspects[0] if self.suspects and self.suspects[0].passes else None
+
+    @property
+    def residual_is_noise(self) -> bool:
+        """Whether the stated noise explains the residual."""
+        return self.reason in ("residual_is_noise", "inseparable_addition")

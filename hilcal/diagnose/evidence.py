@@ -1,0 +1,108 @@
+"""What the readings say of a fit, each part computed when it is first needed, and once."""
+
+from collections.abc import Callable, Collection
+from functools import cached_property
+
+from scipy.stats import chi2
+
+from hilcal.diagnose.backward_elimination import backward_elimination
+from hilcal.diagnose.catalogue_sufficiency import Insufficiency, insufficiency
+from hilcal.diagnose.effect_ranking import Suspect, candidates, rank_suspects
+from hilcal.diagnose.misfit_breakdown import MisfitShare, misfit_breakdown
+from hilcal.diagnose.noise import PureError, pure_error
+from hilcal.diagnose.noise_verdict import MISFIT_ALARM
+from hilcal.diagnose.projection import Projection, projection
+from hilcal.diagnose.residual_curves import ResidualRegression
+from hilcal.diagnose.residual_regression import residual_regression, tree_share
+from hilcal.diagnose.rivals import Alternative, Rivals
+from hilcal.diagnose.stepwise import add
+from hilcal.effects.protocol import Effect
+from hilcal.errors import InputError
+from hilcal.identify.fit import Fit
+
+
+class Evidence:
+    """Statistics of a fit that a judgement combines; they do not depend on the model's history."""
+
+    def __init__(
+        self,
+        fit: Fit,
+        refit: Callable[[Fit, str], Fit] = add,
+        say: Callable[[str], None] = lambda text: None,
+    ) -> None:
+        """Take a fit.
+
+        Args:
+            fit: the fit.
+            refit: returns a fit with one more effect.
+            say: takes progress, one line each.
+
+        Raises:
+            InputError: for a fit whose residual is not whitened.
+        """
+        if fit.scaling != "gc":
+            raise InputError(f"diagnosis needs scaling gc, this fit has {fit.scaling}")
+        self.fit, self._refit, self._say = fit, refit, say
+
+    @cached_property
+    def projection(self) -> Projection:
+        """The fitted model's part of the regression."""
+        return projection(self.fit)
+
+    @cached_property
+    def effects(self) -> tuple[Effect, ...]:
+        """Effects that are not in the model and can be computed."""
+        return candidates(self.fit)
+
+    @cached_property
+    def suspects(self) -> tuple[Suspect, ...]:
+        """All of them scored."""
+        return rank_suspects(self.projection, self.effects)
+
+    @cached_property
+    def misfit_breakdown(self) -> tuple[MisfitShare, ...]:
+        """Variables that the misfit follows, largest share first."""
+        return misfit_breakdown(self.projection)
+
+    @cached_property
+    def pure_error(self) -> PureError | None:
+        """The scatter of repeated readings; None without repeats."""
+        return pure_error(self.fit)
+
+    @cached_property
+    def misfit(self) -> bool:
+        """Whether χ² is larger than the stated noise allows."""
+        return float(chi2.sf(self.fit.chi2, self.fit.dof)) < MISFIT_ALARM
+
+    @cached_property
+    def regression(self) -> ResidualRegression:
+        """What smooth laws, or trees, predict of the misfit on poses left out."""
+        return residual_regression(self.projection)
+
+    @cached_property
+    def tree_share(self) -> float:
+        """Share of the misfit that trees predict on poses left out."""
+        return tree_share(self.projection)
+
+    @cached_property
+    def redundant(self) -> tuple[str, ...]:
+        """Effects of the model without which the readings are explained as well."""
+        return tuple(n.effect for n in backward_elimination(self.fit))
+
+    @cached_property
+    def insufficiency(self) -> Insufficiency | None:
+        """What all effects of the catalogue together leave, where it is not noise."""
+        return insufficiency(self.fit, self._refit, self._say)
+
+    @cached_property
+    def _rivals(self) -> Rivals:
+        return Rivals(self.fit)
+
+    def alternative(self, effect: str, never: Collection[str]) -> Alternative:
+        """Return what could replace an effect of the model.
+
+        Args:
+            effect: of the model.
+            never: effects that are not to be used.
+        """
+        return self._rivals.of(effect, never)

@@ -1,0 +1,145 @@
+"""A diagnosis in one sentence; the `message` of JSON documents and files."""
+
+from hilcal.diagnose.diagnosis import Diagnosis
+from hilcal.diagnose.effect_ranking import LEAST_SHARE, Suspect
+from hilcal.diagnose.noise import PureError
+from hilcal.diagnose.noise_verdict import NoiseVerdict
+from hilcal.diagnose.rivals import Alternative
+from hilcal.diagnose.separability import Separability
+
+
+def message(d: Diagnosis) -> str:
+    """Return the verdict in a sentence; the effect that it names is the first suspect."""
+    if d.reason == "one_suspect":
+        return f"{d.suspects[0].effect} is missing: it {_explains(d.suspects[0])}"
+    if d.reason == "inseparable_suspects":
+        return _inseparable(d)
+    if d.reason == "insufficient_catalogue":
+        return _insufficient(d)
+    if d.reason == "no_suspect":
+        return _no_suspect(d)
+    if d.reason == "misjudged_noise":
+        return _misjudged(d)
+    adequate = (
+        f"Residuals are what the noise explains: variance factor {d.fit.variance_factor:.2f}; no "
+        f"effect of the catalogue is missing{noise_place(d.pure_error)}"
+    )
+    if d.reason == "residual_is_noise":
+        return adequate
+    doubts = "; ".join(_alternative(a) for a in d.alternatives if a.inseparable)
+    return f"{adequate}; but {doubts}: measure what separates them"
+
+
+def _explains(s: Suspect) -> str:
+    return (
+        f"explains {100 * s.share:.0f} % of the misfit, {100 * max(s.holdout_share, 0):.0f} % on "
+        f"poses left out (p = {s.score.p_value:.1g})"
+    )
+
+
+def _inseparable(d: Diagnosis) -> str:
+    lead, rivals = d.suspects[0], d.separability
+    advice = "hilcal next plans what separates them, or add one and judge on new poses"
+    if not any(r.possible for r in rivals):
+        advice = "add one; readings of this kind are predicted as well with any of them"
+    others = ", ".join(separable(r) for r in rivals)
+    return (
+        f"{lead.effect} {_explains(lead)}, but these readings do not separate it from {others}; "
+        f"{advice}"
+    )
+
+
+def separable(r: Separability) -> str:
+    """Name a rival, with the readings that would separate it."""
+    if not r.possible:
+        return f"{r.effect} (no readings of this kind can)"
+    if r.times <= 1.0:
+        return r.effect
+    return f"{r.effect} ({r.times:.2g} times as many readings like these would)"
+
+
+def _alternative(a: Alternative) -> str:
+    """Name the effects that could replace one of the model."""
+    several = len(a.others) > 1 and a.as_good
+    others = (*a.same_as, *([" and ".join(a.others)] if several else []))
+    return f"{a.effect} could as well be {' or '.join(others)}"
+
+
+def _insufficient(d: Diagnosis) -> str:
+    lead, i = d.suspects[0], d.insufficiency
+    if i is None:
+        raise ValueError("a diagnosis of an insufficient catalogue without what it leaves")
+    follows = f", which follows {' and '.join(d.follows)}" if d.follows else ""
+    return (
+        f"{lead.effect} explains {100 * lead.share:.0f} % of the misfit, but all effects of the "
+        f"catalogue together leave {100 * i.share:.0f} % of it, "
+        f"{i.variance_factor**0.5:.2g} times the stated noise{follows}: {lead.effect} may only "
+        f"resemble the missing effect{_repeats_scatter_less(i.noise, d.pure_error)}"
+    )
+
+
+def _no_suspect(d: Diagnosis) -> str:
+    none = f"no effect of the catalogue explains {100 * LEAST_SHARE:.0f} % of it or more"
+    if d.suspects and d.suspects[0].explains:
+        best = d.suspects[0]
+        tried = best.effect in d.history.rejected
+        none = (
+            f"the best effect of the catalogue, {best.effect}, explains {100 * best.share:.0f} % "
+            f"of it, but does not {'' if tried else 'surely '}lower the error on poses left out"
+        )
+    follows = f"; it follows {' and '.join(d.follows)}" if d.follows else ""
+    return (
+        f"Residuals are {_spread(d)}, a generic regression predicts "
+        f"{100 * d.predictable_share:.0f} % of the misfit, and {none}{follows}"
+        f"{_repeats_scatter_less(d.noise, d.pure_error)}"
+    )
+
+
+def _misjudged(d: Diagnosis) -> str:
+    if d.noise is None:
+        raise ValueError("a diagnosis of misjudged noise without a judgement of the noise")
+    repeats = d.pure_error
+    if d.noise.reason == "repeats" and repeats is not None:
+        compared = "less" if d.fit.variance_factor < 1 else "more"
+        return (
+            f"Repeated readings scatter {repeats.factor**0.5:.2g} times as much as stated, and "
+            f"the residuals no {compared} than the repeats: scale the covariance by "
+            f"{repeats.factor:.2g}; no effect is missing{noise_place(repeats)}"
+        )
+    if d.noise.reason == "too_large":
+        return (
+            f"Residuals are only {_spread(d)}: the stated covariance is too large"
+            f"{noise_place(repeats)}"
+        )
+    few = "without repeated readings" if repeats is None else "with so few repeated readings"
+    return (
+        f"Residuals are {_spread(d)} and nothing predicts them; {few} it cannot be known whether "
+        "the noise is larger than stated: repeat some readings"
+    )
+
+
+def _spread(d: Diagnosis) -> str:
+    return f"{d.fit.variance_factor**0.5:.2g} times the stated noise"
+
+
+def _repeats_scatter_less(noise: NoiseVerdict | None, repeats: PureError | None) -> str:
+    """Return the end of a sentence on repeats that scatter less than the residuals."""
+    if noise is None or noise.reason != "lack_of_fit" or repeats is None:
+        return ""
+    factor = repeats.factor**0.5
+    return f"; repeated readings scatter only {factor:.2g} times what is stated"
+
+
+def noise_place(repeats: PureError | None) -> str:
+    """Return the end of a sentence on where the noise differs most from what is stated."""
+    if repeats is None or repeats.where is None:
+        return ""
+    w = repeats.where
+    readings = "unloaded readings" if w.name == "unloaded" else w.name
+    place = {"axis": w.name, "joint": f"along the motion of {w.name}"}.get(
+        w.kind, f"{'of' if w.name == 'unloaded' else 'under'} {readings}"
+    )
+    return (
+        f"; it differs most {place}, where the repeats scatter {w.factor**0.5:.2g} times as much "
+        "as stated"
+    )
