@@ -56,9 +56,9 @@ def check_effect(kind: type[Effect]) -> None:
     """Check that an effect keeps to the protocol, as scikit-learn's `check_estimator` does.
 
     Tried on 30 states of a six-joint arm, or of one with seven: class attributes; shapes and
-    finite values of what each method returns; that the deviation is linear in the parameters and
-    each state stands for itself; `response`, `wrench_columns` and `compliance_columns` against
-    difference quotients; that all columns of the readings that are used are named in `needs`.
+    finite values of what each method returns; that each state stands for itself; `response`,
+    `wrench_columns` and `compliance_columns` against difference quotients; that all columns of
+    the readings that are used are named in `needs`.
 
     Args:
         kind: the class.
@@ -67,33 +67,45 @@ def check_effect(kind: type[Effect]) -> None:
         InputError: what is wrong, in one line: the file, the class or effect, what would be valid.
     """
     where = source_of(kind)
-    if wrong := _class_problem(kind):
-        raise InputError(f"{where}: class {kind.__name__} {wrong}")
+    try:
+        _class(kind)
+    except InputError as error:
+        raise InputError(f"{where}: class {kind.__name__} {error}") from None
     problems = []
     for joints in JOINTS:
         try:
-            wrong = _problem(kind, example_cell(joints))
+            _try(kind, example_cell(joints))
         except HilcalError as error:
             problems.append(InputError(f"{where}: effect {kind.name}: {error}"))
         except Exception as error:
             raised = f"{where}: effect {kind.name}: {type(error).__name__}: {error}"
             problems.append(failure_of(error) or InputError(raised))
         else:
-            if wrong is None:
-                return
-            problems.append(InputError(f"{where}: effect {kind.name}: {wrong}"))
+            return
     raise problems[0]
 
 
-def _class_problem(kind: type[Effect]) -> str | None:
-    """Return what is wrong with the attributes of a class."""
-    if missing := sorted(getattr(kind, "__abstractmethods__", ())):
-        return f"lacks {' and '.join(missing)}"
-    if kind.deviation is not Effect.deviation:
-        return "overrides deviation; give columns, in whose parameters the law is linear"
-    name = "lower-case letters, digits and _, a letter first"
+def _need(good: object, wrong: str) -> None:
+    if not good:
+        raise InputError(wrong)
+
+
+def _is_text(value: object) -> bool:
+    return isinstance(value, str) and bool(value.strip())
+
+
+def _class(kind: type[Effect]) -> None:
+    """Check the attributes of a class."""
+    missing = sorted(getattr(kind, "__abstractmethods__", ()))
+    _need(not missing, f"lacks {' and '.join(missing)}")
+    own = kind.deviation is Effect.deviation
+    _need(own, "overrides deviation; give columns, in whose parameters the law is linear")
     rules: tuple[tuple[str, str, Callable[[Any], bool]], ...] = (
-        ("name", name, lambda v: isinstance(v, str) and bool(NAME.fullmatch(v))),
+        (
+            "name",
+            "lower-case letters, digits and _, a letter first",
+            lambda v: isinstance(v, str) and bool(NAME.fullmatch(v)),
+        ),
         ("summary", "the law in one line", lambda v: _is_text(v) and "\n" not in v),
         ("elastic", "True, False", lambda v: isinstance(v, bool)),
         (
@@ -110,15 +122,9 @@ def _class_problem(kind: type[Effect]) -> str | None:
     )
     for key, valid, good in rules:
         found = getattr(kind, key, None)
-        if not good(found):
-            return f"has {key} = {found!r}; valid: {valid}"
-    if kind.role in FRAME_ROLES and not set(PRIOR_HELP) <= set(kind.option_help):
-        return f"has the role {kind.role}; add {' and '.join(PRIOR_HELP)} to option_help"
-    return None
-
-
-def _is_text(value: object) -> bool:
-    return isinstance(value, str) and bool(value.strip())
+        _need(good(found), f"has {key} = {found!r}; valid: {valid}")
+    has_priors = kind.role not in FRAME_ROLES or set(PRIOR_HELP) <= set(kind.option_help)
+    _need(has_priors, f"has role = {kind.role!r}; add {' and '.join(PRIOR_HELP)} to option_help")
 
 
 def _columns_of(needs: tuple[str, ...]) -> set[str]:
@@ -126,78 +132,72 @@ def _columns_of(needs: tuple[str, ...]) -> set[str]:
     return {column for need in needs for column in str(need).split(" or ")}
 
 
-def _problem(kind: type[Effect], cell: Cell) -> str | None:
-    """Return the first thing that is wrong with an effect on an arm."""
+def _try(kind: type[Effect], cell: Cell) -> None:
+    """Compute an effect on an arm, and check what it returns."""
     states = example_states(cell)
     effect, s = kind(cell, states), example_situation(cell, states)
-    if wrong := _parameters(effect):
-        return wrong
+    _parameters(effect)
     scale = np.array([p.scale for p in effect.parameters])
     theta = scale * np.random.default_rng(1).uniform(0.5, 1.5, len(scale))
-    return (
-        _columns(effect, s)
-        or _results(effect, theta, s)
-        or _states(effect, theta, s)
-        or _elastic(effect, theta, s)
-        or _load(effect, theta, s, scale)
-        or _compliance(effect, theta, s)
-        or _needs(kind, cell, states)
-        or _columns(effect.for_scoring(states), s)
-    )
+    _columns(effect, s)
+    _results(effect, theta, s)
+    _states(effect, theta, s)
+    _elastic(effect, theta, s)
+    _load(effect, theta, s, scale)
+    _compliance(effect, theta, s)
+    _needs(kind, cell, states)
+    _columns(effect.for_scoring(states), s)
 
 
-def _parameters(effect: Effect) -> str | None:
-    found: object = effect.parameters
-    if not isinstance(found, tuple) or not found:
-        return f"parameters are {found!r}; expected a tuple of one Parameter or more"
+def _parameters(effect: Effect) -> None:
+    found: Any = effect.parameters
+    good = isinstance(found, tuple) and len(found) > 0
+    _need(good, f"parameters are {found!r}; expected a tuple of one Parameter or more")
     for p in found:
-        if not isinstance(p, Parameter) or not (_is_text(p.name) and _is_text(p.unit)):
-            return f"parameters hold {p!r}; expected Parameter(name, unit, scale, meaning)"
-        if not isinstance(p.scale, int | float) or not 0 < p.scale < np.inf:
-            return (
-                f"parameters {p.name}: scale = {p.scale!r}; expected an ordinary magnitude, more "
-                "than 0"
-            )
+        good = isinstance(p, Parameter) and _is_text(p.name) and _is_text(p.unit)
+        _need(good, f"parameters hold {p!r}; expected Parameter(name, unit, scale, meaning)")
+        good = isinstance(p.scale, int | float) and 0 < p.scale < np.inf
+        expected = "expected an ordinary magnitude, more than 0"
+        _need(good, f"parameters {p.name}: scale = {p.scale!r}; {expected}")
     names = [p.name for p in found]
-    twice = [name for name in names if names.count(name) > 1]
-    return f"parameters hold {twice[0]!r} twice" if twice else None
+    _need(len(set(names)) == len(names), f"parameters have a name twice: {', '.join(names)}")
 
 
-def _columns(effect: Effect, s: Situation) -> str | None:
-    """Return what is wrong with fields, indices, shapes and values of the columns."""
-    found: object = effect.columns(s)
-    if not isinstance(found, tuple) or not all(isinstance(c, Columns) for c in found):
-        return f"columns returns {type(found).__name__}; expected a tuple of Columns"
+def _columns(effect: Effect, s: Situation) -> None:
+    """Check fields, indices, shapes and values of the columns."""
+    found: Any = effect.columns(s)
+    good = isinstance(found, tuple) and all(isinstance(c, Columns) for c in found)
+    _need(good, f"columns returns {type(found).__name__}; expected a tuple of Columns")
     size, (count, n) = len(effect.parameters), s.angle.shape
     for c in found:
-        if c.field not in get_args(Field):
-            return f"columns has the field {c.field!r}; valid: {', '.join(get_args(Field))}"
+        valid = get_args(Field)
+        _need(c.field in valid, f"columns has the field {c.field!r}; valid: {', '.join(valid)}")
         limits = {"parameter": (c.parameter, size)}
         if c.field in ("dq", "twist"):
             limits["element"] = (c.element, n + (c.field == "twist"))
         for key, (index, most) in limits.items():
             a = np.asarray(index)
-            if a.ndim != 1 or a.dtype.kind not in "iu" or len(a) != np.size(c.parameter):
-                return f"columns has {key} = {index!r}; expected an array (P,) of whole numbers"
-            if a.size and (a.min() < 0 or a.max() >= most):
-                return f"columns has {key} = {a.tolist()}; valid: 0 to {most - 1}"
+            good = a.ndim == 1 and a.dtype.kind in "iu" and len(a) == np.size(c.parameter)
+            _need(good, f"columns has {key} = {index!r}; expected an array (P,) of whole numbers")
+            good = bool(np.all((a >= 0) & (a < most)))
+            _need(good, f"columns has {key} = {a.tolist()}; valid: 0 to {most - 1}")
         per = (len(c.parameter),) if c.field in ("dq", "scale") else (len(c.parameter), 6)
-        if wrong := _array(f"columns has {c.field} values", c.values, (count, *per), (1, *per)):
-            return wrong
-    return None
+        _array(f"columns has {c.field} values", c.values, (count, *per), (1, *per))
 
 
-def _results(effect: Effect, theta: Floats, s: Situation) -> str | None:
-    """Return what is wrong with types, shapes and values of what the other methods return."""
+def _results(effect: Effect, theta: Floats, s: Situation) -> None:
+    """Check types, shapes and values of what the other methods return."""
     (count, n), size = s.angle.shape, len(theta)
     step, prior = np.zeros((count, 2, n + 1, 6)), effect.prior_std()
-    change: object = effect.load_change(theta)
-    response: object = effect.response(theta, s, step)
-    if change is not None and not isinstance(change, LoadChange):
-        return f"load_change returns {type(change).__name__}; expected a LoadChange or None"
-    if not isinstance(response, Response):
-        return f"response returns {type(response).__name__}; expected a Response"
-    optional: tuple[tuple[str, Any, tuple[int, ...]], ...] = (
+    change: Any = effect.load_change(theta)
+    response: Any = effect.response(theta, s, step)
+    for method, found, expected in (
+        ("load_change", change, LoadChange | None),
+        ("response", response, Response),
+    ):
+        wrong = f"{method} returns {type(found).__name__}; expected {expected}"
+        _need(isinstance(found, expected), wrong)
+    for what, found, shape in (
         ("response has dq", response.dq, (count, 2, n)),
         ("response has twist", response.twist, (count, 2, n + 1, 6)),
         ("wrench_change is", effect.wrench_change(theta, s), (count, 6)),
@@ -205,68 +205,67 @@ def _results(effect: Effect, theta: Floats, s: Situation) -> str | None:
         ("compliance is", effect.compliance(theta), (n,)),
         ("groups is", effect.groups(), (size,)),
         ("prior_std is", None if prior is None else prior > 0, (size,)),
-    )
-    for what, found, shape in optional:
-        if found is not None and (wrong := _array(what, found, shape)):
-            return wrong
-    if type(effect)(s.cell, s.states, effect.options).parameters != effect.parameters:
-        return "its options do not build it again; keep in self.options what setup chooses"
-    return None
+    ):
+        if found is not None:
+            _array(what, found, shape)
+    same = type(effect)(s.cell, s.states, effect.options).parameters == effect.parameters
+    _need(same, "its options do not build it again; keep in self.options what setup chooses")
 
 
-def _array(what: str, found: object, *shapes: tuple[int, ...]) -> str | None:
-    """Return what is wrong with an array: its type, its shape, or values that are not finite."""
-    if not isinstance(found, np.ndarray) or found.dtype.kind not in "fiub":
-        return f"{what} of type {type(found).__name__}; expected an array of numbers"
-    if found.shape not in shapes:
-        expected = " or ".join(str(shape) for shape in dict.fromkeys(shapes))
-        return f"{what} of shape {found.shape}; expected {expected}"
-    return None if np.isfinite(found).all() else f"{what} of which some are not finite"
+def _array(what: str, found: Any, *shapes: tuple[int, ...]) -> None:
+    """Check an array: its type, its shape, and that all values are finite."""
+    good = isinstance(found, np.ndarray) and found.dtype.kind in "fiub"
+    _need(good, f"{what} of type {type(found).__name__}; expected an array of numbers")
+    expected = " or ".join(str(shape) for shape in dict.fromkeys(shapes))
+    _need(found.shape in shapes, f"{what} of shape {found.shape}; expected {expected}")
+    _need(np.isfinite(found).all(), f"{what} of which some are not finite")
 
 
-def _states(effect: Effect, theta: Floats, s: Situation) -> str | None:
-    """Return whether the deviation of a state depends on the other states."""
+def _states(effect: Effect, theta: Floats, s: Situation) -> None:
+    """Check that the deviation of a state does not depend on the other states."""
     few = slice(0, len(s.states) // 3)
     own = effect.deviation(theta, s)
     alone = effect.deviation(theta, example_situation(s.cell, s.states[few]))
     for key in _FIELDS:
         a, b = _field(alone, key), _field(own, key)[few]
-        if not np.allclose(a, b, rtol=0.0, atol=ROUNDING * np.abs(a).max()):
-            return (
-                "columns of a state depend on the other states; take what is of all of them, as a "
-                "reference, in setup(self, states)"
-            )
-    return None
+        _need(
+            np.allclose(a, b, rtol=0.0, atol=ROUNDING * np.abs(a).max()),
+            "columns of a state depend on the other states; take what is of all of them, as a "
+            "reference, in setup(self, states)",
+        )
 
 
-def _elastic(effect: Effect, theta: Floats, s: Situation) -> str | None:
+def _elastic(effect: Effect, theta: Floats, s: Situation) -> None:
     """Compare `elastic` and `response` with how the deviation follows the wrenches."""
     rng = np.random.default_rng(2)
     step = STEP * rng.normal(size=s.wrench.shape) * [60, 60, 60, 20, 20, 20]
-    up = effect.deviation(theta, replace(s, wrench=s.wrench + step))
-    down = effect.deviation(theta, replace(s, wrench=s.wrench - step))
-    moved = {key: (_field(up, key) - _field(down, key)) / 2 for key in _FIELDS}
-    if not effect.elastic:
-        if any(np.any(m) for m in moved.values()):
-            return "columns follow the wrenches; set elastic = True and give response"
-        return None
+    up, down = (replace(s, wrench=w) for w in (s.wrench + step, s.wrench - step))
     response = effect.response(theta, s, step[:, None])
-    for key, quotient in moved.items():
+    for key, quotient in _quotients(effect, theta, up, down).items():
+        still = effect.elastic or not np.any(quotient)
+        _need(still, "columns follow the wrenches; set elastic = True and give response")
         given = getattr(response, key, None)
         found = np.zeros(1) if given is None else given[:, 0]
-        if wrong := _differs("response", f"of columns by the wrenches: {key}", found, quotient):
-            return wrong
-    return None
+        _agree("response", f"of columns by the wrenches: {key}", found, quotient)
 
 
-def _load(effect: Effect, theta: Floats, s: Situation, scale: Floats) -> str | None:
+def _compliance(effect: Effect, theta: Floats, s: Situation) -> None:
+    """Compare `compliance_columns` with how the deviation follows the joint compliances."""
+    step = STEP * s.compliance * np.random.default_rng(4).normal(size=len(s.compliance))
+    up, down = (replace(s, compliance=c) for c in (s.compliance + step, s.compliance - step))
+    found = total(effect.compliance_columns(theta, s), step, s)
+    for key, quotient in _quotients(effect, theta, up, down).items():
+        what = f"of columns by the compliance: {key}"
+        _agree("compliance_columns", what, _field(found, key), quotient)
+
+
+def _load(effect: Effect, theta: Floats, s: Situation, scale: Floats) -> None:
     """Compare `wrench_columns` with how the effect changes the load."""
     step = STEP * scale * np.random.default_rng(3).normal(size=len(scale))
     up, down = (_transmitted(effect, t, s) for t in (theta + step, theta - step))
     found = effect.wrench_columns(theta, s)
     given = np.zeros(1) if found is None else np.einsum("npki,p->nki", found, step)
-    what = "of the wrenches by the parameters: it"
-    return _differs("wrench_columns", what, given, (up - down) / 2)
+    _agree("wrench_columns", "of the wrenches by the parameters: it", given, (up - down) / 2)
 
 
 def _transmitted(effect: Effect, theta: Floats, s: Situation) -> Floats:
@@ -281,48 +280,31 @@ def _transmitted(effect: Effect, theta: Floats, s: Situation) -> Floats:
     return slot_wrenches(s.cell.arm, s.chain, load)
 
 
-def _compliance(effect: Effect, theta: Floats, s: Situation) -> str | None:
-    """Compare `compliance_columns` with how the deviation follows the joint compliances."""
-    step = STEP * s.compliance * np.random.default_rng(4).normal(size=len(s.compliance))
-    up, down = (
-        effect.deviation(theta, replace(s, compliance=c))
-        for c in (s.compliance + step, s.compliance - step)
-    )
-    columns = effect.compliance_columns(theta, s)
-    found = total(columns, step, s)
-    for key in _FIELDS:
-        quotient = (_field(up, key) - _field(down, key)) / 2
-        what = f"of columns by the compliance: {key}"
-        if wrong := _differs("compliance_columns", what, _field(found, key), quotient):
-            return wrong
-    return None
-
-
-def _needs(kind: type[Effect], cell: Cell, states: States) -> str | None:
-    """Return whether an effect uses a column that it does not name."""
-    for column in NEEDS:
+def _needs(kind: type[Effect], cell: Cell, states: States) -> None:
+    """Check that an effect uses no column that it does not name."""
+    for column in (c for c in NEEDS if c not in _columns_of(kind.needs)):
         nothing: dict[str, Any] = {column: None}
         fewer = replace(states, **nothing)
-        if column in _columns_of(kind.needs) or not kind.computable(fewer):
-            continue
         try:
             kind(cell, fewer).columns(example_situation(cell, fewer))
         except Exception:
-            return f'uses {column}; name it: needs = ("{column}",)'
-    return None
+            raise InputError(f'uses {column}; name it: needs = ("{column}",)') from None
 
 
-def _differs(method: str, of_what: str, found: Floats, expected: Floats) -> str | None:
-    """Return by how much a derivative differs from the difference quotient, where it does."""
-    size = float(max(np.abs(found).max(), np.abs(expected).max()))
-    off = float(np.abs(found - expected).max()) / size if size > 0 else 0.0
-    if off <= AGREES:
-        return None
-    return (
-        f"{method} is not the derivative {of_what} is off by {100 * off:.1f} % of the largest value"
-    )
+def _quotients(effect: Effect, theta: Floats, up: Situation, down: Situation) -> dict[str, Floats]:
+    """Half the difference of two deviations, by field."""
+    a, b = effect.deviation(theta, up), effect.deviation(theta, down)
+    return {key: (_field(a, key) - _field(b, key)) / 2 for key in _FIELDS}
 
 
 def _field(deviation: Deviation, key: str) -> Floats:
     found: Floats | None = getattr(deviation, key)
     return np.zeros(1) if found is None else found
+
+
+def _agree(method: str, of_what: str, found: Floats, expected: Floats) -> None:
+    """Compare a derivative with the difference quotient."""
+    size = float(max(np.abs(found).max(), np.abs(expected).max()))
+    off = float(np.abs(found - expected).max()) / size if size > 0 else 0.0
+    wrong = f"{method} is not the derivative {of_what} is off by {100 * off:.1f} %"
+    _need(off <= AGREES, f"{wrong} of its largest value")
