@@ -28,7 +28,7 @@ MAX_EQUILIBRIUM_STEPS = 30
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
-    """What a model says of N states.
+    """What a model predicts of N states.
 
     Attributes:
         situation: the states at their deflected configuration.
@@ -240,8 +240,8 @@ class Model:
 
     def _compliance(self, theta: Floats) -> Floats:
         """(n,) joint compliances in force."""
-        told = [c for e, t in self._parts(theta) if (c := e.compliance(t)) is not None]
-        return told[0] if told else typical_compliances(self.cell)
+        found = [c for e, t in self._parts(theta) if (c := e.compliance(t)) is not None]
+        return found[0] if found else typical_compliances(self.cell)
 
     def _load(self, states: States, theta: Floats) -> Load:
         """Load as recorded, where it acts, and the weights."""

@@ -63,13 +63,13 @@ def _options_table(made: list[Effect], defaults: dict[str, dict[str, object]]) -
     """Return the options of effects; an option that others have too is explained once."""
     out = text.table("effect", "option", "default", "what it chooses", left=(0, 1, 2, 3))
     out.columns[0].no_wrap = out.columns[1].no_wrap = True
-    seen: dict[tuple[str, str], str] = {}
+    explained: dict[tuple[str, str], str] = {}
     for e in made:
         for option, meaning in e.option_help.items():
-            first = seen.setdefault((option, meaning), e.name)
-            told = meaning if first == e.name else f"as for {first}"
+            first = explained.setdefault((option, meaning), e.name)
+            words = meaning if first == e.name else f"as for {first}"
             default = written(defaults[e.name][option])
-            out.add_row(e.name, option, Text(default), Text(told))
+            out.add_row(e.name, option, Text(default), Text(words))
     return out
 
 
@@ -128,7 +128,7 @@ def _check_name(name: str) -> None:
     """Refuse a name that an effect cannot have.
 
     Raises:
-        InputError: says what would be valid.
+        InputError: lists what would be valid.
     """
     if not NAME.fullmatch(name) or keyword.iskeyword(name):
         raise InputError(

@@ -44,11 +44,11 @@ NEEDS = (
 """Columns of `States` that readings may lack."""
 AGREES = 1e-3
 """Share of the largest value by which a derivative may differ from the difference quotient. A
-guess: central differences of steps of `STEP` agree to about 1e-6 for all built-in effects."""
+guess, far above 1e-5, by which the built-in effects differ at most (`backlash`)."""
 ROUNDING = 1e-9
 """Share of the largest value that rounding may change; a guess, far above 1e-16."""
 STEP = 1e-4
-"""Steps of difference quotients, in ordinary magnitudes."""
+"""Step of difference quotients, in ordinary magnitudes; a guess between rounding and curvature."""
 _FIELDS = Deviation.__slots__
 
 

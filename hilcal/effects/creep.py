@@ -13,6 +13,7 @@ from hilcal.errors import InputError
 from hilcal.types import Floats
 
 SECOND = 1.0
+"""Unit of time of the law, s."""
 
 
 class Creep(PerJoint):

@@ -1,4 +1,4 @@
-"""What the errors of a force sensor share: its axes, and which states it said anything of."""
+"""What the errors of a force sensor share: its axes, and the states in which it measured."""
 
 from abc import abstractmethod
 from typing import ClassVar
@@ -16,7 +16,7 @@ FORCE_AXES = ("x", "y", "z")
 
 
 class ForceSensorEffect(Effect):
-    """The recorded wrench is what a force sensor said; what acts is another.
+    """The recorded wrench is what the force sensor measured; the acting one differs from it.
 
     It acts through the elastic effects only. With R the sensor's axes in base axes (the
     deflected flange, times an optional turn), w the recorded wrench at the load point as
@@ -40,11 +40,11 @@ class ForceSensorEffect(Effect):
         self.axes = se3.rotation(turn)
 
     @abstractmethod
-    def error(self, theta: Floats, said: Floats) -> Floats:
-        """Return h (N, 6) for wrenches (N, 6) as said, both in sensor axes."""
+    def error(self, theta: Floats, recorded: Floats) -> Floats:
+        """Return h (N, 6) for recorded wrenches (N, 6), both in sensor axes."""
 
     @abstractmethod
-    def error_columns(self, theta: Floats, said: Floats) -> Floats:
+    def error_columns(self, theta: Floats, recorded: Floats) -> Floats:
         """Derivative of h by the parameters, (N, P, 6) or (1, P, 6)."""
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:
@@ -54,19 +54,19 @@ class ForceSensorEffect(Effect):
     def wrench_change(self, theta: Floats, s: Situation) -> Floats:
         """Return −R h."""
         r = self._sensor(s)
-        return -_turned(r, self.error(theta, self._said(s, r))) * _loaded(s)
+        return -_turned(r, self.error(theta, self._recorded(s, r))) * _loaded(s)
 
     def wrench_columns(self, theta: Floats, s: Situation) -> Floats:
         """Slot wrenches by the derivative of −R h."""
         r = self._sensor(s)
-        change = -_turned(r[:, None], self.error_columns(theta, self._said(s, r)))
+        change = -_turned(r[:, None], self.error_columns(theta, self._recorded(s, r)))
         return load_wrench_change(s.chain, s.load, change * _loaded(s)[:, None])
 
     def _sensor(self, s: Situation) -> Floats:
         """(N, 3, 3) sensor axes in base axes."""
         return np.asarray(se3.product(s.chain.rotation[-1], self.axes))
 
-    def _said(self, s: Situation, r: Floats) -> Floats:
+    def _recorded(self, s: Situation, r: Floats) -> Floats:
         """(N, 6) recorded wrench, sensor axes."""
         return _turned(np.swapaxes(r, 1, 2), s.states.wrench)
 

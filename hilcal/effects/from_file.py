@@ -44,7 +44,7 @@ def read_effects(path: Path) -> EffectFile:
     sys.modules[module.__name__] = module
     try:
         with redirect_stdout(sys.stderr):  # stdout may be for one JSON document
-            exec(code, module.__dict__)  # noqa: S102 - the user gave this file to be run
+            exec(code, module.__dict__)  # noqa: S102 - a file that the user named
     except (Exception, SystemExit) as error:
         line = line_in(error, where)
         raise InputError(f"{where}{line}: {type(error).__name__}: {error}") from error

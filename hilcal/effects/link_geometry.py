@@ -10,7 +10,7 @@ AXES = ("x", "y", "z", "rx", "ry", "rz")
 class LinkGeometry(Effect):
     """Constant twist of each link, in the axes of its end; over-complete on purpose.
 
-    Six parameters for each of the n + 1 links. Many combinations cannot be seen (a shift
+    Six parameters for each of the n + 1 links. Many combinations are not identifiable (a shift
     along a joint's axis can be made before or after it); rank analysis drops those.
     """
 

@@ -12,9 +12,10 @@ Options = Mapping[str, object]
 
 
 UNKNOWN_RATING = 150.0
-"""Rated torque of a joint of which nothing is known, N·m."""
+"""Rated torque where the arm's description has none, N·m: a middle-sized joint; a guess."""
 TYPICAL_TWIST = 2e-3
-"""Twist of a joint at its rated torque where nothing tells its compliance, rad."""
+"""Twist of a joint at its rated torque where its compliance is unknown, rad. A guess within the
+0.3 to 5 mrad of most arms."""
 
 PRIOR_HELP = dict.fromkeys(
     ("prior_m", "prior_rad"), "standard deviation of what is known of it already."

@@ -1,4 +1,4 @@
-"""What effects with parameters of joints share: which joints have one, and which share one."""
+"""What effects with parameters per joint have in common: which joints have one or share one."""
 
 import math
 import re
@@ -48,7 +48,7 @@ def joint_groups(effect: str, options: Options, count: int) -> JointGroups:
     parameter for joint 2, one for 3 and one for 4 to 6; a joint that is not named has none.
 
     Raises:
-        InputError: says what is wrong with it, and what would be valid.
+        InputError: what is wrong with it, and what would be valid.
     """
     given = options["joints"]
     text = str(given) if type(given) is int else given
@@ -79,7 +79,7 @@ def joint_groups(effect: str, options: Options, count: int) -> JointGroups:
 def _read(text: str, count: int) -> tuple[list[list[int]], str]:
     """Return the groups of joint indices; or none, and what is wrong."""
     groups: list[list[int]] = []
-    seen: set[int] = set()
+    used: set[int] = set()
     for part in text.split("/"):
         group: list[int] = []
         for piece in part.split("+"):
@@ -93,9 +93,9 @@ def _read(text: str, count: int) -> tuple[list[list[int]], str]:
             for joint in range(first, last + 1):
                 if not 1 <= joint <= count:
                     return [], f", there is no joint {joint}"
-                if joint in seen:
+                if joint in used:
                     return [], f", joint {joint} is there twice"
-                seen.add(joint)
+                used.add(joint)
                 group.append(joint - 1)
         groups.append(group)
     return groups, ""
@@ -140,7 +140,7 @@ class PerJoint(Effect):
             ordinary: (n,) ordinary magnitude at each joint; that of a group is the geometric
                 mean of its joints'.
             meaning: with "{joint}" and "{kind}" where they belong.
-            kinds: what tells the parameters of one group apart, as ".cos2", with its words.
+            kinds: suffixes of the parameters of one group, as ".cos2", each with its words.
         """
         g = self.shared
         sizes: list[list[float]] = [[] for _ in g.labels]
@@ -149,9 +149,9 @@ class PerJoint(Effect):
         scales = [math.prod(s) ** (1 / len(s)) for s in sizes]
         each = (kinds or {"": ""}).items()
         return tuple(
-            Parameter(f"j{label}{kind}", unit, scale, meaning.format(joint=words, kind=said))
+            Parameter(f"j{label}{kind}", unit, scale, meaning.format(joint=words, kind=phrase))
             for label, words, scale in zip(g.labels, g.words, scales, strict=True)
-            for kind, said in each
+            for kind, phrase in each
         )
 
     def joint_columns(self, field: JointField, values: Floats) -> Columns:

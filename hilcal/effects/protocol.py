@@ -1,9 +1,9 @@
 """What an effect is: parameters, a deviation linear in them, and the derivative of it.
 
-An effect says *where it acts* (a `Deviation`), not what the tool does; the chain does the
-rest. A new effect is one small class in one file: `parameters`, `columns`, and where it is
-elastic `response`. One that acts through the load has no columns: it gives `load_change` or
-`wrench_change`, and their derivative `wrench_columns`.
+An effect returns where it acts (a `Deviation`), not how the tool moves; the kinematic chain is
+evaluated on the sum of all deviations. A new effect is one small class in one file: `parameters`,
+`columns`, and where it is elastic `response`. One that acts through the load has no columns: it
+returns `load_change` or `wrench_change`, and their derivative `wrench_columns`.
 """
 
 from abc import ABC, abstractmethod
@@ -48,19 +48,19 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Situation:
-    """N states at their deflected configuration: all that a law may depend on.
+    """N states at their deflected configuration: everything that a law may depend on.
 
     Attributes:
         cell: arm, tool and target.
         states: the N states.
-        angle: (N, n) joint angles that the laws see, rad.
+        angle: (N, n) joint angles at which laws are evaluated, rad: the actual ones where recorded.
         chain: the deviated chain, or None before it is known.
         wrench: (N, n + 1, 6) wrench transmitted through each slot, slot axes; element
             (j, 5) is the torque τ of joint j + 1.
-        load: what pulls at the arm: the recorded wrench (`states.wrench`) as the model
-            corrects it, and where it acts.
-        compliance: (n,) c of the joints in force, rad/(N·m): the model's `joint_compliance`,
-            or a typical one where the model has none.
+        load: the recorded wrench (`states.wrench`) as the model corrects it, where it acts, and
+            the weights.
+        compliance: (n,) joint compliances, rad/(N·m): those of the model, or typical ones where
+            no effect of it has any.
     """
 
     cell: Cell
@@ -118,7 +118,7 @@ class Response:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadChange:
-    """Change of what pulls at the arm, in axes that move with it.
+    """Change of the load on the arm, in axes that move with it.
 
     Attributes:
         point: (3,) shift of the load point, flange axes, m; None for none.
@@ -140,7 +140,7 @@ class Effect(ABC):
         needs: columns of `States` without which the effect cannot be computed; "a or b"
             where one of two will do.
         option_help: the options that the constructor takes: name and meaning.
-        role: which models have the effect without being told:
+        role: which models have the effect without its being named:
             "registration": every model while the tracker-to-base registration is unknown; its
                 six parameters are a twist of the base, in base axes.
             "target": every model while the target's place on the flange is unknown; its first
@@ -233,20 +233,20 @@ class Effect(ABC):
         return None
 
     def compliance(self, theta: Floats) -> Floats | None:
-        """(n,) joint compliances that other effects build on, rad/(N·m); None: not told."""
+        """(n,) joint compliances for the laws of other effects, rad/(N·m); None where none."""
         return None
 
     def compliance_columns(self, theta: Floats, s: Situation) -> tuple[Columns, ...]:
-        """Derivative of the deviation by `s.compliance`, for effects that build on it.
+        """Derivative of the deviation by `s.compliance`, for effects whose law contains it.
 
         The parameters of these columns are the n joints.
         """
         return ()
 
     def of_compliance(self, columns: Columns) -> Columns:
-        """Turn columns by the compliances of the n joints into such by this effect's parameters.
+        """Convert derivatives by the n joint compliances into those by this effect's parameters.
 
-        For effects that tell a `compliance`; here joint j's is parameter j.
+        For effects that return a `compliance`; here parameter j is that of joint j.
         """
         return columns
 

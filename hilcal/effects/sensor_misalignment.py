@@ -21,15 +21,15 @@ class SensorMisalignment(ForceSensorEffect):
             Parameter(f"r{a}", "rad", 1e-2, f"turn of the sensor about its {a}") for a in "xyz"
         )
 
-    def error(self, theta: Floats, said: Floats) -> Floats:
+    def error(self, theta: Floats, recorded: Floats) -> Floats:
         """Return w − exp([δ]×) w."""
         turn = se3.rotation(theta)
-        parts = [said[:, :3], said[:, 3:]]
+        parts = [recorded[:, :3], recorded[:, 3:]]
         return np.concatenate([v - v @ turn.T for v in parts], axis=1)
 
-    def error_columns(self, theta: Floats, said: Floats) -> Floats:
+    def error_columns(self, theta: Floats, recorded: Floats) -> Floats:
         """Return exp([δ]×) [w]× J_r(δ), the derivative of −exp([δ]×) w."""
         twist = np.concatenate([np.zeros(3), theta])
         turn, j = se3.rotation(theta), se3.right_jacobian_blocks(twist)[0]
-        parts = [turn @ se3.skew(v) @ j for v in (said[:, :3], said[:, 3:])]
+        parts = [turn @ se3.skew(v) @ j for v in (recorded[:, :3], recorded[:, 3:])]
         return np.swapaxes(np.concatenate(parts, axis=1), 1, 2)

@@ -31,7 +31,7 @@ class TargetOffset(Effect):
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """Displacement along, and where asked rotation about, the flange's axes."""
+        """Displacement along, and with `rotation` rotation about, the flange's axes."""
         lengths = [Parameter(a, "m", 1e-3, f"offset along flange {a}") for a in "xyz"]
         turns = [Parameter(f"r{a}", "rad", 1e-3, f"turn about flange {a}") for a in "xyz"]
         return tuple((lengths + turns)[: self.size])

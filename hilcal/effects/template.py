@@ -62,7 +62,7 @@ class Template(Effect):
         s.states.joint_temperature (N, n) and so on; each state by itself. What is of all states,
         as the first time, belongs into `setup(self, states)`, which is called once.
 
-        Columns(field, parameter, element, values) says what moves:
+        Columns(field, parameter, element, values) is what moves:
 
             "dq"       joint `element`, by values (N, P) in rad
             "twist"    everything beyond slot `element`, by values (N, P, 6): displacement and

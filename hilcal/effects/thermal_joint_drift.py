@@ -23,7 +23,7 @@ class ThermalJointDrift(PerJoint):
     }
 
     def setup(self, states: States) -> None:
-        """Take the temperatures at the first reading as the reference unless told otherwise."""
+        """Take the temperatures at the first reading as the reference unless given."""
         super().setup(states)
         warm = states.joint_temperature
         assert warm is not None  # noqa: S101 - checked at construction

@@ -25,7 +25,7 @@ class TrackerDrift(Effect):
     }
 
     def setup(self, states: States) -> None:
-        """Take the time of the first reading as the reference unless told otherwise."""
+        """Take the time of the first reading as the reference unless given."""
         assert states.time is not None  # noqa: S101 - checked at construction
         self.options.setdefault("reference_s", float(states.time.min()))
         self.options.setdefault("span_s", max(float(np.ptp(states.time)), 1.0))

@@ -13,7 +13,10 @@ from hilcal.types import Ints
 MOST_HARMONICS = 120
 FEWEST_HARMONICS = 4
 POSES_PER_HARMONIC = 5
+"""A harmonic has two amplitudes per joint, which every pose shows: five poses leave the data in the
+majority. A guess, as the bounds are: the upper one limits the cost."""
 SCORED_HARMONICS = 40
+"""Bounds the cost of scoring; a guess."""
 
 
 class TransmissionError(PerJoint):

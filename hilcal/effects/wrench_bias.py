@@ -20,10 +20,10 @@ class WrenchBias(ForceSensorEffect):
             Parameter(f"f{a}", "N", 1.0, f"offset of the force along {a}") for a in "xyz"
         ) + tuple(Parameter(f"m{a}", "N·m", 0.1, f"offset of the moment about {a}") for a in "xyz")
 
-    def error(self, theta: Floats, said: Floats) -> Floats:
+    def error(self, theta: Floats, recorded: Floats) -> Floats:
         """Return b."""
-        return np.broadcast_to(theta, said.shape)
+        return np.broadcast_to(theta, recorded.shape)
 
-    def error_columns(self, theta: Floats, said: Floats) -> Floats:
+    def error_columns(self, theta: Floats, recorded: Floats) -> Floats:
         """Units."""
         return np.eye(6)[None]

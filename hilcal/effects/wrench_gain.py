@@ -27,7 +27,7 @@ class WrenchGain(ForceSensorEffect):
             for a in "xyz"
         )
 
-    def error(self, theta: Floats, said: Floats) -> Floats:
+    def error(self, theta: Floats, recorded: Floats) -> Floats:
         """Return g/(1 + g) w per axis.
 
         Raises:
@@ -38,8 +38,8 @@ class WrenchGain(ForceSensorEffect):
                 f"{self.name}: a gain error of {100 * theta.min():.0f} % turns the wrench round; "
                 "measure loads in more directions, or leave the effect out"
             )
-        return np.asarray(said * (theta / (1 + theta)))
+        return np.asarray(recorded * (theta / (1 + theta)))
 
-    def error_columns(self, theta: Floats, said: Floats) -> Floats:
+    def error_columns(self, theta: Floats, recorded: Floats) -> Floats:
         """Return w/(1 + g)² on its own axis."""
-        return np.asarray((said / (1 + theta) ** 2)[:, :, None] * np.eye(6))
+        return np.asarray((recorded / (1 + theta) ** 2)[:, :, None] * np.eye(6))

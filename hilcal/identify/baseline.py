@@ -24,7 +24,7 @@ def baseline(
 ) -> Model:
     """Return the starting model: unknown frames, and where a load acts the joints' compliance.
 
-    These are all effects of the catalogue whose `role` says so.
+    They are found by the `role` of the catalogue's effects.
 
     Args:
         cell: the cell.

@@ -28,7 +28,7 @@ def register(cell: Cell, readings: Readings) -> Cell:
     """Return the cell with unknown registration and target offset estimated.
 
     Raises:
-        CannotAnswerError: where the poses cannot tell (fewer than four distinct positions,
+        CannotAnswerError: where the poses do not determine it (fewer than four distinct positions,
             all on one line, or no rotation).
     """
     if cell.registration_known and cell.target_known:

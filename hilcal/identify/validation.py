@@ -20,7 +20,7 @@ CONVERGED = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Validation:
-    """What a model says of readings that it never saw.
+    """Prediction errors of readings that a model was not fitted to.
 
     Attributes:
         readings: the other readings.
