@@ -121,6 +121,11 @@ class Catalogue:
         """Return the effects of some roles, in order."""
         return tuple(kind for kind in self.effects if kind.role in roles)
 
+    def unknown_frames(self, cell: Cell) -> tuple[str, ...]:
+        """Return the names of the effects of those frames that a cell leaves unknown."""
+        unknown = {"registration": not cell.registration_known, "target": not cell.target_known}
+        return tuple(kind.name for kind in self.effects if unknown.get(kind.role))
+
     def with_effects(self, *kinds: type[Effect]) -> "Catalogue":
         """Return the catalogue with more effects, each checked by `check_effect`.
 

@@ -9,7 +9,6 @@ from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.effects.options import Options
-from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.effects.spec import EffectSpec
 from hilcal.identify.registration import register
 from hilcal.model import Model
@@ -69,8 +68,7 @@ def with_effects(
     """
     known, given = catalogue or installed(), options or {}
     model = Model(register(cell, readings), (), known, readings)
-    unknown = {"registration": not cell.registration_known, "target": not cell.target_known}
-    frames = [kind.name for kind in known.with_role(*FRAME_ROLES) if unknown[kind.role]]
+    frames = known.unknown_frames(cell)
     prior = _frame_prior(model, readings) if mode == "deflection" else {}
     for name in dict.fromkeys((*frames, *names)):
         begun = prior if name in frames else {}

@@ -9,7 +9,7 @@ from hilcal.config import CellConfig
 from hilcal.data.readings import States
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.effects.options import Options
-from hilcal.effects.protocol import FRAME_ROLES, Effect
+from hilcal.effects.protocol import Effect
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit
 from hilcal.identify.gauss_newton import prior_of
@@ -84,8 +84,7 @@ def assumed(
             "([sight] tracker_m tells it)"
         )
     registered, station = _registered(cell, config, place)
-    unknown = {"registration": not cell.registration_known, "target": not cell.target_known}
-    frames = [kind.name for kind in known.with_role(*FRAME_ROLES) if unknown[kind.role]]
+    frames = known.unknown_frames(cell)
     names = tuple(dict.fromkeys((*frames, *checked(config.planning.model, "model", known))))
     prior = FRAME_PRIOR if config.planning.readings == "deflection" else {}
     effects = tuple(

@@ -9,6 +9,7 @@ import pytest
 import hilcal
 from hilcal.diagnose.effect_ranking import candidates
 from hilcal.effects.catalogue import installed
+from hilcal.effects.failure import failure_of
 from hilcal.effects.protocol import Columns, Effect, Parameter, Role
 from hilcal.effects.spec import effect
 from hilcal.errors import InputError
@@ -84,3 +85,30 @@ def test_what_a_model_could_have_is_what_its_catalogue_holds() -> None:
     assert "sag" in {e.name for e in candidates(found)}
     with pytest.raises(InputError, match="class Sag: effect sag is in the catalogue already"):
         mine.with_effects(Sag)
+
+
+class Fails(Sag):
+    """Raises where there are many states."""
+
+    name = "fails"
+
+    def columns(self, s):
+        return super().columns([s][len(s.angle) > 40])
+
+
+def test_what_an_effect_raises_in_use_is_traced_to_its_line() -> None:
+    c = campaign()
+    model = baseline(c.cell, c.readings, "absolute") + effect(Fails)
+    with pytest.raises(IndexError) as caught:
+        model.predict(c.readings.states, np.zeros(model.size))
+    line = Fails.columns.__code__.co_firstlineno + 1
+    start = f"{__file__}, line {line}: effect fails: columns raises IndexError: list index out of"
+    assert str(failure_of(caught.value)).startswith(start)
+
+
+def test_what_hilcal_raises_is_no_failure_of_a_users_effect() -> None:
+    c = campaign()
+    model = baseline(c.cell, c.readings, "absolute")
+    with pytest.raises(IndexError) as caught:
+        model.predict(c.readings.states, np.zeros(0))  # no parameters
+    assert failure_of(caught.value) is None
