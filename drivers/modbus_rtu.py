@@ -1,26 +1,25 @@
-"""Reading and writing registers over Modbus RTU: one request, one answer.
+"""Holding registers over Modbus RTU by minimalmodbus, on a line that may be noisy or streaming.
 
 Modbus over Serial Line, Specification and Implementation Guide V1.02 (modbus.org, 2006).
 """
 
-import struct
-import time
+from collections.abc import Callable
+from typing import TypeVar
 
+import minimalmodbus
 import serial
 
-from drivers.frames import crc_modbus
 from drivers.serial_line import drain
 from hilcal.errors import DeviceError
 
-ANSWER_S = 0.25
+T = TypeVar("T")
 QUIET_S = 0.03
 TRIES = 2
-READ, WRITE = 3, 16
-REFUSED = 0x80
+WRITE_MULTIPLE = 16
 
 
 class NoAnswerError(DeviceError):
-    """Nothing came that could be an answer; `heard` tells whether anything came at all."""
+    """No sound answer came; `heard` is whether anything came at all."""
 
     def __init__(self, heard: bool) -> None:
         """Without a text: the caller knows what device it is."""
@@ -40,45 +39,25 @@ def read_registers(port: serial.Serial, slave: int, address: int, count: int) ->
         RefusedError: the device has no such registers.
         OSError: the port failed; termios.error likewise.
     """
-    answer = _ask(port, struct.pack(">BBHH", slave, READ, address, count), 3 + 2 * count)
-    return struct.unpack(f">{count}H", answer[3:])
+    return tuple(_ask(port, slave, lambda device: device.read_registers(address, count)))
 
 
 def write_register(port: serial.Serial, slave: int, address: int, value: int) -> None:
     """Write one register; raises as `read_registers` does."""
-    _ask(port, struct.pack(">BBHHBH", slave, WRITE, address, 1, 2, value), 6)
+    _ask(port, slave, lambda device: device.write_register(address, value, 0, WRITE_MULTIPLE))
 
 
-def _ask(port: serial.Serial, request: bytes, size: int) -> bytes:
-    """Return a sound answer of `size` bytes (without checksum), whatever comes around it."""
+def _ask(port: serial.Serial, slave: int, request: Callable[[minimalmodbus.Instrument], T]) -> T:
     heard = False
+    device = minimalmodbus.Instrument(port, slave)
     for _ in range(TRIES):
-        drain(port, QUIET_S, 4 * QUIET_S)  # also the silence that a request begins with
-        port.write(request + _crc(request))
-        end, got = time.monotonic() + ANSWER_S, b""
-        while time.monotonic() < end:
-            got += port.read(port.in_waiting)
-            if answer := _sound(got, request[:2], size):
-                return answer
-            refusal = _sound(got, bytes([request[0], request[1] | REFUSED]), 3)
-            if refusal:
-                address = int.from_bytes(request[2:4], "big")
-                raise RefusedError(f"register {address} refused (Modbus exception {refusal[2]})")
-            time.sleep(0.002)
-        heard = heard or bool(got)
+        drain(port, QUIET_S, 4 * QUIET_S)
+        try:
+            return request(device)
+        except minimalmodbus.SlaveReportedException as error:
+            raise RefusedError(f"the request is refused ({error})") from None
+        except minimalmodbus.NoResponseError:
+            continue
+        except minimalmodbus.ModbusException:
+            heard = True
     raise NoAnswerError(heard)
-
-
-def _sound(data: bytes, begin: bytes, size: int) -> bytes:
-    """The first message of `size` bytes with this beginning and a right checksum, else b""."""
-    at = data.find(begin)
-    while 0 <= at <= len(data) - size - 2:
-        message, crc = data[at : at + size], data[at + size : at + size + 2]
-        if _crc(message) == crc:
-            return message
-        at = data.find(begin, at + 1)
-    return b""
-
-
-def _crc(data: bytes) -> bytes:
-    return crc_modbus(data).to_bytes(2, "little")
