@@ -8,9 +8,8 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from drivers.simulated.campaign import simulate
 from drivers.simulated.injected_effects import nothing_hidden
-from drivers.simulated.rehearsal import measurement_noise
+from drivers.simulated.rehearsal import measurement_noise, simulate
 from drivers.simulated.world import World
 from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.demo import CELL

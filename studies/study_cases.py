@@ -6,10 +6,8 @@ from zlib import crc32
 
 import numpy as np
 
-from drivers.simulated.campaign import rehearsal_states, simulate
 from drivers.simulated.injected_effects import DEFLECTION_EFFECTS, EFFECTS, hide, nothing_hidden
-from drivers.simulated.rehearsal import as_told, measurement_noise
-from drivers.simulated.unmodelled_laws import INVENTED, Invented, invented, shift
+from drivers.simulated.rehearsal import as_told, measurement_noise, simulate
 from drivers.simulated.world import World
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
@@ -18,6 +16,8 @@ from hilcal.data.whitening import Mode
 from hilcal.errors import InputError
 from hilcal.robot.catalogue import load_arm
 from hilcal.types import Floats
+from studies.random_campaigns import rehearsal_states
+from studies.unmodelled_laws import INVENTED, Invented, invented, shift
 
 POSES = 30
 _G = 9.81  # m/s², of the pulls

@@ -4,9 +4,8 @@ from dataclasses import fields, replace
 
 import numpy as np
 
-from drivers.simulated.campaign import simulate
 from drivers.simulated.planned import planned_states
-from drivers.simulated.temperatures import air, joints
+from drivers.simulated.rehearsal import simulate
 from hilcal.config import CellConfig
 from hilcal.config.loads import Load
 from hilcal.data.readings import Readings, States
@@ -17,6 +16,7 @@ from hilcal.plan.next import measure_next
 from hilcal.plan.planner import Request
 from hilcal.types import Floats
 from studies.study_cases import StudyCase, with_study_loads
+from studies.temperatures import air, joints
 
 POSES = 20
 MOST = 3

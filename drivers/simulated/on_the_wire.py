@@ -8,10 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from drivers.simulated.campaign import simulate
 from drivers.simulated.cell_processes import SimulatedCell
 from drivers.simulated.planned import planned_states
-from drivers.simulated.rehearsal import Rehearsal, Secret, conceal, measurement_noise
+from drivers.simulated.rehearsal import Rehearsal, Secret, conceal, measurement_noise, simulate
 from hilcal.config import CellConfig
 from hilcal.data.plan import UNLOADED, Plan
 

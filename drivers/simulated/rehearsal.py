@@ -1,11 +1,10 @@
-"""The campaign of `hilcal demo`: a cell, an effect that is hidden in it, and the readings."""
+"""A simulated cell with a hidden effect, and the readings of a campaign in it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drivers.simulated.campaign import rehearsal_states, simulate
 from drivers.simulated.injected_effects import DEFLECTION_EFFECTS, EFFECTS, hide, nothing_hidden
 from drivers.simulated.tracker import SimulatedNoise
 from drivers.simulated.world import World
@@ -17,35 +16,11 @@ from hilcal.errors import InputError
 from hilcal.toml import suggest
 from hilcal.types import Ints
 
-POSES = 30
 NOTHING = "nothing"
 RANDOM = "random"
 REGISTRATION_XYZ = (2.4, -1.6, -0.5)
 REGISTRATION_ROTVEC = (0.0, 0.0, 2.1)
 _SOFTER = 1.5  # a gear that stiffens starts softer than its mean
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Rehearsal:
-    """A simulated campaign, and what was hidden in it.
-
-    Attributes:
-        config: the configuration that the program is given.
-        cell: the cell of that configuration.
-        mode: the kind of readings that shows the hidden effect.
-        world: the truth.
-        hidden: the name of the hidden effect, or "nothing".
-        strength_sigma: rms of what it does to the readings, in units of their noise.
-        readings: what was measured.
-    """
-
-    config: CellConfig
-    cell: Cell
-    mode: Mode
-    world: World
-    hidden: str
-    strength_sigma: float
-    readings: Readings
 
 
 def choices() -> tuple[str, ...]:
@@ -86,6 +61,17 @@ class Secret:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Rehearsal(Secret):
+    """A simulated campaign in such a cell.
+
+    Attributes:
+        readings: what was measured.
+    """
+
+    readings: Readings
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class CampaignStates:
     """States of a campaign, in order, and which pose, load and cycle they belong to."""
 
@@ -93,37 +79,6 @@ class CampaignStates:
     pose: Ints
     load: Ints
     cycle: Ints
-
-
-def rehearse(config: CellConfig, choice: str, seed: int, n_poses: int = POSES) -> Rehearsal:
-    """Measure a campaign in a simulated cell: each pose unloaded, then under each load.
-
-    A known registration is told to the program only where the error hides in it. What a
-    deflection shows is measured in deflections, the rest in absolute positions; what was
-    drawn at random, and nothing at all, in absolute positions, which give nothing away.
-
-    Args:
-        config: the cell; its loads are all used.
-        choice: an effect of `choices()`, "random" or "nothing".
-        seed: of everything random.
-        n_poses: number of poses.
-
-    Raises:
-        InputError: an unknown choice; lists the valid ones. No loads in the configuration.
-    """
-    rng = np.random.default_rng(seed)
-    visits: list[CampaignStates] = []
-
-    def visit(cell: Cell) -> CampaignStates:
-        pulls = [(load.name, load.wrench(cell.gravity)) for load in config.loads]
-        visits.append(CampaignStates(*rehearsal_states(cell, n_poses, pulls, rng)))
-        return visits[0]
-
-    s = conceal(config, choice, rng, visit, measurement_noise(config))
-    names = ("none", *(load.name for load in config.loads))
-    v = visits[0]
-    readings = simulate(s.world, v.states, v.pose, v.load, v.cycle, names, rng)
-    return Rehearsal(s.config, s.cell, s.mode, s.world, s.hidden, s.strength_sigma, readings)
 
 
 def measurement_noise(config: CellConfig, samples: int = 1) -> SimulatedNoise:
@@ -192,3 +147,42 @@ def conceal(
             hidden, cell, v.states, strength, mode, rng, world=world, pose=v.pose, cycle=v.cycle
         )
     return Secret(config, cell, mode, world, hidden, strength)
+
+
+def simulate(
+    world: World,
+    states: States,
+    pose: Ints,
+    load: Ints,
+    cycle: Ints,
+    load_names: Sequence[str],
+    rng: np.random.Generator,
+    m: int = 3,
+) -> Readings:
+    """Return what the tracker reads of the states, with the covariance of every reading.
+
+    Args:
+        world: the simulated cell.
+        states: N states.
+        pose: (N,) index of the pose.
+        load: (N,) index into `load_names`.
+        cycle: (N,) index of the cycle.
+        load_names: names of the loads, "none" for unloaded.
+        rng: generator of the noise.
+        m: 3 for positions, 6 for poses.
+
+    Raises:
+        InputError: another m.
+    """
+    if m not in (3, 6):
+        raise InputError(f"a reading has {m} elements; valid: 3 (position) or 6 (pose)")
+    return Readings(
+        states=states,
+        pose=np.asarray(pose, dtype=np.int64),
+        load=np.asarray(load, dtype=np.int64),
+        cycle=np.asarray(cycle, dtype=np.int64),
+        value=world.observe(states, rng, m),
+        covariance=world.covariance(world.sight(states), m),
+        load_names=tuple(load_names),
+        pose_names=tuple(f"p{i + 1}" for i in range(int(np.max(pose)) + 1)),
+    )

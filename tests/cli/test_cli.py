@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.simulated.campaign import simulate
+from drivers.simulated.rehearsal import simulate
 from hilcal import __version__
 from hilcal.data.campaign import Campaign
 from hilcal.data.table import read_table

@@ -5,10 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.simulated.rehearsal import choices, rehearse
+from drivers.simulated.rehearsal import choices
 from hilcal.config import load_config
 from hilcal.data.campaign import Campaign
 from hilcal.errors import InputError
+from studies.random_campaigns import rehearse
 from tests.support.cli_cases import CELL, ok, refused, rehearsal
 
 Capsys = pytest.CaptureFixture[str]

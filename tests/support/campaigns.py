@@ -5,8 +5,8 @@ from functools import cache
 
 import numpy as np
 
-from drivers.simulated.campaign import rehearsal_states, simulate
 from drivers.simulated.injected_effects import hide, nothing_hidden
+from drivers.simulated.rehearsal import simulate
 from drivers.simulated.tracker import SimulatedNoise
 from drivers.simulated.world import World
 from hilcal.cell import Cell, cell_from_config
@@ -16,6 +16,7 @@ from hilcal.data.whitening import Mode
 from hilcal.robot import se3
 from hilcal.robot.catalogue import configs_dir
 from hilcal.types import Floats, Ints
+from studies.random_campaigns import rehearsal_states
 
 NOTHING = "none"
 

@@ -10,12 +10,13 @@ from typing import Any
 
 import pytest
 
-from drivers.simulated.rehearsal import Rehearsal, rehearse
+from drivers.simulated.rehearsal import Rehearsal
 from hilcal.cli import main
 from hilcal.config import load_config
 from hilcal.data.table import write_table
 from hilcal.robot.catalogue import configs_dir
 from studies.__main__ import main as studies
+from studies.random_campaigns import rehearse
 
 CELL = configs_dir() / "cells" / "demo_ur10e.toml"
 POSES = 14

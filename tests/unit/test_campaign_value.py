@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.simulated.rehearsal import rehearse
 from hilcal.campaign import Campaign
 from hilcal.config import load_config
 from hilcal.data.campaign import Campaign as CampaignFile
@@ -15,6 +14,7 @@ from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import fit
 from hilcal.refine import refine
 from hilcal.robot.catalogue import configs_dir
+from studies.random_campaigns import rehearse
 
 CELL = configs_dir() / "cells" / "demo_ur10e.toml"
 

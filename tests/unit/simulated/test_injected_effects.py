@@ -10,12 +10,12 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 import drivers.simulated
-from drivers.simulated.campaign import dead_weights, rehearsal_states
 from drivers.simulated.injected_effects import DEFLECTION_EFFECTS, EFFECTS, hide, nothing_hidden
 from drivers.simulated.truth import Truth
 from drivers.simulated.world import World
 from hilcal.data.readings import States
 from hilcal.errors import InputError
+from studies.random_campaigns import dead_weights, rehearsal_states
 from tests.support.example_cell import ur10e_cell
 
 CELL = ur10e_cell()

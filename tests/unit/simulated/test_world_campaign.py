@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivers.simulated.campaign import dead_weights, rehearsal_states, simulate
 from drivers.simulated.injected_effects import hide, nothing_hidden
-from drivers.simulated.temperatures import air, joints
+from drivers.simulated.rehearsal import simulate
 from hilcal.errors import InputError
+from studies.random_campaigns import dead_weights, rehearsal_states
+from studies.temperatures import air, joints
 from tests.support.example_cell import ur10e_cell
 
 CELL = ur10e_cell()

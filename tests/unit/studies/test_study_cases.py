@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from drivers.simulated.campaign import dead_weights
 from drivers.simulated.injected_effects import EFFECTS
-from drivers.simulated.unmodelled_laws import INVENTED, invented, shift
 from hilcal.cell import cell_from_config
 from hilcal.cli.demo import CELL
 from hilcal.config import CellConfig, load_config
@@ -18,6 +16,7 @@ from hilcal.identify.fit import fit
 from hilcal.robot.catalogue import configs_dir
 from hilcal.types import Floats
 from studies.diagnosis import intervals
+from studies.random_campaigns import dead_weights
 from studies.study_cases import (
     StudyCase,
     effects_shown,
@@ -25,6 +24,7 @@ from studies.study_cases import (
     study_case,
     with_study_loads,
 )
+from studies.unmodelled_laws import INVENTED, invented, shift
 from tests.support.effect_cases import make
 
 

@@ -157,7 +157,7 @@ def shift(
 ) -> Floats:
     """Return (N, 3) by how much the law moves the readings, sensor axes, m.
 
-    The size is such that sqrt(mean |W d|²) = strength_sigma, as in `hidden.hide`: d what it
+    The size is such that sqrt(mean |W d|²) = strength_sigma, as in `injected_effects.hide`: d what it
     changes in a reading, or in a loaded minus its unloaded reading; W whitens that.
 
     Raises:

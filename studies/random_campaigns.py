@@ -1,4 +1,4 @@
-"""A rehearsal: random well-spread poses, loads that hang on them, and the readings."""
+"""Campaigns drawn at random: well-spread poses, the loads on them, and the readings."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -8,13 +8,21 @@ import numpy as np
 from drivers.simulated.elastic_tree import build
 from drivers.simulated.elasticity import elasticity
 from drivers.simulated.mechanics import equilibrium
-from drivers.simulated.temperatures import air, joints
-from drivers.simulated.world import World
+from drivers.simulated.rehearsal import (
+    CampaignStates,
+    Rehearsal,
+    conceal,
+    measurement_noise,
+    simulate,
+)
 from hilcal.cell import Cell
-from hilcal.data.readings import Readings, States
+from hilcal.config import CellConfig
+from hilcal.data.readings import States
 from hilcal.errors import InputError
 from hilcal.types import Bools, Floats, Ints
+from studies.temperatures import air, joints
 
+POSES = 30
 UNLOADED = "none"
 _READING = 20.0  # s from one reading to the next
 _LOADING = 30.0  # s that it takes to change the load
@@ -93,45 +101,6 @@ def rehearsal_states(
             joint_temperature=joints(time, cell.arm.n, apart),
         )
     return states, pose, load, cycle
-
-
-def simulate(
-    world: World,
-    states: States,
-    pose: Ints,
-    load: Ints,
-    cycle: Ints,
-    load_names: Sequence[str],
-    rng: np.random.Generator,
-    m: int = 3,
-) -> Readings:
-    """Return what the tracker reads of the states, with the covariance of every reading.
-
-    Args:
-        world: the simulated cell.
-        states: N states.
-        pose: (N,) index of the pose.
-        load: (N,) index into `load_names`.
-        cycle: (N,) index of the cycle.
-        load_names: names of the loads, "none" for unloaded.
-        rng: generator of the noise.
-        m: 3 for positions, 6 for poses.
-
-    Raises:
-        InputError: another m.
-    """
-    if m not in (3, 6):
-        raise InputError(f"a reading has {m} elements; valid: 3 (position) or 6 (pose)")
-    return Readings(
-        states=states,
-        pose=np.asarray(pose, dtype=np.int64),
-        load=np.asarray(load, dtype=np.int64),
-        cycle=np.asarray(cycle, dtype=np.int64),
-        value=world.observe(states, rng, m),
-        covariance=world.covariance(world.sight(states), m),
-        load_names=tuple(load_names),
-        pose_names=tuple(f"p{i + 1}" for i in range(int(np.max(pose)) + 1)),
-    )
 
 
 def dead_weights(masses: Sequence[float], gravity: Floats) -> list[tuple[str, Floats]]:
@@ -253,3 +222,34 @@ def _about_z(angle: Floats) -> Floats:
     out[:, 0, 0], out[:, 0, 1], out[:, 1, 0], out[:, 1, 1] = cos, -sin, sin, cos
     out[:, 2, 2] = out[:, 3, 3] = 1.0
     return out
+
+
+def rehearse(config: CellConfig, choice: str, seed: int, n_poses: int = POSES) -> Rehearsal:
+    """Measure a campaign in a simulated cell: each pose unloaded, then under each load.
+
+    A known registration is told to the program only where the error hides in it. What a
+    deflection shows is measured in deflections, the rest in absolute positions; what was
+    drawn at random, and nothing at all, in absolute positions, which give nothing away.
+
+    Args:
+        config: the cell; its loads are all used.
+        choice: an effect of `choices()`, "random" or "nothing".
+        seed: of everything random.
+        n_poses: number of poses.
+
+    Raises:
+        InputError: an unknown choice; lists the valid ones. No loads in the configuration.
+    """
+    rng = np.random.default_rng(seed)
+    visits: list[CampaignStates] = []
+
+    def visit(cell: Cell) -> CampaignStates:
+        pulls = [(load.name, load.wrench(cell.gravity)) for load in config.loads]
+        visits.append(CampaignStates(*rehearsal_states(cell, n_poses, pulls, rng)))
+        return visits[0]
+
+    s = conceal(config, choice, rng, visit, measurement_noise(config))
+    names = ("none", *(load.name for load in config.loads))
+    v = visits[0]
+    readings = simulate(s.world, v.states, v.pose, v.load, v.cycle, names, rng)
+    return Rehearsal(s.config, s.cell, s.mode, s.world, s.hidden, s.strength_sigma, readings)
