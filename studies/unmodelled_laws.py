@@ -157,8 +157,8 @@ def shift(
 ) -> Floats:
     """Return (N, 3) by how much the law moves the readings, sensor axes, m.
 
-    The size is such that sqrt(mean |W d|²) = strength_sigma, as in `injected_effects.hide`: d what it
-    changes in a reading, or in a loaded minus its unloaded reading; W whitens that.
+    The size is such that sqrt(mean |W d|²) = strength_sigma, as in `injected_effects.hide`: d is
+    the change of a reading, or of a loaded minus its unloaded reading; W whitens it.
 
     Raises:
         InputError: a mode that does not show the law, or states that lack what it depends on.

@@ -91,13 +91,13 @@ class Hook:
         what = "take everything off" if load is None else f"hang {load.name}"
         why = ""
         for _ in range(TRIES):
-            self._watcher.tell(Phase(f"waiting for the operator to {what}"))
+            self._watcher.notify(Phase(f"waiting for the operator to {what}"))
             self._operator.hang(load, why)
             self._mover.look()
             why = wrong()
             if not why:
                 return
-            self._watcher.tell(Remark(f"asked to {what}: {why}"))
+            self._watcher.notify(Remark(f"asked to {what}: {why}"))
         raise WrongLoadError(f"operator: asked {TRIES} times to {what}; {why}")
 
     def _differs(self, load: Load | None) -> str:

@@ -93,7 +93,7 @@ class Measurer:
             if repeats == AGAIN:
                 raise DeviceError(f"{name}: measured {AGAIN} times in vain: {why}")
             remarks.append(f"measured again: {why}")
-            self._watcher.tell(Remark(f"{name}: {why}; measuring again"))
+            self._watcher.notify(Remark(f"{name}: {why}; measuring again"))
 
     def _settle(self, name: str) -> float:
         """Wait until arm and readings have settled; returns how long it took, cell seconds."""
@@ -154,7 +154,7 @@ class Measurer:
         """
         while searches < SEARCHES:
             searches += 1
-            self._watcher.tell(Remark(f"{name}: {error}; searching the target"))
+            self._watcher.notify(Remark(f"{name}: {error}; searching the target"))
             try:
                 self._tracker.find_target()
             except TargetLostError as again:

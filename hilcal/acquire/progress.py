@@ -112,6 +112,6 @@ class ReadingStored:
 class Watcher(Protocol):
     """Receives the events of a campaign."""
 
-    def tell(self, event: object) -> None:
+    def notify(self, event: object) -> None:
         """Receive a `Phase`, a `Remark`, a `ReadingStored` or a `GoalMet`; returns soon."""
         ...

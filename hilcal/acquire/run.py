@@ -63,11 +63,11 @@ def run(
     refuse(whole)
     left = plan.without(store.done())
     if not left.steps:
-        watcher.tell(Phase("nothing is missing"))
+        watcher.notify(Phase("nothing is missing"))
         return
     refuse(dry_run(cell, config, left))  # the way past what is done is another one
     for text in whole.remarks:
-        watcher.tell(Remark(text))
+        watcher.notify(Remark(text))
     stops = route(left, cell.arm, config.limits.joint_margin_rad)
     session = Session(rig, cell, config, plan, store, clock, watcher, live, wall, goal)
     try:

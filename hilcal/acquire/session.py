@@ -159,14 +159,14 @@ class Session:
 
     def _move(self, stop: Stop) -> None:
         if not self._mover.is_at(stop.q):
-            self._watcher.tell(Phase(f"moving to {stop.name}"))
+            self._watcher.notify(Phase(f"moving to {stop.name}"))
             self._mover.move(stop.q, stop.name)
 
     def _tare(self) -> None:
         """Set the force sensor's zero at the present pose, with nothing on the hook."""
         if self._meter is None:
             return
-        self._watcher.tell(Phase("taring the force sensor"))
+        self._watcher.notify(Phase("taring the force sensor"))
         self._mover.wait(self._config.acquire.settle_s)
         sample = self._meter.average()
         q = self._mover.look().q
@@ -189,7 +189,7 @@ class Session:
         try:
             tool = self._meter.identify(self._state.tared_wrenches)
         except HilcalError as error:
-            self._watcher.tell(Remark(f"the tool is not identified: {error}"))
+            self._watcher.notify(Remark(f"the tool is not identified: {error}"))
             return
         if tool is None:
             return
@@ -205,13 +205,13 @@ class Session:
         )
         differs = self._meter.tool_differs(self._config.operator.tolerance_N)
         if differs is not None:
-            self._watcher.tell(Remark(differs))
+            self._watcher.notify(Remark(differs))
 
     # one reading
 
     def _reading(self, stop: Stop, step: Step) -> tuple[Readings, float]:
         """Measure and store; the arm has arrived."""
-        self._watcher.tell(Phase(f"measuring {step}"))
+        self._watcher.notify(Phase(f"measuring {step}"))
         measured = self._measurer.measure(stop.name)
         wrong = self._state.registration.implausible(measured.q, measured.mean.value[:3])
         if wrong is not None:
@@ -242,7 +242,7 @@ class Session:
         self._store.record(reading, step, detail(step, measured, tared, zero, session))
         self._done += 1
         for text in measured.remarks:
-            self._watcher.tell(Remark(f"{step}: {text}"))
+            self._watcher.notify(Remark(f"{step}: {text}"))
         mean = measured.mean
         shift = self._state.add(step, measured.q, mean.value, mean.covariance, tared)
         if shift is not None:
@@ -275,7 +275,7 @@ class Session:
         content = {"shift_m": shift.metres.tolist(), "sigma": shift.sigma}
         self._event("drift", {"cycle": step.cycle, **content, "over": shift.sigma > limit})
         if shift.sigma > limit:
-            self._watcher.tell(Remark(shift.words(limit)))
+            self._watcher.notify(Remark(shift.words(limit)))
 
     # people
 
@@ -287,7 +287,7 @@ class Session:
         if self._live is not None and (readings := self._store.readings()) is not None:
             with suppress(HilcalError):  # too early for a model; nothing depends on it
                 live = self._live(readings)
-        self._watcher.tell(
+        self._watcher.notify(
             ReadingStored(
                 step,
                 self._done,
@@ -305,9 +305,9 @@ class Session:
         found = self._state.repeatability()
         if found is not None:
             self._event("repeatability", asdict(found))
-            self._watcher.tell(Remark(found.words(self._joint_std)))
+            self._watcher.notify(Remark(found.words(self._joint_std)))
         self._event("finished", {"readings": self._done})
-        self._watcher.tell(Phase("finished"))
+        self._watcher.notify(Phase("finished"))
 
     def _event(self, kind: str, content: dict[str, Any]) -> None:
         self._store.event(kind, {"wall_s": self._wall(), **content})

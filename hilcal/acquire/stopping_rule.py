@@ -64,7 +64,7 @@ class GoalCheck:
         if now.met or last:
             self._event("goal", {**now.to_dict(), "readings": count, "planned": planned})
         if now.met:
-            self._watcher.tell(GoalMet(now, count, planned))
+            self._watcher.notify(GoalMet(now, count, planned))
         return now.met
 
 

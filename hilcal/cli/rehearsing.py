@@ -14,14 +14,14 @@ from hilcal.acquire.dry_run import dry_run
 from hilcal.cell import cell_from_config
 from hilcal.cli.plan_output import refuse
 from hilcal.cli.planning import make_plan
-from hilcal.cli.running import create, measure
+from hilcal.cli.running import measure
 from hilcal.cli.terminal import Terminal
 from hilcal.config import CellConfig
-from hilcal.data.appended import fitted_on
+from hilcal.data.appended import with_new_names
 from hilcal.data.campaign import Campaign
 from hilcal.data.plan import Plan
 from hilcal.data.readings import Readings
-from hilcal.data.run_log import RunLog
+from hilcal.data.run_log import RunLog, create_run
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import DeviceError
 from hilcal.identify.full_covariance import campaign_readings
@@ -91,7 +91,7 @@ def on_devices(
             secret = secret_of(told.config, plan, told.choice, told.seed)
             say("starting the simulated devices")
             there = stack.enter_context(simulated_cell(secret, told.seed, told.base_dir))
-        made = create(told.output, there.config, told.base_dir, plan, True)
+        made = create_run(told.output, there.config, told.base_dir, plan, True)
         campaign = stack.enter_context(made)
 
         def measured() -> Rehearsal:
@@ -105,7 +105,7 @@ def on_devices(
 
         def further(more: Plan) -> Rehearsal:
             log = RunLog(campaign)
-            log.append(log.fitted(more))
+            log.append(log.with_new_names(more))
             return measured()
 
         yield measured(), further
@@ -133,7 +133,7 @@ def in_process(
         def further(more: Plan) -> Rehearsal:
             time = campaign.readings().states.time
             last = 0.0 if time is None else float(time.max())
-            return measured(fitted_on(more, plan, 2), 2, last + BREAK)
+            return measured(with_new_names(more, plan, 2), 2, last + BREAK)
 
         yield measured(plan, 1, 0.0), further
 

@@ -32,18 +32,14 @@ from hilcal.cli.planning import (
 from hilcal.cli.terminal import Json, Terminal, terminal
 from hilcal.config import CellConfig
 from hilcal.data.campaign import Campaign
-from hilcal.data.covariance import COVERS, INSTRUMENT
 from hilcal.data.plan import Plan, load_plan
-from hilcal.data.run_log import PLAN, RunLog
+from hilcal.data.run_log import RunLog, check_same_cell, create_run
 from hilcal.diagnose.live_model import LiveModel
 from hilcal.errors import CannotAnswerError, DeviceError, InputError
 from hilcal.plan.goal_rule import GoalRule
 from hilcal.report.goal_words import missed_words, status_words
 from hilcal.report.live_run import watching
 from hilcal.report.progress import Say, working
-
-SAME = ("robot", "tool", "loads")
-_ADDRESSES = {"driver", "host", "port", "baud", "options"}
 
 
 def run(
@@ -88,7 +84,7 @@ def run(
             if plan is not None:
                 raise InputError("--plan with --resume: the plan is in the campaign; leave it out")
             campaign = stack.enter_context(Campaign.open(output))
-            _same_cell(campaign, config)
+            check_same_cell(campaign, config)
             made = RunLog(campaign).plans[0]
         elif append:
             campaign, further = _append(stack, output, plan, config, numbers)
@@ -115,7 +111,7 @@ def run(
         if append:
             RunLog(campaign).append(further)
         elif not resume:
-            campaign = stack.enter_context(create(output, config, base_dir, made))
+            campaign = stack.enter_context(create_run(output, config, base_dir, made))
         measured = measure(t, config, numbers, campaign, goal)
         planned = len(RunLog(campaign).plan.steps)
     document: dict[str, object] = {"campaign": str(output), "readings": measured}
@@ -143,25 +139,10 @@ def _append(
     if plan is None:
         raise InputError("--append needs the further plan: give it with --plan PLAN")
     campaign = stack.enter_context(Campaign.open(output))
-    _same_cell(campaign, config)
-    further = RunLog(campaign).fitted(load_plan(plan))
+    check_same_cell(campaign, config)
+    further = RunLog(campaign).with_new_names(load_plan(plan))
     refuse(dry_run(cell, config, further), str(plan))
     return campaign, further
-
-
-def create(
-    output: Path, config: CellConfig, base_dir: Path, plan: Plan, overwrite: bool = False
-) -> Campaign:
-    """Make the empty campaign of a run, its plan inside.
-
-    Raises:
-        InputError: it cannot be written, or is there already.
-    """
-    more = {PLAN: plan.to_json(), COVERS: INSTRUMENT}
-    source = "measured by hilcal run"
-    return Campaign.create(
-        output, config.to_json(), str(base_dir), source, overwrite=overwrite, more=more
-    )
 
 
 def measure(
@@ -235,26 +216,3 @@ def _ends_as_interrupt(t: Terminal) -> Iterator[None]:
     finally:
         for kind, handler in zip(kinds, before, strict=True):
             signal.signal(kind, handler)
-
-
-def _same_cell(campaign: Campaign, config: CellConfig) -> None:
-    """Refuse to go on in another cell.
-
-    Raises:
-        InputError: names the section that differs.
-    """
-    stored = asdict_of(CellConfig.from_json(campaign.config_json))
-    given = asdict_of(config)
-    for section in SAME:
-        if stored[section] != given[section]:
-            raise InputError(
-                f"[{section}] differs from what {campaign.path} was begun with; a campaign is "
-                "measured in one cell: start another one for this"
-            )
-
-
-def asdict_of(config: CellConfig) -> dict[str, object]:
-    """Return what a campaign must not change, section by section; addresses may change."""
-    data = config.model_dump(mode="json")
-    data["robot"] = {k: v for k, v in data["robot"].items() if k not in _ADDRESSES}
-    return data

@@ -9,7 +9,7 @@ from hilcal.data.plan import REFERENCE, Plan, Step
 from hilcal.errors import InputError
 
 
-def fitted_on(plan: Plan, before: Plan, number: int) -> Plan:
+def with_new_names(plan: Plan, before: Plan, number: int) -> Plan:
     """Return a further plan with names and cycles that a campaign does not have yet.
 
     The reference pose becomes that of the campaign, so that the drift is told over all of it. A

@@ -2,13 +2,16 @@
 
 import json
 import sqlite3
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from hilcal.config import CellConfig
 from hilcal.data import rows, schema
-from hilcal.data.appended import fitted_on, joined
+from hilcal.data.appended import joined, with_new_names
 from hilcal.data.campaign import Campaign
+from hilcal.data.covariance import COVERS, INSTRUMENT
 from hilcal.data.plan import Plan, Step, read_plan
 from hilcal.data.readings import Readings
 from hilcal.data.revision import utc_now
@@ -16,6 +19,45 @@ from hilcal.errors import InputError
 
 PLAN = "plan"
 """Key of the plan among the texts about a campaign; further ones are "plan 2" and so on."""
+
+
+SAME = ("robot", "tool", "loads")
+"""Sections of the configuration that stay as they are for a whole campaign ..."""
+ADDRESSES = {"driver", "host", "port", "baud", "options"}
+"""... but for these keys of them."""
+
+
+def create_run(
+    path: Path, config: CellConfig, base_dir: Path, plan: Plan, overwrite: bool = False
+) -> Campaign:
+    """Make the empty campaign of a run, its plan inside.
+
+    Raises:
+        InputError: it cannot be written, or is there already.
+    """
+    more = {PLAN: plan.to_json(), COVERS: INSTRUMENT}
+    source = "measured by hilcal run"
+    return Campaign.create(
+        path, config.to_json(), str(base_dir), source, overwrite=overwrite, more=more
+    )
+
+
+def check_same_cell(campaign: Campaign, config: CellConfig) -> None:
+    """Refuse to continue a campaign in another cell.
+
+    Raises:
+        InputError: names the section that differs.
+    """
+    for section in SAME:
+        stored, given = (
+            c.model_dump(mode="json", include={section: True}, exclude={section: ADDRESSES})
+            for c in (CellConfig.from_json(campaign.config_json), config)
+        )
+        if stored != given:
+            raise InputError(
+                f"[{section}] differs from what {campaign.path} was begun with; a campaign is "
+                "measured in one cell: start another one for this"
+            )
 
 
 class RunLog:
@@ -54,7 +96,7 @@ class RunLog:
             whole = joined(whole, done, further)
         return whole
 
-    def fitted(self, plan: Plan) -> Plan:
+    def with_new_names(self, plan: Plan) -> Plan:
         """Return a further plan with names and cycles that the campaign does not have yet.
 
         Raises:
@@ -62,8 +104,8 @@ class RunLog:
         """
         last, whole = self.plans[-1], self.plan
         missing = len(last.without(self.done()).steps)
-        made = fitted_on(plan, whole, len(self.plans) + 1)
-        again = fitted_on(plan, self._before_last(), len(self.plans))
+        made = with_new_names(plan, whole, len(self.plans) + 1)
+        again = with_new_names(plan, self._before_last(), len(self.plans))
         if missing and again.steps == last.steps and np.array_equal(again.q, last.q):
             raise InputError(
                 f"{self._campaign.path}: this plan is in the campaign already, and {missing} of "
@@ -83,7 +125,7 @@ class RunLog:
         return Plan(whole.pose_names, whole.q, kept)
 
     def append(self, plan: Plan) -> None:
-        """Take in a further plan, see `fitted`; what is missing of those before is given up.
+        """Append a further plan, see `with_new_names`; what is missing of those before is given up.
 
         Raises:
             DeviceError: the disk is full or failed.

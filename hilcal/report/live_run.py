@@ -22,7 +22,7 @@ class _Lines:
     console: Console
     begun: float = field(default_factory=time.monotonic)
 
-    def tell(self, event: object) -> None:
+    def notify(self, event: object) -> None:
         """Take note."""
         if isinstance(event, Phase):
             self._print(event.text)
@@ -46,7 +46,7 @@ class _Bar:
     progress: Progress
     task: TaskID
 
-    def tell(self, event: object) -> None:
+    def notify(self, event: object) -> None:
         """Take note."""
         if isinstance(event, Phase):
             self.progress.update(self.task, phase=event.text)

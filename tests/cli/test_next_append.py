@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilcal.data.appended import fitted_on, joined
+from hilcal.data.appended import joined, with_new_names
 from hilcal.data.campaign import Campaign
 from hilcal.data.plan import REFERENCE, Plan, Step, load_plan
 from hilcal.data.run_log import RunLog
@@ -35,7 +35,7 @@ def made(*names: str, shift: float = 0.0) -> Plan:
 
 def test_new_poses_get_names_of_their_own() -> None:
     before, further = made(REFERENCE, "p1", "p2"), made(REFERENCE, "p1", "p3", shift=0.2)
-    out = fitted_on(further, before, 2)
+    out = with_new_names(further, before, 2)
     assert out.pose_names == (REFERENCE, "p1-2", "p3")
     assert np.array_equal(out.joints(REFERENCE), before.joints(REFERENCE))
     assert np.array_equal(out.joints("p1-2"), further.joints("p1"))
@@ -43,7 +43,7 @@ def test_new_poses_get_names_of_their_own() -> None:
         (REFERENCE, "none", 1), ("p1-2", "none", 0), ("p3", "none", 0),
         (REFERENCE, "5kg", 1), ("p1-2", "5kg", 0), ("p3", "5kg", 0),
     ]  # fmt: skip
-    third = fitted_on(further, joined(before, frozenset(before.steps), out), 3)
+    third = with_new_names(further, joined(before, frozenset(before.steps), out), 3)
     assert third.pose_names == (REFERENCE, "p1-3", "p3")
     assert {s.cycle for s in third.steps if s.pose == "p3"} == {1}
     assert {s.cycle for s in third.steps if s.pose == REFERENCE} == {2}
@@ -51,7 +51,7 @@ def test_new_poses_get_names_of_their_own() -> None:
 
 def test_the_same_poses_again_are_new_cycles_with_references_of_their_own() -> None:
     plan = made(REFERENCE, "p1")
-    again = fitted_on(plan, plan, 2)
+    again = with_new_names(plan, plan, 2)
     assert again.pose_names == plan.pose_names
     assert {s.cycle for s in again.steps} == {1}
     assert not set(again.steps) & set(plan.steps)
@@ -62,7 +62,7 @@ def test_the_same_poses_again_are_new_cycles_with_references_of_their_own() -> N
 def test_a_name_that_was_made_up_is_not_taken_twice() -> None:
     before = made("p1", "p1-2")
     further = made("p1", shift=0.1)
-    assert fitted_on(further, before, 2).pose_names == ("p1-2-2",)
+    assert with_new_names(further, before, 2).pose_names == ("p1-2-2",)
 
 
 @pytest.mark.parametrize(
@@ -74,7 +74,7 @@ def test_a_name_that_was_made_up_is_not_taken_twice() -> None:
 )
 def test_what_does_not_go_together(plan: Plan, words: str) -> None:
     with pytest.raises(InputError, match=words):
-        fitted_on(plan, made(REFERENCE, "p1"), 2)
+        with_new_names(plan, made(REFERENCE, "p1"), 2)
 
 
 # the file
@@ -88,11 +88,11 @@ def test_what_was_not_measured_before_is_given_up(tmp_path: Path) -> None:
         for step in STEPS[:3]:
             log.record(_reading(step), step, {})
         assert log.plan.steps == MADE.steps
-        fitted = log.fitted(further)
+        fitted = log.with_new_names(further)
         log.append(fitted)
         assert log.plan.steps == (*STEPS[:3], *fitted.steps)
         with pytest.raises(InputError, match="in the campaign already, and 4 of its 4 readings"):
-            log.fitted(further)
+            log.with_new_names(further)
     with Campaign.open(path) as campaign:
         log = RunLog(campaign)
         assert [len(p.steps) for p in log.plans] == [6, 4]
@@ -109,7 +109,7 @@ from hilcal.data.campaign import Campaign
 from hilcal.data.run_log import RunLog
 with Campaign.open(Path(sys.argv[1])) as campaign:
     log = RunLog(campaign)
-    log.append(log.fitted(made("p8", "p9")))
+    log.append(log.with_new_names(made("p8", "p9")))
     os._exit(9)
 """
 
@@ -177,7 +177,7 @@ def test_an_append_that_was_stopped_is_resumed(site: Site, capsys: Capsys) -> No
     further = str(further_plan(site))
     with Campaign.open(site.directory / "run.hilcal") as campaign:  # stopped before it moved
         log = RunLog(campaign)
-        log.append(log.fitted(load_plan(Path(further))))
+        log.append(log.with_new_names(load_plan(Path(further))))
     line = refused(capsys, 2, *site.command("--append", "--plan", further))
     assert "go on with --resume" in line
     d = ok(capsys, *site.command("--resume", "--json")).document

@@ -78,7 +78,7 @@ class Notes:
 
     told: list[object] = field(default_factory=list)
 
-    def tell(self, event: object) -> None:
+    def notify(self, event: object) -> None:
         self.told.append(event)
 
     def of(self, kind: type) -> list[Any]:

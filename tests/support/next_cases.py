@@ -9,7 +9,7 @@ from drivers.simulated.on_the_wire import read_plan, secret_of
 from drivers.simulated.rehearsal import Rehearsal, Secret
 from hilcal.cell import cell_from_config
 from hilcal.config import load_config
-from hilcal.data.appended import fitted_on
+from hilcal.data.appended import with_new_names
 from hilcal.data.plan import Plan
 from hilcal.data.readings import Readings, States
 from hilcal.diagnose.diagnosis import Diagnosis
@@ -69,7 +69,7 @@ def settled(first: Doubtful, poses: int = 20) -> tuple[Diagnosis, Next]:
         cell, SMALL, first.fit, first.suspects, Request(poses), np.random.default_rng(1),
         reference=reference,
     )  # fmt: skip
-    further = fitted_on(found.planned.ordered.plan, first.plan, 2)
+    further = with_new_names(found.planned.ordered.plan, first.plan, 2)
     more = read_plan(first.secret, further, [9, 2], 3000.0).readings
     readings = both(first.rehearsal.readings, more)
     mode = first.rehearsal.mode
