@@ -52,16 +52,17 @@ STEP = 1e-4
 _FIELDS = Deviation.__slots__
 
 
-def check_effect(kind: type[Effect]) -> None:
+def check_effect(kind: type[Effect], cell: Cell | None = None) -> None:
     """Check that an effect keeps to the protocol, as scikit-learn's `check_estimator` does.
 
-    Tried on 30 states of a six-joint arm, or of one with seven: class attributes; shapes and
-    finite values of what each method returns; that each state stands for itself; `response`,
-    `wrench_columns` and `compliance_columns` against difference quotients; that all columns of
-    the readings that are used are named in `needs`.
+    Checked on 30 states are: class attributes; shapes and finite values of what each method
+    returns; that no state depends on the others; `response`, `wrench_columns` and
+    `compliance_columns` against difference quotients; that all columns of the readings that are
+    used are named in `needs`.
 
     Args:
         kind: the class.
+        cell: of the arm that it is made for; an arm of six joints, or of seven, unless given.
 
     Raises:
         InputError: what is wrong, in one line: the file, the class or effect, what would be valid.
@@ -72,9 +73,9 @@ def check_effect(kind: type[Effect]) -> None:
     except InputError as error:
         raise InputError(f"{where}: class {kind.__name__} {error}") from None
     problems = []
-    for joints in JOINTS:
+    for example in map(example_cell, JOINTS) if cell is None else (cell,):
         try:
-            _try(kind, example_cell(joints))
+            _try(kind, example)
         except HilcalError as error:
             problems.append(InputError(f"{where}: effect {kind.name}: {error}"))
         except Exception as error:

@@ -17,6 +17,8 @@ joints, P that of the effect's parameters. Slot k = 0..n is the frame after link
 for k < n its z axis is the axis of joint k + 1; slot n is the flange.
 """
 
+from typing import ClassVar
+
 import numpy as np
 
 from hilcal.effects.protocol import Columns, Effect, Parameter, Response, Situation
@@ -40,6 +42,9 @@ class Template(Effect):
     # air_temperature, joint_temperature, approach, q_actual; e.g. ("time", "joint_temperature").
     # Where readings lack one of them, the effect is not among the suspects.
     needs = ()
+    # Options with their meaning; what is given for them is in self.options, e.g.
+    # {"period": "angle of one turn of the bearing, rad; unless given, 2π."}.
+    option_help: ClassVar[dict[str, str]] = {}
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
