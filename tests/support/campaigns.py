@@ -81,6 +81,7 @@ def world_of(cell: Cell, rng: np.random.Generator) -> World:
     )
 
 
+@cache
 def campaign(
     effect: str = NOTHING,
     mode: Mode = "absolute",
@@ -98,6 +99,7 @@ def campaign(
     """Measure a campaign in a world that hides one effect at `strength` σ.
 
     With `plan_seed` equal plans share their states; otherwise poses are drawn for each seed.
+    Equal arguments give the same object; its readings cannot be written to.
     """
     cell = cell_of(registration_known=registration_known, target_known=target_known)
     p = plan(poses, 1000 + seed if plan_seed is None else plan_seed, cycles)
@@ -111,7 +113,10 @@ def campaign(
             effect, cell, p.states, strength, mode, rng,
             world=world, m=m, pose=p.pose, cycle=p.cycle, harmonics=harmonics,
         )  # fmt: skip
-    return Campaign(cell, world, measured(world, p, rng, m), mode)
+    readings = measured(world, p, rng, m)
+    for values in (readings.value, readings.covariance, readings.states.q, readings.states.wrench):
+        values.flags.writeable = False
+    return Campaign(cell, world, readings, mode)
 
 
 def measured(world: World, p: Plan, rng: np.random.Generator, m: int = 3) -> Readings:

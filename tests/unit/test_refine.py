@@ -99,9 +99,10 @@ def test_shares_on_poses_left_out_are_what_a_refit_reaches_there():
     readings = with_pose_errors(c.readings, 1)
     before = fit(baseline(c.cell, readings, "absolute"), readings, "absolute")
     p = projection(before)
-    for s in rank_suspects(p, candidates(p.fit)):
-        if s.effect not in ("transmission_error", "link_geometry", "encoder_offset"):
-            continue
+    some = ("transmission_error", "link_geometry", "encoder_offset")
+    suspects = [s for s in rank_suspects(p, candidates(p.fit)) if s.effect in some]
+    assert len(suspects) == len(some)
+    for s in suspects:
         after = add(before, s.effect)
         squares = [np.sum(f.whitening.whiten(f.left_out) ** 2) for f in (before, after)]
         reached = (squares[0] - squares[1]) / squares[0]

@@ -101,10 +101,10 @@ def test_wrong_options_of_the_simulated_person_are_refused(options, message):
 
 PROGRAM = """
 import json, sys
-from tests.support.living_cell import config
 from drivers.terminal_operator import open_operator
+from hilcal.config import CellConfig
 from hilcal.errors import DeviceError
-made = config()
+made = CellConfig.model_validate_json(sys.argv[2])
 person = open_operator(made)
 print(json.dumps(person.report().problems), flush=True)
 loads = {load.name: load for load in made.loads}
@@ -126,7 +126,7 @@ class Person:
     def __init__(self, *requests, stdin=None):
         self.master, slave = pty.openpty()
         self.process = subprocess.Popen(
-            [sys.executable, "-c", PROGRAM, json.dumps(requests)],
+            [sys.executable, "-c", PROGRAM, json.dumps(requests), config().model_dump_json()],
             stdin=slave if stdin is None else stdin,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,

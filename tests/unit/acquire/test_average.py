@@ -84,7 +84,16 @@ def test_covariance_is_symmetric_to_the_last_bit():
 # calibration
 
 
-@pytest.mark.parametrize(("count", "share"), [(3, 0.0), (5, 0.0), (5, 0.4), (20, 0.0), (40, 0.2)])
+@pytest.mark.parametrize(
+    ("count", "share"),
+    [
+        (3, 0.0),
+        pytest.param(5, 0.0, marks=pytest.mark.slow),
+        (5, 0.4),
+        pytest.param(20, 0.0, marks=pytest.mark.slow),
+        (40, 0.2),
+    ],
+)
 def test_stated_ellipsoid_covers_the_truth_as_often_as_it_says(count, share):
     # 2500 windows: 3 standard errors are 1.3 %; a posterior of 20 + K - 1 repeats costs 1 %
     got = covered(np.random.default_rng(count), count, 2500, share)

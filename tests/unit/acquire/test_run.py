@@ -139,6 +139,7 @@ def test_times_and_temperatures() -> None:
 def test_everything_raw_is_stored_as_json() -> None:
     b = Bench()
     measure(b)
+    assert b.store.rows
     for text in (text for _, _, text in b.store.rows):
         detail = json.loads(text)
         assert len(detail["tracker"]) == b.config.acquire.samples
@@ -154,6 +155,7 @@ def test_nothing_moves_between_measuring_and_storing() -> None:
     measure(b)
     calls = b.world.calls
     stored = [k for k, name in enumerate(calls) if name == "store.record"]
+    assert len(stored) == len(b.store.rows) > 1
     for a, z in pairwise([0, *stored]):
         last = max(k for k in range(a, z) if calls[k] == "tracker.measure")
         assert "arm.start_move" not in calls[last:z]

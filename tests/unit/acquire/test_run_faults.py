@@ -1,6 +1,7 @@
 """A campaign under a fault at any call of any device: each reading exactly once, arm stopped."""
 
 from collections import Counter
+from functools import cache
 
 import numpy as np
 import pytest
@@ -45,6 +46,7 @@ def each_once(b: Bench, plan: Plan) -> bool:
     return Counter(step for step, _, _ in b.store.rows) == Counter(plan.steps)
 
 
+@cache
 def calls_of_a_whole_run() -> int:
     b = bench()
     measure(b, small_plan())

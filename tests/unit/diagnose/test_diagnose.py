@@ -136,9 +136,10 @@ def test_scores_foretell_what_adding_does(mode):
     """The F-test of a family is that of the refit with all its columns free."""
     found = fit_of(hidden("joint_tilt_compliance", mode, 0, strength=0.8, poses=15))
     p = projection(found)
-    for s in rank_suspects(p, candidates(p.fit)):
-        if s.effect not in ("base_compliance", "hysteresis", "joint_tilt_compliance"):
-            continue
+    some = ("base_compliance", "hysteresis", "joint_tilt_compliance")
+    suspects = [s for s in rank_suspects(p, candidates(p.fit)) if s.effect in some]
+    assert len(suspects) == len(some)
+    for s in suspects:
         after = add(found, s.effect)
         rank, rest = s.score.rank, found.dof - s.score.rank
         # Frames with a prior are learnt a little less well beside more parameters.

@@ -1,5 +1,7 @@
 """What an operator is told of each reading while a campaign is measured."""
 
+from functools import cache
+
 import numpy as np
 
 from hilcal.acquire.progress import LiveResidual, ReadingStored
@@ -20,6 +22,7 @@ def quiet() -> CellConfig:
     return config.model_copy(update={"repeatability": scatter})
 
 
+@cache
 def told(seed: int) -> list[tuple[LiveResidual, Readings, float]]:
     """Each reading's judgement, itself, and its true deflection against the reference.
 

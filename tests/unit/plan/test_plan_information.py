@@ -55,7 +55,9 @@ def test_prediction_is_what_identification_states(mode, known):
         config = config.model_copy(update={"sight": sight})
     p = problem(assumed(c.cell, config), config, poses_in(c.readings))
     stated = dict(zip(p_names(p), found.uncertainty.formal, strict=True))
-    for name, std in joints(predicted(p, everything_once(p)).by_name()).items():
+    foreseen = joints(predicted(p, everything_once(p)).by_name())
+    assert len(foreseen) == c.cell.arm.n
+    for name, std in foreseen.items():
         assert std == pytest.approx(stated[name], rel=0.01 if known else 0.05), name
 
 

@@ -147,7 +147,7 @@ def test_true_parameters_have_the_program_s_names() -> None:
     for effect in EFFECTS:
         if effect == "joint_compliance":
             continue
-        c = case(effect, poses=30 if effect == "transmission_error" else 8)  # for its harmonics
+        c = case(effect, poses=30 if effect == "transmission_error" else 4)  # for its harmonics
         effects = {effect, "joint_compliance"}
         names = {
             f"{e}.{p.name}" for e in effects for p in make(e, c.cell, c.readings.states).parameters

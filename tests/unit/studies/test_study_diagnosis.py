@@ -263,8 +263,8 @@ def test_the_document_is_json_and_holds_every_case() -> None:
 
 
 SMALL = (
-    "studies", "diagnosis", "hidden", "--robot", "ur10e", "--readings", "deflection",
-    "--effect", "hysteresis", "--strength", "3", "--strength", "1", "--seeds", "1", "--json",
+    "studies", "diagnosis", "hidden", "nothing", "--robot", "ur10e", "--readings", "deflection",
+    "--effect", "hysteresis", "--strength", "3", "--seeds", "1", "--nothing", "1", "--json",
 )  # fmt: skip
 
 
@@ -277,7 +277,7 @@ def test_the_command_gives_the_same_on_any_number_of_processes(capsys: Capsys) -
     strong, _ = one["cases"]
     assert strong["found"] is True
     assert strong["refined"]["model"][-1] == "hysteresis"
-    assert {c["kind"] for c in one["claims"]} == {"hidden"}
+    assert {c["kind"] for c in one["claims"]} == {"hidden", "nothing"}
 
 
 @pytest.mark.parametrize(
