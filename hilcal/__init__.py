@@ -1,3 +1,90 @@
-"""hilcal: hardware-in-the-loop calibration of the elastic and geometric errors of a robot arm."""
+"""hilcal: calibration of the elastic and geometric errors of a robot arm.
+
+    import hilcal as hc
+
+    with hc.Campaign.open("run.hilcal") as run:
+        model = hc.baseline(run.cell, run.readings)
+        found = hc.fit(model, run.readings)
+        print(found.summary())
+        print(hc.diagnose(found).verdict)
+
+Every name is imported when it is first used, so that `import hilcal` costs nothing.
+"""
+
+import sys
+from importlib import import_module
+from types import ModuleType
+from typing import TYPE_CHECKING
 
 __version__ = "0.1.0"
+
+_PLACES = {
+    "Campaign": "hilcal.campaign",
+    "CannotAnswerError": "hilcal.errors",
+    "Catalogue": "hilcal.effects.catalogue",
+    "Cell": "hilcal.cell",
+    "DeviceError": "hilcal.errors",
+    "Diagnosis": "hilcal.diagnose.verdict",
+    "Effect": "hilcal.effects.protocol",
+    "Fit": "hilcal.identify.fit",
+    "HilcalError": "hilcal.errors",
+    "InputError": "hilcal.errors",
+    "Model": "hilcal.model",
+    "Readings": "hilcal.data.readings",
+    "Refinement": "hilcal.refine",
+    "States": "hilcal.data.readings",
+    "baseline": "hilcal.library",
+    "check_effect": "hilcal.effects.check",
+    "diagnose": "hilcal.diagnose.verdict",
+    "effect": "hilcal.effects.spec",
+    "fit": "hilcal.library",
+    "plan": "hilcal.library",
+    "read_table": "hilcal.library",
+    "refine": "hilcal.library",
+}
+
+__all__ = ["__version__", *_PLACES]
+
+if TYPE_CHECKING:
+    from hilcal.campaign import Campaign
+    from hilcal.cell import Cell
+    from hilcal.data.readings import Readings, States
+    from hilcal.diagnose.verdict import Diagnosis, diagnose
+    from hilcal.effects.catalogue import Catalogue
+    from hilcal.effects.check import check_effect
+    from hilcal.effects.protocol import Effect
+    from hilcal.effects.spec import effect
+    from hilcal.errors import CannotAnswerError, DeviceError, HilcalError, InputError
+    from hilcal.identify.fit import Fit
+    from hilcal.library import baseline, fit, plan, read_table, refine
+    from hilcal.model import Model
+    from hilcal.refine import Refinement
+
+
+def __getattr__(name: str) -> object:
+    """Import a name of the library when it is first used."""
+    if name not in _PLACES:
+        raise AttributeError(f"module 'hilcal' has no attribute {name!r}")
+    found = getattr(import_module(_PLACES[name]), name)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    """Return the names of the library."""
+    return sorted(__all__)
+
+
+class _Library(ModuleType):
+    """A module in which `diagnose`, `plan` and `refine` are functions, not the subpackages.
+
+    Importing a submodule sets it as an attribute of its parent; here names of the library keep
+    their meaning. `from hilcal.plan.planner import make` is not affected.
+    """
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if name not in _PLACES or not isinstance(value, ModuleType):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Library

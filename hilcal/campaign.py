@@ -36,6 +36,10 @@ from hilcal.types import Floats
 class Campaign:
     """An open campaign file; close it, or use it in a `with` statement.
 
+    >>> with hc.Campaign.open(RUN) as run:
+    ...     len(run.readings), run.cell.arm.name, run.mode()
+    (50, 'ur10e', 'deflection')
+
     Attributes:
         file: the SQLite file, open for appending revisions.
         config: the cell's configuration.

@@ -46,6 +46,9 @@ class Cell:
     def load(cls, path: str | Path) -> "Cell":
         """Read a cell from its TOML file; paths in it are relative to the file.
 
+        >>> hc.Cell.load(CELL).arm.name
+        'ur10e'
+
         Raises:
             InputError: no such file, an unknown key, a bad value, or an unusable robot.
         """

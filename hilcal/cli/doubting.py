@@ -8,7 +8,6 @@ from drivers.simulated.injected_effects import HARD_TO_SEPARATE
 from drivers.simulated.rehearsal import Rehearsal
 from hilcal.acquire.dry_run import dry_run
 from hilcal.cli.next import plan_of, separates
-from hilcal.cli.plan_output import refuse
 from hilcal.cli.terminal import Terminal
 from hilcal.data.plan import REFERENCE, Plan
 from hilcal.data.records import content_hash
@@ -18,6 +17,7 @@ from hilcal.diagnose.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
+from hilcal.plan.checked_plan import refuse
 from hilcal.plan.next import measure_next
 from hilcal.plan.planner import Request
 from hilcal.report import numbers, text, text_demo

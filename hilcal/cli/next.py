@@ -8,18 +8,8 @@ import typer
 
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import Opened, check_record, effect_names, open_run
-from hilcal.cli.plan_output import (
-    POSES,
-    Csv,
-    Output,
-    Poses,
-    Quick,
-    Seed,
-    checked,
-    generator,
-    write,
-)
-from hilcal.cli.planning import plan_json, read_cell
+from hilcal.cli.plan_output import POSES, Csv, Output, Poses, Quick, Seed, generator, write
+from hilcal.cli.planning import read_cell
 from hilcal.cli.terminal import Json, Record, Run, Terminal, terminal
 from hilcal.data.plan import REFERENCE, Plan, read_plan
 from hilcal.data.run_log import PLAN
@@ -30,6 +20,7 @@ from hilcal.diagnose.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.fit import Fit
+from hilcal.plan.checked_plan import checked
 from hilcal.plan.next import Next, measure_next
 from hilcal.plan.planner import Request
 from hilcal.plan.summary import about, summarise
@@ -81,7 +72,7 @@ def next_(
     t.show(f"  hilcal run {cell or 'CELL.toml'} -o {run} --append --plan {output}")
     t.document(
         {
-            **plan_json(made),
+            **made.to_dict(),
             "plan": str(output),
             "suspects": list(effects),
             **separates(found),

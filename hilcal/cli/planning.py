@@ -11,25 +11,14 @@ from hilcal.acquire.dry_run import dry_run
 from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import check_record, open_run
-from hilcal.cli.plan_output import (
-    POSES,
-    CheckedPlan,
-    Csv,
-    Output,
-    Poses,
-    Quick,
-    Seed,
-    checked,
-    generator,
-    refuse,
-    write,
-)
+from hilcal.cli.plan_output import POSES, Csv, Output, Poses, Quick, Seed, generator, write
 from hilcal.cli.terminal import Json, Record, Terminal, terminal
 from hilcal.config import CellConfig, load_config
 from hilcal.data.plan import Plan, load_plan
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import DeviceError, InputError
 from hilcal.identify.fit import Fit
+from hilcal.plan.checked_plan import checked, refuse
 from hilcal.plan.choice import CRITERIA
 from hilcal.plan.planner import Request, make
 from hilcal.plan.summary import about, remarks, summarise
@@ -89,7 +78,7 @@ def plan(
     write(t, numbers, config, made, output, csv, record)
     t.show(plan_report(made.summary))
     t.show(f"The plan is in {output}: a file that you may edit. Every limit was checked.")
-    t.document({**plan_json(made), "plan": str(output)})
+    t.document({**made.to_dict(), "plan": str(output)})
 
 
 def _criterion(name: str | None) -> str | None:
@@ -153,17 +142,6 @@ def make_plan(
     """Return a plan of as many readings as so many poses take under every load of the cell."""
     chosen = make(cell, config, Request(poses), generator(seed), None, say, catalogue)
     return replace(chosen.ordered.plan, about={**about(chosen), "remarks": list(remarks(chosen))})
-
-
-def plan_json(made: CheckedPlan) -> dict[str, object]:
-    """Return the JSON document of a plan."""
-    return {
-        **made.summary.to_dict(),
-        "loads": list(made.plan.loads),
-        "load_changes": made.dry.load_changes,
-        "motions": made.dry.motions,
-        "duration_s": made.dry.duration,
-    }
 
 
 def answer_json(answer: ConnectionResult) -> dict[str, object]:

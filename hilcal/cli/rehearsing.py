@@ -12,7 +12,6 @@ from drivers.simulated.on_the_wire import read_plan, secret_of, simulated_cell
 from drivers.simulated.rehearsal import Rehearsal, Secret, as_told
 from hilcal.acquire.dry_run import dry_run
 from hilcal.cell import cell_from_config
-from hilcal.cli.plan_output import refuse
 from hilcal.cli.planning import make_plan
 from hilcal.cli.running import measure
 from hilcal.cli.terminal import Terminal
@@ -25,6 +24,7 @@ from hilcal.data.run_log import RunLog, create_run
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import DeviceError
 from hilcal.identify.full_covariance import campaign_readings
+from hilcal.plan.checked_plan import refuse
 from hilcal.report.progress import Say, counting, working
 
 TRIES = 4

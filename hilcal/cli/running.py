@@ -20,7 +20,7 @@ from hilcal.acquire.rig import Rig
 from hilcal.acquire.run import run as run_plan
 from hilcal.cell import Cell
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
-from hilcal.cli.plan_output import POSES, refuse
+from hilcal.cli.plan_output import POSES
 from hilcal.cli.planning import (
     CellFile,
     PlanFile,
@@ -36,6 +36,7 @@ from hilcal.data.plan import Plan, load_plan
 from hilcal.data.run_log import RunLog, check_same_cell, create_run
 from hilcal.diagnose.live_model import LiveModel
 from hilcal.errors import CannotAnswerError, DeviceError, InputError
+from hilcal.plan.checked_plan import refuse
 from hilcal.plan.goal_rule import GoalRule
 from hilcal.report.goal_words import missed_words, status_words
 from hilcal.report.live_run import watching

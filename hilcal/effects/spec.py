@@ -27,6 +27,9 @@ class EffectSpec:
 def effect(kind: str | type[Effect], **options: object) -> EffectSpec:
     """Return an effect by name and options, to be added to a model.
 
+    >>> hc.effect("creep", joints="each")
+    EffectSpec(kind='creep', options={'joints': 'each'})
+
     Args:
         kind: a name of the model's catalogue, or a class.
         **options: those that are not the usual ones, as `joints="each"`.

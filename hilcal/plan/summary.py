@@ -185,7 +185,7 @@ def summarise(
     planned: Planned,
     config: CellConfig,
     rng: np.random.Generator,
-    say: Say,
+    say: Say = lambda words: None,
     *,
     compare: bool = True,
 ) -> PlanSummary:

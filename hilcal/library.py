@@ -1,0 +1,168 @@
+"""The functions of `import hilcal`: thin, with defaults that suit a script."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from hilcal.cell import Cell
+from hilcal.data.covariance import tracker_noise
+from hilcal.data.readings import Readings
+from hilcal.data.table import read_table as read_exchange_table
+from hilcal.data.whitening import MODES, SCALINGS, Mode, usual_mode
+from hilcal.effects.catalogue import Catalogue
+from hilcal.errors import InputError
+from hilcal.identify import baseline as starting_models
+from hilcal.identify import fit as fits
+from hilcal.identify.fit import Fit
+from hilcal.model import Model
+from hilcal.plan.checked_plan import CheckedPlan, checked
+from hilcal.plan.planner import Request, make
+from hilcal.plan.summary import about, summarise
+from hilcal.refine import Refinement
+from hilcal.refine import refine as refine_model
+from hilcal.types import Floats
+
+
+def read_table(path: str | Path, cell: Cell) -> Readings:
+    """Read an exchange table, one row per reading, SI units.
+
+    >>> cell = hc.Cell.load(CELL)
+    >>> readings = hc.read_table(TABLE, cell)
+    >>> readings.load_names
+    ('none', '5kg', '10kg', 'pull x', 'pull y')
+
+    Args:
+        path: CSV file; its columns are listed in docs/reference/exchange-table.md.
+        cell: the cell that it was measured in; its tracker gives the covariances where the table
+            has none.
+
+    Raises:
+        InputError: anything that cannot be right, with row and column.
+    """
+    tracker = cell.configured().tracker
+    return read_exchange_table(path, cell.arm, tracker_noise(tracker), tracker.station_m)
+
+
+def baseline(
+    cell: Cell, data: Readings, readings: str | None = None, catalogue: Catalogue | None = None
+) -> Model:
+    """Return the model that every campaign starts from.
+
+    Unknown frames are registered and become part of the model; joint compliance joins where any
+    reading was taken under a load.
+
+    >>> cell = hc.Cell.load(CELL)
+    >>> model = hc.baseline(cell, hc.read_table(TABLE, cell))
+    >>> (model + hc.effect("base_compliance")).names
+    ('base_frame', 'joint_compliance', 'base_compliance')
+
+    Args:
+        cell: the cell.
+        data: what is to be fitted.
+        readings: "deflection" or "absolute"; what the data allow where None.
+        catalogue: the effects that a model can have; the installed ones where None.
+
+    Raises:
+        InputError: another kind of readings.
+        CannotAnswerError: the readings do not determine an unknown frame.
+    """
+    return starting_models.baseline(cell, data, _mode(readings, data), catalogue)
+
+
+def fit(
+    model: Model,
+    data: Readings,
+    readings: str | None = None,
+    scaling: str = "gc",
+    prior: Floats | None = None,
+) -> Fit:
+    """Fit a model to readings by whitened Gauss-Newton.
+
+    >>> with hc.Campaign.open(RUN) as run:
+    ...     found = hc.fit(hc.baseline(run.cell, run.readings), run.readings)
+    >>> found.model.names
+    ('base_frame', 'joint_compliance')
+    >>> found.parameters["joint_compliance.j2"].unit
+    'rad/(N·m)'
+    >>> found.error.rms_sigma < found.holdout.rms_sigma
+    True
+
+    Args:
+        model: robot and effects.
+        data: what was measured.
+        readings: "deflection" or "absolute"; what the data allow where None.
+        scaling: "none", "gu" or "gc" (whitened by the full covariance).
+        prior: (P,) standard deviations of zero-mean priors, infinite for flat ones, zero for
+            parameters held at zero; where None, those of the effects.
+
+    Raises:
+        InputError: another kind of readings or of scaling, or a deflection without its unloaded
+            reading.
+        CannotAnswerError: fewer measured elements than identifiable parameters.
+    """
+    for known in SCALINGS:
+        if scaling == known:
+            return fits.fit(model, data, _mode(readings, data), known, prior=prior)
+    raise InputError(f"scaling {scaling!r} is unknown; valid: {', '.join(SCALINGS)}")
+
+
+def refine(model: Model, data: Readings, readings: str | None = None) -> Refinement:
+    """Fit, diagnose, add the leading suspect, and repeat until the model is adequate.
+
+    >>> with hc.Campaign.open(RUN) as run:
+    ...     path = hc.refine(hc.baseline(run.cell, run.readings), run.readings)
+    ...     number = run.append(path)
+    >>> [step.added for step in path.steps]
+    [None, 'joint_tilt_compliance']
+
+    Args:
+        model: the model to start from.
+        data: what was measured.
+        readings: "deflection" or "absolute"; what the data allow where None.
+
+    Raises:
+        InputError: another kind of readings.
+        CannotAnswerError: fewer measured elements than identifiable parameters.
+    """
+    return refine_model(model, data, _mode(readings, data))
+
+
+def plan(
+    cell: Cell,
+    poses: int = 20,
+    criterion: str | None = None,
+    given: Fit | None = None,
+    seed: int = 0,
+) -> CheckedPlan:
+    """Choose poses, loads and their order by optimal design, with a certificate.
+
+    >>> plan = hc.plan(hc.Cell.load(CELL), poses=6)
+    >>> plan.efficiency > 0.9
+    True
+
+    Args:
+        cell: the cell with its limits, loads and `[planning]`, from `Cell.load`.
+        poses: as many readings as so many poses take, unloaded and under each load.
+        criterion: "D", "A", "E", "K", "I" or "separate"; that of `[planning]` where None.
+        given: a fit of what has been measured already.
+        seed: of the random candidates.
+
+    Raises:
+        InputError: numbers or names that cannot be, or a cell without configuration.
+        CannotAnswerError: the cell leaves too few poses, or the readings are too few.
+    """
+    config, rng = cell.configured(), np.random.default_rng(seed)
+    planned = make(cell, config, Request(poses, criterion=criterion), rng, given)
+    file = replace(planned.ordered.plan, about=about(planned))
+    return checked(cell, config, file, summarise(planned, config, rng, compare=False))
+
+
+def _mode(asked: str | None, data: Readings) -> Mode:
+    """Check the kind of readings; what the data allow where none is asked for."""
+    if asked is None:
+        return usual_mode(data)
+    for known in MODES:
+        if asked == known:
+            return known
+    raise InputError(f"readings {asked!r} is unknown; valid: {', '.join(MODES)}")

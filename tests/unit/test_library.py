@@ -1,0 +1,116 @@
+"""`import hilcal`: its names, its types, and every example of its docstrings."""
+
+import ast
+import doctest
+import inspect
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import hilcal as hc
+from drivers.simulated.rehearsal import rehearse
+from hilcal.config import load_config
+from hilcal.data.campaign import Campaign as CampaignFile
+from hilcal.data.table import write_table
+from hilcal.robot.catalogue import configs_dir
+from tests.support.paths import ROOT
+
+CELL = configs_dir() / "cells" / "demo_ur10e.toml"
+WITHOUT_EXAMPLE = {
+    # values that functions return, and errors
+    "CannotAnswerError", "DeviceError", "Diagnosis", "Effect", "Fit", "HilcalError", "InputError",
+    "Model", "Readings", "Refinement", "States", "Catalogue", "diagnose",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+    """A table and a campaign of ten poses in which the joints tilt."""
+    folder = tmp_path_factory.mktemp("library")
+    config = load_config(CELL)
+    readings = rehearse(config, "joint_tilt_compliance", 3, 10).readings
+    table, run = folder / "t.csv", folder / "run.hilcal"
+    write_table(readings, table)
+    with CampaignFile.create(run, config.to_json(), str(CELL.parent), "test") as file:
+        file.append_readings(readings)
+    return SimpleNamespace(table=table, run=run, cell=CELL, folder=folder)
+
+
+def names() -> list[str]:
+    return [name for name in hc.__all__ if not name.startswith("__")]
+
+
+@pytest.mark.parametrize("name", names())
+def test_the_examples_of_a_docstring_run(name: str, site: SimpleNamespace) -> None:
+    thing = getattr(hc, name)
+    known = {"hc": hc, "np": np, "CELL": site.cell, "TABLE": site.table, "RUN": site.run}
+    finder = doctest.DocTestFinder(recurse=True)
+    tests = [t for t in finder.find(thing, name, module=False, globs=known) if t.examples]
+    if name in WITHOUT_EXAMPLE:
+        return
+    assert tests, f"hc.{name} has no example"
+    for test in tests:
+        runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
+        assert runner.run(test).failed == 0, f"hc.{name}: see the output above"
+
+
+def test_the_lazy_names_are_those_that_type_checkers_see() -> None:
+    tree = ast.parse(Path(hc.__file__).read_text(encoding="utf-8"))
+    (checked,) = [
+        node for node in tree.body if isinstance(node, ast.If) and isinstance(node.test, ast.Name)
+    ]
+    seen = {}
+    for node in checked.body:
+        assert isinstance(node, ast.ImportFrom)
+        seen |= {alias.name: node.module for alias in node.names}
+    assert seen == hc._PLACES
+
+
+@pytest.mark.parametrize("first", ["import hilcal.plan.planner, hilcal.diagnose.verdict", "pass"])
+def test_functions_are_not_hidden_by_the_packages_of_their_names(first: str) -> None:
+    code = (
+        f"{first}\nimport hilcal as hc\nfrom hilcal.plan import tour\n"
+        "assert all(map(callable, (hc.plan, hc.diagnose, hc.refine))), hc.plan\n"
+        "assert tour.__name__ == 'hilcal.plan.tour'"
+    )
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
+
+
+def test_an_unknown_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="no attribute 'fitt'"):
+        hc.fitt  # noqa: B018
+    assert set(names()) <= set(dir(hc))
+
+
+def test_the_public_names_are_documented_and_typed() -> None:
+    assert (ROOT / "hilcal" / "py.typed").is_file()
+    for name in names():
+        thing = getattr(hc, name)
+        assert inspect.getdoc(thing), name
+        if inspect.isfunction(thing):
+            signature = inspect.signature(thing)
+            assert signature.return_annotation is not inspect.Signature.empty, name
+
+
+def test_fit_diagnosis_and_residuals_in_eight_lines(site: SimpleNamespace) -> None:
+    """What docs/how-to/use-the-library.md promises."""
+    with hc.Campaign.open(site.run) as run:
+        fit = hc.fit(hc.baseline(run.cell, run.readings), run.readings)
+        diagnosis = hc.diagnose(fit)
+        residuals = fit.residuals(frame="base")
+    assert diagnosis.suspects[0].effect == "joint_tilt_compliance"
+    assert residuals.shape == (40, 3)
+
+
+def test_wrong_words_are_refused_with_the_valid_ones(site: SimpleNamespace) -> None:
+    cell = hc.Cell.load(site.cell)
+    readings = hc.read_table(site.table, cell)
+    model = hc.baseline(cell, readings)
+    with pytest.raises(hc.InputError, match="valid: none, gu, gc"):
+        hc.fit(model, readings, scaling="gx")
+    with pytest.raises(hc.InputError, match="valid: deflection, absolute"):
+        hc.fit(model, readings, readings="relative")
