@@ -24,7 +24,7 @@ _PLACES = {
     "Catalogue": "hilcal.effects.catalogue",
     "Cell": "hilcal.cell",
     "DeviceError": "hilcal.errors",
-    "Diagnosis": "hilcal.diagnose.verdict",
+    "Diagnosis": "hilcal.diagnose.diagnosis",
     "Effect": "hilcal.effects.protocol",
     "Fit": "hilcal.identify.fit",
     "HilcalError": "hilcal.errors",
@@ -49,7 +49,8 @@ if TYPE_CHECKING:
     from hilcal.campaign import Campaign
     from hilcal.cell import Cell
     from hilcal.data.readings import Readings, States
-    from hilcal.diagnose.verdict import Diagnosis, diagnose
+    from hilcal.diagnose.diagnosis import Diagnosis
+    from hilcal.diagnose.verdict import diagnose
     from hilcal.effects.catalogue import Catalogue
     from hilcal.effects.check import check_effect
     from hilcal.effects.protocol import Effect

@@ -1,5 +1,6 @@
 """A campaign: its readings with their full covariance, and the fits that were stored in it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -7,18 +8,21 @@ from typing import Self
 
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
-from hilcal.data.campaign import Campaign as CampaignFile
+from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.readings import Readings
 from hilcal.data.records import content_hash
 from hilcal.data.revision import RevisionRecord
 from hilcal.data.whitening import Mode, usual_mode
 from hilcal.diagnose.diagnosis import Diagnosis, History
+from hilcal.diagnose.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError
-from hilcal.identify.fit import Fit
+from hilcal.identify.baseline import baseline
+from hilcal.identify.fit import Fit, fit
 from hilcal.identify.full_covariance import campaign_readings
 from hilcal.model import Model
 from hilcal.refine import Refinement
+from hilcal.report.build_story import Chapter
 from hilcal.report.diagnosis_document import to_json
 from hilcal.revisions import (
     chain,
@@ -30,6 +34,8 @@ from hilcal.revisions import (
     to_record,
 )
 from hilcal.types import Floats
+
+Say = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -184,3 +190,42 @@ class Campaign:
             raise InputError(f"{self.path}: the fit is of other readings than this campaign's")
         document = None if diagnosis is None else to_json(diagnosis)
         return self.file.append_revision(to_record(found, document, added, hashed, removed))
+
+    def latest_fit(self, say: Say = lambda text: None) -> tuple[int, Fit]:
+        """Return number and fit of the latest revision; without any, fit and store the baseline.
+
+        Args:
+            say: takes progress, one line each.
+
+        Raises:
+            InputError: its readings or effects are not at hand as they were when it was stored.
+            CannotAnswerError: the readings do not determine the baseline.
+        """
+        record = self.latest()
+        if record is not None:
+            say(f"restoring revision {record.number}")
+            return record.number, self.restore(record)
+        model = baseline(self.cell, self.readings, self.mode(), self.catalogue)
+        say(f"fitting {' + '.join(model.names) or 'the nominal arm'}")
+        found = fit(model, self.readings, self.mode())
+        return self.store(found), found
+
+    def chapters(self, say: Say = lambda text: None) -> list[Chapter]:
+        """Return the latest revision and those that it was made from, diagnosed; see `view`.
+
+        Args:
+            say: takes progress, one line each.
+
+        Raises:
+            InputError: its readings or effects are not at hand as they were when it was stored.
+        """
+        out = []
+        for record in chain(self.file.revisions()):
+            say(f"restoring revision {record.number}")
+            found = self.restore(record)
+            judged = None
+            if found.scaling == "gc":
+                say(f"diagnosing revision {record.number}")
+                judged = diagnose(found, self.history(record.number), say)
+            out.append(Chapter(record.number, record.added, found, judged, record.removed))
+        return out

@@ -16,7 +16,7 @@ from hilcal.cli.refining import Row, revisions_json
 from hilcal.cli.rehearsing import RehearsalSettings, first_plan, in_process, on_devices
 from hilcal.cli.terminal import Json, Record, Terminal, terminal
 from hilcal.config import load_config
-from hilcal.data.campaign import Campaign, may_write
+from hilcal.data.campaign_file import CampaignFile, may_write
 from hilcal.data.plan import Plan
 from hilcal.data.records import content_hash
 from hilcal.errors import InputError
@@ -92,7 +92,7 @@ def demo(
     with working(t.progress) as say:
         model = baseline(r.cell, r.readings, r.mode, catalogue)
         found = refine_model(model, r.readings, r.mode, say)
-    with Campaign.open(output) as campaign:
+    with CampaignFile.open(output) as campaign:
         if doubt is not None and doubt.plan is not None:
             first = to_json(doubt.diagnosis)
             campaign.append_revision(to_record(doubt.fit, first, None, doubt.hashed))

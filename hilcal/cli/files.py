@@ -1,158 +1,48 @@
-"""Campaign files as the commands see them: open, fit, and keep what was fitted."""
+"""What the commands share: the latest fit of a campaign, options of effects, recordings."""
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 
-from hilcal.cell import Cell, cell_from_config
+from hilcal.campaign import Campaign
 from hilcal.cli.terminal import Terminal
-from hilcal.config import CellConfig
-from hilcal.data.campaign import Campaign
 from hilcal.data.readings import Readings
-from hilcal.data.records import content_hash
-from hilcal.data.revision import RevisionRecord
-from hilcal.data.whitening import MODES, SCALINGS, Mode, Scaling, usual_mode
-from hilcal.diagnose.diagnosis import Diagnosis, History
-from hilcal.diagnose.verdict import diagnose
-from hilcal.effects.catalogue import Catalogue, installed
+from hilcal.data.whitening import MODES, SCALINGS, Mode, Scaling
+from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.options import Options
 from hilcal.effects.written import chosen_options, read_effects_text, write_effect
 from hilcal.errors import InputError
-from hilcal.identify.baseline import baseline
-from hilcal.identify.fit import Fit, fit
-from hilcal.identify.full_covariance import campaign_readings
+from hilcal.identify.fit import Fit
 from hilcal.model import Model
 from hilcal.report.build_story import Chapter, build_story
-from hilcal.report.diagnosis_document import to_json
 from hilcal.report.progress import Say, working
-from hilcal.revisions import (
-    chain,
-    check_sources,
-    history,
-    mode_of,
-    restore,
-    restore_model,
-    to_record,
-)
-from hilcal.types import Floats
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Opened:
-    """An open campaign.
-
-    Attributes:
-        path: the file.
-        campaign: open for appending.
-        config: the cell's configuration.
-        cell: the cell.
-        readings: all readings.
-        catalogue: the effects that a model can have.
-    """
-
-    path: Path
-    campaign: Campaign
-    config: CellConfig
-    cell: Cell
-    readings: Readings
-    catalogue: Catalogue
-
-    def latest(self) -> RevisionRecord | None:
-        """Return the latest revision, if there is any."""
-        records = self.campaign.revisions()
-        return records[-1] if records else None
-
-    def mode(self, asked: str | None) -> Mode:
-        """Kind of readings: as asked, else as in the latest revision, else what they allow.
-
-        Raises:
-            InputError: an unknown kind.
-        """
-        if asked is not None:
-            return choice(asked, MODES, "--readings")
-        record = self.latest()
-        return usual_mode(self.readings) if record is None else mode_of(record)
-
-    def store(
-        self,
-        found: Fit,
-        diagnosis: Diagnosis | None,
-        added: str | None,
-        removed: str | None = None,
-    ) -> int:
-        """Append a fit; returns its revision number."""
-        document = None if diagnosis is None else to_json(diagnosis)
-        record = to_record(found, document, added, content_hash(self.readings), removed)
-        return self.campaign.append_revision(record)
-
-    def restore(self, record: RevisionRecord) -> Fit:
-        """Find a stored fit again.
-
-        Raises:
-            InputError: its readings or its effects are not at hand as they were then.
-        """
-        check_sources(record, self.path, self.catalogue)
-        return restore(record, self.cell, self.readings, self.catalogue)
-
-    def model_of(self, record: RevisionRecord) -> tuple[Model, Floats]:
-        """Return model and parameters of a stored fit; raises as `restore` does."""
-        check_sources(record, self.path, self.catalogue)
-        return restore_model(record, self.cell, self.readings, self.catalogue)
-
-    def history(self, number: int | None = None) -> History:
-        """Return how the model of a revision was reached, by default of the latest."""
-        return history(chain(self.campaign.revisions()[:number]))
-
-    def latest_fit(self, t: Terminal, say: Say) -> tuple[int, Fit]:
-        """Return the latest revision as a fit; without any, make and store the baseline."""
-        record = self.latest()
-        if record is not None:
-            say(f"restoring revision {record.number}")
-            return record.number, self.restore(record)
-        mode = self.mode(None)
-        model = baseline(self.cell, self.readings, mode, self.catalogue)
-        say(f"fitting {' + '.join(model.names) or 'the nominal arm'}")
-        found = fit(model, self.readings, mode)
-        number = self.store(found, None, None)
+def latest_fit(t: Terminal, run: Campaign, say: Say) -> tuple[int, Fit]:
+    """Return the latest revision as a fit; without any, make the baseline and say so."""
+    there = run.latest() is not None
+    number, found = run.latest_fit(say)
+    if not there:
         t.notice(
             f"no revision yet: made the baseline, revision {number} "
-            f"({' + '.join(model.names) or 'the nominal arm'}, {mode} readings)"
+            f"({' + '.join(found.model.names) or 'the nominal arm'}, {found.mode} readings)"
         )
-        return number, found
-
-    def chapters(self, t: Terminal, say: Say) -> list[Chapter]:
-        """Return the latest revision and those that it was made from, diagnosed."""
-        if self.latest() is None:
-            self.latest_fit(t, say)
-        out = []
-        for record in chain(self.campaign.revisions()):
-            say(f"restoring revision {record.number}")
-            found = self.restore(record)
-            judged = None
-            if found.scaling == "gc":
-                say(f"diagnosing revision {record.number}")
-                judged = diagnose(found, self.history(record.number), say)
-            out.append(Chapter(record.number, record.added, found, judged, record.removed))
-        return out
+    return number, found
 
 
-@contextmanager
-def open_run(path: Path, catalogue: Catalogue | None = None) -> Iterator[Opened]:
-    """Open a campaign file.
+def chapters_of(t: Terminal, run: Campaign, say: Say) -> list[Chapter]:
+    """Return the latest revision and those that it was made from, diagnosed."""
+    if run.latest() is None:
+        latest_fit(t, run, say)
+    return run.chapters(say)
 
-    Args:
-        path: the file.
-        catalogue: the effects that a model can have; the installed ones unless given.
+
+def mode_of_option(run: Campaign, asked: str | None) -> Mode:
+    """Kind of readings: as asked, else as in the latest revision, else what they allow.
 
     Raises:
-        InputError: not a sound campaign, or without readings.
+        InputError: an unknown kind.
     """
-    with Campaign.open(path) as campaign:
-        config = CellConfig.from_json(campaign.config_json)
-        cell = cell_from_config(config, Path(campaign.base_dir))
-        readings = campaign_readings(campaign, cell, config)
-        yield Opened(path, campaign, config, cell, readings, catalogue or installed())
+    return run.mode() if asked is None else choice(asked, MODES, "--readings")
 
 
 def choice(name: str, valid: tuple[Mode, ...], option: str) -> Mode:
@@ -205,7 +95,7 @@ def effect_names(text: str | None, catalogue: Catalogue) -> tuple[str, ...] | No
     return None if wanted is None else tuple(wanted)
 
 
-def check_options(o: Opened, wanted: Mapping[str, Options]) -> None:
+def check_options(o: Campaign, wanted: Mapping[str, Options]) -> None:
     """Refuse options of effects before any work is done.
 
     Raises:

@@ -6,11 +6,13 @@ from typing import Annotated
 
 import typer
 
+from hilcal.campaign import Campaign
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import (
     check_options,
     chosen,
-    open_run,
+    latest_fit,
+    mode_of_option,
     scalings,
     titles,
     wanted_effects,
@@ -57,8 +59,8 @@ def identify(
     """Fit a model to the readings, and keep it as a revision."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     wanted, named = scalings(scaling), wanted_effects(effects, catalogue)
-    with open_run(run, catalogue) as o:
-        mode = o.mode(readings)
+    with Campaign.open(run, catalogue) as o:
+        mode = mode_of_option(o, readings)
         check_options(o, named or {})
         fits: dict[Scaling, Fit] = {}
         with working(t.progress) as say:
@@ -98,8 +100,8 @@ def options_json(found: Fit) -> dict[str, dict[str, object]]:
 def compare(run: Run, effects_from: EffectsFrom = None, as_json: Json = False) -> None:
     """Show where the latest model fails."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
-    with open_run(run, catalogue) as o, working(t.progress) as say:
-        number, found = o.latest_fit(t, say)
+    with Campaign.open(run, catalogue) as o, working(t.progress) as say:
+        number, found = latest_fit(t, o, say)
         if found.scaling != "gc":
             raise InputError(
                 f"revision {number} has scaling {found.scaling}; comparing needs gc: run hilcal "
@@ -144,16 +146,20 @@ def validate(
 ) -> None:
     """Predict readings of another campaign with the latest model."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
-    with open_run(run, catalogue) as o, open_run(other) as unseen, working(t.progress) as say:
+    with (
+        Campaign.open(run, catalogue) as o,
+        Campaign.open(other) as unseen,
+        working(t.progress) as say,
+    ):
         if o.cell.arm.name != unseen.cell.arm.name:
             raise InputError(
                 f"{other}: robot {unseen.cell.arm.name}; the model of {run} is of {o.cell.arm.name}"
             )
         record = o.latest()
         if record is None:
-            o.latest_fit(t, say)
-            record = o.campaign.revision(1)
-        model, theta = o.model_of(record)
+            latest_fit(t, o, say)
+            record = o.file.revision(1)
+        model, theta = o.restore_model(record)
         say(f"predicting {len(unseen.readings)} readings")
         found = predict_other(
             model, theta, o.readings, unseen.readings, mode_of(record), registered=register

@@ -6,8 +6,9 @@ from typing import Annotated
 
 import typer
 
+from hilcal.campaign import Campaign
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
-from hilcal.cli.files import Opened, check_record, effect_names, open_run
+from hilcal.cli.files import check_record, effect_names, latest_fit
 from hilcal.cli.plan_output import POSES, Csv, Output, Poses, Quick, Seed, generator, write
 from hilcal.cli.planning import read_cell
 from hilcal.cli.terminal import Json, Record, Run, Terminal, terminal
@@ -56,7 +57,7 @@ def next_(
     rng = generator(seed)
     if poses < 1:
         raise InputError(f"--poses {poses}; valid: a whole number from 1")
-    with open_run(run, catalogue) as o, working(t.progress) as say:
+    with Campaign.open(run, catalogue) as o, working(t.progress) as say:
         config, numbers = (o.config, o.cell) if cell is None else read_cell(cell)
         before, effects = _without_suspects(t, o, _named(suspects, catalogue), say)
         place = reference_of(o)
@@ -99,7 +100,7 @@ def plan_of(found: Next, suspects: tuple[str, ...]) -> Plan:
 
 
 def _without_suspects(
-    t: Terminal, o: Opened, named: tuple[str, ...] | None, say: Say
+    t: Terminal, o: Campaign, named: tuple[str, ...] | None, say: Say
 ) -> tuple[Fit, tuple[str, ...]]:
     """Return a fit, and the effects to separate that its model does not hold.
 
@@ -107,7 +108,7 @@ def _without_suspects(
         InputError: the latest revision is not in scaling gc.
         CannotAnswerError: nothing is in doubt; says what else to do.
     """
-    number, newest = o.latest_fit(t, say)
+    number, newest = latest_fit(t, o, say)
     if newest.scaling != "gc":
         raise InputError(
             f"revision {number} has scaling {newest.scaling}; next needs gc: run hilcal identify "
@@ -127,7 +128,7 @@ def _without_suspects(
     return newest, suspects
 
 
-def _settled(o: Opened, d: Diagnosis) -> str:
+def _settled(o: Campaign, d: Diagnosis) -> str:
     """Say that no suspects are to be separated, and what else to do."""
     head = "no suspects to separate:"
     if d.verdict == "adequate":
@@ -155,9 +156,9 @@ def _settled(o: Opened, d: Diagnosis) -> str:
     )
 
 
-def reference_of(o: Opened) -> Floats | None:
+def reference_of(o: Campaign) -> Floats | None:
     """Return the joints (n,) of the campaign's reference pose; None where it has none."""
-    text = o.campaign.about(PLAN)
+    text = o.file.about(PLAN)
     if text is None:
         return None
     plan = read_plan(text, f"{o.path}, its plan")

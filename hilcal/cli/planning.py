@@ -8,9 +8,10 @@ import typer
 
 from hilcal.acquire.connect import ConnectionResult, connect
 from hilcal.acquire.dry_run import dry_run
+from hilcal.campaign import Campaign
 from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
-from hilcal.cli.files import check_record, open_run
+from hilcal.cli.files import check_record, latest_fit
 from hilcal.cli.plan_output import POSES, Csv, Output, Poses, Quick, Seed, generator, write
 from hilcal.cli.terminal import Json, Record, Terminal, terminal
 from hilcal.config import CellConfig, load_config
@@ -94,8 +95,8 @@ def _criterion(name: str | None) -> str | None:
 
 def _known(t: Terminal, path: Path, catalogue: Catalogue, say: Say) -> Fit:
     """Return the newest fit of a campaign."""
-    with open_run(path, catalogue) as run:
-        return run.latest_fit(t, say)[1]
+    with Campaign.open(path, catalogue) as run:
+        return latest_fit(t, run, say)[1]
 
 
 def check(cell: CellFile, plan: PlanFile = None, as_json: Json = False) -> None:

@@ -13,12 +13,15 @@ from typing import Annotated
 
 import typer
 
+from hilcal.campaign import Campaign
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.ending import told_to_end
 from hilcal.cli.files import (
+    chapters_of,
     check_options,
     check_record,
-    open_run,
+    latest_fit,
+    mode_of_option,
     record_story,
     wanted_effects,
 )
@@ -67,8 +70,8 @@ class Row:
 def diagnose(run: Run, effects_from: EffectsFrom = None, as_json: Json = False) -> None:
     """Say which effect the latest model lacks."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
-    with open_run(run, catalogue) as o, working(t.progress) as say:
-        number, found = o.latest_fit(t, say)
+    with Campaign.open(run, catalogue) as o, working(t.progress) as say:
+        number, found = latest_fit(t, o, say)
         say(f"diagnosing revision {number}")
         d = judge(found, o.history(number), say)
     t.show(text_refine.diagnosis_report(d))
@@ -122,10 +125,10 @@ def _change(
     t, adds = terminal(as_json), options is not None
     named = write_effect(effect, options or {})
     check_record(record)
-    with open_run(run, catalogue) as o:
+    with Campaign.open(run, catalogue) as o:
         check_options(o, {effect: options or {}} if adds else {})
         with working(t.progress) as say:
-            before_number, before = o.latest_fit(t, say)
+            before_number, before = latest_fit(t, o, say)
             say(f"{'adding' if adds else 'removing'} {named}")
             after = make(before, effect)
             say("diagnosing")
@@ -137,7 +140,7 @@ def _change(
             )
             d = judge(after, how, say)
             number = o.store(after, d, added, removed)
-        stored = o.campaign.revision(before_number)
+        stored = o.file.revision(before_number)
         verdict = str(stored.result_json.get("diagnose", {}).get("verdict", ""))
         rows: list[Row] = [
             Row(before_number, before, verdict, stored.added, stored.removed),
@@ -148,7 +151,7 @@ def _change(
         t.show(["", text_refine.verdict_line(d)])
         if record is not None:
             with working(t.progress) as say:
-                chapters = o.chapters(t, say)
+                chapters = chapters_of(t, o, say)
             record_story(t, chapters, record)
     t.document(
         {
@@ -199,11 +202,11 @@ def refine(
     check_record(record)
     if from_latest and (named is not None or readings is not None):
         raise InputError("--from-latest keeps effects and readings; leave out the other options")
-    with open_run(run, catalogue) as o:
+    with Campaign.open(run, catalogue) as o:
         latest = o.latest() if from_latest else None
         if from_latest and latest is None:
             raise InputError(f"{run}: no revision yet; leave out --from-latest")
-        mode = o.mode(readings)
+        mode = mode_of_option(o, readings)
         check_options(o, named or {})
         with working(t.progress) as say:
             if latest is not None:
@@ -280,8 +283,8 @@ def view(
     """Tell the story of the latest revisions in rerun."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     check_record(record)
-    with open_run(run, catalogue) as o, working(t.progress) as say:
-        chapters = o.chapters(t, say)
+    with Campaign.open(run, catalogue) as o, working(t.progress) as say:
+        chapters = chapters_of(t, o, say)
     if record is not None:
         record_story(t, chapters, record)
         t.document({"recording": str(record), "revisions": [c.number for c in chapters]})

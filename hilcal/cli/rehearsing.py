@@ -17,7 +17,7 @@ from hilcal.cli.running import measure
 from hilcal.cli.terminal import Terminal
 from hilcal.config import CellConfig
 from hilcal.data.appended import with_new_names
-from hilcal.data.campaign import Campaign
+from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.plan import Plan
 from hilcal.data.readings import Readings
 from hilcal.data.run_log import RunLog, create_run
@@ -123,7 +123,9 @@ def in_process(
         secret = secret_of(told.config, plan, told.choice, told.seed)
     source = "rehearsal in a simulated cell, without devices"
     made = secret.config.to_json()
-    with Campaign.create(told.output, made, str(told.base_dir), source, overwrite=True) as campaign:
+    with CampaignFile.create(
+        told.output, made, str(told.base_dir), source, overwrite=True
+    ) as campaign:
 
         def measured(part: Plan, number: int, begun: float) -> Rehearsal:
             r = read_plan(secret, part, [told.seed, number], begun)
@@ -167,7 +169,7 @@ def to_the_end(t: Terminal, work: Callable[[], object], done: Callable[[], int])
             return
 
 
-def _write(t: Terminal, campaign: Campaign, readings: Readings) -> None:
+def _write(t: Terminal, campaign: CampaignFile, readings: Readings) -> None:
     """Append readings in their order, pose after pose."""
     starts = [0, *(np.flatnonzero(np.diff(readings.pose)) + 1).tolist(), len(readings)]
     with counting(t.progress, "measuring poses", len(starts) - 1) as advance:

@@ -31,7 +31,7 @@ from hilcal.cli.planning import (
 )
 from hilcal.cli.terminal import Json, Terminal, terminal
 from hilcal.config import CellConfig
-from hilcal.data.campaign import Campaign
+from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.plan import Plan, load_plan
 from hilcal.data.run_log import RunLog, check_same_cell, create_run
 from hilcal.diagnose.live_model import LiveModel
@@ -84,7 +84,7 @@ def run(
                 raise InputError("--append begins a further plan, --resume goes on; give one")
             if plan is not None:
                 raise InputError("--plan with --resume: the plan is in the campaign; leave it out")
-            campaign = stack.enter_context(Campaign.open(output))
+            campaign = stack.enter_context(CampaignFile.open(output))
             check_same_cell(campaign, config)
             made = RunLog(campaign).plans[0]
         elif append:
@@ -131,7 +131,7 @@ def run(
 
 def _append(
     stack: ExitStack, output: Path, plan: Path | None, config: CellConfig, cell: Cell
-) -> tuple[Campaign, Plan]:
+) -> tuple[CampaignFile, Plan]:
     """Open a campaign, and return it with a further plan that has been checked.
 
     Raises:
@@ -139,7 +139,7 @@ def _append(
     """
     if plan is None:
         raise InputError("--append needs the further plan: give it with --plan PLAN")
-    campaign = stack.enter_context(Campaign.open(output))
+    campaign = stack.enter_context(CampaignFile.open(output))
     check_same_cell(campaign, config)
     further = RunLog(campaign).with_new_names(load_plan(plan))
     refuse(dry_run(cell, config, further), str(plan))
@@ -147,7 +147,11 @@ def _append(
 
 
 def measure(
-    t: Terminal, config: CellConfig, cell: Cell, campaign: Campaign, goal: GoalRule | None = None
+    t: Terminal,
+    config: CellConfig,
+    cell: Cell,
+    campaign: CampaignFile,
+    goal: GoalRule | None = None,
 ) -> int:
     """Measure what is missing in a campaign; returns how many readings it then holds.
 

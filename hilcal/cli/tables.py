@@ -9,11 +9,11 @@ import numpy as np
 import typer
 from rich.padding import Padding
 
+from hilcal.campaign import Campaign
 from hilcal.cell import cell_from_config
-from hilcal.cli.files import open_run
 from hilcal.cli.terminal import Json, Run, terminal
 from hilcal.config import CellConfig, load_config
-from hilcal.data.campaign import Campaign
+from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.covariance import tracker_noise
 from hilcal.data.ipa_ur10 import read_ipa_ur10
 from hilcal.data.readings import Readings
@@ -53,7 +53,7 @@ def import_(
         readings, notes = _read(table, kind, settings, cell.arm)
         say(f"writing {output}")
         source = f"{table.name} ({kind})"
-        with Campaign.create(
+        with CampaignFile.create(
             output, settings.to_json(), str(base_dir), source, overwrite=force
         ) as campaign:
             campaign.append_readings(readings)
@@ -115,7 +115,7 @@ def export(
     for path in wanted:
         if path.exists() and not force:
             raise InputError(f"{path}: the file exists; choose another name or give --force")
-    with open_run(run) as opened_run:
+    with Campaign.open(run) as opened_run:
         record = opened_run.latest()
         if parameters is not None and record is None:
             raise InputError(f"{run}: no revision yet, so no parameters; run hilcal identify first")

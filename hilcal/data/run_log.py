@@ -10,7 +10,7 @@ import numpy as np
 from hilcal.config import CellConfig
 from hilcal.data import rows, schema
 from hilcal.data.appended import joined, with_new_names
-from hilcal.data.campaign import Campaign
+from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.covariance import COVERS, INSTRUMENT
 from hilcal.data.plan import Plan, Step, read_plan
 from hilcal.data.readings import Readings
@@ -29,7 +29,7 @@ ADDRESSES = {"driver", "host", "port", "baud", "options"}
 
 def create_run(
     path: Path, config: CellConfig, base_dir: Path, plan: Plan, overwrite: bool = False
-) -> Campaign:
+) -> CampaignFile:
     """Make the empty campaign of a run, its plan inside.
 
     Raises:
@@ -37,12 +37,12 @@ def create_run(
     """
     more = {PLAN: plan.to_json(), COVERS: INSTRUMENT}
     source = "measured by hilcal run"
-    return Campaign.create(
+    return CampaignFile.create(
         path, config.to_json(), str(base_dir), source, overwrite=overwrite, more=more
     )
 
 
-def check_same_cell(campaign: Campaign, config: CellConfig) -> None:
+def check_same_cell(campaign: CampaignFile, config: CellConfig) -> None:
     """Refuse to continue a campaign in another cell.
 
     Raises:
@@ -66,7 +66,7 @@ class RunLog:
     A reading, its step and its raw details enter together or not at all, and no step twice.
     """
 
-    def __init__(self, campaign: Campaign) -> None:
+    def __init__(self, campaign: CampaignFile) -> None:
         """Write to an open campaign.
 
         Raises:

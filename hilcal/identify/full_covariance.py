@@ -6,7 +6,7 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.data.campaign import Campaign
+from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.covariance import COVERS, INSTRUMENT, joint_scatter
 from hilcal.data.readings import Readings
 from hilcal.errors import CannotAnswerError
@@ -15,7 +15,7 @@ from hilcal.robot.chain import evaluate, joint_jacobian
 from hilcal.types import Floats
 
 
-def campaign_readings(campaign: Campaign, cell: Cell, config: CellConfig) -> Readings:
+def campaign_readings(campaign: CampaignFile, cell: Cell, config: CellConfig) -> Readings:
     """Return all readings of a campaign with their full covariance, see `data.covariance`.
 
     The arm's repeatability is added where the stored covariances cover the instrument alone, that

@@ -10,7 +10,7 @@ import pytest
 
 from drivers.simulated.rehearsal import simulate
 from hilcal import __version__
-from hilcal.data.campaign import Campaign
+from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.table import read_table
 from hilcal.effects.catalogue import installed
 from tests.support.cli_cases import CELL, ok, refused, rehearsal, run, table
@@ -97,7 +97,7 @@ def test_all_scalings_stand_side_by_side(campaign: Path, capsys: Capsys) -> None
     assert all(found["scaling"] == name for name, found in d["scalings"].items())
     assert d["scalings"]["gc"]["parameters"] == d["parameters"]
     assert d["scalings"]["none"]["parameters"] != d["parameters"]
-    with Campaign.open(campaign) as stored:
+    with CampaignFile.open(campaign) as stored:
         assert [r.options["scaling"] for r in stored.revisions()] == ["gc"]
     words = ok(capsys, "identify", campaign, "--scaling", "all").out
     assert "The same readings with every scaling" in words
@@ -115,7 +115,7 @@ def test_the_baseline_is_made_and_stored_where_there_is_no_revision(
     strongest = next(w for w in d["where"] if not w["variable"].startswith("direction"))
     assert "approach" in strongest["variable"]  # what hysteresis depends on
     assert d["worst"][0]["sigma"] > d["worst"][-1]["sigma"] > 3
-    with Campaign.open(campaign) as stored:
+    with CampaignFile.open(campaign) as stored:
         assert len(stored.revisions()) == 1
     again = ok(capsys, "compare", campaign, "--json")
     assert again.document["error"]["fit"] == pytest.approx(d["error"]["fit"])
@@ -181,7 +181,7 @@ def test_refine_ends_adequate_and_keeps_every_revision(campaign: Path, capsys: C
     low, high = d["revisions"][-1]["variance_factor_interval"]
     assert low < 1 < high
     assert "adding hysteresis" in result.err  # progress
-    with Campaign.open(campaign) as stored:
+    with CampaignFile.open(campaign) as stored:
         records = stored.revisions()
     assert [r.added for r in records] == [None, "hysteresis"]
     assert records[-1].result_json["diagnose"]["verdict"] == "adequate"
@@ -192,14 +192,14 @@ def test_refine_can_start_elsewhere(campaign: Path, capsys: Capsys) -> None:
     ok(capsys, "add", campaign, "hysteresis")
     d = ok(capsys, "refine", campaign, "--from-latest", "--json").document
     assert [r["revision"] for r in d["revisions"]] == [2]  # adequate already: nothing is stored
-    with Campaign.open(campaign) as stored:
+    with CampaignFile.open(campaign) as stored:
         assert len(stored.revisions()) == 2
     refused(capsys, 2, "refine", campaign, "--from-latest", "--effects", "hysteresis")
     chosen = ("--effects", "hysteresis,joint_compliance", "--readings", "absolute")
     d = ok(capsys, "refine", campaign, *chosen, "--json").document
     assert d["revisions"][0]["model"] == ["base_frame", "hysteresis", "joint_compliance"]
     assert {r["readings"] for r in d["revisions"]} == {"absolute"}
-    with Campaign.open(campaign) as stored:  # what was fitted last is what is gone on with
+    with CampaignFile.open(campaign) as stored:  # what was fitted last is what is gone on with
         assert stored.revisions()[-1].options["readings"] == "absolute"
     assert ok(capsys, "identify", campaign, "--json").document["readings"] == "absolute"
 
@@ -211,7 +211,7 @@ def test_validate_predicts_what_was_never_fitted(
     r = rehearsal("hysteresis")
     half = r.readings.pose < 7  # the other readings: the same cell and tracker, half of the poses
     other = tmp_path / "other.hilcal"
-    with Campaign.create(other, r.config.to_json(), str(tmp_path), "test") as file:
+    with CampaignFile.create(other, r.config.to_json(), str(tmp_path), "test") as file:
         file.append_readings(r.readings[half])
     d = ok(capsys, "validate", campaign, other, "--json").document
     assert d["n_readings"] == int(half.sum())
@@ -226,7 +226,7 @@ def test_validate_predicts_what_was_never_fitted(
     there = replace(r.world, registration=moved)
     readings = simulate(there, seen.states, seen.pose, seen.load, seen.cycle, seen.load_names, rng)
     far = tmp_path / "far.hilcal"
-    with Campaign.create(far, r.config.to_json(), str(tmp_path), "test") as file:
+    with CampaignFile.create(far, r.config.to_json(), str(tmp_path), "test") as file:
         file.append_readings(readings)
     wrong = ok(capsys, "validate", campaign, far)
     assert "--register" in wrong.out
@@ -260,7 +260,7 @@ def test_export_writes_tables_that_go_in_again(
     ok(capsys, "refine", campaign)
     ok(capsys, "export", campaign, "--table", readings, "--parameters", parameters)
     refused(capsys, 2, "export", campaign, "--table", readings)
-    with Campaign.open(campaign) as stored:
+    with CampaignFile.open(campaign) as stored:
         again = read_table(readings, rehearsal("nothing").cell.arm, None)
         assert (again.value == stored.readings().value).all()
     with parameters.open(encoding="utf-8", newline="") as stream:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from hilcal.data.campaign import Campaign
+from hilcal.data.campaign_file import CampaignFile
 from tests.support.cli_cases import CELL, Outcome, ok, refused, table
 
 Capsys = pytest.CaptureFixture[str]
@@ -29,7 +29,7 @@ def names_of(result: Outcome, effect: str) -> list[str]:
 
 
 def revisions(path: Path) -> list[tuple[tuple[str, ...], str | None, dict[str, object]]]:
-    with Campaign.open(path) as stored:
+    with CampaignFile.open(path) as stored:
         return [(r.effects, r.added, r.options["effects"]) for r in stored.revisions()]
 
 

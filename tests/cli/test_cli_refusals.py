@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from hilcal.data.campaign import Campaign
+from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.readings import Readings
 from tests.support.cli_cases import CELL, ok, refused, rehearsal, run, start, table
 
@@ -149,7 +149,7 @@ def test_fewer_readings_than_parameters(tmp_path: Path, capsys: Capsys) -> None:
     r = rehearsal("nothing", poses=4)
     path = tmp_path / "few.hilcal"
     unloaded = r.readings.unloaded
-    with Campaign.create(path, r.config.to_json(), str(tmp_path), "test") as file:
+    with CampaignFile.create(path, r.config.to_json(), str(tmp_path), "test") as file:
         file.append_readings(r.readings[unloaded])
     line = refused(
         capsys, 4, "identify", path, "--effects", "encoder_offset,link_geometry", "--readings",
@@ -157,7 +157,7 @@ def test_fewer_readings_than_parameters(tmp_path: Path, capsys: Capsys) -> None:
     )  # fmt: skip
     assert "measure" in line
     two = tmp_path / "two.hilcal"
-    with Campaign.create(two, r.config.to_json(), str(tmp_path), "test") as file:
+    with CampaignFile.create(two, r.config.to_json(), str(tmp_path), "test") as file:
         file.append_readings(r.readings[r.readings.pose < 2])
     assert "poses" in refused(capsys, 4, "identify", two)
 
@@ -165,7 +165,7 @@ def test_fewer_readings_than_parameters(tmp_path: Path, capsys: Capsys) -> None:
 def test_readings_appended_after_a_fit(campaign: Path, capsys: Capsys) -> None:
     ok(capsys, "identify", campaign)
     more: Readings = rehearsal("nothing", seed=2, poses=2).readings
-    with Campaign.open(campaign) as file:
+    with CampaignFile.open(campaign) as file:
         names = tuple(f"new{k}" for k in range(2))
         file.append_readings(type(more)(**{**_fields(more), "pose_names": names}))
     line = refused(capsys, 2, "compare", campaign)
@@ -275,7 +275,7 @@ def test_a_kill_leaves_every_committed_revision(campaign: Path, capsys: Capsys) 
     time.sleep(0.3)  # anywhere: whatever it is doing, the file stays whole
     process.kill()
     process.communicate()
-    with Campaign.open(campaign) as stored:
+    with CampaignFile.open(campaign) as stored:
         assert len(stored.revisions()) >= 1
     assert ok(capsys, "refine", campaign, "--json").document["verdict"] == "adequate"
 

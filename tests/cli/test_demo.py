@@ -7,7 +7,7 @@ import pytest
 
 from drivers.simulated.rehearsal import choices
 from hilcal.config import load_config
-from hilcal.data.campaign import Campaign
+from hilcal.data.campaign_file import CampaignFile
 from hilcal.errors import InputError
 from studies.random_campaigns import rehearse
 from tests.support.cli_cases import CELL, ok, refused, rehearsal
@@ -33,7 +33,7 @@ def test_the_hidden_effect_is_found(effect: str, tmp_path: Path, capsys: Capsys)
     assert "true" in result.err  # people's text is on stderr
     off = [abs(p["value"] - p["true"]) / p["std"] for p in d["parameters"]]
     assert np.sqrt(np.mean(np.square(off))) < 2
-    with Campaign.open(path) as stored:
+    with CampaignFile.open(path) as stored:
         assert 80 < stored.n_readings < 150
         assert [r.added for r in stored.revisions()] == [r["added"] for r in d["revisions"]]
 

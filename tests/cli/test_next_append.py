@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hilcal.data.appended import joined, with_new_names
-from hilcal.data.campaign import Campaign
+from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.plan import REFERENCE, Plan, Step, load_plan
 from hilcal.data.run_log import RunLog
 from hilcal.errors import InputError
@@ -93,7 +93,7 @@ def test_what_was_not_measured_before_is_given_up(tmp_path: Path) -> None:
         assert log.plan.steps == (*STEPS[:3], *fitted.steps)
         with pytest.raises(InputError, match="in the campaign already, and 4 of its 4 readings"):
             log.with_new_names(further)
-    with Campaign.open(path) as campaign:
+    with CampaignFile.open(path) as campaign:
         log = RunLog(campaign)
         assert [len(p.steps) for p in log.plans] == [6, 4]
         assert log.plan.steps == (*STEPS[:3], *fitted.steps)
@@ -105,9 +105,9 @@ _KILLED = """
 import os, sys
 from pathlib import Path
 from tests.cli.test_next_append import made
-from hilcal.data.campaign import Campaign
+from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.run_log import RunLog
-with Campaign.open(Path(sys.argv[1])) as campaign:
+with CampaignFile.open(Path(sys.argv[1])) as campaign:
     log = RunLog(campaign)
     log.append(log.with_new_names(made("p8", "p9")))
     os._exit(9)
@@ -125,7 +125,7 @@ def test_an_appended_plan_survives_a_kill(tmp_path: Path) -> None:
         check=False,
     )
     assert child.returncode == 9
-    with Campaign.open(path) as campaign:
+    with CampaignFile.open(path) as campaign:
         assert RunLog(campaign).plans[1].pose_names == ("p8", "p9")
 
 
@@ -151,7 +151,7 @@ def test_a_further_plan_is_measured_into_the_campaign(site: Site, capsys: Capsys
     d = ok(capsys, *site.command("--append", "--plan", str(further), "--json")).document
     added = d["readings"] - first
     assert (added, d["planned"]) == (15, d["readings"])
-    with Campaign.open(path) as campaign:
+    with CampaignFile.open(path) as campaign:
         readings, events = campaign.readings(), RunLog(campaign).events()
     old, new = readings[slice(0, first)], readings[slice(first, None)]
     names = readings.pose_names
@@ -175,7 +175,7 @@ def test_an_append_that_was_stopped_is_resumed(site: Site, capsys: Capsys) -> No
     ok(capsys, *site.command(*site.fresh))
     site.bench.world.again()
     further = str(further_plan(site))
-    with Campaign.open(site.directory / "run.hilcal") as campaign:  # stopped before it moved
+    with CampaignFile.open(site.directory / "run.hilcal") as campaign:  # stopped before it moved
         log = RunLog(campaign)
         log.append(log.with_new_names(load_plan(Path(further))))
     line = refused(capsys, 2, *site.command("--append", "--plan", further))

@@ -7,7 +7,7 @@ import pytest
 
 from drivers.simulated.injected_effects import HARD_TO_SEPARATE
 from hilcal.cli.doubting import in_doubt
-from hilcal.data.campaign import Campaign
+from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.plan import load_plan
 from hilcal.robot.catalogue import configs_dir
 from tests.support.cli_cases import ok, refused
@@ -20,7 +20,7 @@ CELLS = str(configs_dir() / "cells")
 
 def stored(path: Path, effect: str, seed: int) -> Path:
     """Write a small campaign, as `hilcal import` would."""
-    with Campaign.create(path, SMALL.to_json(), CELLS, "a test", overwrite=True) as campaign:
+    with CampaignFile.create(path, SMALL.to_json(), CELLS, "a test", overwrite=True) as campaign:
         campaign.append_readings(doubtful(effect, seed).rehearsal.readings)
     return path
 
@@ -150,7 +150,7 @@ def test_the_demo_settles_a_doubt(tmp_path: Path, capsys: Capsys) -> None:
     assert d["diagnoses"][0]["suspects"][0]["effect"] == LINK
     assert d["diagnoses"][0]["suspects"][0]["same_as"] == []
     assert "readings were added" in result.err
-    with Campaign.open(path) as campaign:
+    with CampaignFile.open(path) as campaign:
         records, readings = campaign.revisions(), campaign.readings()
     assert [r.added for r in records] == [None, None, LINK]
     assert records[0].data_hash != records[1].data_hash

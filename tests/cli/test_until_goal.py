@@ -12,7 +12,7 @@ import hilcal.plan.goal_rule as goal_rule
 from hilcal.acquire.connect import ConnectionResult
 from hilcal.config import CellConfig, Repeatability
 from hilcal.config.write import to_toml
-from hilcal.data.campaign import Campaign as CampaignFile
+from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.plan import Plan, Step
 from hilcal.data.run_log import RunLog
 from hilcal.errors import InputError

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hilcal.cell import Cell
-from hilcal.data.campaign import Campaign
+from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.plan import Step
 from hilcal.data.run_log import RunLog
 from hilcal.identify.full_covariance import with_joint_scatter
@@ -163,7 +163,7 @@ def finish(site: Site, path: Path) -> None:
 
 def whole(site: Site, path: Path) -> None:
     """Check that every step of the plan is there once, and that every reading is right."""
-    with Campaign.open(path) as campaign:
+    with CampaignFile.open(path) as campaign:
         log = RunLog(campaign)
         stored = [Step(**d["step"]) for d in log.details()]
         assert sorted(map(str, stored)) == sorted(map(str, site.plan.steps))
@@ -173,7 +173,7 @@ def whole(site: Site, path: Path) -> None:
 
 def right(site: Site, path: Path) -> None:
     """Check that every stored reading is what a tracker may read of the state it is stored with."""
-    with Campaign.open(path) as campaign:
+    with CampaignFile.open(path) as campaign:
         readings = campaign.readings()
     for k, name in enumerate(readings.load_names):
         load = next((x for x in site.config.loads if x.name == name), None)

@@ -8,7 +8,7 @@ import pytest
 
 from hilcal.campaign import Campaign
 from hilcal.config import load_config
-from hilcal.data.campaign import Campaign as CampaignFile
+from hilcal.data.campaign_file import CampaignFile
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import fit

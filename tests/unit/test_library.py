@@ -14,7 +14,7 @@ import pytest
 import hilcal as hc
 from drivers.simulated.rehearsal import rehearse
 from hilcal.config import load_config
-from hilcal.data.campaign import Campaign as CampaignFile
+from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.table import write_table
 from hilcal.robot.catalogue import configs_dir
 from tests.support.paths import ROOT

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilcal.data.campaign import Campaign
+from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.run_log import RunLog
 from tests.support.campaign_cases import (
     STARVED,
@@ -56,7 +56,7 @@ def test_a_plea_to_end_stops_the_arm_first(kind: signal.Signals, cell: Site, pat
     assert "interrupted" in failed(run, 130)
     stopped_on_its_way(cell, since, goal)
     right(cell, path)
-    with Campaign.open(path) as campaign:
+    with CampaignFile.open(path) as campaign:
         assert RunLog(campaign).events()[-1]["kind"] == "interrupted"
 
 
@@ -116,7 +116,7 @@ def _kill_at_random(cell: Site, path: Path, kills: int, seed: int) -> int:
 
 
 def _sound(path: Path) -> None:
-    with Campaign.open(path) as campaign:
+    with CampaignFile.open(path) as campaign:
         log = RunLog(campaign)
         assert campaign.n_readings == len(log.done()) == len(log.details())
 

@@ -16,7 +16,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from hilcal.data.campaign import Campaign
+from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.readings import Readings
 from hilcal.data.records import content_hash
 from hilcal.data.revision import RevisionRecord
@@ -39,15 +39,15 @@ REVISION = RevisionRecord(
 
 
 def make(path: Path, x: Readings | None = None) -> Path:
-    with Campaign.create(path, '{"robot": "ur10"}', "base/dir", "a test") as campaign:
+    with CampaignFile.create(path, '{"robot": "ur10"}', "base/dir", "a test") as campaign:
         if x is not None:
             campaign.append_readings(x)
     return path
 
 
 @pytest.fixture
-def run(tmp_path: Path) -> Iterator[Campaign]:
-    with Campaign.create(tmp_path / "run.hilcal", "{}", "", "a test") as campaign:
+def run(tmp_path: Path) -> Iterator[CampaignFile]:
+    with CampaignFile.create(tmp_path / "run.hilcal", "{}", "", "a test") as campaign:
         yield campaign
 
 
@@ -55,9 +55,9 @@ def run(tmp_path: Path) -> Iterator[Campaign]:
 @given(x=readings())
 def test_round_trip_is_exact(tmp_path: Path, x: Readings) -> None:
     path = tmp_path / "run.hilcal"
-    with Campaign.create(path, "{}", "", "", overwrite=True) as campaign:
+    with CampaignFile.create(path, "{}", "", "", overwrite=True) as campaign:
         assert campaign.append_readings(x) == len(x)
-    with Campaign.open(path) as campaign:
+    with CampaignFile.open(path) as campaign:
         assert_same(campaign.readings(), x)
         assert campaign.data_hash() == content_hash(x)
     assert [p.name for p in tmp_path.iterdir()] == ["run.hilcal"]
@@ -65,7 +65,7 @@ def test_round_trip_is_exact(tmp_path: Path, x: Readings) -> None:
 
 def test_description_is_kept(tmp_path: Path) -> None:
     path = make(tmp_path / "run.hilcal")
-    with Campaign.open(path) as campaign:
+    with CampaignFile.open(path) as campaign:
         assert campaign.config_json == '{"robot": "ur10"}'
         assert campaign.base_dir == "base/dir"
         assert campaign.source == "a test"
@@ -81,7 +81,7 @@ def test_hash_does_not_depend_on_how_readings_were_appended(
     tmp_path: Path, cuts: list[int]
 ) -> None:
     x = simple(12)
-    with Campaign.create(tmp_path / "run.hilcal", "{}", "", "", overwrite=True) as campaign:
+    with CampaignFile.create(tmp_path / "run.hilcal", "{}", "", "", overwrite=True) as campaign:
         for start, stop in zip([0, *cuts], [*cuts, 12], strict=True):
             campaign.append_readings(x[start:stop])
         assert_same(campaign.readings(), x)
@@ -115,7 +115,7 @@ def test_hash_sees_every_change() -> None:
     assert len(hashes) == len(others) + 1
 
 
-def test_later_readings_bring_new_poses_and_loads(run: Campaign) -> None:
+def test_later_readings_bring_new_poses_and_loads(run: CampaignFile) -> None:
     x, y = simple(2), simple(3, seed=1)
     y = replace(y, pose_names=("p1", "new", "p0"), load_names=("plate",))
     q = y.states.q.copy()
@@ -131,7 +131,7 @@ def test_later_readings_bring_new_poses_and_loads(run: Campaign) -> None:
     np.testing.assert_array_equal(z.value, np.vstack([x.value, y.value]))
 
 
-def test_readings_that_do_not_fit_are_refused_whole(run: Campaign) -> None:
+def test_readings_that_do_not_fit_are_refused_whole(run: CampaignFile) -> None:
     x = simple(4)
     run.append_readings(x[:2])
     nan = x.value.copy()
@@ -156,7 +156,7 @@ def test_readings_that_do_not_fit_are_refused_whole(run: Campaign) -> None:
 @pytest.mark.parametrize("table", ["readings", "revisions", "poses", "loads", "meta"])
 def test_rows_cannot_be_changed_deleted_or_replaced(tmp_path: Path, table: str) -> None:
     path = make(tmp_path / "run.hilcal", simple(3))
-    with Campaign.open(path) as campaign:
+    with CampaignFile.open(path) as campaign:
         campaign.append_revision(REVISION)
     connection = sqlite3.connect(path)
     column = {"readings": "cycle", "revisions": "content", "meta": "value"}.get(table, "name")
@@ -168,12 +168,12 @@ def test_rows_cannot_be_changed_deleted_or_replaced(tmp_path: Path, table: str) 
         with pytest.raises(sqlite3.IntegrityError, match=f"{table} are immutable"):
             connection.execute(change)
     connection.close()
-    with Campaign.open(path) as campaign:
+    with CampaignFile.open(path) as campaign:
         assert_same(campaign.readings(), simple(3))
         assert len(campaign.revisions()) == 1
 
 
-def test_revisions_are_numbered_and_come_back(run: Campaign) -> None:
+def test_revisions_are_numbered_and_come_back(run: CampaignFile) -> None:
     first = replace(REVISION, added=None, number=99)
     assert run.append_revision(first) == 1
     assert run.append_revision(REVISION) == 2
@@ -190,17 +190,17 @@ def test_an_existing_file_is_not_overwritten_unasked(tmp_path: Path) -> None:
     path = make(tmp_path / "run.hilcal", simple(2))
     with pytest.raises(InputError, match="the file exists"):
         make(path)
-    with Campaign.open(path) as campaign:
+    with CampaignFile.open(path) as campaign:
         assert campaign.n_readings == 2
-    with Campaign.create(path, "{}", "", "", overwrite=True) as campaign:
+    with CampaignFile.create(path, "{}", "", "", overwrite=True) as campaign:
         assert campaign.n_readings == 0
     other = tmp_path / "thesis.txt"
     other.write_text("years of work")
     with pytest.raises(InputError, match="is not a campaign; it is not overwritten"):
-        Campaign.create(other, "{}", "", "", overwrite=True)
+        CampaignFile.create(other, "{}", "", "", overwrite=True)
     assert other.read_text() == "years of work"
     with pytest.raises(InputError, match="cannot be written"):
-        Campaign.create(tmp_path / "absent" / "run.hilcal", "{}", "", "")
+        CampaignFile.create(tmp_path / "absent" / "run.hilcal", "{}", "", "")
 
 
 def test_a_journal_left_by_another_file_is_not_rolled_into_a_new_one(tmp_path: Path) -> None:
@@ -209,14 +209,14 @@ def test_a_journal_left_by_another_file_is_not_rolled_into_a_new_one(tmp_path: P
     stray.write_bytes(b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7" + bytes(1000))
     make(path, simple(2))
     assert not stray.exists()
-    with Campaign.open(path) as campaign:
+    with CampaignFile.open(path) as campaign:
         assert_same(campaign.readings(), simple(2))
 
 
 def test_files_that_are_no_campaign(tmp_path: Path) -> None:
     def refused(path: Path, message: str) -> None:
         with pytest.raises(InputError, match=message) as error:
-            Campaign.open(path)
+            CampaignFile.open(path)
         assert "\n" not in str(error.value)
 
     refused(tmp_path / "absent.hilcal", "no such campaign file")
@@ -248,16 +248,16 @@ def test_every_truncation_is_noticed(tmp_path: Path) -> None:
     for length in sorted(lengths):
         cut.write_bytes(whole[:length])
         with pytest.raises(InputError):
-            Campaign.open(cut)
+            CampaignFile.open(cut)
     cut.write_bytes(whole)
-    with Campaign.open(cut) as campaign:
+    with CampaignFile.open(cut) as campaign:
         assert_same(campaign.readings(), simple(60))
 
 
 def test_damaged_bytes_never_give_wrong_data(tmp_path: Path) -> None:
     x = simple(40)
     path = make(tmp_path / "run.hilcal", x)
-    with Campaign.open(path) as campaign:
+    with CampaignFile.open(path) as campaign:
         campaign.append_revision(REVISION)
     whole = path.read_bytes()
     damaged = tmp_path / "damaged.hilcal"
@@ -268,7 +268,7 @@ def test_damaged_bytes_never_give_wrong_data(tmp_path: Path) -> None:
         content[at] ^= 1 << rng.randrange(8)
         damaged.write_bytes(content)
         try:
-            with Campaign.open(damaged) as campaign:
+            with CampaignFile.open(damaged) as campaign:
                 assert_same(campaign.readings(), x)
                 assert campaign.revisions() == (replace(REVISION, number=1),)
         except InputError:
@@ -278,10 +278,10 @@ def test_damaged_bytes_never_give_wrong_data(tmp_path: Path) -> None:
 
 WRITER = """
 import sys
-from hilcal.data.campaign import Campaign
-with Campaign.open(sys.argv[1]) as source:
+from hilcal.data.campaign_file import CampaignFile
+with CampaignFile.open(sys.argv[1]) as source:
     readings = source.readings()
-with Campaign.open(sys.argv[2]) as run:
+with CampaignFile.open(sys.argv[2]) as run:
     for k in range(run.n_readings, len(readings)):
         print(run.append_readings(readings[k:k + 1]), flush=True)
 """
@@ -311,12 +311,12 @@ def test_a_kill_at_any_moment_loses_nothing_committed(tmp_path: Path) -> None:
         journal = tmp_path / "run.hilcal-journal"
         if journal.exists():
             shutil.copy(journal, tmp_path / "copy.hilcal-journal")
-        with Campaign.open(moved) as campaign:
+        with CampaignFile.open(moved) as campaign:
             stored = campaign.readings()
         assert acknowledged <= len(stored) <= acknowledged + 1
         assert_same(stored, x[: len(stored)])
     assert acknowledged >= 6
-    with Campaign.open(path) as campaign:
+    with CampaignFile.open(path) as campaign:
         count = campaign.append_readings(x[campaign.n_readings :])
         assert count == len(x)
         assert campaign.data_hash() == content_hash(x)
@@ -327,7 +327,7 @@ def test_a_kill_at_any_moment_loses_nothing_committed(tmp_path: Path) -> None:
 
 def test_a_second_writer_waits_or_is_told(tmp_path: Path) -> None:
     path = make(tmp_path / "run.hilcal", simple(2))
-    with Campaign.open(path) as one, Campaign.open(path) as two:
+    with CampaignFile.open(path) as one, CampaignFile.open(path) as two:
         one.append_readings(replace(simple(1), pose_names=("a",)))
         two.append_readings(replace(simple(1), pose_names=("b",)))
         assert one.readings().pose_names == ("p0", "p1", "a", "b")

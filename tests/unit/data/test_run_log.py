@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hilcal.data import schema
-from hilcal.data.campaign import Campaign
+from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.plan import Plan, Step, load_plan, read_plan
 from hilcal.data.readings import Readings, States
 from hilcal.data.run_log import PLAN, RunLog
@@ -34,8 +34,8 @@ def _reading(step: Step) -> Readings:
     )
 
 
-def _campaign(path: Path) -> Campaign:
-    return Campaign.create(path, "{}", ".", "test", more={PLAN: MADE.to_json()})
+def _campaign(path: Path) -> CampaignFile:
+    return CampaignFile.create(path, "{}", ".", "test", more={PLAN: MADE.to_json()})
 
 
 def test_what_was_recorded_comes_back_after_reopening(tmp_path: Path) -> None:
@@ -46,7 +46,7 @@ def test_what_was_recorded_comes_back_after_reopening(tmp_path: Path) -> None:
         for k, step in enumerate(STEPS[:3]):
             log.record(_reading(step), step, {"k": k})
         log.event("stopped", {"why": "test"})
-    with Campaign.open(path) as campaign:
+    with CampaignFile.open(path) as campaign:
         log = RunLog(campaign)
         assert log.done() == frozenset(STEPS[:3])
         assert [d["k"] for d in log.details()] == [0, 1, 2]
@@ -68,7 +68,7 @@ def test_a_step_is_never_there_twice_and_its_refusal_leaves_no_reading(tmp_path:
 
 
 def test_a_table_cannot_be_resumed(tmp_path: Path) -> None:
-    made = Campaign.create(tmp_path / "run.hilcal", "{}", ".", "a table")
+    made = CampaignFile.create(tmp_path / "run.hilcal", "{}", ".", "a table")
     with made as campaign, pytest.raises(InputError, match="cannot be resumed"):
         RunLog(campaign)
 
@@ -88,7 +88,7 @@ def test_a_full_database_stores_all_or_nothing(tmp_path: Path) -> None:
             fill()
         stored = campaign.n_readings
     assert 0 < stored < 100
-    with Campaign.open(path) as campaign:
+    with CampaignFile.open(path) as campaign:
         assert campaign.n_readings == len(RunLog(campaign).done()) == stored
 
 
@@ -96,12 +96,12 @@ _FILL = """
 import resource, sys
 from pathlib import Path
 from tests.unit.data.test_run_log import _reading
-from hilcal.data.campaign import Campaign
+from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.plan import Step
 from hilcal.data.run_log import RunLog
 from hilcal.errors import DeviceError
 path = Path(sys.argv[1])
-with Campaign.open(path) as campaign:
+with CampaignFile.open(path) as campaign:
     log = RunLog(campaign)
     limit = path.stat().st_size + 8192
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
@@ -134,18 +134,18 @@ def test_a_write_that_the_system_refuses_loses_nothing(tmp_path: Path) -> None:
     assert "make room on the disk" in done.stderr
     stored = len(done.stdout.split())
     assert stored > 0
-    with Campaign.open(path) as campaign:
+    with CampaignFile.open(path) as campaign:
         assert campaign.n_readings == len(RunLog(campaign).done()) == stored
 
 
 def test_files_of_the_first_version_open(tmp_path: Path) -> None:
     path = tmp_path / "old.hilcal"
-    with Campaign.create(path, "{}", ".", "a table") as campaign:
+    with CampaignFile.create(path, "{}", ".", "a table") as campaign:
         campaign.append_readings(_reading(STEPS[0]))
         for table in ("details", "events"):
             campaign.connection.execute(f"DROP TABLE {table}")
         campaign.connection.execute("PRAGMA user_version = 1")
-    with Campaign.open(path) as campaign:
+    with CampaignFile.open(path) as campaign:
         assert campaign.n_readings == 1
     assert schema.VERSION > 1
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilcal.data.campaign import Campaign
+from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.readings import Readings
 from hilcal.data.table import write_table
 from hilcal.effects.catalogue import installed
@@ -99,7 +99,7 @@ def test_a_missing_law_is_named_added_and_the_error_falls_to_the_noise(
     assert after["error"]["holdout"]["rms_sigma"] < 0.6 * before["error"]["holdout"]["rms_sigma"]
     assert NAME.encode() in recording.read_bytes()
 
-    with Campaign.open(run_file) as stored:
+    with CampaignFile.open(run_file) as stored:
         parameters = stored.revisions()[-1].parameters_json
     found = {
         name: (value, std)

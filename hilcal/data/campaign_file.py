@@ -18,7 +18,7 @@ from hilcal.errors import InputError
 _META = ("config", "base_dir", "source", "created", "program_version")
 
 
-class Campaign:
+class CampaignFile:
     """An open campaign file; use it in a `with` statement.
 
     What `append_readings` and `append_revision` have returned from survives a kill of the
