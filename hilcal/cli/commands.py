@@ -60,7 +60,7 @@ COMMANDS = {
     "refine": Command("refining:refine", "Diagnose and add until the model is adequate."),
     "next": Command(
         "next:next_",
-        "Plan the measurements that separate the leading suspects; exit 4 where there is no doubt.",
+        "Plan the measurements that separate the leading suspects; exit 4 where none are in doubt.",
     ),
     "validate": Command(
         "fitting:validate", "Predict readings of another campaign with the latest model."
