@@ -7,8 +7,8 @@ from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode
 from hilcal.diagnose.diagnosis import Diagnosis, History, Verdict
 from hilcal.diagnose.evidence import Evidence
-from hilcal.diagnose.rivals import Alternative
 from hilcal.diagnose.stepwise import Refits, add, exchange, predicts_better, remove
+from hilcal.diagnose.stepwise_alternatives import Alternative
 from hilcal.diagnose.verdict import NOTHING, judge
 from hilcal.identify.fit import Fit, fit
 from hilcal.model import Model

@@ -20,13 +20,13 @@ from hilcal.cli.files import (
 from hilcal.cli.terminal import Json, Run, terminal
 from hilcal.data.whitening import Scaling
 from hilcal.diagnose.misfit_breakdown import misfit_breakdown
-from hilcal.diagnose.projection import projection
 from hilcal.effects.written import write_effect
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline, with_effects
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.fit_document import to_json
 from hilcal.identify.full_prediction import everything
+from hilcal.identify.linearisation import linearise
 from hilcal.identify.validation import validate as predict_other
 from hilcal.report import numbers, text
 from hilcal.report.progress import working
@@ -108,7 +108,7 @@ def compare(run: Run, effects_from: EffectsFrom = None, as_json: Json = False) -
                 "identify again"
             )
         say("looking where it fails")
-        places = misfit_breakdown(projection(found))
+        places = misfit_breakdown(linearise(found))
     e = everything(found)
     worst = text.worst_poses(e)
     name = text.model_name(titles(found.model, found.readings))

@@ -7,9 +7,9 @@ redundant where its F-test is not significant.
 
 from dataclasses import dataclass
 
-from hilcal.diagnose.score import Score, score
-from hilcal.diagnose.without import Without, leave_out_effect, whitened_columns
 from hilcal.identify.fit import Fit
+from hilcal.identify.linearisation import eliminate_effect, model_columns
+from hilcal.regression.evidence import FamilyScore
 
 CHANCE = 0.01
 """An effect with a smaller p-value is kept."""
@@ -25,7 +25,7 @@ class Redundant:
     """
 
     effect: str
-    score: Score
+    score: FamilyScore
 
 
 def backward_elimination(fit: Fit) -> tuple[Redundant, ...]:
@@ -33,16 +33,10 @@ def backward_elimination(fit: Fit) -> tuple[Redundant, ...]:
     judged = [e.name for e in fit.model.effects if e.role == "effect"]
     if not judged:
         return ()
-    x = whitened_columns(fit)
+    x = model_columns(fit)
     found = []
     for name in judged:
-        result = own_score(leave_out_effect(fit, x, name))
+        result = eliminate_effect(fit, x, name).score()
         if result.p_value > CHANCE:
             found.append(Redundant(name, result))
     return tuple(sorted(found, key=lambda n: -n.score.p_value))
-
-
-def own_score(w: Without) -> Score:
-    """Score an effect against the model without it."""
-    x = w.columns
-    return score(x.T @ w.free(x), x.T @ w.rest, float(w.rest @ w.rest), w.dof)

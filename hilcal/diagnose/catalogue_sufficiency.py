@@ -3,10 +3,10 @@
 An effect outside of the catalogue resembles some that are in it: a base that sways with the air's
 temperature looks like a tracker that drifts. The best suspect then explains a good part of the
 misfit, passes every test, and is wrong. Forward selection tests this: the model takes all
-significant effects, one after the other, by algebra at the linearisation (see `rivals`). Where
-the remaining residual is noise, the catalogue is sufficient. Where it is not, the linearisation
-may be too coarse: the best effect is added by a refit, and forward selection is repeated from
-there. A residual that remains after two refits, and that repeats or a generic regression show
+significant effects, one after the other, by algebra at the linearisation (see
+`regression.forward_selection`). Where the remaining residual is noise, the catalogue is
+sufficient. Where it is not, the linearisation may be too coarse: the best effect is added by a
+refit, and forward selection is repeated from there. A residual that remains after two refits, and that repeats or a generic regression show
 not to be noise, no effect of the catalogue explains.
 
 The algebra alone decides where it leaves noise: then no refit is made.
@@ -17,15 +17,15 @@ from dataclasses import dataclass
 
 from scipy.stats import chi2
 
-from hilcal.diagnose.effect_ranking import FALSE_ALARM
+from hilcal.diagnose.effect_ranking import FALSE_ALARM, catalogue_columns
 from hilcal.diagnose.noise import pure_error
 from hilcal.diagnose.noise_verdict import MISFIT_ALARM, PREDICTABLE, NoiseVerdict, judge_noise
-from hilcal.diagnose.projection import projection
 from hilcal.diagnose.residual_curves import Dependence
 from hilcal.diagnose.residual_regression import residual_regression
-from hilcal.diagnose.rivals import outside, with_family
-from hilcal.diagnose.score import score
 from hilcal.identify.fit import Fit
+from hilcal.identify.linearisation import linearise
+from hilcal.regression import forward_selection as selection
+from hilcal.regression.forward_selection import families_beside
 
 LEAST_REMAINDER = 0.02
 """Share of the misfit that must remain for the first suspect to be in doubt; set by the study of
@@ -77,22 +77,16 @@ class Insufficiency:
 
 def forward_selection(fit: Fit) -> ForwardSelection:
     """Add all significant effects by algebra, the one of largest evidence first."""
-    p = projection(fit)
-    x, slices = outside(fit)
-    tested = max(len(slices), 1)
-    free = p.free(x)
-    s, g, yy, dof = x.T @ free, x.T @ p.white, p.yy, float(fit.dof)
+    linear = linearise(fit)
+    families = families_beside(linear.projection, linear.residual, fit.dof, *catalogue_columns(fit))
+    tested = max(len(families.columns), 1)
     added: list[str] = []
-    while slices and len(added) < MOST_TOGETHER:
-        scores = {n: score(s[k, k], g[k], yy, dof) for n, k in slices.items()}
-        best = max(scores, key=lambda n: scores[n].log_evidence)
-        found = scores[best]
-        if found.log_evidence <= 0 or found.p_value * tested >= FALSE_ALARM:
+    for step in selection.forward_selection(families, MOST_TOGETHER):
+        if step.score.log_evidence <= 0 or step.score.p_value * tested >= FALSE_ALARM:
             break
-        added.append(best)
-        s, g, yy = with_family(s, g, yy, dof, slices.pop(best), found)
-        dof = max(dof - found.effective, 1.0)
-    return ForwardSelection(tuple(added), yy, dof)
+        added.append(step.name)
+        families = step.after
+    return ForwardSelection(tuple(added), families.rss, max(families.dof - families.spent, 1.0))
 
 
 def insufficiency(
@@ -120,7 +114,7 @@ def insufficiency(
         say(f"testing the whole catalogue: adding {found.effects[0]}")
         current = refit(current, found.effects[0])
         names.append(found.effects[0])
-    regression = residual_regression(projection(current))
+    regression = residual_regression(linearise(current))
     noise = judge_noise(current, pure_error(current), regression.share > PREDICTABLE)
     if noise.misjudged or not noise.off:
         return None

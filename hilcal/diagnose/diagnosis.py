@@ -13,8 +13,8 @@ from hilcal.diagnose.misfit_breakdown import MisfitShare
 from hilcal.diagnose.noise import PureError
 from hilcal.diagnose.noise_verdict import NoiseVerdict
 from hilcal.diagnose.residual_curves import Dependence
-from hilcal.diagnose.rivals import Alternative
 from hilcal.diagnose.separability import Separability
+from hilcal.diagnose.stepwise_alternatives import Alternative
 from hilcal.identify.fit import Fit
 
 Verdict = Literal["adequate", "missing_effect", "ambiguous", "unknown_effect", "noise_misjudged"]

@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilcal.diagnose.minimum_detectable_effect import Strength, least_strength
-from hilcal.diagnose.projection import Projection
-from hilcal.diagnose.score import Score
 from hilcal.effects.protocol import Effect
 from hilcal.identify.fit import Fit
+from hilcal.identify.linearisation import EffectColumns, Linearisation, effect_columns
+from hilcal.regression.evidence import FamilyScore
 from hilcal.types import Floats
 
 SAME_EVIDENCE = 3.0
@@ -42,7 +42,7 @@ class Suspect:
     """
 
     effect: str
-    score: Score
+    score: FamilyScore
     share: float
     holdout_share: float
     explains: bool
@@ -56,23 +56,6 @@ class Suspect:
         return self.explains and self.sure
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Family:
-    """The columns of an effect in ordinary magnitudes of its parameters.
-
-    Attributes:
-        effect: the effect.
-        scale: (P,) ordinary magnitudes, SI.
-        white: (R, P) whitened columns.
-        motion: (D, 3, P) displacement of each measured position, m.
-    """
-
-    effect: Effect
-    scale: Floats
-    white: Floats
-    motion: Floats
-
-
 def candidates(fit: Fit) -> tuple[Effect, ...]:
     """Effects that are not in the model and can be computed from these readings."""
     states = fit.readings[~fit.outlier].states
@@ -84,26 +67,28 @@ def candidates(fit: Fit) -> tuple[Effect, ...]:
     return tuple(out)
 
 
-def family(fit: Fit, effect: Effect) -> Family:
-    """Return the columns of an effect, at the parameters of the fit."""
-    s, w = fit.solution, fit.whitening
-    jacobian = fit.model.jacobian_of((effect,), s.prediction, s.theta, w.m)
-    scale = np.array([q.scale for q in effect.parameters])
-    raw = w.raw(jacobian * scale)
-    return Family(effect, scale, w.whiten(raw).reshape(-1, len(scale)), raw[:, :3])
+def catalogue_columns(fit: Fit) -> tuple[Floats, dict[str, slice]]:
+    """Return the columns (R, P) of all `candidates`, and which are whose."""
+    families = [effect_columns(fit, e) for e in candidates(fit)]
+    ends = np.cumsum([0] + [f.white.shape[1] for f in families])
+    columns = np.hstack([np.zeros((len(fit.white), 0)), *(f.white for f in families)])
+    return columns, {
+        f.effect.name: slice(int(a), int(b))
+        for f, a, b in zip(families, ends[:-1], ends[1:], strict=True)
+    }
 
 
 def rank_suspects(
-    p: Projection, effects: Sequence[Effect], level: float = FALSE_ALARM
+    p: Linearisation, effects: Sequence[Effect], level: float = FALSE_ALARM
 ) -> tuple[Suspect, ...]:
     """Score all effects; best first, see `ranked`.
 
     Args:
-        p: the fitted model's part.
+        p: linearisation of the fit.
         effects: that are not in the model.
         level: of the test over all of them together.
     """
-    found = [_suspect(p, family(p.fit, e), level / len(effects)) for e in effects]
+    found = [_suspect(p, effect_columns(p.fit, e), level / len(effects)) for e in effects]
     tested = max(sum(s.score.rank > 0 for s in found), 1)
     return ranked(
         replace(
@@ -144,9 +129,9 @@ def ranked(suspects: Iterable[Suspect], rejected: Collection[str] = ()) -> tuple
     )
 
 
-def _suspect(p: Projection, of: Family, level: float) -> Suspect:
-    s = of.white.T @ p.free(of.white)
-    result = p.score_of(s, of.white)
+def _suspect(p: Linearisation, of: EffectColumns, level: float) -> Suspect:
+    s = p.information(of.white)
+    result = p.score(of.white, s)
     held = p.held_out(of.white, result)
     return Suspect(
         effect=of.effect.name,

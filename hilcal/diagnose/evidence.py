@@ -11,14 +11,14 @@ from hilcal.diagnose.effect_ranking import Suspect, candidates, rank_suspects
 from hilcal.diagnose.misfit_breakdown import MisfitShare, misfit_breakdown
 from hilcal.diagnose.noise import PureError, pure_error
 from hilcal.diagnose.noise_verdict import MISFIT_ALARM
-from hilcal.diagnose.projection import Projection, projection
 from hilcal.diagnose.residual_curves import ResidualRegression
 from hilcal.diagnose.residual_regression import residual_regression, tree_share
-from hilcal.diagnose.rivals import Alternative, Rivals
 from hilcal.diagnose.stepwise import add
+from hilcal.diagnose.stepwise_alternatives import Alternative, StepwiseAlternatives
 from hilcal.effects.protocol import Effect
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit
+from hilcal.identify.linearisation import Linearisation, linearise
 
 
 class Evidence:
@@ -45,9 +45,9 @@ class Evidence:
         self.fit, self._refit, self._say = fit, refit, say
 
     @cached_property
-    def projection(self) -> Projection:
+    def linearisation(self) -> Linearisation:
         """The fitted model's part of the regression."""
-        return projection(self.fit)
+        return linearise(self.fit)
 
     @cached_property
     def effects(self) -> tuple[Effect, ...]:
@@ -57,12 +57,12 @@ class Evidence:
     @cached_property
     def suspects(self) -> tuple[Suspect, ...]:
         """All of them scored."""
-        return rank_suspects(self.projection, self.effects)
+        return rank_suspects(self.linearisation, self.effects)
 
     @cached_property
     def misfit_breakdown(self) -> tuple[MisfitShare, ...]:
         """Variables that the misfit follows, largest share first."""
-        return misfit_breakdown(self.projection)
+        return misfit_breakdown(self.linearisation)
 
     @cached_property
     def pure_error(self) -> PureError | None:
@@ -77,12 +77,12 @@ class Evidence:
     @cached_property
     def regression(self) -> ResidualRegression:
         """What smooth laws, or trees, predict of the misfit on poses left out."""
-        return residual_regression(self.projection)
+        return residual_regression(self.linearisation)
 
     @cached_property
     def tree_share(self) -> float:
         """Share of the misfit that trees predict on poses left out."""
-        return tree_share(self.projection)
+        return tree_share(self.linearisation)
 
     @cached_property
     def redundant(self) -> tuple[str, ...]:
@@ -95,14 +95,14 @@ class Evidence:
         return insufficiency(self.fit, self._refit, self._say)
 
     @cached_property
-    def _rivals(self) -> Rivals:
-        return Rivals(self.fit)
+    def _alternatives(self) -> StepwiseAlternatives:
+        return StepwiseAlternatives(self.fit)
 
-    def alternative(self, effect: str, never: Collection[str]) -> Alternative:
+    def alternative(self, effect: str, excluded: Collection[str]) -> Alternative:
         """Return what could replace an effect of the model.
 
         Args:
             effect: of the model.
-            never: effects that are not to be used.
+            excluded: effects that are not to be used.
         """
-        return self._rivals.of(effect, never)
+        return self._alternatives.of(effect, excluded)

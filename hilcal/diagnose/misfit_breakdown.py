@@ -12,7 +12,7 @@ import numpy as np
 from scipy.stats import chi2
 from scipy.stats import f as f_distribution
 
-from hilcal.diagnose.projection import Projection
+from hilcal.identify.linearisation import Linearisation
 from hilcal.observe import motion
 from hilcal.types import Floats
 
@@ -36,7 +36,7 @@ class MisfitShare:
     p_value: float
 
 
-def misfit_breakdown(p: Projection) -> tuple[MisfitShare, ...]:
+def misfit_breakdown(p: Linearisation) -> tuple[MisfitShare, ...]:
     """Score all variables that vary in these readings; largest share first."""
     fit, w = p.fit, p.fit.whitening
     prediction, model = fit.solution.prediction, fit.model
@@ -61,7 +61,7 @@ def misfit_breakdown(p: Projection) -> tuple[MisfitShare, ...]:
             raw = _times(at_measurement, basis[w.reading])
         x = w.whiten(raw).reshape(-1, raw.shape[2])
         result = p.score(x)
-        share = max(p.held_out_share(x, result), 0.0)
+        share = max(p.held_out(x, result).share, 0.0)
         out.append(MisfitShare(name, share, result.p_value))
     out += [*_poses(p, axes[w.reading]), *_axes(p)]
     return tuple(sorted(out, key=lambda v: (-v.share, v.p_value)))
@@ -73,7 +73,7 @@ def _times(motions: Floats, basis: Floats) -> Floats:
     return product.reshape(*motions.shape[:2], -1)
 
 
-def _variables(p: Projection) -> list[tuple[str, Floats, bool]]:
+def _variables(p: Linearisation) -> list[tuple[str, Floats, bool]]:
     """Name, functions (N, F), and whether a deflection takes their difference."""
     fit = p.fit
     readings = fit.readings[~fit.outlier]
@@ -113,7 +113,7 @@ def _powers(x: Floats, centre: float | None = None) -> Floats:
     return np.asarray(scaled[:, None] ** np.arange(1, POLYNOMIAL + 1))
 
 
-def _poses(p: Projection, axes: Floats) -> list[MisfitShare]:
+def _poses(p: Linearisation, axes: Floats) -> list[MisfitShare]:
     """How far the misfit is common to all readings of a pose, where poses have several.
 
     A pose that is left out cannot be predicted from itself, so the share is in-sample, less
@@ -125,17 +125,17 @@ def _poses(p: Projection, axes: Floats) -> list[MisfitShare]:
         return []
     member = (fit.pose[:, None] == np.arange(poses)).astype(float)
     raw = 1e-3 * _times(axes, member)
-    free = p.free(w.whiten(raw).reshape(-1, raw.shape[2]))
+    free = p.project_out(w.whiten(raw).reshape(-1, raw.shape[2]))
     u, s, _ = np.linalg.svd(free, full_matrices=False)
     u = u[:, s > 1e-6 * s.max(initial=0.0)]
     rank = u.shape[1]
-    gain = float(np.sum((u.T @ p.white) ** 2))
-    within = (p.yy - gain) / (fit.dof - rank)
+    gain = float(np.sum((u.T @ p.residual) ** 2))
+    within = (p.rss - gain) / (fit.dof - rank)
     p_value = float(f_distribution.sf(gain / rank / within, rank, fit.dof - rank))
     return [MisfitShare("pose", p.share(gain - rank * within), p_value)]
 
 
-def _axes(p: Projection) -> list[MisfitShare]:
+def _axes(p: Linearisation) -> list[MisfitShare]:
     """Directions: towards the base axis, around it, and up."""
     fit, w = p.fit, p.fit.whitening
     o = fit.solution.prediction.observation

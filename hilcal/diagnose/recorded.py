@@ -5,7 +5,7 @@ from itertools import combinations
 
 import numpy as np
 
-from hilcal.diagnose.projection import Projection
+from hilcal.identify.linearisation import Linearisation
 from hilcal.observe import motion
 from hilcal.types import Floats, Ints
 
@@ -47,7 +47,7 @@ class Variable:
         return replace(out, functions=out.functions[order]) if name == self.name else out
 
 
-def recorded(p: Projection) -> list[Variable]:
+def recorded(p: Linearisation) -> list[Variable]:
     """Everything recorded of the state that varies."""
     readings = p.fit.readings[~p.fit.outlier]
     s, situation = readings.states, p.fit.solution.prediction.situation
@@ -96,7 +96,7 @@ def recorded(p: Projection) -> list[Variable]:
     return out + [replace(a, other=b) for a, b in combinations(turns, 2)]
 
 
-def motions(p: Projection) -> list[Floats]:
+def motions(p: Linearisation) -> list[Floats]:
     """(N, m, 1) motion by each joint, and (N, m, 3) of the target along base axes."""
     fit, m = p.fit, p.fit.whitening.m
     prediction = fit.solution.prediction
@@ -112,7 +112,7 @@ def motions(p: Projection) -> list[Floats]:
     return [PER_MOTION * moves[:, :, [j]] for j in range(moves.shape[2])] + [PER_MOTION * axes]
 
 
-def law_columns(p: Projection, v: Variable, way: Floats) -> Floats:
+def law_columns(p: Linearisation, v: Variable, way: Floats) -> Floats:
     """(R, WIDTH) whitened columns of one law, zeros where it has fewer."""
     w = p.fit.whitening
     functions = v.product()[:, : WIDTH // way.shape[2]]

@@ -16,9 +16,7 @@ Source of the latter: Breiman, *Random forests*, Machine Learning 45 (2001) 5-32
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg as sl
 
-from hilcal.diagnose.projection import Projection
 from hilcal.diagnose.recorded import (
     PER_MOTION,
     WIDTH,
@@ -29,6 +27,9 @@ from hilcal.diagnose.recorded import (
     recorded,
 )
 from hilcal.identify.folds import random_folds
+from hilcal.identify.linearisation import Linearisation
+from hilcal.regression.evidence import log_evidence, visible
+from hilcal.regression.projection import Projection, projection
 from hilcal.types import Bools, Floats
 
 FOLDS = 5
@@ -38,6 +39,9 @@ SHUFFLES = 4
 LEAST_EVIDENCE = 8.0
 """Gain in log evidence that a law needs, for the many that are tried."""
 STRENGTHS = np.logspace(-2, 3, 21)
+"""Prior standard deviations that are tried: fewer than for effects, since laws are many."""
+LEAST_RIDGE, LAW_RIDGE = 1e-6, 1e-3
+"""Least ridge of the model's directions, not all of which some rows determine; of laws. Guesses."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,7 +95,7 @@ class _Laws:
     way: tuple[int, ...]
 
 
-def smooth_laws(p: Projection) -> ResidualRegression:
+def smooth_laws(p: Linearisation) -> ResidualRegression:
     """Find the laws that predict the misfit of poses left out, and what they depend on."""
     variables, ways = recorded(p), motions(p)
     laws = _laws(p, variables, ways)
@@ -126,14 +130,13 @@ def smooth_laws(p: Projection) -> ResidualRegression:
     return ResidualRegression(share, _dependences(p, variables, ways, laws, lost, share))
 
 
-def _choose(p: Projection, laws: _Laws, rows: Bools) -> list[int]:
+def _choose(p: Linearisation, laws: _Laws, rows: Bools) -> list[int]:
     """Laws chosen one after the other by their evidence on some of the rows."""
     rows = _thinned(rows, p.fit.whitening.m)
     white, own = p.fit.white[rows], p.rows[rows]
     x = laws.x[rows].reshape(len(white), -1)
-    factor = _factor(p, own)
-    fixed = sl.solve_triangular(factor, own.T, lower=True).T
-    x, r = x - fixed @ (fixed.T @ x), white - fixed @ (fixed.T @ white)
+    model = _beside(p, own, np.zeros((len(white), 0)))
+    x, r = model.project_out(x), model.project_out(white)
     dof = max(len(r) - own.shape[1], 1)
     chosen: list[int] = []
     for _ in range(MOST_LAWS):
@@ -156,44 +159,34 @@ def _thinned(rows: Bools, m: int) -> Bools:
     return np.asarray(rows & (np.arange(len(rows)) // m % every == 0))
 
 
-def _evidence(gram: Floats, g: Floats, yy: float, dof: int) -> Floats:
-    """(L,) gain in log evidence of laws with a common prior N(0, τ²), τ at its best."""
+def _evidence(gram: Floats, g: Floats, rss: float, dof: float) -> Floats:
+    """(L,) gain in log evidence of each of L laws, at its best prior strength."""
     lam, u = np.linalg.eigh(gram)
-    lam = np.maximum(lam, 0.0)
-    c = np.einsum("lij,li->lj", u, g)
-    explained = np.where(lam > 1e-4, c**2 / np.maximum(lam, 1e-4), 0.0)
-    t2 = (STRENGTHS**2 * dof / yy)[:, None, None]
-    shrunk = t2 * lam / (1 + t2 * lam)
-    left = np.maximum(1 - np.sum(shrunk * explained, axis=2) / yy, 1e-12)
-    value = -0.5 * np.sum(np.log1p(t2 * lam), axis=2) - 0.5 * dof * np.log(left)
-    return np.asarray(value.max(axis=0))
+    seen = visible(lam)
+    c2 = np.einsum("lij,li->lj", u, g) ** 2
+    explained = np.where(seen, c2 / np.where(seen, lam, 1.0), 0.0)
+    found = log_evidence(np.where(seen, lam, 0.0), explained, rss, dof, STRENGTHS)
+    return np.asarray(found.max(axis=0))
 
 
-def _factor(p: Projection, own: Floats) -> Floats:
-    """Cholesky factor of the model's normal equations from some rows."""
-    precision = p.fit.solution.equations.basis.prior_precision
-    h = own.T @ own + np.diag(np.maximum(p.fit.solution.beta * precision, 1e-6))
-    return np.asarray(np.linalg.cholesky(h))
+def _beside(p: Linearisation, own: Floats, x: Floats) -> Projection:
+    """Return the projection off the model's columns and laws X, from some rows."""
+    ridge = np.maximum(p.projection.ridge, LEAST_RIDGE)
+    return projection(np.hstack([own, x]), np.append(ridge, np.full(x.shape[1], LAW_RIDGE)))
 
 
 def _refit(
-    p: Projection, laws: _Laws, chosen: list[int], rows: Bools
+    p: Linearisation, laws: _Laws, chosen: list[int], rows: Bools
 ) -> tuple[Floats, list[Floats]]:
     """Model step (K,) and coefficients of the chosen laws, from some rows."""
     own, white = p.rows[rows], p.fit.white[rows]
-    x = np.concatenate([own, *(laws.x[rows, k] for k in chosen)], axis=1)
-    h = x.T @ x
-    size = own.shape[1]
-    precision = p.fit.solution.beta * p.fit.solution.equations.basis.prior_precision
-    ridge = np.full(len(h), 1e-3)
-    ridge[:size] = np.maximum(precision, 1e-6)
-    step = sl.solve(h + np.diag(ridge), x.T @ white, assume_a="pos", check_finite=False)
-    return step[:size], [
-        step[size + i * WIDTH : size + (i + 1) * WIDTH] for i in range(len(chosen))
-    ]
+    x = np.hstack([np.zeros((len(white), 0)), *(laws.x[rows, k] for k in chosen)])
+    both = _beside(p, own, x)
+    step, size = both.solve(both.rows.T @ white), own.shape[1]
+    return step[:size], list(step[size:].reshape(-1, WIDTH))
 
 
-def _laws(p: Projection, variables: list[Variable], ways: list[Floats]) -> _Laws:
+def _laws(p: Linearisation, variables: list[Variable], ways: list[Floats]) -> _Laws:
     columns, of, by = [], [], []
     for i, v in enumerate(variables):
         for k, way in enumerate(ways):
@@ -204,7 +197,7 @@ def _laws(p: Projection, variables: list[Variable], ways: list[Floats]) -> _Laws
 
 
 def _dependences(
-    p: Projection,
+    p: Linearisation,
     variables: list[Variable],
     ways: list[Floats],
     laws: _Laws,
@@ -227,16 +220,16 @@ def _dependences(
     return tuple(out)
 
 
-def _best(p: Projection, laws: _Laws, mine: list[int]) -> int:
+def _best(p: Linearisation, laws: _Laws, mine: list[int]) -> int:
     """The law of one variable with the largest evidence on all rows."""
     x = laws.x[:, mine].reshape(len(p.fit.white), -1)
-    blocks = p.free(x).reshape(len(x), -1, WIDTH).transpose(1, 2, 0)
+    blocks = p.project_out(x).reshape(len(x), -1, WIDTH).transpose(1, 2, 0)
     plain = x.reshape(len(x), -1, WIDTH).transpose(1, 0, 2)
-    found = _evidence(blocks @ plain, blocks @ p.white, p.yy, int(p.fit.dof))
+    found = _evidence(blocks @ plain, blocks @ p.residual, p.rss, p.fit.dof)
     return mine[int(np.argmax(found))]
 
 
-def _curve(p: Projection, v: Variable, number: int, way: Floats, share: float) -> Dependence:
+def _curve(p: Linearisation, v: Variable, number: int, way: Floats, share: float) -> Dependence:
     """Mean error by bins of the variable, along what errs most."""
     bins, x = bins_of(v)
     member = (bins[:, None] == np.arange(len(x))).astype(float)
@@ -265,11 +258,11 @@ def _curve(p: Projection, v: Variable, number: int, way: Floats, share: float) -
     )
 
 
-def _least(p: Projection, x: Floats) -> tuple[Floats, Floats]:
+def _least(p: Linearisation, x: Floats) -> tuple[Floats, Floats]:
     """Coefficients and covariance of columns (R, K) beside the model."""
-    free = p.free(x)
+    free = p.project_out(x)
     gram = (free.T @ x + x.T @ free) / 2
     inverse = np.linalg.pinv(gram, rcond=1e-9, hermitian=True)
-    y = inverse @ (free.T @ p.white)
-    left = max(p.yy - float(y @ gram @ y), 0.0) / max(p.fit.dof - len(y), 1.0)
+    y = inverse @ (free.T @ p.residual)
+    left = max(p.rss - float(y @ gram @ y), 0.0) / max(p.fit.dof - len(y), 1.0)
     return y, np.asarray(inverse * max(left, 1e-300))

@@ -12,9 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from hilcal.diagnose.projection import Projection
 from hilcal.diagnose.residual_curves import ResidualRegression, smooth_laws
 from hilcal.identify.folds import random_folds
+from hilcal.identify.linearisation import Linearisation
 from hilcal.types import Floats
 
 TREES = 60
@@ -27,7 +27,7 @@ LITTLE = 0.1
 """Share below which smooth laws have found little, and trees are asked as well."""
 
 
-def residual_regression(p: Projection) -> ResidualRegression:
+def residual_regression(p: Linearisation) -> ResidualRegression:
     """Share of the misfit that can be predicted on poses left out, and what carries it."""
     found = smooth_laws(p)
     if found.share >= LITTLE:
@@ -35,7 +35,7 @@ def residual_regression(p: Projection) -> ResidualRegression:
     return replace(found, share=max(found.share, tree_share(p)))
 
 
-def tree_share(p: Projection) -> float:
+def tree_share(p: Linearisation) -> float:
     """Share of the misfit that trees predict on poses left out, within [0, 1]."""
     from sklearn.ensemble import ExtraTreesRegressor
 
@@ -58,10 +58,10 @@ def tree_share(p: Projection) -> float:
         left[mine] -= trees.fit(features[~mine], target[~mine]).predict(features[mine])
     total = float(np.sum(target**2))
     gain = (total - float(np.sum(left**2))) / total
-    return float(np.clip(gain * p.yy / p.misfit(), 0.0, 1.0))
+    return float(np.clip(gain * p.rss / p.misfit(), 0.0, 1.0))
 
 
-def _features(p: Projection) -> Floats:
+def _features(p: Linearisation) -> Floats:
     """(D, F) everything recorded of the state of each measurement."""
     fit, w = p.fit, p.fit.whitening
     s = fit.readings[~fit.outlier].states[w.reading]

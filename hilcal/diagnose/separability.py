@@ -1,29 +1,29 @@
 """How well the readings at hand separate two suspects.
 
-Suppose suspect A is the cause, as strong as it is estimated: it adds y = M X_A β to the whitened
-residual, M the projection that the fitted model leaves. What suspect B cannot imitate of it,
+Suppose suspect A is the cause, with the parameters β that are estimated: it adds βᵀ S_A β to the
+whitened sum of squares beside the fitted model, S_A the information on A. The share
 
-    u = ‖y − M X_B (X_Bᵀ M X_B)⁻¹ X_Bᵀ M y‖² / ‖y‖²,
+    u = βᵀ S_A|B β / βᵀ S_A β,
 
-adds u ‖y‖² to the sum of squares that remains when B is fitted instead. With k times as many
-readings like these it is k times that; they are separated when it reaches `NEEDED`.
+S_A|B the Schur complement of suspect B, remains when B is fitted instead: λ = βᵀ S_A|B β is the
+non-centrality of the test of A beyond B, as in planning. With k times as many readings like these
+it is k λ; the two are separated when it reaches `NEEDED`.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.diagnose.effect_ranking import Suspect, family
-from hilcal.diagnose.projection import Projection
+from hilcal.diagnose.effect_ranking import Suspect
 from hilcal.effects.protocol import Effect
-from hilcal.types import Floats
+from hilcal.identify.linearisation import Linearisation, effect_columns
+from hilcal.regression.schur import schur_complement
 
 NEEDED = 12.0
 """Sum of squares, in σ², by which the right one of two suspects fits better when it is found in
 nine cases of ten at odds of 20 : 1: the difference scatters by twice the root of it."""
 ALIKE = 1e-3
 """Share below which no number of readings like these separates two effects; a guess."""
-ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,7 @@ class Separability:
 
     Attributes:
         effect: the rival.
-        unlike: u, the share of what the suspect does that the rival cannot imitate.
+        unlike: u, the share of the suspect's sum of squares that the rival cannot explain.
         times: k, how many times as many readings like these would separate them; infinite
             where no number would.
     """
@@ -48,30 +48,23 @@ class Separability:
 
 
 def separability(
-    p: Projection, lead: Suspect, effects: tuple[Effect, ...]
+    p: Linearisation, lead: Suspect, effects: tuple[Effect, ...]
 ) -> tuple[Separability, ...]:
     """Return how each rival in `lead.same_as` differs from the leading suspect.
 
     Args:
-        p: the fitted model's part.
+        p: linearisation of the fit.
         lead: the leading suspect.
         effects: all candidates.
     """
     by_name = {e.name: e for e in effects}
-    own = p.free(family(p.fit, by_name[lead.effect]).white)
-    y = own @ lead.score.step
-    total = float(y @ y)
+    own, beta = effect_columns(p.fit, by_name[lead.effect]).white, lead.score.step
+    effect = np.arange(own.shape[1])
     out = []
     for name in lead.same_as:
-        rival = p.free(family(p.fit, by_name[name]).white)
-        unlike = float(np.sum(_left(rival, y) ** 2)) / max(total, 1e-300)
+        s = p.information(np.hstack([own, effect_columns(p.fit, by_name[name]).white]))
+        total = float(beta @ s[np.ix_(effect, effect)] @ beta)
+        unlike = float(beta @ schur_complement(s, effect) @ beta) / max(total, 1e-300)
         times = np.inf if unlike < ALIKE else NEEDED / max(unlike * total, 1e-300)
         out.append(Separability(name, unlike, times))
     return tuple(out)
-
-
-def _left(x: Floats, y: Floats) -> Floats:
-    """Residual (R,) of y by the columns (R, P)."""
-    u, s, _ = np.linalg.svd(x, full_matrices=False)
-    u = u[:, s > ROUNDING * s.max(initial=0.0)]
-    return np.asarray(y - u @ (u.T @ y))

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 
 from hilcal.data.readings import Readings
-from hilcal.diagnose.projection import left_out_by_pose
 from hilcal.effects.options import Options
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit, fit
+from hilcal.identify.linearisation import left_out_by_pose
 from hilcal.model import Model
 from hilcal.regression.paired_test import LEAST_GAIN, improves
 from hilcal.types import Floats

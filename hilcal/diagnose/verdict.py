@@ -60,7 +60,7 @@ def judge(e: Evidence, history: History) -> Diagnosis:
             reason = "insufficient_catalogue"
             regression = ResidualRegression(regression.share, insufficiency.dependences)
         else:
-            rivals = separability(e.projection, lead, e.effects) if lead.same_as else ()
+            rivals = separability(e.linearisation, lead, e.effects) if lead.same_as else ()
             reason = "inseparable_suspects" if rivals else "one_suspect"
         follows = _carrying(regression)
     else:

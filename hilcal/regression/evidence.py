@@ -86,20 +86,24 @@ NOTHING = FamilyScore(
 
 
 def visible(values: Floats) -> Bools:
-    """Return which eigenvalues (P,) of S belong to directions that can be tested."""
-    return np.asarray(values > max(VISIBLE, RELATIVE * float(values.max(initial=0.0))))
+    """Return which eigenvalues (..., P) of S belong to directions that can be tested."""
+    largest = values.max(axis=-1, keepdims=True, initial=0.0)
+    return np.asarray(values > np.maximum(VISIBLE, RELATIVE * largest))
 
 
-def log_evidence(lam: Floats, explained: Floats, rss: float, dof: float) -> Floats:
-    """Return the log evidence (T, ...) of families at all T `STRENGTHS`.
+def log_evidence(
+    lam: Floats, explained: Floats, rss: float, dof: float, strengths: Floats = STRENGTHS
+) -> Floats:
+    """Return the log evidence (T, ...) of families at each strength τ.
 
     Args:
         lam: (..., P) eigenvalues of S.
         explained: (..., P) reduction of ‖r‖² by each eigenvector without a prior.
         rss: ‖r‖².
         dof: ν.
+        strengths: (T,) τ.
     """
-    t2 = (STRENGTHS**2 * dof / rss).reshape(-1, *(1,) * lam.ndim)
+    t2 = (strengths**2 * dof / rss).reshape(-1, *(1,) * lam.ndim)
     shrunk = t2 * lam / (1 + t2 * lam)
     left = np.maximum(rss - (shrunk * explained).sum(axis=-1), ROUNDING * rss)
     return np.asarray(-0.5 * np.log1p(t2 * lam).sum(axis=-1) - 0.5 * dof * np.log(left / rss))

@@ -9,8 +9,10 @@ compare.
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 from hilcal.regression.evidence import FamilyScore, score_family
+from hilcal.regression.projection import Projection
 from hilcal.regression.schur import eliminate
 from hilcal.types import Floats
 
@@ -57,7 +59,29 @@ class Families:
         return Families(s, g, rss, self.dof, others, self.spent + found.effective)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+def families_beside(
+    p: Projection,
+    residual: Floats,
+    dof: float,
+    x: Floats,
+    columns: Mapping[str, slice],
+    gram: Floats | None = None,
+) -> Families:
+    """Return families beside a model.
+
+    Args:
+        p: of the model.
+        residual: (R,) its residual r.
+        dof: degrees of freedom of r.
+        x: (R, P) whitened columns of all families, in ordinary magnitudes.
+        columns: of each family.
+        gram: (P, P) XᵀX where it is known.
+    """
+    rss = float(residual @ residual)
+    return Families(p.information(x, gram), x.T @ residual, rss, dof, columns)
+
+
+@dataclass(frozen=True, eq=False)
 class Addition:
     """One step of forward selection, before it is taken.
 
@@ -73,6 +97,7 @@ class Addition:
     scores: Mapping[str, FamilyScore]
     before: Families
 
+    @cached_property
     def after(self) -> Families:
         """Return the families beside the model with it."""
         return self.before.with_family(self.name, self.score)
@@ -90,4 +115,4 @@ def forward_selection(families: Families, most: int) -> Iterator[Addition]:
         best = max(scores, key=lambda n: scores[n].log_evidence)
         step = Addition(best, scores[best], scores, families)
         yield step
-        families = step.after()
+        families = step.after

@@ -41,10 +41,15 @@ class Projection:
         """Return M X = X − B H⁻¹ Bᵀ X of whitened columns (R,) or (R, P)."""
         return np.asarray(x - self.rows @ self.solve(self.rows.T @ x))
 
-    def information(self, x: Floats) -> Floats:
-        """Return Xᵀ M X (P, P), the Schur complement of the model in the information on X."""
+    def information(self, x: Floats, gram: Floats | None = None) -> Floats:
+        """Return Xᵀ M X (P, P), the Schur complement of the model in the information on X.
+
+        Args:
+            x: (R, P) whitened columns.
+            gram: (P, P) XᵀX where it is known.
+        """
         cross = self.rows.T @ x
-        return np.asarray(x.T @ x - cross.T @ self.solve(cross))
+        return np.asarray((x.T @ x if gram is None else gram) - cross.T @ self.solve(cross))
 
     def residual(self, y: Floats, z: Floats) -> Floats:
         """Return the residual (R,) after the model's own remaining step.

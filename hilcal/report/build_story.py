@@ -5,19 +5,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg as sl
 
 from hilcal.cell import Cell
 from hilcal.data.revision import change
 from hilcal.data.whitening import Mode
 from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.diagnose.effect_ranking import Suspect, candidates
-from hilcal.diagnose.projection import projection
 from hilcal.diagnose.residual_curves import Dependence
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit, mahalanobis2
 from hilcal.identify.fit_document import finite
 from hilcal.identify.full_prediction import Everything, everything
+from hilcal.identify.linearisation import linearise
 from hilcal.model import Model
 from hilcal.report import numbers
 from hilcal.report.story import (
@@ -246,7 +245,7 @@ def regressor(fit: Fit, suspect: Suspect) -> Regressor | None:
     are |c| and the residual along c, both with the sign of c along the direction in which
     the c spread most. Where the suspect is right the points lie on the line of slope 1.
     """
-    p = projection(fit)
+    p = linearise(fit)
     effect = next((e for e in candidates(p.fit) if e.name == suspect.effect), None)
     if effect is None or not len(suspect.score.step):
         return None
@@ -255,7 +254,7 @@ def regressor(fit: Fit, suspect: Suspect) -> Regressor | None:
     jacobian = fit.model.jacobian_of((effect,), s.prediction, s.theta, w.m)
     contribution = w.raw(jacobian @ (scale * suspect.score.step))
     if p.rows.shape[1]:
-        z = sl.cho_solve(p.factor, p.rows.T @ w.whiten(contribution).reshape(-1))
+        z = p.projection.solve(p.rows.T @ w.whiten(contribution).reshape(-1))
         adapted = fit.model.predict(
             s.prediction.situation.states, s.theta - s.equations.basis.transform @ z
         )

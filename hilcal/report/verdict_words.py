@@ -4,8 +4,8 @@ from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.diagnose.effect_ranking import LEAST_SHARE, Suspect
 from hilcal.diagnose.noise import PureError
 from hilcal.diagnose.noise_verdict import NoiseVerdict
-from hilcal.diagnose.rivals import Alternative
 from hilcal.diagnose.separability import Separability
+from hilcal.diagnose.stepwise_alternatives import Alternative
 
 
 def message(d: Diagnosis) -> str:

@@ -13,10 +13,10 @@ import pytest
 
 from hilcal.data.whitening import Mode
 from hilcal.diagnose.effect_ranking import Suspect, candidates, rank_suspects
-from hilcal.diagnose.projection import projection
 from hilcal.diagnose.verdict import diagnose
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
+from hilcal.identify.linearisation import linearise
 from hilcal.model import Model
 from tests.benchmarks.conftest import Claim
 from tests.support.campaigns import campaign
@@ -55,7 +55,7 @@ def largest(found: Fit) -> Model:
 
 def score(found: Fit) -> tuple[Suspect, ...]:
     """Score every suspect of the catalogue."""
-    p = projection(found)
+    p = linearise(found)
     return rank_suspects(p, candidates(found))
 
 

@@ -10,11 +10,11 @@ from hilcal.acquire.average import PRIOR_REPEATS
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import MODES
 from hilcal.diagnose.effect_ranking import candidates, rank_suspects
-from hilcal.diagnose.projection import projection
 from hilcal.diagnose.stepwise import add
 from hilcal.effects.catalogue import installed
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import fit
+from hilcal.identify.linearisation import linearise
 from tests.support.campaigns import NOTHING, campaign
 
 SAMPLES = 5
@@ -52,7 +52,7 @@ def p_values(kind: str, mode: str, seeds: range) -> dict[str, list[float]]:
         if kind == "several effects":
             for name in IN_THE_MODEL[mode]:
                 found = add(found, name)
-        p = projection(found)
+        p = linearise(found)
         for s in rank_suspects(p, candidates(p.fit)):
             if s.score.rank:
                 out.setdefault(s.effect, []).append(s.score.p_value)

@@ -8,10 +8,10 @@ import pytest
 from drivers.simulated.injected_effects import hide
 from hilcal.data.readings import Readings
 from hilcal.diagnose.effect_ranking import candidates, rank_suspects
-from hilcal.diagnose.projection import projection
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import fit
+from hilcal.identify.linearisation import linearise
 from hilcal.model import Model
 from hilcal.refine import MOST_REVISIONS, Refinement, add, refine
 from hilcal.regression.paired_test import LEAST_GAIN
@@ -98,7 +98,7 @@ def test_shares_on_poses_left_out_are_what_a_refit_reaches_there():
     c = campaign(seed=3, plan_seed=0, poses=15)
     readings = with_pose_errors(c.readings, 1)
     before = fit(baseline(c.cell, readings, "absolute"), readings, "absolute")
-    p = projection(before)
+    p = linearise(before)
     some = ("transmission_error", "link_geometry", "encoder_offset")
     suspects = [s for s in rank_suspects(p, candidates(p.fit)) if s.effect in some]
     assert len(suspects) == len(some)

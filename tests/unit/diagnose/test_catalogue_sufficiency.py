@@ -9,12 +9,12 @@ from hilcal.config import load_config
 from hilcal.data.whitening import Mode
 from hilcal.diagnose.catalogue_sufficiency import forward_selection, insufficiency
 from hilcal.diagnose.diagnosis import Diagnosis
-from hilcal.diagnose.effect_ranking import candidates, family
-from hilcal.diagnose.projection import projection
+from hilcal.diagnose.effect_ranking import candidates
 from hilcal.diagnose.stepwise import Refits, add
 from hilcal.diagnose.verdict import diagnose
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
+from hilcal.identify.linearisation import effect_columns, linearise
 from hilcal.report.diagnosis_document import to_json
 from hilcal.report.verdict_words import message
 from hilcal.robot.catalogue import configs_dir
@@ -128,8 +128,8 @@ def test_a_fit_that_is_not_quite_at_rest_credits_no_effect_with_its_own_step() -
     step = np.random.default_rng(0).standard_normal(s.rows.shape[1])
     theta = s.theta - s.equations.basis.transform @ step
     off = replace(at_rest, solution=replace(s, theta=theta, white=s.white + s.rows @ step))
-    one, other = projection(at_rest), projection(off)
+    one, other = linearise(at_rest), linearise(off)
     np.testing.assert_allclose(other.white, one.white, atol=1e-9)
     for effect in candidates(at_rest):
-        x = family(at_rest, effect).white
+        x = effect_columns(at_rest, effect).white
         assert other.score(x).log_evidence == pytest.approx(one.score(x).log_evidence, abs=1e-6)

@@ -14,12 +14,12 @@ from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.diagnose.effect_ranking import candidates, rank_suspects
 from hilcal.diagnose.misfit_breakdown import misfit_breakdown
 from hilcal.diagnose.noise import pure_error
-from hilcal.diagnose.projection import projection
 from hilcal.diagnose.verdict import diagnose
 from hilcal.effects.catalogue import BUILT_IN
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
+from hilcal.identify.linearisation import linearise
 from hilcal.refine import add
 from hilcal.report.diagnosis_document import to_json
 from hilcal.report.verdict_words import message
@@ -58,7 +58,7 @@ def null_p_values(
         found = fit(model, with_noise(clean, rng), mode)
         if found.outlier.any():
             continue  # once in a thousand, and then not the same design
-        p = projection(found)
+        p = linearise(found)
         for s in rank_suspects(p, candidates(p.fit)):
             if s.score.rank:
                 out.setdefault(s.effect, []).append(s.score.p_value)
@@ -107,7 +107,7 @@ def test_nothing_hidden_is_adequate(mode):
 
 @pytest.mark.parametrize(("effect", "mode"), HIDDEN)
 def test_a_hidden_effect_leads(effect, mode):
-    p = projection(fit_of(hidden(effect, mode, 0)))
+    p = linearise(fit_of(hidden(effect, mode, 0)))
     lead = rank_suspects(p, candidates(p.fit))[0]
     assert effect in (lead.effect, *lead.same_as)
     assert lead.score.p_value < 1e-6
@@ -135,7 +135,7 @@ def test_the_verdict_names_it_and_adding_it_settles_it(effect):
 def test_scores_foretell_what_adding_does(mode):
     """The F-test of a family is that of the refit with all its columns free."""
     found = fit_of(hidden("joint_tilt_compliance", mode, 0, strength=0.8, poses=15))
-    p = projection(found)
+    p = linearise(found)
     some = ("base_compliance", "hysteresis", "joint_tilt_compliance")
     suspects = [s for s in rank_suspects(p, candidates(p.fit)) if s.effect in some]
     assert len(suspects) == len(some)
@@ -153,7 +153,7 @@ def test_scores_foretell_what_adding_does(mode):
 def test_effects_that_cannot_be_told_apart_name_each_other():
     """Turning the base about z is turning the first joint, elastically as well."""
     found = fit_of(campaign("base_compliance", "deflection", 3, poses=8))
-    p = projection(found)
+    p = linearise(found)
     by_name = {s.effect: s for s in rank_suspects(p, candidates(p.fit))}
     for s in by_name.values():
         for other in s.same_as:
@@ -240,7 +240,7 @@ def test_without_repeats_there_is_no_pure_error():
     ],
 )
 def test_the_misfit_follows_the_variable_that_drives_it(effect, mode, kind):
-    places = misfit_breakdown(projection(fit_of(hidden(effect, mode, 0))))
+    places = misfit_breakdown(linearise(fit_of(hidden(effect, mode, 0))))
     # "pose" and "direction" say where, not after what.
     follows = [v for v in places if v.variable != "pose" and "direction" not in v.variable]
     strongest = min(follows, key=lambda v: v.p_value)
@@ -250,7 +250,7 @@ def test_the_misfit_follows_the_variable_that_drives_it(effect, mode, kind):
 
 
 def test_where_names_each_variable_once_and_in_order():
-    places = misfit_breakdown(projection(fit_of(hidden("hysteresis", "absolute", 0))))
+    places = misfit_breakdown(linearise(fit_of(hidden("hysteresis", "absolute", 0))))
     names = [v.variable for v in places]
     assert len(set(names)) == len(names)
     follows = [v.share for v in places if v.variable != "pose" and "direction" not in v.variable]

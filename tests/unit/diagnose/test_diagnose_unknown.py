@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from hilcal.data.readings import States
-from hilcal.diagnose.projection import projection
 from hilcal.diagnose.residual_curves import Dependence, ResidualRegression
 from hilcal.diagnose.residual_regression import residual_regression
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import fit
+from hilcal.identify.linearisation import linearise
 from tests.support.campaigns import Campaign, campaign, plan
 
 Law = Callable[[States], np.ndarray]
@@ -80,7 +80,7 @@ def hidden(name: str, mode: str, seed: int, strength: float = 3.0, poses: int = 
 
 def told(c: Campaign) -> ResidualRegression:
     return residual_regression(
-        projection(fit(baseline(c.cell, c.readings, c.mode), c.readings, c.mode))
+        linearise(fit(baseline(c.cell, c.readings, c.mode), c.readings, c.mode))
     )
 
 

@@ -10,15 +10,16 @@ from scipy.stats import ncf
 from drivers.simulated.injected_effects import hide
 from hilcal.diagnose.backward_elimination import CHANCE, backward_elimination
 from hilcal.diagnose.doubt import in_doubt
-from hilcal.diagnose.effect_ranking import candidates, family, rank_suspects
-from hilcal.diagnose.minimum_detectable_effect import POWER, least_strength, noncentrality
-from hilcal.diagnose.projection import projection
-from hilcal.diagnose.rivals import PRICE, Alternative, Rivals
+from hilcal.diagnose.effect_ranking import candidates, rank_suspects
+from hilcal.diagnose.minimum_detectable_effect import POWER, least_strength
 from hilcal.diagnose.stepwise import add, exchange, remove
+from hilcal.diagnose.stepwise_alternatives import PRICE, Alternative, StepwiseAlternatives
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
+from hilcal.identify.linearisation import effect_columns, linearise
 from hilcal.refine import Path
+from hilcal.regression.power import noncentrality_of_power
 from tests.support.campaigns import NOTHING, Campaign, campaign, measured, plan, world_of
 
 
@@ -124,7 +125,7 @@ def test_an_addition_that_cannot_be_told_from_another_is_a_doubt():
     c = campaign("tracker_scale", "absolute", 1, poses=20, strength=1.0)
     w = work(c, "tracker_scale")
     d = w.steps[-1].diagnosis
-    assert Rivals(w.steps[-1].fit).of("tracker_scale").same_as
+    assert StepwiseAlternatives(w.steps[-1].fit).of("tracker_scale").same_as
     assert not w.reconsider()
     assert d.reason == "inseparable_addition"
     assert in_doubt(d)[0] == "tracker_scale"
@@ -141,9 +142,9 @@ def test_algebra_tells_what_a_refit_would_of_an_effect_and_of_others_in_its_plac
     c = campaign("hysteresis", mode, 4, poses=20, registration_known=True)
     full = fitted(c, "hysteresis")
     without = remove(full, "hysteresis")
-    p = projection(without)
+    p = linearise(without)
     scores = {s.effect: s.score for s in rank_suspects(p, candidates(without))}
-    other = Rivals(full).of("hysteresis")
+    other = StepwiseAlternatives(full).of("hysteresis")
     own = scores.pop("hysteresis").log_evidence
     assert own > 30.0
     assert other.own == pytest.approx(own, rel=0.03)
@@ -155,12 +156,12 @@ def test_algebra_tells_what_a_refit_would_of_an_effect_and_of_others_in_its_plac
 def test_effects_added_by_algebra_explain_what_they_do_in_a_fit():
     """Evidence of a chain against that of adding its effects one by one, each refitted."""
     full = _two_in_the_guise_of_one().steps[-1].fit
-    other = Rivals(full).of("link_geometry")
+    other = StepwiseAlternatives(full).of("link_geometry")
     assert {*other.others} == {"encoder_offset", "tracker_drift"}
     assert other.better
     current, total = remove(full, "link_geometry"), 0.0
     for name in other.others:
-        p = projection(current)
+        p = linearise(current)
         (found,) = (s for s in rank_suspects(p, candidates(current)) if s.effect == name)
         total += found.score.log_evidence
         current = add(current, name)
@@ -199,7 +200,7 @@ def test_the_power_at_the_least_strength_is_what_it_says():
     rng = np.random.default_rng(0)
     x = rng.normal(size=(40, 3))
     level, dof = 1e-3, 37.0
-    needed = noncentrality(3, dof, level)
+    needed = noncentrality_of_power(3, dof, level, POWER)
     assert ncf.sf(f_distribution.isf(level, 3, dof), 3, dof, needed) == pytest.approx(POWER)
     beta = rng.normal(size=3)
     beta *= np.sqrt(needed / np.sum((x @ beta) ** 2))
@@ -233,10 +234,10 @@ def test_at_its_least_strength_an_effect_is_found_as_often_as_said(effect):
     """In the linearised campaign, with random parameters of that strength."""
     c = campaign(NOTHING, "deflection", 5, poses=20)
     found = fitted(c)
-    p = projection(found)
+    p = linearise(found)
     (e,) = (e for e in candidates(p.fit) if e.name == effect)
-    of = family(p.fit, e)
-    s = of.white.T @ p.free(of.white)
+    of = effect_columns(p.fit, e)
+    s = of.white.T @ p.project_out(of.white)
     units = tuple(q.unit for q in e.parameters)
     level = 1e-3
     least = least_strength(s, of.motion, of.scale, units, found.dof, 1.0, level)
@@ -246,10 +247,10 @@ def test_at_its_least_strength_an_effect_is_found_as_often_as_said(effect):
         beta = rng.standard_normal(len(s))
         flat = of.motion.reshape(-1, len(s)) @ beta
         moved = np.sqrt(np.sum(flat**2) / len(of.motion))
-        noise = p.free(rng.standard_normal((len(of.white), 1)))[:, 0]
-        y = p.free((of.white @ beta * least.displacement_m / moved)[:, None])[:, 0] + noise
-        b = np.linalg.lstsq(p.free(of.white), y, rcond=1e-5)[0]
-        gain = float(y @ (p.free(of.white) @ b))
+        noise = p.project_out(rng.standard_normal((len(of.white), 1)))[:, 0]
+        y = p.project_out((of.white @ beta * least.displacement_m / moved)[:, None])[:, 0] + noise
+        b = np.linalg.lstsq(p.project_out(of.white), y, rcond=1e-5)[0]
+        gain = float(y @ (p.project_out(of.white) @ b))
         rank = int(np.linalg.matrix_rank(s, tol=1e-4))
         ratio = (gain / rank) / ((float(y @ y) - gain) / (found.dof - rank))
         hits.append(f_distribution.sf(ratio, rank, found.dof - rank) < level)

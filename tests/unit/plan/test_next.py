@@ -7,12 +7,11 @@ import pytest
 from scipy import stats
 
 from hilcal.cell import cell_from_config
-from hilcal.diagnose.effect_ranking import candidates, family
-from hilcal.diagnose.projection import projection
+from hilcal.diagnose.effect_ranking import candidates
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
-from hilcal.identify.linearisation import linearise
+from hilcal.identify.linearisation import effect_columns, linearise
 from hilcal.plan.discriminated_pairs import (
     LEVEL,
     discriminated_pairs,
@@ -83,9 +82,9 @@ def test_the_power_is_the_share_of_rejections_in_the_simulated_world() -> None:
     start = add(first, LINK)
     for _ in range(100):
         rival = fit(start.model, with_noise(clean, rng), "deflection", start=start.theta)
-        f = projection(rival)
-        x = family(rival, next(e for e in candidates(rival) if e.name == TILT)).white
-        s, g = x.T @ f.free(x), x.T @ rival.white
+        f = linearise(rival)
+        x = effect_columns(rival, next(e for e in candidates(rival) if e.name == TILT)).white
+        s, g = x.T @ f.project_out(x), x.T @ rival.white
         rejected += bool(g @ np.linalg.solve(s, g) > stats.chi2.isf(LEVEL, len(g)))
     assert share_is(rejected, 100, promised)
 

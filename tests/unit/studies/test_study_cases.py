@@ -9,10 +9,10 @@ from hilcal.cli.demo import CELL
 from hilcal.config import CellConfig, load_config
 from hilcal.data.whitening import MODES, Mode
 from hilcal.diagnose.misfit_breakdown import misfit_breakdown
-from hilcal.diagnose.projection import projection
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import fit
+from hilcal.identify.linearisation import linearise
 from hilcal.robot.catalogue import configs_dir
 from hilcal.types import Floats
 from studies.diagnosis import intervals
@@ -120,7 +120,7 @@ def test_the_variables_of_a_law_are_those_that_a_diagnosis_knows() -> None:
     for mode in MODES:
         c = case(mode=mode)
         f = fit(baseline(c.cell, c.readings, mode), c.readings, mode)
-        known = {w.variable for w in misfit_breakdown(projection(f))}
+        known = {w.variable for w in misfit_breakdown(linearise(f))}
         for name in laws_shown(mode):
             assert set(invented(name).variables) <= known
 
