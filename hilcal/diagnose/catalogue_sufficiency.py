@@ -6,8 +6,8 @@ misfit, passes every test, and is wrong. Forward selection tests this: the model
 significant effects, one after the other, by algebra at the linearisation (see
 `regression.forward_selection`). Where the remaining residual is noise, the catalogue is
 sufficient. Where it is not, the linearisation may be too coarse: the best effect is added by a
-refit, and forward selection is repeated from there. A residual that remains after two refits, and that repeats or a generic regression show
-not to be noise, no effect of the catalogue explains.
+refit, and forward selection is repeated from there. A residual that remains after two refits, and
+that repeats or a generic regression show not to be noise, no effect of the catalogue explains.
 
 The algebra alone decides where it leaves noise: then no refit is made.
 """

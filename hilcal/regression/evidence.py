@@ -18,7 +18,8 @@ The whole family is judged at once:
       −½ log det(1 + t² S) − ½ ν log(‖r‖²_t / ‖r‖²),    ‖r‖²_t = ‖r‖² − gᵀ (S + t⁻²)⁻¹ g
 
   and β | r is Student's with ν degrees of freedom, mean (S + t⁻²)⁻¹ g and scale matrix
-  (‖r‖²_t / ν) (S + t⁻²)⁻¹. t is where the evidence is largest. Of two families that explain the
+  (‖r‖²_t / ν) (S + t⁻²)⁻¹. This is exact for a model without priors; where it has some, ‖r‖²
+  stands for rᵀ M⁻¹ r, which is larger by the penalty. t is where the evidence is largest. Of two families that explain the
   same, the smaller one has more evidence.
 
 Diagnosis and planning use this one formula. An earlier form for planning took the stated noise as
