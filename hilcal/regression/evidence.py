@@ -19,8 +19,8 @@ The whole family is judged at once:
 
   and β | r is Student's with ν degrees of freedom, mean (S + t⁻²)⁻¹ g and scale matrix
   (‖r‖²_t / ν) (S + t⁻²)⁻¹. This is exact for a model without priors; where it has some, ‖r‖²
-  stands for rᵀ M⁻¹ r, which is larger by the penalty. t is where the evidence is largest. Of two families that explain the
-  same, the smaller one has more evidence.
+  stands for rᵀ M⁻¹ r, which is larger by the penalty. t is where the evidence is largest. Of two
+  families that explain the same, the smaller one has more evidence.
 
 Diagnosis and planning use this one formula. An earlier form for planning took the stated noise as
 the true one (σ² = 1). That is wrong exactly when it is needed, with a misfit: at a variance factor
