@@ -38,6 +38,7 @@ _PLACES = {
     "diagnose": "hilcal.diagnose.verdict",
     "effect": "hilcal.effects.spec",
     "fit": "hilcal.library",
+    "installed": "hilcal.effects.catalogue",
     "plan": "hilcal.library",
     "read_table": "hilcal.library",
     "refine": "hilcal.library",
@@ -51,7 +52,7 @@ if TYPE_CHECKING:
     from hilcal.data.readings import Readings, States
     from hilcal.diagnose.diagnosis import Diagnosis
     from hilcal.diagnose.verdict import diagnose
-    from hilcal.effects.catalogue import Catalogue
+    from hilcal.effects.catalogue import Catalogue, installed
     from hilcal.effects.check import check_effect
     from hilcal.effects.protocol import Effect
     from hilcal.effects.spec import effect
@@ -80,7 +81,8 @@ class _Library(ModuleType):
     """A module in which `diagnose`, `plan` and `refine` are functions, not the subpackages.
 
     Importing a submodule sets it as an attribute of its parent; here names of the library keep
-    their meaning. `from hilcal.plan.planner import make` is not affected.
+    their meaning. Modules are imported by `from hilcal.plan import planner`; `import
+    hilcal.plan.planner as planner` would look the attribute up, and find the function.
     """
 
     def __setattr__(self, name: str, value: object) -> None:

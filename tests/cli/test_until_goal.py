@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import hilcal.cli.running as running
-import hilcal.plan.goal_rule as goal_rule
 from hilcal.acquire.connect import ConnectionResult
 from hilcal.config import CellConfig, Repeatability
 from hilcal.config.write import to_toml
@@ -18,6 +17,7 @@ from hilcal.data.run_log import RunLog
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import fit
+from hilcal.plan import goal_rule as goal_rule
 from hilcal.plan.goal_rule import GoalRule
 from hilcal.plan.nominal_model import nominal_states
 from hilcal.report.goal_words import status_words

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import kstest, wishart
 
-from hilcal.acquire.average import PRIOR_REPEATS
+from hilcal.data.covariance import PRIOR_REPEATS
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import MODES
 from hilcal.diagnose.effect_ranking import candidates, rank_suspects

@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 
 import hilcal as hc
-from drivers.simulated.rehearsal import rehearse
 from hilcal.config import load_config
 from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.table import write_table
 from hilcal.robot.catalogue import configs_dir
+from studies.random_campaigns import rehearse
 from tests.support.paths import ROOT
 
 CELL = configs_dir() / "cells" / "demo_ur10e.toml"
 WITHOUT_EXAMPLE = {
     # values that functions return, and errors
     "CannotAnswerError", "DeviceError", "Diagnosis", "Effect", "Fit", "HilcalError", "InputError",
-    "Model", "Readings", "Refinement", "States", "Catalogue", "diagnose",
+    "Model", "Readings", "Refinement", "States", "Catalogue", "installed",
 }  # fmt: skip
 
 
