@@ -1,4 +1,4 @@
-"""Time as the cell knows it: real time, or a simulated world's that goes faster."""
+"""Cell time: real time, or the faster time of a simulated world."""
 
 import time
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Opening the devices that a configuration names, and everything that fails at once."""
+"""Opening the devices that a configuration names; all failures are reported together."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -18,12 +18,12 @@ Factory = Callable[[CellConfig], Any]
 
 @dataclass(frozen=True, slots=True)
 class ConnectionResult:
-    """What became of one device.
+    """The result of opening one device.
 
     Attributes:
         device: its part in the cell.
         driver: the driver's name.
-        report: what it says of itself; None where it did not answer.
+        report: its name, facts and problems; None where it did not answer.
         failure: why it did not, one line; empty where it did.
     """
 
@@ -45,7 +45,7 @@ class ConnectionResult:
 
 @dataclass(frozen=True, slots=True)
 class _Wanted:
-    """One device that the configuration asks for."""
+    """One device that the configuration names."""
 
     device: str
     group: str
@@ -137,7 +137,7 @@ def _factory(one: _Wanted) -> Factory:
 
 
 def _open(factory: Factory, config: CellConfig) -> tuple[Any, str | HilcalError]:
-    """Open a device; what fails is told, whatever it is."""
+    """Open a device; returns it, or why it failed."""
     try:
         return factory(config), ""
     except Exception as error:  # a driver of somebody else's may fail in any way
@@ -145,7 +145,7 @@ def _open(factory: Factory, config: CellConfig) -> tuple[Any, str | HilcalError]
 
 
 def _why(error: Exception) -> str | HilcalError:
-    """Return what an error says; it keeps its kind where it is one of ours."""
+    """Return an error as one line, or itself where it is a HilcalError."""
     if isinstance(error, HilcalError):
         return error
     return f"{type(error).__name__}: {' '.join(str(error).split())}"

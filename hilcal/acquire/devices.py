@@ -1,4 +1,4 @@
-"""What the run asks of an arm, a tracker, a force sensor and an operator.
+"""Protocols of the devices of a run: arm, tracker, force sensor and operator.
 
 A driver is a factory `open(config: CellConfig) -> device`, found by the name that the
 configuration gives, as an entry point of the groups below. Opening connects and moves nothing;
@@ -28,11 +28,11 @@ class WrongLoadError(DeviceError):
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """What a device says of itself; nothing moved for it.
+    """Identity, state and problems of a device, read without any motion.
 
     Attributes:
         device: its part in the cell: "arm", "tracker", "force sensor", "operator".
-        name: the maker's name for it, with its serial number where it tells.
+        name: the maker's name for it, with its serial number where known.
         facts: (what, value) for people: versions, modes, rates, temperatures.
         problems: what has to be put right before a run, one clear line each.
     """
@@ -60,9 +60,9 @@ class ArmSample:
         tcp_pose: (6,) position and rotation vector of the tool point, m and rad.
         tcp_force: (6,) wrench as the controller estimates it, N and N·m.
         ft_raw_wrench: (6,) raw wrench of a sensor built into the arm; None where unknown.
-        payload: payload that the controller has been told, kg.
+        payload: payload that is set in the controller, kg.
         payload_com: (3,) its centre of mass, flange axes, m; None where unknown.
-        speed_scaling: what the controller makes of the speed, 0 to 1.
+        speed_scaling: factor that the controller applies to the speed, 0 to 1.
         safety: the safety state in the maker's words, "normal" where all is well.
     """
 
@@ -88,11 +88,11 @@ class ArmDevice(Protocol):
     """An arm that moves in joint space.
 
     Without `take_control` nothing can move. Any failure of the arm or of its link raises
-    DeviceError that names the cause, after the arm has been told to stop.
+    DeviceError that names the cause, after a stop has been commanded.
     """
 
     def report(self) -> Report:
-        """Say who answered, versions, state, and every problem at once; moves nothing."""
+        """Return identity, versions, state, and every problem at once; moves nothing."""
         ...
 
     def sample(self) -> ArmSample:
@@ -104,7 +104,7 @@ class ArmDevice(Protocol):
         ...
 
     def take_control(self, mass: float, com: Floats) -> None:
-        """Become the one who commands the arm, and set its payload.
+        """Take control of the arm, and set its payload.
 
         Args:
             mass: payload at the flange, kg.
@@ -113,7 +113,7 @@ class ArmDevice(Protocol):
         ...
 
     def set_payload(self, mass: float, com: Floats) -> None:
-        """Tell the controller what hangs at the flange, kg and m (flange axes); verified."""
+        """Set the payload in the controller, kg and m (flange axes), and verify it."""
         ...
 
     def start_move(self, q: Floats, speed: float, acceleration: float) -> None:

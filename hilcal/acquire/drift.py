@@ -1,4 +1,4 @@
-"""Returns to the reference pose: has anything moved since the first one?"""
+"""Drift: returns to the reference pose against the first reading there."""
 
 from dataclasses import dataclass, field
 
@@ -37,7 +37,7 @@ class Drift:
     _first: tuple[Floats, Floats] | None = field(default=None)
 
     def add(self, step: Step, position: Floats, covariance: Floats) -> Shift | None:
-        """Take note of a position; returns its shift where it is a return, else None.
+        """Add a position; returns its shift where it is a return, else None.
 
         Args:
             step: which reading.

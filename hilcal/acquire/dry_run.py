@@ -1,4 +1,4 @@
-"""Going through a plan in thought: every limit is checked, and nothing moves."""
+"""Dry run of a plan: every limit is checked, and nothing moves."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -138,7 +138,7 @@ def route_problems(cell: Cell, config: CellConfig, stops: tuple[Stop, ...]) -> l
 
 
 _Problems = dict[tuple[str, ...], str]
-"""By (kind, where): a path's problem is not told again where one of its ends has it."""
+"""By (kind, where): a problem of a path is left out where one of its ends has it."""
 
 
 def _at_stop(shapes: Clearance, sight: LineOfSight | None, stop: Stop) -> _Problems:
@@ -224,14 +224,14 @@ def _moment(
 
 
 def _pull(cell: Cell, config: CellConfig, load: str) -> Floats | None:
-    """(6,) wrench of a load, zero unloaded; None for an unknown one, which is told elsewhere."""
+    """(6,) wrench of a load, zero unloaded; None where unknown (see `_load_problems`)."""
     if load == UNLOADED:
         return np.zeros(6)
     return next((x.wrench(cell.gravity) for x in config.loads if x.name == load), None)
 
 
 def _unchecked(cell: Cell, config: CellConfig) -> tuple[str, ...]:
-    """What is not checked since it is not known; told where the cell says more of it."""
+    """Lines on what is not checked because the configuration lacks it."""
     out = []
     if tracker_place(cell, config) is None and config.sight.target_normal is not None:
         out.append(UNKNOWN)

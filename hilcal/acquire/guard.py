@@ -1,4 +1,4 @@
-"""What must hold at every moment, in motion and at rest."""
+"""Limits that are checked at every sample, in motion and at rest."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Changing what hangs: the person is asked, the arm is told, the force sensor is asked."""
+"""Changing the load: the operator, the payload of the controller, and the force sensor's check."""
 
 from collections.abc import Callable
 
@@ -60,9 +60,9 @@ class Hook:
         return next((load for load in self._config.loads if load.name == name), None)
 
     def begin(self) -> None:
-        """Have everything taken off before anything moves: nobody knows what hangs.
+        """Have every load taken off before anything moves, for what hangs is unknown.
 
-        Where the force sensor is known from an earlier session, it is asked too.
+        The force sensor confirms it where its zero is known from an earlier session.
         """
         self._ask(None, self._still_hangs)
         self.hanging, self.since = UNLOADED, self._clock.now()
@@ -70,7 +70,7 @@ class Hook:
     def change(self, name: str) -> None:
         """Have another load hung, at the present pose.
 
-        The arm is told of a heavier payload before it is hung, of a lighter one after the
+        A heavier payload is set in the controller before it is hung, a lighter one after the
         heavier has been taken off.
 
         Raises:
@@ -101,7 +101,7 @@ class Hook:
         raise WrongLoadError(f"operator: asked {TRIES} times to {what}; {why}")
 
     def _differs(self, load: Load | None) -> str:
-        """What the force sensor has against a load; weighed twice, for it may swing."""
+        """Why the measured wrench is not that of a load; weighed twice, for it may swing."""
         if self._meter is None:
             return ""
         text = ""
@@ -117,9 +117,9 @@ class Hook:
     def _still_hangs(self) -> str:
         """What seems to hang still: a load that fits better than nothing does.
 
-        By the zero of an earlier session; the sensor's own may have changed meanwhile. Without
-        one it is the sensor's own, which may be far off: then it is asked once, and what the
-        person says to that is taken.
+        By the zero of an earlier session, since the sensor's own may have changed meanwhile.
+        Without one it is the sensor's own, which may be far off: then it is checked once only, and
+        the operator's answer is accepted.
         """
         if self._meter is None or (self._doubted and not np.any(self._meter.zero)):
             return ""

@@ -1,4 +1,4 @@
-"""Taking one reading: wait until everything has settled, average, refuse what cannot be."""
+"""Measuring one reading: wait until everything has settled, average, check."""
 
 from dataclasses import dataclass
 
@@ -55,7 +55,7 @@ class Measured:
 
 
 class Measurer:
-    """Takes readings of an arm that stands at its goal."""
+    """Measures readings of an arm that stands at its goal."""
 
     def __init__(
         self,

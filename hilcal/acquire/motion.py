@@ -1,4 +1,4 @@
-"""Moving the arm from pose to pose, with an eye on everything meanwhile."""
+"""Moving the arm from pose to pose while every limit is checked."""
 
 import numpy as np
 
@@ -22,7 +22,7 @@ STILL_RAD = 1e-4
 
 
 class Mover:
-    """Commands the arm, and knows from which side each joint arrived.
+    """Commands the arm, and keeps from which side each joint arrived.
 
     Nothing here stops the arm: whatever is wrong is raised at once, and the run stops the arm
     before it does anything else.
@@ -53,7 +53,7 @@ class Mover:
         reason = self._guard.check(sample, felt)
         if reason is not None:
             if sample.safety != NORMAL:
-                self._arm.moving()  # in motion the driver tells the cause and what to do
+                self._arm.moving()  # in motion the driver raises the cause and what to do
             raise DeviceError(reason)
         return sample
 
@@ -102,7 +102,7 @@ class Mover:
         self.side = np.where(moved == 0.0, self.side, moved)
 
     def at_rest(self, sample: ArmSample) -> bool:
-        """Whether a sample says that the arm stands where it has been commanded to."""
+        """Whether the arm stands where it has been commanded to, by a sample."""
         goal = sample.q if self.goal is None else self.goal
         there = np.abs(sample.q - goal).max() <= self._motion.arrival_rad
         return bool(there and np.abs(sample.qd).max() <= self._motion.speed_rad_s / 50)

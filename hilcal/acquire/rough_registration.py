@@ -23,7 +23,7 @@ class RoughRegistration:
     """
 
     def __init__(self, cell: Cell) -> None:
-        """Start with what the configuration knows."""
+        """Start with what is configured."""
         self._cell = cell
         self._held: list[Floats] = []
         self._seen: list[Floats] = []

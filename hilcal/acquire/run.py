@@ -39,7 +39,7 @@ def run(
     """Measure what is missing of a plan, or as much of it as a goal needs.
 
     Every reading is stored before the next motion. Whatever is raised, also an interrupt from
-    the keyboard, the arm is told to stop before anything else is done. The rig stays open.
+    the keyboard, the arm is stopped before anything else is done. The rig stays open.
 
     Args:
         rig: the open devices.
@@ -55,7 +55,7 @@ def run(
             off, and the rest is not measured.
 
     Raises:
-        InputError: the plan is not safe (says the first problem), or the store fails.
+        InputError: the plan is not safe (names the first problem), or the store fails.
         DeviceError: a device failed, a limit was exceeded, a person gave up.
         KeyboardInterrupt: as it came; the arm stands.
     """
@@ -82,7 +82,7 @@ def refuse(checked: DryRun) -> None:
     """Refuse a plan with problems.
 
     Raises:
-        InputError: says the first problem, and how many more there are.
+        InputError: names the first problem, and how many more there are.
     """
     if checked.problems:
         more = len(checked.problems) - 1
@@ -115,7 +115,7 @@ def _note(store: Store, error: BaseException, trouble: str) -> None:
     kind = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
     try:
         store.event(kind, content)
-    except Exception:  # the error that is told is the one that came first
+    except Exception:  # the error that is raised is the one that came first
         return
 
 

@@ -1,4 +1,4 @@
-"""One session of a campaign: from nothing known to the last reading that was missing."""
+"""One session of a campaign: from connected devices to the last missing reading."""
 
 import time
 from collections.abc import Callable
@@ -36,7 +36,7 @@ LiveModel = Callable[[Readings], LiveResidual]
 
 
 class Session:
-    """Walks a route and stores a reading at every stop that asks for one."""
+    """Follows a route and stores a reading at every stop that has a step."""
 
     def __init__(
         self,
@@ -75,7 +75,7 @@ class Session:
         self._begun, self._elapsed, self._epoch = clock.now(), 0.0, wall()
         self._remember()
 
-    # what earlier sessions know
+    # earlier sessions
 
     def _remember(self) -> None:
         """Take over from the stored readings: times, tool, reference, unloaded positions."""
@@ -136,7 +136,7 @@ class Session:
         self._finish()
 
     def _begin(self, start: tuple[Stop, ...]) -> None:
-        """Find out where the arm stands, have the hook cleared, go to the reference, tare."""
+        """Check where the arm stands, have the load taken off, go to the reference, tare."""
         sample = self._rig.arm.sample()
         unfit = self._guard.state(sample)
         if unfit is not None:
@@ -250,7 +250,7 @@ class Session:
         return reading, measured.settling
 
     def _wrench(self, step: Step, tared: TaredWrench | None) -> Floats:
-        """(6,) wrench of the load at the load point, base axes: told or measured."""
+        """(6,) wrench of the load at the load point, base axes: configured or measured."""
         load = self._hook.load(step.load)
         if load is None:
             return np.zeros(6)

@@ -1,4 +1,4 @@
-"""What the readings of a campaign so far tell those that follow."""
+"""What is carried from reading to reading: registration, unloaded readings, drift, scatter."""
 
 import numpy as np
 
@@ -33,7 +33,7 @@ class SessionState:
     def add(
         self, step: Step, q: Floats, value: Floats, covariance: Floats, tared: TaredWrench | None
     ) -> Shift | None:
-        """Take note of a reading; returns its shift where it is a return to the reference.
+        """Add a reading; returns its shift where it is a return to the reference.
 
         Args:
             step: which one.

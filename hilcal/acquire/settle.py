@@ -31,20 +31,20 @@ from hilcal.types import Floats
 
 DRIFT_P = 0.04
 AFTER_DRIFT_P = 0.3
-"""The same after readings have drifted: every sample gives another look at a drift that is there,
-and one of many looks must not miss it."""
+"""The same after readings have drifted: the test is repeated at every sample, and none of the
+repeated tests may miss a drift that is there."""
 SCATTER_P = 0.001
 SHRINKING_P = 0.05
 NEGLIGIBLE = 0.5
 """Drift over the window that does not matter, as a share of the standard deviation of a mean."""
 FEW = 12
-"""Fewer samples than this say nothing about scatter of their own."""
+"""Fewer samples than this do not estimate a scatter."""
 LONGEST = 10
 """The window grows to at most so many times K samples."""
 
 
 class SettleWindow:
-    """Collects samples after the arm has stopped and says when they are at rest."""
+    """Collects samples after the arm has stopped, and tests whether they are at rest."""
 
     def __init__(self, count: int, scale: float = 1.0) -> None:
         """Start empty.
@@ -63,7 +63,7 @@ class SettleWindow:
         self._settled = self._has_drifted = False
 
     def add(self, sample: TrackerSample) -> None:
-        """Take in the next sample."""
+        """Add the next sample."""
         self._samples.append(sample)
         del self._samples[: -2 * LONGEST * self._count]
         self._settled = len(self._samples) >= self._count and self._judge()
@@ -95,7 +95,7 @@ class SettleWindow:
         return self._settled
 
     def _judge(self) -> bool:
-        """Look at the window after a new sample."""
+        """Test the window after a new sample."""
         window = self._window()
         trend = _trend(window, self._scale)
         if trend.moment == 0.0:

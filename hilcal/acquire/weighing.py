@@ -17,7 +17,7 @@ def compare(
     tolerance_share: float,
     gravity: Floats = STANDARD_GRAVITY,
 ) -> tuple[bool, str]:
-    """Say whether what hangs is what was asked for, and the finding in one line.
+    """Return whether the load is the one asked for, and the finding in one line.
 
     It is, where |f - f_expected| <= max(tolerance_N, tolerance_share |f_expected|); three sigma
     of the measurement have to fit into that too. A load that is a moment alone is judged by its
@@ -29,7 +29,7 @@ def compare(
         std: (6,) its standard uncertainty.
         tolerance_N: by how much the force may differ.
         tolerance_share: the same as a share of the force.
-        gravity: (3,) base axes, m/s²; along it a load is told in kg.
+        gravity: (3,) base axes, m/s²; along it a load is given in kg.
     """
     force, moment = (float(np.linalg.norm(part)) for part in (expected[:3], expected[3:]))
     if force == 0.0 and moment > 0.0:

@@ -12,7 +12,7 @@ from hilcal.errors import InputError
 def with_new_names(plan: Plan, before: Plan, number: int) -> Plan:
     """Return a further plan with names and cycles that a campaign does not have yet.
 
-    The reference pose becomes that of the campaign, so that the drift is told over all of it. A
+    The reference pose becomes that of the campaign, so that the drift is measured over all of it. A
     pose of a known name at other joints gets another name; one at the same joints is the same
     pose, and its readings get new cycles, with unloaded readings of their own.
 

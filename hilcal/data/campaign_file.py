@@ -273,7 +273,7 @@ def may_write(path: Path, overwrite: bool) -> None:
     """Refuse to replace a file that is no campaign, or any without `overwrite`.
 
     Raises:
-        InputError: says which file, and why.
+        InputError: names the file and the reason.
     """
     if not path.exists():
         return

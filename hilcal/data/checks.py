@@ -9,7 +9,7 @@ from hilcal.robot.arm import Arm
 from hilcal.types import Floats, Ints
 
 MAX_DISTANCE = 100.0  # m; no instrument measures an arm from further away
-MAX_STD = 0.01  # m; a reading worse than that says nothing about an arm
+MAX_STD = 0.01  # m; a reading worse than that is useless for an arm; a guess
 SAME_POSE = 1e-6  # rad; commanded joints of one pose agree to this
 _LIMIT_MARGIN = 1e-4  # rad; rounding of a limit written with few digits
 _TRACKING = 0.1  # rad; actual and commanded joints of an arm at rest are closer
@@ -20,7 +20,7 @@ def check_joints(table: CsvTable, names: tuple[str, ...], q: Floats, arm: Arm) -
     """Refuse commanded joints beyond the arm's limits; (N, n), rad.
 
     Raises:
-        InputError: names row, joint and limits, and says where the angles look like degrees.
+        InputError: names row, joint and limits, and remarks angles that look like degrees.
     """
     bad = (q < arm.q_min - _LIMIT_MARGIN) | (q > arm.q_max + _LIMIT_MARGIN)
     if not bad.any():
@@ -125,9 +125,9 @@ def check_covariances(table: CsvTable, covariance: Floats) -> None:
         )
     scale = 1.0 / np.sqrt(np.where(variance > 0, variance, 1.0))
     correlation = scale[:, :, None] * covariance * scale[:, None, :]
-    unseen = (variance == 0)[:, :, None] & (covariance != 0)
+    undefined = (variance == 0)[:, :, None] & (covariance != 0)
     smallest = np.linalg.eigvalsh(correlation)[:, 0]
-    for i in np.flatnonzero((smallest < -1e-9) | np.any(unseen, axis=(1, 2)))[:1]:
+    for i in np.flatnonzero((smallest < -1e-9) | np.any(undefined, axis=(1, 2)))[:1]:
         raise InputError(
             f"{table.at(int(i))}: the covariance is not positive semi-definite "
             f"(smallest eigenvalue of the correlation matrix {smallest[i]:.3g})"

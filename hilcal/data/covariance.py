@@ -7,8 +7,8 @@ and R the random covariance of the K samples of a reading (`covariance_of_mean`)
 the scatter of the joints from one arrival to the next, J the Jacobian of the target
 (`joint_scatter`).
 
-A measured campaign stores the first two terms, and its file says so (`COVERS` = `INSTRUMENT`): the
-third needs the registration, and is added when the readings are opened
+A measured campaign stores the first two terms, which its file states (`COVERS` = `INSTRUMENT`):
+the third needs the registration, and is added when the readings are opened
 (`hilcal.identify.full_covariance`). An imported campaign stores what its table states, or
 `tracker_covariance` where the table states none; `[repeatability]` is not added to it.
 """

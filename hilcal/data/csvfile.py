@@ -69,7 +69,7 @@ class CsvTable:
         """Raise for the first true cell of an (N, k) mask over number columns.
 
         Raises:
-            InputError: a cell is marked; `what` says from its value what is wrong.
+            InputError: a cell is marked; `what` makes from its value the reason.
         """
         if bad.any():
             i, j = divmod(int(np.argmax(bad)), bad.shape[1])

@@ -1,4 +1,4 @@
-"""States and readings: what the arm was told, and what the tracker saw."""
+"""States of the arm, and readings of the tracker in them."""
 
 from dataclasses import dataclass, fields, replace
 

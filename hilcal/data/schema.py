@@ -76,7 +76,7 @@ def sqlite_errors(path: Path) -> Iterator[None]:
     """Turn SQLite's errors into one line.
 
     Raises:
-        InputError: says what is wrong with the file.
+        InputError: names what is wrong with the file.
         DeviceError: the disk is full or failed.
     """
     try:
@@ -127,7 +127,7 @@ def check_file(connection: sqlite3.Connection, path: Path) -> None:
     """Refuse what is not a sound campaign of a known version.
 
     Raises:
-        InputError: says which.
+        InputError: names it.
     """
     (application,) = connection.execute("PRAGMA application_id").fetchone()
     if application != APPLICATION_ID:

@@ -26,7 +26,7 @@ def read_table(
 
     Args:
         path: a CSV file with the columns of `columns.known_columns`.
-        arm: tells the number of joints, their limits and the reach.
+        arm: its number of joints, their limits and its reach are checked.
         noise: gives the covariances where the table has none.
         station: (3,) where the tracker's beam starts, m; the origin where None.
 
