@@ -26,7 +26,7 @@ def _checksum(frame: bytes) -> bytes:
 
 
 def _overload(wrench: Floats, status: int) -> str:
-    """What the status says; bit 0 (fewer samples behind a value) does not make it wrong."""
+    """The status in words; bit 0 (fewer samples behind a value) does not make it wrong."""
     for bit, words in _STATUS:
         if status & bit:
             return f"the Bota sensor {words} (status {status:#06x})"

@@ -33,7 +33,7 @@ class StreamingSensor:
             stream: already running.
             name: the maker's, with the serial number where known.
             facts: for the report, besides those of the stream.
-            before_close: what to tell the sensor at the end; must not raise.
+            before_close: sends the last command to the sensor; must not raise.
         """
         self._port, self._stream, self._name, self._facts = port, stream, name, facts
         self._before_close = before_close

@@ -1,4 +1,4 @@
-"""Robotiq FT 300 and FT 300-S over serial: asked over Modbus RTU, then told to stream.
+"""Robotiq FT 300 and FT 300-S over serial: registers over Modbus RTU, then a stream.
 
 Robotiq FT 300 Instruction Manual: 19200 Bd, slave 9, registers 500 firmware, 510 to 513 serial
 number; 0x0200 in register 410 starts the stream of 100 frames per second, fifty bytes FF end
@@ -40,7 +40,7 @@ def _checksum(frame: bytes) -> bytes:
 
 
 def _overload(wrench: Floats, status: int) -> str:
-    """Whether a component is at the end of its range, where it tells no more."""
+    """Whether a component is at the end of its range, where it measures no more."""
     worst = int(np.argmax(np.abs(wrench) / RANGE))
     if abs(wrench[worst]) < 0.9999 * RANGE[worst]:
         return ""

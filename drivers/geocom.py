@@ -55,7 +55,7 @@ class GeoComTracker:
     """A GeoCOM instrument as a `hilcal.acquire.devices.TrackerDevice` of positions (m = 3)."""
 
     def __init__(self, link: Link, config: TrackerConfig, options: Options, clock: Clock) -> None:
-        """Take over an open link; asks nothing yet."""
+        """Take over an open link; sends nothing yet."""
         self._link, self._config, self._options, self._clock = link, config, options, clock
         self._full_known = True
         self._last_ms = 0.0
@@ -238,7 +238,7 @@ class GeoComTracker:
         return facts
 
     def _locked(self, until: float) -> bool | None:
-        """Whether it follows the target; None where the instrument cannot tell."""
+        """Whether it follows the target; None where the instrument does not report it."""
         state = self._told(until, geo.LOCK_STATE, int)
         return None if state is None else bool(state[0])
 

@@ -2,7 +2,7 @@
 
 Frame (OptoForce General DAQ protocol): `AA 07 08 10`; `>HH6h` of counter, status and wrench in
 counts; the sum of all bytes before it as a big-endian u16: 22 bytes at 1 MBd. What a count is
-stands in each sensor's own sheet, so the configuration has to tell it:
+stands in each sensor's own sheet, so the configuration has to give it:
 
     [force_sensor]
     driver = "hex"

@@ -11,9 +11,9 @@ from drivers.simulated.mechanics import equilibrium
 from drivers.simulated.rehearsal import (
     CampaignStates,
     Rehearsal,
-    conceal,
     measurement_noise,
     simulate,
+    simulation_case,
 )
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
@@ -248,7 +248,7 @@ def rehearse(config: CellConfig, choice: str, seed: int, n_poses: int = POSES) -
         visits.append(CampaignStates(*rehearsal_states(cell, n_poses, pulls, rng)))
         return visits[0]
 
-    s = conceal(config, choice, rng, visit, measurement_noise(config))
+    s = simulation_case(config, choice, rng, visit, measurement_noise(config))
     names = ("none", *(load.name for load in config.loads))
     v = visits[0]
     readings = simulate(s.world, v.states, v.pose, v.load, v.cycle, names, rng)

@@ -17,7 +17,7 @@ from hilcal.errors import InputError
 from hilcal.robot.catalogue import load_arm
 from hilcal.types import Floats
 from studies.random_campaigns import rehearsal_states
-from studies.unmodelled_laws import INVENTED, Invented, invented, shift
+from studies.unmodelled_laws import LAWS, UnmodelledLaw, law_named, shift
 
 POSES = 30
 _G = 9.81  # m/s², of the pulls
@@ -80,7 +80,7 @@ def effects_shown(mode: Mode) -> tuple[str, ...]:
 
 def laws_shown(mode: Mode) -> tuple[str, ...]:
     """Return the laws outside of the catalogue that readings of a kind show."""
-    return tuple(law.name for law in INVENTED if mode in law.readings)
+    return tuple(law.name for law in LAWS if mode in law.readings)
 
 
 def study_case(
@@ -104,7 +104,7 @@ def study_case(
         config: the cell; robot and loads are replaced.
         robot: name of the arm.
         mode: the kind of readings in which the strength holds.
-        hidden: effects of `EFFECTS` or names of `INVENTED`; none of them hides nothing.
+        hidden: effects of `EFFECTS` or names of `LAWS`; none of them hides nothing.
         strength: of each, rms in units of the noise.
         seed: of everything random.
         stated: stated over true standard deviation of the noise.
@@ -126,14 +126,14 @@ def study_case(
     if "joint_stiffening" in hidden:
         softer = _SOFTER * world.physics.joint_compliance
         world = replace(world, physics=world.physics.with_effect("joint_compliance", softer))
-    laws: list[Invented] = []
+    laws: list[UnmodelledLaw] = []
     for name in hidden:
         if name in EFFECTS:
             world = hide(
                 name, cell, states, strength, mode, rng, world=world, pose=pose, cycle=cycle
             )
         else:
-            laws.append(invented(name))
+            laws.append(law_named(name))
     load_names = ("none", *(name for name, _ in loads))
     readings = simulate(world, states, pose, load, cycle, load_names, rng)
     clean = world.sight(states).position

@@ -22,7 +22,7 @@ Law = Callable[[States, Floats], Floats]
 
 
 @dataclass(frozen=True, slots=True)
-class Invented:
+class UnmodelledLaw:
     """An effect outside of the catalogue.
 
     Attributes:
@@ -96,34 +96,34 @@ def _turned(s: States, torque: Floats) -> Floats:
     return _of_joint(2, s, pull * np.cos(2.0 * s.q[:, 0]))
 
 
-INVENTED: tuple[Invented, ...] = (
-    Invented("crossed gear", "dq_2 = a sin 3 q_4", ("joint 4 angle",), (ABSOLUTE,), _crossed),
-    Invented("slip in time", "dq_3 = a tanh of time", ("time",), (ABSOLUTE,), _settled),
-    Invented(
+LAWS: tuple[UnmodelledLaw, ...] = (
+    UnmodelledLaw("crossed gear", "dq_2 = a sin 3 q_4", ("joint 4 angle",), (ABSOLUTE,), _crossed),
+    UnmodelledLaw("slip in time", "dq_3 = a tanh of time", ("time",), (ABSOLUTE,), _settled),
+    UnmodelledLaw(
         "swaying bench", "target rises with the air", ("air temperature",), (ABSOLUTE,), _swaying
     ),
-    Invented(
+    UnmodelledLaw(
         "dragging cable",
         "dq_5 = a s_3, the side joint 3 came from",
         ("joint 3 approach",),
         (ABSOLUTE, DEFLECTION),
         _dragged,
     ),
-    Invented(
+    UnmodelledLaw(
         "coupled joint",
         "dq_4 = a tau_2²",
         ("joint 2 torque",),
         (ABSOLUTE, DEFLECTION),
         _coupled,
     ),
-    Invented(
+    UnmodelledLaw(
         "relaxing bench",
         "target sinks by a sqrt(time under the load)",
         ("time under load",),
         (DEFLECTION,),
         _relaxing,
     ),
-    Invented(
+    UnmodelledLaw(
         "base that turns",
         "dq_2 = a |f| cos 2 q_1",
         ("joint 1 angle", "load"),
@@ -134,20 +134,20 @@ INVENTED: tuple[Invented, ...] = (
 """Every law, by what shows it."""
 
 
-def invented(name: str) -> Invented:
+def law_named(name: str) -> UnmodelledLaw:
     """Return a law by name.
 
     Raises:
         InputError: lists the valid names.
     """
-    for law in INVENTED:
+    for law in LAWS:
         if law.name == name:
             return law
-    raise InputError(f"law {name!r}; valid: {', '.join(law.name for law in INVENTED)}")
+    raise InputError(f"law {name!r}; valid: {', '.join(law.name for law in LAWS)}")
 
 
 def shift(
-    law: Invented,
+    law: UnmodelledLaw,
     world: World,
     states: States,
     strength_sigma: float,

@@ -36,8 +36,8 @@ def ask(path: Path, op: str, timeout: float = 5.0, **arguments: Any) -> Any:
 def serve(path: Path, handler: Handler) -> None:
     """Answer requests in a daemon thread; `handler(op, arguments)` returns what JSON can hold.
 
-    What the handler raises is told to the one who asked. The socket appears only when it
-    answers, so its existence tells that the device is ready.
+    An exception of the handler is returned to the client. The socket appears only when it
+    answers, so its existence shows that the device is ready.
     """
     new = path.with_name(path.name + ".new")
     new.unlink(missing_ok=True)

@@ -1,7 +1,7 @@
 """The one physical world, as all simulated devices see it: a small shared file.
 
 Each section has one writer and any number of readers, in other processes. A sequence number
-that is odd while the section is being written tells readers to look again (a seqlock; see
+that is odd while the section is being written makes readers read again (a seqlock; see
 Linux kernel documentation, "Sequence counters and sequential locks").
 """
 
@@ -27,7 +27,7 @@ SECTIONS: dict[str, np.dtype[Any]] = {
             ("side", "<f8", N),  # direction of each joint's last motion, -1 or +1
             ("arrivals", "<i8"),  # motions that have ended (also by a stop)
             ("moving", "<f8"),  # 1 while the trajectory runs
-            ("payload", "<f8"),  # what the controller has been told, kg
+            ("payload", "<f8"),  # as set in the controller, kg
             ("payload_com", "<f8", 3),  # flange axes, m
         ]
     ),

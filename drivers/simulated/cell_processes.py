@@ -72,7 +72,7 @@ class SimulatedCell:
 
         Args:
             world: what is true.
-            config: what the program is told; the world's cell was made from it.
+            config: what the program is given; the world's cell was made from it.
             directory: a directory for this cell alone; made where it is missing.
             seed: of everything random.
             base_dir: directory that a robot's file path in `config` is relative to.

@@ -15,13 +15,13 @@ _END = 2.0  # s that a process has to end by itself, and again after it was aske
 class DeviceProcess:
     """Starts, watches and ends `python -m MODULE --directory DIR ...`.
 
-    Its standard input is a pipe held by this process, whose end it follows; what it says goes
+    Its standard input is a pipe held by this process, whose end it follows; its output goes
     to DIR/NAME.log; it is ready when DIR/NAME.sock appears.
 
     Attributes:
         name: of the device: "world", "arm", "tracker", "force".
         socket: its admin socket.
-        log: the file of what it says.
+        log: the file of its output.
     """
 
     def __init__(self, name: str, module: str, directory: Path, arguments: tuple[str, ...]) -> None:

@@ -14,7 +14,7 @@ from hilcal.types import Floats
 class Misreading:
     """acting = G (said - b), both at the load point and in the axes of the body that carries it.
 
-    The sensor says b + diag(1 + g) exp([delta])ᵀ acting, so G = exp([delta]) diag(1 / (1 + g)),
+    The sensor reads b + diag(1 + g) exp([delta])ᵀ acting, so G = exp([delta]) diag(1 / (1 + g)),
     the same rotation for force and moment.
 
     Attributes:
@@ -49,7 +49,7 @@ class Misreading:
         return Misreading(turn @ self.gain @ turn.T, turn @ self.bias)
 
     def acting(self, said: Floats) -> Floats:
-        """Return the (6,) wrench that acts where the sensor says `said`, N and N·m."""
+        """Return the (6,) wrench that acts where the sensor reads `said`, N and N·m."""
         return np.asarray(self.gain @ (said - self.bias))
 
 

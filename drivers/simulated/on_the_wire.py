@@ -10,19 +10,25 @@ import numpy as np
 
 from drivers.simulated.cell_processes import SimulatedCell
 from drivers.simulated.planned import planned_states
-from drivers.simulated.rehearsal import Rehearsal, Secret, conceal, measurement_noise, simulate
+from drivers.simulated.rehearsal import (
+    Rehearsal,
+    SimulationCase,
+    measurement_noise,
+    simulate,
+    simulation_case,
+)
 from hilcal.config import CellConfig
 from hilcal.data.plan import UNLOADED, Plan
 
 
-def secret_of(config: CellConfig, plan: Plan, choice: str, seed: int) -> Secret:
+def case_of_plan(config: CellConfig, plan: Plan, choice: str, seed: int) -> SimulationCase:
     """Hide an effect in the simulated cell of a configuration.
 
     Its strength holds for the readings of the plan, each the mean of several measurements; the
     world's tracker has the noise of a single one.
 
     Args:
-        config: the cell; `[simulation]` tells the strength.
+        config: the cell; `[simulation]` gives the strength.
         plan: what will be measured.
         choice: an effect, "random" or "nothing".
         seed: of everything random.
@@ -32,15 +38,17 @@ def secret_of(config: CellConfig, plan: Plan, choice: str, seed: int) -> Secret:
     """
     rng = np.random.default_rng(seed)
     mean = measurement_noise(config, config.acquire.samples)
-    secret = conceal(config, choice, rng, lambda cell: planned_states(cell, config, plan), mean)
+    secret = simulation_case(
+        config, choice, rng, lambda cell: planned_states(cell, config, plan), mean
+    )
     return replace(secret, world=replace(secret.world, noise=measurement_noise(config)))
 
 
-def read_plan(s: Secret, plan: Plan, seed: Sequence[int], begun: float = 0.0) -> Rehearsal:
+def read_plan(s: SimulationCase, plan: Plan, seed: Sequence[int], begun: float = 0.0) -> Rehearsal:
     """Draw the readings of a plan in a simulated cell that is there already.
 
     Args:
-        s: what is told and what is true.
+        s: configuration and truth of the cell.
         plan: what is measured, each reading the mean of several measurements.
         seed: of the noise.
         begun: when, in the time of the campaign, s.
@@ -57,12 +65,12 @@ def read_plan(s: Secret, plan: Plan, seed: Sequence[int], begun: float = 0.0) ->
 
 @contextmanager
 def simulated_cell(
-    secret: Secret, seed: int, base_dir: Path, directory: Path | None = None
+    secret: SimulationCase, seed: int, base_dir: Path, directory: Path | None = None
 ) -> Iterator[SimulatedCell]:
     """Run the simulated devices of a cell; they end with the block.
 
     Args:
-        secret: what is told and what is true.
+        secret: configuration and truth of the cell.
         seed: of the devices' noise.
         base_dir: directory that a robot's file path is relative to.
         directory: where the devices meet; a temporary one if None.

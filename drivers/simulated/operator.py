@@ -17,7 +17,7 @@ _OPTIONS = ("socket", "hand_s")
 
 @dataclass(frozen=True, slots=True)
 class SimulatedOperator:
-    """A diligent person, who errs only where the world's admin line says so.
+    """A diligent person, who errs only where the world's admin line commands it.
 
     Attributes:
         socket: the world's admin socket.

@@ -9,7 +9,7 @@ import threading
 def end_with_parent() -> None:
     """Exit at once when standard input closes (the parent holds its other end).
 
-    A pipe tells of any death, also of kill -9; asynchronous and on every platform.
+    A pipe ends with any death, also of kill -9; asynchronous and on every platform.
     """
 
     def wait() -> None:

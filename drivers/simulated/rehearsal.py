@@ -24,7 +24,7 @@ _SOFTER = 1.5  # a gear that stiffens starts softer than its mean
 
 
 def choices() -> tuple[str, ...]:
-    """Effects that can be hidden: all that the world knows; every arm has joint compliance."""
+    """Effects that can be hidden: all that the world has; every arm has joint compliance."""
     return tuple(e for e in EFFECTS if e != "joint_compliance")
 
 
@@ -40,7 +40,7 @@ def check_choice(choice: str) -> None:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Secret:
+class SimulationCase:
     """A simulated cell with something hidden in it.
 
     Attributes:
@@ -61,7 +61,7 @@ class Secret:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rehearsal(Secret):
+class Rehearsal(SimulationCase):
     """A simulated campaign in such a cell.
 
     Attributes:
@@ -109,17 +109,17 @@ def as_told(config: CellConfig, choice: str) -> CellConfig:
     return config.model_copy(update={"tracker": tracker})
 
 
-def conceal(
+def simulation_case(
     config: CellConfig,
     choice: str,
     rng: np.random.Generator,
     visit: Callable[[Cell], CampaignStates],
     noise: SimulatedNoise,
-) -> Secret:
+) -> SimulationCase:
     """Make a simulated cell and hide an effect in it at the configured strength.
 
     Args:
-        config: the cell; `[simulation]` tells the strength.
+        config: the cell; `[simulation]` gives the strength.
         choice: an effect of `choices()`, "random" or "nothing".
         rng: generator.
         visit: returns the states at which the strength holds.
@@ -146,7 +146,7 @@ def conceal(
         world = hide(
             hidden, cell, v.states, strength, mode, rng, world=world, pose=v.pose, cycle=v.cycle
         )
-    return Secret(config, cell, mode, world, hidden, strength)
+    return SimulationCase(config, cell, mode, world, hidden, strength)
 
 
 def simulate(

@@ -120,7 +120,7 @@ class World:
         """Return the static equilibrium of N states.
 
         Args:
-            states: what the arm was told and what pulls at it.
+            states: commanded joints and wrenches.
             slip: (N, n) how far each joint missed its command, rad (repeatability).
 
         Raises:

@@ -24,7 +24,7 @@ from drivers.simulated import admin
 from drivers.simulated.blackboard import Blackboard
 from drivers.simulated.parent import end_with_parent
 from drivers.simulated.world_file import read_world
-from drivers.simulated.world_state import LivingWorld
+from drivers.simulated.world_state import WorldState
 from hilcal.errors import HilcalError
 
 OPS = ("hang", "mistake", "push", "swing", "state", "log", "die")
@@ -42,7 +42,7 @@ def open_board(directory: Path, scale: float) -> Blackboard:
     return Blackboard.attach(path)
 
 
-def handler(living: LivingWorld) -> admin.Handler:
+def handler(living: WorldState) -> admin.Handler:
     """Return what answers the requests."""
 
     def answer(op: str, given: dict[str, Any]) -> Any:
@@ -76,7 +76,7 @@ def main() -> int:
     try:
         world, config = read_world(arguments.directory / "world.json")
         board = open_board(arguments.directory, config.simulation.clock)
-        living = LivingWorld(world, config, board, arguments.seed)
+        living = WorldState(world, config, board, arguments.seed)
     except HilcalError as error:
         print(error, file=sys.stderr)
         return error.exit_code

@@ -49,7 +49,7 @@ class Swing:
         return time < 14.0 * self.decay
 
 
-class LivingWorld:
+class WorldState:
     """Looks at the arm, computes where it rests, and publishes what is true.
 
     The arm's repeatability: with every arrival the joints miss their command anew by
@@ -136,7 +136,7 @@ class LivingWorld:
             self._mistakes.append(self._number(name))
 
     def push(self, wrench: Sequence[float]) -> None:
-        """Let somebody lean on the load point, base axes, N and N·m, until told otherwise.
+        """Apply a further wrench at the load point, base axes, N and N·m, until it is changed.
 
         Raises:
             InputError: not six numbers, or a wrench that the arm does not bear.

@@ -89,7 +89,7 @@ class Brakes:
             return Halt(None, False, lost)
 
     def _watch(self, brake: float) -> Halt:
-        """See the arm come to a stand; tell it once more if it does not."""
+        """Wait until the arm stands; command the stop once more if it does not."""
         reading = self._until_still(_AGAIN_S, program=True)
         if reading is None:
             self._by_script(brake)

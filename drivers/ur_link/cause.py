@@ -1,4 +1,4 @@
-"""Why a motion ended, in the order in which one cause hides another."""
+"""Why a motion ended: the causes in the order in which one masks another."""
 
 import contextlib
 
@@ -14,7 +14,7 @@ def find(host: str, halt: Halt, noticed: str, has_dashboard: bool) -> tuple[str,
     """Return what happened and what to do about it, after the arm has been stopped.
 
     A safety stop ends the program, and a lost link the process that commands the arm: what was
-    noticed first is told only where nothing deeper is found.
+    noticed first is reported only where nothing deeper is found.
 
     Args:
         host: address of the controller.

@@ -12,7 +12,7 @@ from drivers.ur_link.worker import Worker, WorkerError
 from hilcal.types import Floats
 
 LEASE_S = 0.5
-"""A motion that nobody watches for so long is stopped, real s."""
+"""Lease of a motion: not renewed for so long, the motion is stopped, real s."""
 COMMAND_S = 0.5
 """Deadline of a command, real s."""
 CONNECT_S = 8.0
@@ -27,10 +27,10 @@ _NO_COG = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Pulse:
-    """What the control worker knows.
+    """State of the control worker.
 
     Attributes:
-        expired: the motion was stopped because nobody watched it.
+        expired: the motion was stopped because its lease was not renewed.
         late: the longest pause between two signs of life that was too long, s; 0 for none.
     """
 

@@ -36,7 +36,7 @@ class ControlInterface:
         self._guard(REST_HZ)
 
     def kick(self) -> None:
-        """Tell the robot that this process lives; stop the arm if nobody watches its motion."""
+        """Kick the robot's watchdog; stop the arm where the lease of its motion has expired."""
         now = time.monotonic()
         if now - self._kicked >= KICK_S:
             if now - self._kicked > LATE_S:

@@ -14,7 +14,7 @@ NOT_UNDERSTOOD = "could not understand"
 
 @dataclass(frozen=True, slots=True)
 class RobotFacts:
-    """What the dashboard tells about the robot.
+    """State of the robot by its dashboard.
 
     Attributes:
         model: e.g. "UR10"; empty where unknown.
@@ -22,7 +22,7 @@ class RobotFacts:
         version: of the software, as the robot writes it.
         mode: e.g. "RUNNING".
         safety: e.g. "NORMAL".
-        remote: whether it is in remote control; None where the robot knows no such thing.
+        remote: whether it is in remote control; None where the robot has no such mode.
         program: "PLAYING", "PAUSED", "STOPPED" and the name of the loaded program.
     """
 
@@ -79,7 +79,7 @@ def describe(host: str, seconds: float) -> RobotFacts:
 
 
 def in_remote_control(host: str, seconds: float) -> bool | None:
-    """Whether programs may command the arm; None where the robot knows no such thing (CB3).
+    """Whether programs may command the arm; None where the robot has no such mode (CB3).
 
     Raises:
         LinkError: no dashboard, or it does not answer in time.

@@ -1,4 +1,4 @@
-"""How a failure of the arm is told: which arm, what happened, what to do."""
+"""The message of a failure of the arm: which arm, what happened, what to do."""
 
 from hilcal.errors import DeviceError
 

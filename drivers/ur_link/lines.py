@@ -8,7 +8,7 @@ from typing import Self
 
 
 class LinkError(Exception):
-    """A connection failed; the text says which and why.
+    """A connection failed; the text names it and the reason.
 
     Attributes:
         refused: nobody listens on the port.

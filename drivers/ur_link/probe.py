@@ -21,7 +21,7 @@ _STREAM_HZ = 125.0
 
 @dataclass(frozen=True, slots=True)
 class ControllerFacts:
-    """What a controller says of itself.
+    """Version and outputs of a controller.
 
     Attributes:
         version: major, minor, bugfix, build.

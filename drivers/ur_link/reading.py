@@ -15,7 +15,7 @@ N = 6
 """Joints of every arm of this maker."""
 
 OUTPUTS = tuple(GETTERS)
-"""What is recorded of what the client library knows."""
+"""The outputs of the client library that are recorded."""
 
 OPTIONAL = frozenset({"target_speed_fraction", "payload", "payload_cog", "ft_raw_wrench"})
 """Outputs that older controllers lack (payload and payload_cog come with 5.5.1, ft_raw_wrench

@@ -70,7 +70,7 @@ class Receiver:
         """
         begun = time.monotonic()
         self._worker.kill()
-        # It tells much earlier than the library does that no data come.
+        # It shows much earlier than the library does that no data come.
         probe.check_stream(self._host, min(seconds, 0.25))
         self._worker = self._start(seconds - (time.monotonic() - begun))
 

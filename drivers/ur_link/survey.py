@@ -1,4 +1,4 @@
-"""What the arm says of itself, and everything that hinders a run."""
+"""Identity and state of the arm, and everything that hinders a run."""
 
 import math
 
@@ -78,7 +78,7 @@ def _problems(robot: dashboard.RobotFacts, model: str) -> list[str]:
     out = []
     if robot.remote is False:
         out.append("it is in local mode; switch it to remote control on the pendant")
-    # "UR10" may stand for an UR10e as well: only the size tells
+    # "UR10" may stand for an UR10e as well: only the size decides
     size = "".join(c for c in robot.model if c.isdigit())
     told = model.lower().removeprefix("ur").removesuffix("e")
     if model.lower().startswith("ur") and told.isdigit() and size and told != size:

@@ -17,7 +17,7 @@ _ROOT = Path(__file__).resolve().parents[2]
 
 
 class WorkerError(Exception):
-    """A worker did not do what was asked; the text says why.
+    """A worker did not carry out a request; the text gives the reason.
 
     Attributes:
         lost: the process is gone (it crashed, or was ended because it did not answer).
@@ -37,7 +37,7 @@ class Worker:
     """
 
     def __init__(self, module: str, arguments: tuple[str, ...], seconds: float) -> None:
-        """Start the process and wait until it says that it is ready.
+        """Start the process and wait until it reports that it is ready.
 
         Args:
             module: name of the module to run.

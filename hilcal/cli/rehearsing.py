@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from drivers.simulated.on_the_wire import read_plan, secret_of, simulated_cell
-from drivers.simulated.rehearsal import Rehearsal, Secret, as_told
+from drivers.simulated.on_the_wire import case_of_plan, read_plan, simulated_cell
+from drivers.simulated.rehearsal import Rehearsal, SimulationCase, as_told
 from hilcal.acquire.dry_run import dry_run
 from hilcal.cell import cell_from_config
 from hilcal.cli.planning import make_plan
@@ -88,7 +88,7 @@ def on_devices(
     """
     with ExitStack() as stack:
         with working(t.progress) as say:
-            secret = secret_of(told.config, plan, told.choice, told.seed)
+            secret = case_of_plan(told.config, plan, told.choice, told.seed)
             say("starting the simulated devices")
             there = stack.enter_context(simulated_cell(secret, told.seed, told.base_dir))
         made = create_run(told.output, there.config, told.base_dir, plan, True)
@@ -120,7 +120,7 @@ def in_process(
     They are written bit by bit, as a real campaign grows.
     """
     with working(t.progress):
-        secret = secret_of(told.config, plan, told.choice, told.seed)
+        secret = case_of_plan(told.config, plan, told.choice, told.seed)
     source = "rehearsal in a simulated cell, without devices"
     made = secret.config.to_json()
     with CampaignFile.create(
@@ -178,7 +178,7 @@ def _write(t: Terminal, campaign: CampaignFile, readings: Readings) -> None:
             advance(1)
 
 
-def _rehearsal(secret: Secret, config: CellConfig, readings: Readings) -> Rehearsal:
+def _rehearsal(secret: SimulationCase, config: CellConfig, readings: Readings) -> Rehearsal:
     return Rehearsal(
         config=config,
         cell=secret.cell,

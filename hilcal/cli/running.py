@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from drivers.simulated.on_the_wire import secret_of, simulated_cell
+from drivers.simulated.on_the_wire import case_of_plan, simulated_cell
 from drivers.simulated.rehearsal import NOTHING
 from hilcal.acquire.clock import Clock
 from hilcal.acquire.connect import ConnectionResult, connect
@@ -106,7 +106,7 @@ def run(
             with working(t.progress) as say:
                 say("starting the simulated devices")
                 choice = config.simulation.hide or NOTHING
-                secret = secret_of(config, made, choice, config.simulation.seed)
+                secret = case_of_plan(config, made, choice, config.simulation.seed)
                 simulated = simulated_cell(secret, config.simulation.seed, base_dir)
                 config = stack.enter_context(simulated).config
         if append:

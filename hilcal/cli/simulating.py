@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from drivers.simulated.on_the_wire import secret_of, simulated_cell
+from drivers.simulated.on_the_wire import case_of_plan, simulated_cell
 from drivers.simulated.rehearsal import NOTHING
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.ending import told_to_end
@@ -44,7 +44,7 @@ def simulate(
         raise InputError(f"--seed {number}; valid: a whole number, 0 or more")
     made = make_plan(numbers, config, POSES, number, catalogue) if plan is None else load_plan(plan)
     base_dir = cell.absolute().parent
-    secret = secret_of(config, made, hide or config.simulation.hide or NOTHING, number)
+    secret = case_of_plan(config, made, hide or config.simulation.hide or NOTHING, number)
     with told_to_end(signal.SIGTERM, signal.SIGINT, signal.SIGHUP) as wait, ExitStack() as stack:
         with working(t.progress) as say:
             say("starting the devices")

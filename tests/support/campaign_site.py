@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drivers.simulated.cell_processes import SimulatedCell
-from drivers.simulated.on_the_wire import secret_of, simulated_cell
+from drivers.simulated.on_the_wire import case_of_plan, simulated_cell
 from drivers.simulated.world import World
 from hilcal.acquire.dry_run import dry_run
 from hilcal.cell import Cell, cell_from_config
@@ -109,7 +109,7 @@ def site(directory: Path, *, clock: float = 20.0, poses: int = 3, seed: int = 5)
     rngs = (np.random.default_rng([seed, k]) for k in range(20))
     plans = (spread_plan(cell, config, poses, rng, repeats=1) for rng in rngs)
     plan = next(p for p in plans if not dry_run(cell, config, p).problems)
-    secret = secret_of(config, plan, "nothing", seed)
+    secret = case_of_plan(config, plan, "nothing", seed)
     with simulated_cell(secret, seed, base_dir, directory / "cell") as running:
         toml, plan_file = directory / "cell.toml", directory / "plan.json"
         toml.write_text(to_toml(running.config), encoding="utf-8")

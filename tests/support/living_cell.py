@@ -11,7 +11,7 @@ from drivers.simulated.blackboard import Blackboard
 from drivers.simulated.injected_effects import nothing_hidden
 from drivers.simulated.truth import Truth
 from drivers.simulated.world import World
-from drivers.simulated.world_state import LivingWorld
+from drivers.simulated.world_state import WorldState
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
 from hilcal.data.readings import States
@@ -55,7 +55,7 @@ class Life:
     def __init__(self, world: World, made: CellConfig, path: Path, seed: int = 5) -> None:
         self.world = world
         self.board = Blackboard.create(path / "world.bin", made.simulation.clock)
-        self.living = LivingWorld(world, made, self.board, seed)
+        self.living = WorldState(world, made, self.board, seed)
         self.arrivals = 0
         self.now_ns = 0
 

@@ -5,8 +5,8 @@ from functools import cache
 
 import numpy as np
 
-from drivers.simulated.on_the_wire import read_plan, secret_of
-from drivers.simulated.rehearsal import Rehearsal, Secret
+from drivers.simulated.on_the_wire import case_of_plan, read_plan
+from drivers.simulated.rehearsal import Rehearsal, SimulationCase
 from hilcal.cell import cell_from_config
 from hilcal.config import load_config
 from hilcal.data.appended import with_new_names
@@ -33,7 +33,7 @@ SMALL = _CONFIG.model_copy(
 
 @dataclass(frozen=True)
 class Doubtful:
-    secret: Secret
+    secret: SimulationCase
     plan: Plan
     rehearsal: Rehearsal
     fit: Fit
@@ -55,7 +55,7 @@ def first_plan() -> Plan:
 @cache
 def doubtful(effect: str, seed: int) -> Doubtful:
     """A small campaign with a weak hidden effect."""
-    secret = secret_of(SMALL, first_plan(), effect, seed)
+    secret = case_of_plan(SMALL, first_plan(), effect, seed)
     r = read_plan(secret, first_plan(), [seed, 1])
     found = fit(baseline(r.cell, r.readings, r.mode), r.readings, r.mode)
     return Doubtful(secret, first_plan(), r, found, diagnose(found))

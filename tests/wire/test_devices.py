@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.simulated.on_the_wire import secret_of, simulated_cell
+from drivers.simulated.on_the_wire import case_of_plan, simulated_cell
 from hilcal.acquire.average import average
 from hilcal.acquire.clock import Clock
 from hilcal.acquire.connect import ConnectionResult, connect
@@ -47,7 +47,7 @@ def there(
     config = config.model_copy(update={"simulation": simulation})
     cell = cell_from_config(config)
     plan = spread_plan(cell, config, 4, np.random.default_rng(0))
-    secret = secret_of(config, plan, "nothing", 3)
+    secret = case_of_plan(config, plan, "nothing", 3)
     with simulated_cell(secret, 3, base_dir, tmp_path_factory.mktemp("cell")) as running:
         yield running.config, secret.cell
 

@@ -1,4 +1,4 @@
-"""What the controller tells of itself: every RTDE output variable, from state and truth."""
+"""Every RTDE output variable of the controller, from state and truth."""
 
 import re
 from collections.abc import Callable
@@ -18,7 +18,7 @@ _SPEED_STD = 2e-4  # rad/s
 # Torque per motor current at the joint, N·m/A: plausible for gear ratios of about 100.
 _TORQUE_PER_AMPERE = np.array([13.0, 13.0, 11.0, 9.0, 9.0, 9.0])
 _CURRENT_STD = 0.02  # A
-_TEMPERATURES = np.array([29.0, 30.0, 30.5, 33.0, 34.0, 33.5])  # °C, where nobody knows better
+_TEMPERATURES = np.array([29.0, 30.0, 30.5, 33.0, 34.0, 33.5])  # °C, a guess
 _FORCE_OFFSET = np.array([3.1, -2.4, 4.2, 0.12, -0.21, 0.08])  # N and N·m, flange axes
 _FORCE_STD = np.array([0.4, 0.4, 0.5, 0.02, 0.02, 0.01])
 _REGISTER = re.compile(r"output_(int|double)_register_(\d+)")

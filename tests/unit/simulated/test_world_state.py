@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from drivers.simulated.blackboard import Blackboard
 from drivers.simulated.truth import Truth
 from drivers.simulated.world import World
-from drivers.simulated.world_state import LivingWorld
+from drivers.simulated.world_state import WorldState
 from hilcal.errors import InputError
 from tests.support.arm_cases import ODD, arm_of
 from tests.support.living_cell import (
@@ -314,4 +314,4 @@ def test_an_arm_of_seven_joints_is_refused(tmp_path):
     )
     board = Blackboard.create(tmp_path / "world.bin", 1.0)
     with pytest.raises(InputError, match="arm odd has 7 joints; valid: arms of 6 joints"):
-        LivingWorld(odd, made, board, 1)
+        WorldState(odd, made, board, 1)

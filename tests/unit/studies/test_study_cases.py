@@ -24,7 +24,7 @@ from studies.study_cases import (
     study_case,
     with_study_loads,
 )
-from studies.unmodelled_laws import INVENTED, invented, shift
+from studies.unmodelled_laws import LAWS, law_named, shift
 from tests.support.effect_cases import make
 
 
@@ -98,7 +98,7 @@ def test_several_effects_are_hidden_at_once() -> None:
     assert names == {"joint_compliance", "creep", "encoder_offset"}
 
 
-@pytest.mark.parametrize("law", INVENTED, ids=lambda law: law.name)
+@pytest.mark.parametrize("law", LAWS, ids=lambda law: law.name)
 def test_a_law_outside_of_the_catalogue_acts_at_the_strength_asked(law) -> None:
     for mode in law.readings:
         c = case(law.name, mode=mode, strength=3.0)
@@ -122,25 +122,25 @@ def test_the_variables_of_a_law_are_those_that_a_diagnosis_knows() -> None:
         f = fit(baseline(c.cell, c.readings, mode), c.readings, mode)
         known = {w.variable for w in misfit_breakdown(linearise(f))}
         for name in laws_shown(mode):
-            assert set(invented(name).variables) <= known
+            assert set(law_named(name).variables) <= known
 
 
 def test_laws_and_effects_that_do_not_fit_are_refused() -> None:
     with pytest.raises(InputError, match="crossed gear"):
-        invented("crossed gears")
+        law_named("crossed gears")
     with pytest.raises(InputError, match="absolute"):
         case("crossed gear", mode="deflection")
     with pytest.raises(InputError, match="cancels in deflections"):
         case("encoder_offset", mode="deflection")
     c = case()
     still = c.readings.states
-    law, none = invented("base that turns"), np.zeros(3, dtype=np.int64)
+    law, none = law_named("base that turns"), np.zeros(3, dtype=np.int64)
     with pytest.raises(InputError, match="no loaded reading"):
         shift(law, c.world, still[none], 3.0, "deflection", none, none)
     with pytest.raises(InputError, match="no unloaded reading"):
         shift(law, c.world, still[none + 1], 3.0, "deflection", none, none)
     with pytest.raises(InputError, match="changes nothing"):
-        shift(invented("swaying bench"), c.world, still[none], 3.0, "absolute", none, none)
+        shift(law_named("swaying bench"), c.world, still[none], 3.0, "absolute", none, none)
 
 
 def test_true_parameters_have_the_program_s_names() -> None:
