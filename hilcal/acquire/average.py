@@ -19,11 +19,11 @@ from hilcal.robot import se3
 from hilcal.types import Bools, Floats
 
 UNEXPLAINED = 1e-3
-"""Scatter less probable than this under the stated noise makes the statement unbelievable."""
+"""Scatter less probable than this disproves the stated noise; a choice, no study set it."""
 GROSS_SIGMA = 6.0
-"""A sample so far off (as improbable as so many sigmas of a single number) is left out."""
+"""A sample so far off (as improbable as so many sigmas of a single number) is left out; a guess."""
 MOST_LEFT_OUT = 0.2
-"""Share of the samples that may be left out; one always may."""
+"""Share of the samples that may be left out; one always may. A guess."""
 _MEAN_STEPS = 10
 
 

@@ -25,7 +25,7 @@ MIN_FRAMES = 20
 ENOUGH_POSES = 4
 """Unloaded readings from which the tool is identified at least."""
 TOOL_OFF_M = 0.01
-"""A tool whose centre of mass is so far from the configured one is remarked, m."""
+"""A tool whose centre of mass is so far from the configured one is remarked, m; a guess."""
 _FLOOR = np.diag([1e-3**2] * 3 + [1e-4**2] * 3)
 """Variance of a mean wrench at least, N² and N²·m²: a line that rounds shows no noise at all."""
 

@@ -14,8 +14,8 @@ one is looked at for longer. In the window, a line x_k = x̄ + b (t_k - t̄) + n
   scatter less than the first; drift is then judged relative to the scatter (an F test).
 
 At rest and with the stated noise, the first full window is refused with a probability of
-DRIFT_P + SCATTER_P at most. What it cannot tell: a first window that moves by less than about
-four sigmas of a sample; more samples see smaller drifts.
+DRIFT_P + SCATTER_P at most. A first window that moves by less than about four sigmas of a
+sample is not detected; more samples detect smaller drifts.
 """
 
 from collections.abc import Sequence
@@ -30,6 +30,8 @@ from hilcal.data.whitening import inverse_root
 from hilcal.types import Floats
 
 DRIFT_P = 0.04
+"""False alarm rate of the drift test. The constants here are choices, traded by hand in
+tests/unit/acquire/test_settle.py: time lost at rest against the bias that a decay leaves."""
 AFTER_DRIFT_P = 0.3
 """The same after readings have drifted: the test is repeated at every sample, and none of the
 repeated tests may miss a drift that is there."""
