@@ -15,13 +15,13 @@ _FELT = 1e-5  # weight from which a pair enters the curvature
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pair:
-    """An effect that is there, and the parameters that try to explain it.
+    """An effect that is there, and the parameters that are fitted in its place.
 
     Attributes:
         effect: (E,) indices of the effect's parameters.
         beta: (E,) their values.
         nuisance: (F,) indices of the parameters of the model and of the rival effect.
-        name: said where no candidate separates the two.
+        name: for messages where no candidate separates the two.
     """
 
     effect: Ints

@@ -1,14 +1,14 @@
-"""How strong a family of parameters is, chosen from the data by the evidence.
+"""Empirical Bayes: prior variances of groups of parameters that maximise the evidence.
 
 Parameters of one group share a prior N(0, σ_g²). The σ_g maximise the marginal likelihood
 (evidence) of the linear problem; MacKay's fixed point for the linear-Gaussian model:
 
     γ_g = Σ_{p in g} (1 − Σ_pp/σ_g²),   σ_g² ← Σ θ_p²/γ_g,   β ← ‖r − A θ‖²/(R − Σ γ)
 
-with Σ the posterior covariance and β the noise variance factor (at least 1: the stated
-noise is believed to be there). Groups that the data do not ask for are dropped: those that
-shrink to nothing, and those whose evidence is largest at σ_g = 0, where Σ q_p²/s_p over the
-group is less than its size (q, s: quality and sparsity of a column).
+with Σ the posterior covariance and β the noise variance factor, at least 1: no noise is smaller
+than stated. Groups are dropped that shrink to nothing, and those whose evidence is largest at
+σ_g = 0, where Σ q_p²/s_p over the group is less than its size (q, s: quality and sparsity of a
+column).
 
 Sources: MacKay, *Bayesian interpolation*, Neural Computation 4 (1992) 415-447; Tipping and
 Faul, *Fast marginal likelihood maximisation for sparse Bayesian models*, AISTATS 2003.
@@ -23,10 +23,13 @@ from hilcal.regression.schur import eliminate
 from hilcal.types import Floats, Ints
 
 ITERATIONS = 25
+"""Most fixed-point iterations; a choice, the strengths are needed to `TOLERANCE` only."""
 NEGLIGIBLE = 1e-3
+"""Share of the noise per parameter below which a group counts as zero; a guess."""
 TOLERANCE = 0.2
+"""Change of the logarithm of a variance at which it counts as converged: 10 % of σ; a choice."""
 PATIENCE = 3
-"""Iterations before groups are judged by quality and sparsity."""
+"""Iterations before groups are judged by quality and sparsity; a choice."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,7 +73,7 @@ def shrink(
     g, b = g[flat:, flat:], b[flat:]
     count = int(groups.max()) + 1 if len(groups) else 0
     members = np.maximum(np.bincount(groups, minlength=count), 1)
-    # Group variances; a group's strength is judged by what it does to the data.
+    # A group is negligible where its effect on the data is.
     variance = np.bincount(groups, weights=start**2, minlength=count) / members
     reach = np.bincount(groups, weights=np.diag(g), minlength=count)
     active = (variance > 0) & (reach > 0)
@@ -97,7 +100,7 @@ def shrink(
         rss = yy - 2 * float(theta @ b) + float(theta @ (g @ theta))
         beta = max(1.0, rss / max(rows - flat - effective, 1.0))
         updated = np.where(active, norm2 / np.maximum(gamma, 1e-12), 0.0)
-        # Dropped: what is left of the group moves the data by far less than the noise ...
+        # Dropped: the shrunk group moves the data by far less than the noise ...
         gone = active & (updated * reach < NEGLIGIBLE * beta * members)
         if iteration >= PATIENCE:
             # ... or the evidence falls with its variance all the way down to zero.

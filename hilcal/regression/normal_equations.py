@@ -8,7 +8,7 @@ A (R, P) whitened Jacobian, r (R,) whitened residual, σ (P,) prior standard dev
 Parameter scaling: columns are multiplied by an ordinary magnitude of their parameter, so
 that singular values are pure numbers: s = by how many σ all data together move when the
 parameters move along a direction by an ordinary amount. Directions with s below
-`INFORMATION` (or below rounding) cannot be seen and are held at zero; the remaining flat
+`INFORMATION` (or below rounding) are not identifiable and are held at zero; the other flat
 directions are rotated and scaled to be orthonormal before the normal equations are formed,
 so that forming them costs no accuracy.
 """
@@ -33,13 +33,13 @@ class Basis:
     Attributes:
         transform: (P, K) columns of θ per z; prior columns are scaled units.
         prior_precision: (K,) 1/σ² in z coordinates (zero for flat ones).
-        null: (P, U) unit directions, in units of the ordinary magnitudes, that the data
-            cannot see.
+        null: (P, U) unit directions, in units of the ordinary magnitudes, that are not
+            identifiable.
         flat: (P,) parameters without a prior.
         held: indices of the parameters with a prior, in the order of their z.
         singular: (K_flat,) singular values that were kept.
         structural: number of directions of the flat parameters that the columns span, up to
-            rounding, whether the noise lets them be seen or not.
+            rounding, identifiable under the noise or not.
         condition_unscaled: condition number of A in physical units, identifiable part.
         condition_scaled: the same after parameter scaling.
     """
@@ -56,7 +56,7 @@ class Basis:
 
 
 def find_basis(a: Floats, scale: Floats, prior: Floats, spread: float | None = 1.0) -> Basis:
-    """Rank analysis of A (R, P): what the data can see of the flat parameters.
+    """Rank analysis of A (R, P): the identifiable directions of the flat parameters.
 
     Args:
         a: (R, P) whitened Jacobian.

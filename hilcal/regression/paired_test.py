@@ -1,4 +1,4 @@
-"""Whether a change of the model lowers the error on poses left out, beyond chance."""
+"""Paired test of the errors on poses left out, before and after a change of the model."""
 
 import numpy as np
 from scipy.stats import norm, wilcoxon
