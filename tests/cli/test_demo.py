@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 
 from drivers.simulated.rehearsal import choices
-from hilcal.config import load_config
+from hilcal.cli.rehearsing import RehearsalSettings, first_plan
+from hilcal.config import CellConfig, load_config
 from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.plan import Plan
 from hilcal.errors import InputError
+from hilcal.report.progress import Say
 from studies.random_campaigns import rehearse
 from tests.support.cli_cases import CELL, ok, refused, rehearsal
 
@@ -46,7 +49,18 @@ def test_nothing_hidden_is_nothing_found(tmp_path: Path, capsys: Capsys) -> None
     assert [r["added"] for r in d["revisions"]] == [None]
 
 
-def test_the_demo_in_words(tmp_path: Path, capsys: Capsys) -> None:
+def test_the_demo_in_words(tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[int, int]] = []
+    made: list[Plan] = []
+
+    def plan(settings: RehearsalSettings, config: CellConfig, poses: int, say: Say) -> Plan:
+        """Plan the first time only; that a seed gives one plan is tested with the planner."""
+        asked.append((settings.seed, poses))
+        if not made:
+            made.append(first_plan(settings, config, poses, say))
+        return made[0]
+
+    monkeypatch.setattr("hilcal.cli.demo.first_plan", plan)
     path, recording = tmp_path / "demo.hilcal", tmp_path / "demo.rrd"
     arguments = ("demo", FAST, "--hide", "hysteresis", "--seed", "1", "-o", path)
     words = ok(capsys, *arguments, "--record", recording).out
@@ -65,6 +79,7 @@ def test_the_demo_in_words(tmp_path: Path, capsys: Capsys) -> None:
     assert recording.read_bytes()[:4] == b"RRF2"
     again = ok(capsys, *arguments)
     assert again.out == words  # the same seed, the same story
+    assert asked[0] == asked[1]
     assert "is replaced" in again.err
 
 
