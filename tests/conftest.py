@@ -57,7 +57,7 @@ LONG = (
     "test_fault_matrix_arm",
     "test_plan_optimum",
     "test_stops",
-    "test_plan_information",
+    "test_information",
     "test_simulated_cell",
     "test_study_diagnosis",
     "test_p_values",
@@ -68,7 +68,7 @@ LONG = (
     "test_study_plans",
     "test_run_faults",
     "test_live_model",
-    "test_plan_space_run",
+    "test_feasible_motions",
 )
 """Files that take longest: they begin first, so that none of them is left over at the end."""
 
