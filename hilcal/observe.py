@@ -4,16 +4,17 @@ T_sensor_target = exp(station) T_sensor_base exp(base) T_base_flange T_flange_ta
 position read   = (1 + scale) · position
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.effects.protocol import Columns, Response
+from hilcal.effects.protocol import Columns
 from hilcal.robot import se3
 from hilcal.robot.batch import along_states, empty, zeros
-from hilcal.robot.chain import Chain, joint_jacobian, slot_jacobian, twist_jacobian
+from hilcal.robot.chain import Chain, joint_jacobian, twist_jacobian
 from hilcal.robot.deviation import Deviation
+from hilcal.robot.geometric_stiffness import MotionGradient, rows_times
 from hilcal.types import Floats
 
 
@@ -62,9 +63,21 @@ def observe(cell: Cell, chain: Chain, deviation: Deviation) -> Observation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """Motion of the reading per change of each field of the deviation, sensor axes.
+    """Derivative of the reading by each field of the deviation, sensor axes.
 
-    Only the first m rows (position, or position and rotation) are kept.
+    Only the first m rows (position, or position and rotation) are kept. Without
+    `yielding` the wrenches stay as they are; with it the arm yields to their change where it moves
+    (see `equilibrium`).
+
+    Attributes:
+        cell: arm and target.
+        observation: the reading.
+        chain: the deviated chain.
+        deviation: the deviation.
+        m: number of rows.
+        frames: of the slots.
+        dq: (N, m, n) derivative by the joint displacements.
+        yielding: derivative by motions of the chain of what the arm yields to them.
     """
 
     cell: Cell
@@ -72,7 +85,10 @@ class Motion:
     chain: Chain
     deviation: Deviation
     m: int
+    frames: "SlotFrames"
     dq: Floats
+    yielding: MotionGradient | None = None
+    _known: dict[int, tuple[Floats, Floats]] = field(default_factory=dict, repr=False)
 
     def by_columns(self, c: Columns) -> Floats:
         """Motion (N, m, P) by the parameters of one block of columns."""
@@ -91,21 +107,25 @@ class Motion:
         sides = {"base": self.by_base, "station": self.by_station, "target": self.by_target}
         return _per_column(sides[c.field](), c.values)
 
-    def by_response(self, r: Response) -> Floats:
-        """Motion (N, m, P) by a response of the elastic deviations."""
-        out: Floats = np.zeros(1)
-        if r.dq is not None:
-            out = out + _per_column(self.dq, r.dq)
-        if r.twist is not None:
-            for slot in range(r.twist.shape[2]):
-                if np.any(r.twist[:, :, slot]):
-                    out = out + _per_column(self.by_slot(slot), r.twist[:, :, slot])
-        return out
+    def by_slot(self, slot: int, first: int = 0) -> Floats:
+        """Motion (N, m, 6 − first) by the twist of a slot, from its element `first` (0 or 3) on."""
+        v, w = self._rigid(slot)
+        if self.yielding is not None:
+            more = self.yielding.displacement(slot)
+            v, w = v if more is None else v + more, w + self.yielding.turn(slot)
+        return self.frames.by_twist(slot, v, w, first)
 
-    def by_slot(self, slot: int) -> Floats:
-        """Motion (N, m, 6) by the twist of a slot."""
-        moved = slot_jacobian(self.chain, slot, self.observation.base_position)
-        return _to_sensor(self.observation, self.deviation, moved, self.m)
+    def _rigid(self, slot: int) -> tuple[Floats, Floats]:
+        """Rows (N, m, 3) by displacement and turn of all beyond a slot, as of a rigid body."""
+        if slot not in self._known:
+            o, scale = self.observation, self.deviation.scale
+            axes = o.axes if scale is None else o.axes * (1 + scale[:, None, None])
+            lever = o.base_position - self.chain.position[slot]
+            v, w = axes, rows_times(axes, se3.skew(lever), transposed=True)
+            if self.m == 6:
+                v, w = (np.concatenate(x, axis=1) for x in ((axes, 0 * axes), (w, o.axes)))
+            self._known[slot] = v, w
+        return self._known[slot]
 
     def by_base(self) -> Floats:
         """Motion (N, m, 6) by the twist of the base."""
@@ -142,13 +162,52 @@ class Motion:
         return position if scale is None else position / (1 + scale[:, None])
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class SlotFrames:
+    """From motions of a frame to its twist ξ: v = R J dξ_v + R Q dξ_ω, ω = R J dξ_ω.
+
+    J and Q are the blocks of the right Jacobian (`se3`), R the frame's orientation after ξ.
+
+    Attributes:
+        chain: the deviated chain.
+        known: R J and R Q (None for zero) of the slots that were asked for.
+    """
+
+    chain: Chain
+    known: dict[int, tuple[Floats, Floats | None]] = field(default_factory=dict)
+
+    def by_twist(self, slot: int, v: Floats | None, w: Floats, first: int) -> Floats:
+        """Rows (N, m, 6 − first) by the twist, from rows by v (None for zero) and ω, base axes."""
+        turned, shift = self._blocks(slot)
+        out = empty(*w.shape[:2], 6 - first)
+        np.einsum("nmi,nij->nmj", w, turned, out=out[..., -3:])
+        if v is not None and shift is not None:
+            out[..., -3:] += rows_times(v, shift)
+        if not first and v is not None:
+            np.einsum("nmi,nij->nmj", v, turned, out=out[..., :3])
+        elif not first:
+            out[..., :3] = 0.0
+        return out
+
+    def _blocks(self, slot: int) -> tuple[Floats, Floats | None]:
+        if slot not in self.known:
+            r, shift = self.chain.rotation[slot], None
+            twist = None if self.chain.twist is None else self.chain.twist[slot]
+            if twist is not None and np.any(twist):
+                j, q = se3.right_jacobian_blocks(twist)
+                shift = se3.product(r, q) if np.any(twist[:, :3]) else None
+                r = se3.product(r, j)
+            self.known[slot] = r, shift
+        return self.known[slot]
+
+
 def motion(
     cell: Cell, observation: Observation, chain: Chain, deviation: Deviation, m: int
 ) -> Motion:
-    """Prepare the motions of a reading with m elements."""
+    """Prepare the motions of a reading with m elements, the wrenches held as they are."""
     moved = joint_jacobian(chain, observation.base_position)
     dq = _to_sensor(observation, deviation, moved, m)
-    return Motion(cell, observation, chain, deviation, m, dq)
+    return Motion(cell, observation, chain, deviation, m, SlotFrames(chain), dq)
 
 
 def _still(o: Observation) -> Floats:

@@ -17,6 +17,7 @@ class Backlash(PerJoint):
     name = "backlash"
     summary = "dq_j = b_j sign(τ_j): the joint's play is taken up to the side of the torque"
     elastic = True
+    local_response = True
     option_help: ClassVar = {
         **PerJoint.option_help,
         "crossing": "τ0_j as a share of the joint's rated torque, more than 0; unless given, 0.01.",

@@ -17,6 +17,7 @@ class BaseCompliance(Effect):
     name = "base_compliance"
     summary = "rotation B t_0 about the base origin: the ground gives way"
     elastic = True
+    local_response = True
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

@@ -28,6 +28,7 @@ class Creep(PerJoint):
     name = "creep"
     summary = "dq_j = k c_j τ_j log10(1 + t/1 s): joints go on giving way under the load"
     elastic = True
+    local_response = True
     needs = ("load_time",)
     usual_joints = COMMON
     option_help: ClassVar = {

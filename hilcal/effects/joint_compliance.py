@@ -12,6 +12,7 @@ class JointCompliance(PerJoint):
     name = "joint_compliance"
     summary = "dq_j = c_j τ_j: each joint gives way in proportion to its torque"
     elastic = True
+    local_response = True
     role = "baseline"
 
     @property

@@ -12,6 +12,7 @@ class JointStiffening(PerJoint):
     name = "joint_stiffening"
     summary = "dq_j = s_j τ_j³: compliance changes with the torque (s_j < 0: stiffens)"
     elastic = True
+    local_response = True
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

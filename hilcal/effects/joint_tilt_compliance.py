@@ -16,6 +16,7 @@ class JointTiltCompliance(PerJoint):
     name = "joint_tilt_compliance"
     summary = "rotation k_j t_j⊥ at joint j: its bearing tilts under the moment across its axis"
     elastic = True
+    local_response = True
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

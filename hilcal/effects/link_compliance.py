@@ -27,6 +27,7 @@ class LinkCompliance(Effect):
     name = "link_compliance"
     summary = "tip moves L³/3EI F + L²/2EI M, turns L²/2EI F + L/EI M, twists L/GJ M: links bend"
     elastic = True
+    local_response = True
 
     @property
     def links(self) -> Ints:

@@ -24,6 +24,7 @@ class PeriodicJointCompliance(PerJoint):
     name = "periodic_joint_compliance"
     summary = "dq_j = τ_j (a_j cos 2q_j + b_j sin 2q_j): compliance changes with the joint angle"
     elastic = True
+    local_response = True
     option_help: ClassVar = {
         **PerJoint.option_help,
         "orders": "periods k per turn of the joint, a list of whole numbers, 1 to 1000; unless "

@@ -137,6 +137,9 @@ class Effect(ABC):
         name: canonical name.
         summary: the law in one line.
         elastic: the deviation depends on the transmitted wrenches.
+        local_response: the displacement of joint k + 1 and the twist of slot k depend on the
+            wrench through slot k alone, and `response` takes changes (1, P, n + 1, 6) that are
+            the same for all states, too; Jacobians then cost less.
         needs: columns of `States` without which the effect cannot be computed; "a or b"
             where one of two will do.
         option_help: the options that the constructor takes: name and meaning.
@@ -154,6 +157,7 @@ class Effect(ABC):
     name: ClassVar[str]
     summary: ClassVar[str]
     elastic: ClassVar[bool] = False
+    local_response: ClassVar[bool] = False
     needs: ClassVar[tuple[str, ...]] = ()
     option_help: ClassVar[Mapping[str, str]] = {}
     role: ClassVar[Role] = "effect"

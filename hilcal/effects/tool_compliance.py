@@ -21,6 +21,7 @@ class ToolCompliance(Effect):
     name = "tool_compliance"
     summary = "rotation a t_z + c t_⊥ at the flange: tool or force sensor tilts under the moment"
     elastic = True
+    local_response = True
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

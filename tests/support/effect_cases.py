@@ -111,35 +111,6 @@ def numeric_jacobian(model, states, theta, scale, m, live=None):
     return out
 
 
-def give(model: Model, prediction, theta) -> float:
-    """By how much more a unit motion of the arm deflects it: Σ compliance · (f·reach + m).
-
-    What an analytic derivative at fixed wrenches leaves out is a motion's own change of the
-    wrenches, so it is this share of the motion, at most. A motion by a unit turns forces f and
-    moments m by as much and shifts forces by the reach.
-    """
-    s = prediction.situation
-    reach = model.cell.arm.reach + np.linalg.norm(model.cell.load_point)
-    force = np.linalg.norm(s.wrench[:, :, :3], axis=2).max()
-    moment = np.linalg.norm(s.wrench[:, :, 3:], axis=2).max()
-    slots = s.wrench.shape[1]
-    size = np.array([force] * 3 + [force * reach + moment] * 3)
-    change = np.zeros((len(s.states), 6 * slots, slots, 6))
-    for slot in range(slots):
-        change[:, 6 * slot : 6 * slot + 6, slot] = np.diag(size)
-    total = 0.0
-    for effect, rows in zip(model.effects, model.slices(), strict=True):
-        if not effect.elastic:
-            continue
-        r = effect.response(theta[rows], s, change)
-        if r.dq is not None:
-            total += np.abs(r.dq).max(axis=0).sum()
-        if r.twist is not None:
-            weight = np.array([1 / reach] * 3 + [1.0] * 3)
-            total += (np.abs(r.twist) * weight).max(axis=0).sum()
-    return float(total)
-
-
 SOFT = 2e-5
 """Compliance of every joint in what follows, rad/(N·m)."""
 

@@ -1,0 +1,164 @@
+"""The static equilibrium differentiated: how a reading moves where the arm yields to its motion.
+
+The elastic deviation f depends on the slot wrenches W, these on the deviated chain, and the chain
+on the deviation D: D = f(θ, W(D)). With the reading y(D), the derivatives C = ∂f/∂W (compliance)
+and K = ∂W/∂D (geometric stiffness),
+
+    dy/dθ = A ∂f/∂θ + B ∂W/∂θ,     A = ∂y/∂D + B K,     B = A C = Σ_i ∂y/∂D C (K C)^i
+
+The factor K C is about deflection/reach, so that few terms of the series are needed. B has as many
+rows as the reading, however many parameters there are.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from hilcal.effects.protocol import Effect, Situation
+from hilcal.observe import Motion, SlotFrames
+from hilcal.robot.batch import zeros
+from hilcal.robot.geometric_stiffness import GeometricStiffness, MotionGradient, rows_times
+from hilcal.types import Floats
+
+TOLERANCE = 1e-8
+"""Part of the derivative, root mean square over the states, that may be missing; a choice, with
+room for states whose loads are several times the mean."""
+MAX_TERMS = 40
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Block:
+    """Derivative of the deviation at one slot by the wrench through one slot.
+
+    Attributes:
+        slot: whose wrench.
+        to: which joint (index) or slot deviates.
+        joint: whether it is a joint displacement, else a twist.
+        components: range of the components of the wrench.
+        elements: range of the elements of the deviation.
+        values: (N, I, E) or (1, I, E).
+    """
+
+    slot: int
+    to: int
+    joint: bool
+    components: slice
+    elements: slice
+    values: Floats
+
+
+def compliance(parts: Sequence[tuple[Effect, Floats]], s: Situation) -> list[Block]:
+    """Derivative of the elastic deviations by the slot wrenches, without what is zero."""
+    blocks = (b for e, theta in parts if theta.any() for b in _of_effect(e, theta, s))
+    return [pruned for b in blocks if (pruned := _pruned(b)) is not None]
+
+
+def at_equilibrium(moves: Motion, stiffness: GeometricStiffness, blocks: list[Block]) -> Motion:
+    """Add to the motions of a reading how the arm yields to the change of the wrenches.
+
+    Args:
+        moves: derivatives of the reading with the wrenches held as they are.
+        stiffness: of the chain under its load.
+        blocks: the compliance.
+    """
+    term = by_wrenches(blocks, lambda j: moves.dq[:, :, j], moves.by_slot)
+    form, whole = dict(term), _norm(term)
+    before = whole
+    for _ in range(MAX_TERMS):
+        gradient = stiffness.gradient(term)
+        term = by_wrenches(blocks, gradient.joint, partial(_by_twist, gradient, moves.frames))
+        for slot, b in term.items():
+            form[slot] = form[slot] + b
+        now = _norm(term)
+        # The terms shrink by one factor; what is missing of B is about the next one, and of A
+        # smaller by that factor once more.
+        if now * (now / before) ** 2 <= TOLERANCE * whole:
+            break
+        before = now
+    yielding = stiffness.gradient(form)
+    dq = moves.dq.copy(order="F")
+    for j in range(dq.shape[2]):
+        dq[:, :, j] += yielding.joint(j)
+    return replace(moves, dq=dq, yielding=yielding)
+
+
+def by_wrench_changes(moves: Motion, blocks: list[Block], change: Floats) -> Floats:
+    """Motion (N, m, P) of a reading by P changes (N, P, n + 1, 6) of the slot wrenches."""
+    out = zeros(len(moves.dq), moves.m, change.shape[1])
+    for slot, rows in by_wrenches(blocks, lambda j: moves.dq[:, :, j], moves.by_slot).items():
+        out += rows_times(rows, change[:, :, slot], transposed=True)
+    return out
+
+
+def by_wrenches(
+    blocks: list[Block],
+    by_joint: Callable[[int], Floats],
+    by_slot: Callable[[int, int], Floats],
+) -> dict[int, Floats]:
+    """Derivatives (N, m, 6) by the wrench of each slot, from those by the deviation.
+
+    Args:
+        blocks: the compliance.
+        by_joint: (N, m) by the displacement of a joint.
+        by_slot: (N, m, 6 − e) by the twist of a slot, from its element e on.
+    """
+    first: dict[int, int] = {}
+    for b in blocks:
+        if not b.joint:
+            first[b.to] = min(first.get(b.to, 3), 3 if b.elements.start >= 3 else 0)
+    twists = {to: by_slot(to, e) for to, e in first.items()}
+    out: dict[int, Floats] = {}
+    for b in blocks:
+        if b.joint:
+            found = by_joint(b.to)[..., None]
+        else:
+            e = first[b.to]
+            found = twists[b.to][..., b.elements.start - e : b.elements.stop - e]
+        if b.slot not in out:
+            out[b.slot] = zeros(*found.shape[:2], 6)
+        out[b.slot][..., b.components] += np.einsum("nme,nie->nmi", found, b.values)
+    return out
+
+
+def _by_twist(gradient: MotionGradient, frames: SlotFrames, slot: int, first: int) -> Floats:
+    """Derivative (N, m, 6 − first) by the twist of a slot, from that by its motion."""
+    return frames.by_twist(slot, gradient.displacement(slot), gradient.turn(slot), first)
+
+
+def _norm(form: Mapping[int, Floats]) -> float:
+    """Root of the sum of squares of the coefficients of the wrenches, in SI units."""
+    flat = (b.ravel(order="K") for b in form.values())
+    return math.sqrt(sum(float(b @ b) for b in flat))
+
+
+def _of_effect(effect: Effect, theta: Floats, s: Situation) -> Iterator[Block]:
+    """Compliance of one effect, from its response to unit wrenches."""
+    slots = s.wrench.shape[1]
+    every = range(slots)
+    groups = [every] if effect.local_response else [range(k, k + 1) for k in every]
+    for group in groups:
+        units = zeros(1 if effect.local_response else len(s.wrench), 6, slots, 6)
+        for i in range(6):
+            units[:, i, group, i] = 1.0
+        r = effect.response(theta, s, units)
+        for to in every:
+            slot = to if effect.local_response else group[0]
+            if r.twist is not None:
+                yield Block(slot, to, False, slice(0, 6), slice(0, 6), r.twist[:, :, to])
+            if r.dq is not None and to < r.dq.shape[2]:
+                yield Block(slot, to, True, slice(0, 6), slice(0, 1), r.dq[:, :, to, None])
+
+
+def _pruned(b: Block) -> Block | None:
+    """Return the block without components and elements that are zero in all states."""
+    there = np.any(b.values, axis=0)
+    i, e = np.flatnonzero(there.any(axis=1)), np.flatnonzero(there.any(axis=0))
+    if not len(i):
+        return None
+    components, elements = slice(i[0], i[-1] + 1), slice(e[0], e[-1] + 1)
+    return replace(
+        b, components=components, elements=elements, values=b.values[:, components, elements]
+    )

@@ -1,0 +1,185 @@
+"""Geometric stiffness: how the slot wrenches change where the arm moves under its load.
+
+Everything beyond slot j is displaced by v, at p_j, and turned by ω; forces, weights and the
+load's moment m keep their directions in base axes. With f_k the force through slot k and
+
+    D_k = Σ l fᵀ − (Σ l · f) I
+
+over all that is beyond slot k (l: lever from p_k), the components in slot axes change as
+
+    k < j:  δf_k = 0,             δt_k = v × f_j + D_j ω         (slot k stands still)
+    k ≥ j:  δf_k = −ω × f_k,      δt_k = D_kᵀ ω − ω × m          (slot k moves along)
+
+The displacement of joint j + 1 is a turn about z_j that leaves slot j standing still. What is
+computed is the transpose: the gradient by the motions of a linear form of the slot wrenches.
+
+Source of the term: geometric (initial stress) stiffness, e.g. Chen and Kao, *Conservative
+congruence transformation for joint and Cartesian stiffness matrices of robotic hands and
+fingers*, Int. J. Robotics Research 19 (2000) 835-847.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilcal.robot import se3
+from hilcal.robot.arm import Arm
+from hilcal.robot.batch import empty
+from hilcal.robot.chain import Chain
+from hilcal.robot.statics import Load, body_axes
+from hilcal.types import Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GeometricStiffness:
+    """The load of a chain as its motions see it; base axes.
+
+    Attributes:
+        chain: the deviated chain.
+        force: (n + 1,) list of (N, 3) f_k, N.
+        dyad: (n + 1,) list of (N, 3, 3) D_k, N·m.
+        moment: (N, 3, 3) [m]×, N·m; None where there is no moment.
+        load_point: (N, 3) where the load acts, m.
+        following: (N, 6, 6) change of the load's wrench at the load point by a displacement and
+            a turn of the flange; None where it stays as it is.
+    """
+
+    chain: Chain
+    force: list[Floats]
+    dyad: list[Floats]
+    moment: Floats | None
+    load_point: Floats
+    following: Floats | None = None
+
+    def gradient(self, form: Mapping[int, Floats]) -> "MotionGradient":
+        """Gradient by the motions of Σ_k b_k · (f_k, t_k), `form` b_k (N, m, 6) by slot."""
+        chain, slots = self.chain, len(self.force)
+        still: list[Floats | None] = [None]
+        along: list[Floats | None] = [None] * (slots + 1)
+        load: Floats | None = None
+        for k in range(slots):
+            b = form.get(k)
+            if b is None:
+                still.append(still[-1])
+                continue
+            by_moment = rows_times(b[..., 3:], chain.rotation[k], transposed=True)
+            still.append(_sum(still[-1], by_moment))
+            dyad = self.dyad[k] if self.moment is None else self.dyad[k] - self.moment
+            turn = rows_times(by_moment, dyad, transposed=True)
+            if b[..., :3].any():
+                by_force = rows_times(b[..., :3], chain.rotation[k], transposed=True)
+                turn -= se3.cross(self.force[k][:, None], by_force)
+                load = _sum(load, by_force) if self.following is not None else None
+            if self.following is not None:
+                lever = self.load_point - chain.position[k]
+                load = _sum(load, se3.cross(by_moment, lever[:, None]))
+            along[k] = turn
+        for k in range(slots - 1, -1, -1):
+            along[k] = _sum(along[k], along[k + 1])
+        flange = None
+        if self.following is not None and load is not None and still[-1] is not None:
+            flange = rows_times(np.concatenate([load, still[-1]], axis=2), self.following)
+        return MotionGradient(self, still, along, flange)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionGradient:
+    """Gradient of a linear form of the slot wrenches by motions of the chain.
+
+    Attributes:
+        stiffness: the load.
+        still: (n + 2,) sums (N, m, 3) over the slots i < k of the moments' coefficients, base
+            axes; None for zero, here and below.
+        along: (n + 2,) gradients (N, m, 3) by a turn that carries the slots i ≥ k along.
+        flange: (N, m, 6) gradient by a displacement and a turn of the flange, of what the
+            load's wrench does with it.
+    """
+
+    stiffness: GeometricStiffness
+    still: list[Floats | None]
+    along: list[Floats | None]
+    flange: Floats | None
+
+    def joint(self, j: int) -> Floats:
+        """(N, m) gradient by the displacement of joint j + 1."""
+        turn, z = self._turn(j, j + 1), self.stiffness.chain.rotation[j, :, :, 2]
+        return np.einsum("nmi,ni->nm", turn, z, out=empty(*turn.shape[:2]))
+
+    def displacement(self, j: int) -> Floats | None:
+        """(N, m, 3) gradient by the displacement of all beyond slot j, base axes."""
+        out = None if self.flange is None else self.flange[..., :3]
+        still = self.still[j]
+        if still is not None:
+            out = _sum(out, se3.cross(self.stiffness.force[j][:, None], still))
+        return out
+
+    def turn(self, j: int) -> Floats:
+        """(N, m, 3) gradient by the turn of all beyond slot j about p_j, base axes."""
+        return self._turn(j, j)
+
+    def _turn(self, j: int, first: int) -> Floats:
+        """Gradient by a turn about p_j that carries the slots from `first` along."""
+        out, still = self.along[first], self.still[first]
+        chain, flange = self.stiffness.chain, self.flange
+        if still is not None:
+            out = _sum(out, rows_times(still, self.stiffness.dyad[j]))
+        if flange is not None:
+            lever = (chain.position[-1] - chain.position[j])[:, None]
+            out = _sum(out, flange[..., 3:] + se3.cross(lever, flange[..., :3]))
+        assert out is not None  # noqa: S101 - a slot either stands still or moves along
+        return out
+
+
+def geometric_stiffness(
+    arm: Arm, chain: Chain, load: Load, following: Floats | None = None
+) -> GeometricStiffness:
+    """Prepare the geometric stiffness of a chain under a load."""
+    n, p = arm.n, chain.position
+    point, weight = chain.point(load.point), load.tool_mass * load.gravity
+    force = load.wrench[:, :3] + weight
+    dyad = _outer(point - p[n], load.wrench[:, :3])
+    _add_weight(dyad, chain.point(load.tool_com) - p[n], weight)
+    forces, dyads = [force], [dyad]
+    for k in range(n - 1, -1, -1):
+        dyad = dyad + _outer(p[k + 1] - p[k], force)
+        weight = arm.masses[k] * load.gravity
+        _add_weight(dyad, chain.com[k] - p[k], weight)
+        if load.first_moment is not None:
+            moment = se3.apply(body_axes(arm, chain, k), load.first_moment[k])
+            _add_weight(dyad, moment, load.gravity)
+        force = force + weight
+        forces.insert(0, force)
+        dyads.insert(0, dyad)
+    for dyad in dyads:
+        trace = dyad[:, 0, 0] + dyad[:, 1, 1] + dyad[:, 2, 2]
+        for axis in range(3):
+            dyad[:, axis, axis] -= trace
+    moment = load.wrench[:, 3:]
+    turned = se3.skew(moment) if moment.any() else None
+    return GeometricStiffness(chain, forces, dyads, turned, point, following)
+
+
+def rows_times(rows: Floats, matrix: Floats, *, transposed: bool = False) -> Floats:
+    """Rows (N, m, i) times matrices (N, i, j), or their transposes."""
+    out = empty(*rows.shape[:2], matrix.shape[1 if transposed else 2])
+    by = "nmi,nji->nmj" if transposed else "nmi,nij->nmj"
+    return np.asarray(np.einsum(by, rows, matrix, out=out))
+
+
+def _sum(a: Floats | None, b: Floats | None) -> Floats | None:
+    """Sum of what may be None for zero."""
+    if a is None or b is None:
+        return b if a is None else a
+    return np.asarray(a + b)
+
+
+def _outer(a: Floats, b: Floats) -> Floats:
+    """Dyads a bᵀ (N, 3, 3)."""
+    return np.einsum("ni,nj->nij", a, b, out=empty(len(a), 3, 3))
+
+
+def _add_weight(dyad: Floats, lever: Floats, weight: Floats) -> None:
+    """Add l wᵀ of a weight w (3,) that is the same in all states."""
+    for axis in np.flatnonzero(weight):
+        dyad[:, :, axis] += lever * weight[axis]
