@@ -75,7 +75,7 @@ def at_equilibrium(moves: Motion, stiffness: GeometricStiffness, blocks: list[Bl
         now = _norm(term)
         # The terms shrink by one factor; what is missing of B is about the next one, and of A
         # smaller by that factor once more.
-        if now * (now / before) ** 2 <= TOLERANCE * whole:
+        if now**3 <= TOLERANCE * whole * before**2:
             break
         before = now
     yielding = stiffness.gradient(form)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilcal.effects.protocol import Columns, Response
+from hilcal.effects.protocol import Columns
 from hilcal.observe import Motion, Observation, motion, observe
 from hilcal.robot import se3
 from hilcal.robot.chain import evaluate
@@ -145,11 +145,14 @@ def test_motion_by_columns_is_a_slope(field: str, d: Deviation, constant: bool) 
 
 
 @pytest.mark.parametrize("d", DEVIATIONS)
-def test_motion_by_response_is_a_slope(d: Deviation) -> None:
+def test_motion_by_joints_and_slots_is_a_slope(d: Deviation) -> None:
     rng = np.random.default_rng(10)
     dq, twist = rng.normal(size=(COUNT, 2, 6)), rng.normal(size=(COUNT, 2, 7, 6))
     twist[:, :, 3] = 0.0
-    found = motion_of(d).by_response(Response(dq=dq, twist=twist))
+    moves = motion_of(d)
+    found = np.einsum("nmj,npj->nmp", moves.dq, dq)
+    for slot in range(7):
+        found += np.einsum("nme,npe->nmp", moves.by_slot(slot), twist[:, :, slot])
     for p in range(2):
         expected = along(d, "dq", dq[:, p]) + along(d, "twist", twist[:, p])
         assert_close_relative(found[:, :, p], expected)
