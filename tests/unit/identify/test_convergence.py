@@ -77,10 +77,10 @@ def test_a_misfit_does_not_hinder(seed: int, more: tuple[str, ...]) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_pulls_tell_the_first_joints_zero_from_the_registration(seed: int) -> None:
+def test_sideways_pulls_separate_the_first_joints_offset_from_the_registration(seed: int) -> None:
     """Turned with the arm or not, a sideways pull deflects otherwise: both are determined.
 
-    Under weights alone, along the axis of the first joint, nothing tells them apart.
+    Under weights alone, along the axis of the first joint, they are one gauge freedom.
     """
     model, readings = case(seed, ("base_frame", "joint_compliance", "encoder_offset"))
     found = fit(model, readings, "absolute")
