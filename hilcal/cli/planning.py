@@ -20,7 +20,7 @@ from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import DeviceError, InputError
 from hilcal.identify.fit import Fit
 from hilcal.plan.checked_plan import checked, refuse
-from hilcal.plan.choice import CRITERIA
+from hilcal.plan.choice import CRITERIA, canonical
 from hilcal.plan.planner import Request, make
 from hilcal.plan.summary import about, remarks, summarise
 from hilcal.report import text_run
@@ -42,7 +42,7 @@ def plan(
     ] = None,
     criterion: Annotated[
         str | None,
-        typer.Option("--criterion", metavar="|".join(CRITERIA), help="What it is to be best at."),
+        typer.Option("--criterion", metavar="|".join(CRITERIA), help="The optimality criterion."),
     ] = None,
     after: Annotated[
         Path | None,
@@ -88,7 +88,7 @@ def _criterion(name: str | None) -> str | None:
     Raises:
         InputError: lists the valid ones.
     """
-    if name is not None and name not in CRITERIA:
+    if name is not None and canonical(name) not in CRITERIA:
         raise InputError(f"--criterion {name!r} is unknown; valid: {', '.join(CRITERIA)}")
     return name
 

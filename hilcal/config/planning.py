@@ -3,7 +3,7 @@
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, Strict, model_validator
+from pydantic import BeforeValidator, Field, Strict, model_validator
 
 from hilcal.config.rig import VECTOR_M, Whole
 from hilcal.toml import NonNegative, Number, Positive, Section, Vector3
@@ -30,9 +30,10 @@ class Planning(Section):
         description='"catalogue", or a list of effects (may be empty), which the plan could still '
         "find although the model lacks them",
     )
-    criterion: Literal["D", "A", "E", "K", "test", "separate"] = Field(
-        "D", description='"D", "A", "E", "K", "test" or "separate"'
-    )
+    criterion: Annotated[
+        Literal["D", "A", "E", "K", "I", "separate"],
+        BeforeValidator(lambda name: "I" if name == "test" else name),  # its name before 1.0
+    ] = Field("D", description='"D", "A", "E", "K", "I" or "separate"')
     work_q_rad: tuple[_Joints, ...] = Field(
         (), description="a list of joint vectors in rad where the robot will work"
     )
@@ -73,9 +74,9 @@ class Planning(Section):
                 raise ValueError(f"work_min_m = {list(low)} is not below work_max_m = {list(high)}")
         if len({len(q) for q in self.work_q_rad}) > 1:
             raise ValueError("work_q_rad has joint vectors of different lengths")
-        if self.criterion == "test" and low is None and not self.work_q_rad:
+        if self.criterion == "I" and low is None and not self.work_q_rad:
             raise ValueError(
-                'criterion = "test" needs work_q_rad, or work_min_m and work_max_m: where the '
+                'criterion = "I" needs work_q_rad, or work_min_m and work_max_m: where the '
                 "robot will work"
             )
         return self

@@ -87,7 +87,7 @@ def relax(
     prior = checked(units, budget, prior, most)
     share = min(budget / float(units.cost.sum()), cap)
     spread = prior + total_information(units, np.full(len(units), share))
-    criterion.sure(spread, names)
+    criterion.require(spread, names)
     if share == cap and criterion.monotone:
         value = float(criterion.value(spread))  # all there is
         all_of_them = np.arange(len(units))

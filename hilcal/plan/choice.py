@@ -8,17 +8,17 @@ import numpy as np
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.plan.approximate_design import relax
 from hilcal.plan.candidate_set import Units
-from hilcal.plan.criteria import A, D, Linear
+from hilcal.plan.criteria import A, D, MeanVariance
 from hilcal.plan.criterion import Criterion
 from hilcal.plan.discriminated_pairs import discriminated_pairs
 from hilcal.plan.eigenvalue_criteria import E, K
 from hilcal.plan.information import Problem
-from hilcal.plan.optimum import Curve, Design, best, curve
+from hilcal.plan.optimum import Design, best
 from hilcal.plan.prediction_poses import WorkPoses
 from hilcal.plan.t_optimality import Separate
 from hilcal.types import Bools, Floats, Ints
 
-CRITERIA = ("D", "A", "E", "K", "test", "separate")
+CRITERIA = ("D", "A", "E", "K", "I", "separate")
 LOOSE = 3e-3
 """Relative gap at which sets of loads are compared."""
 EFFORT = 200
@@ -29,16 +29,16 @@ SAMPLE = 150
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Question:
-    """What a plan is to be best at.
+    """A design problem with its criterion.
 
-    D, A, test: all parameters, the potential terms with their priors among them; of A and test
-    only the model's count, the others are in its way. E and K are of the model's parameters
-    alone, as the observability indices of the literature are, without those that have a prior.
+    D, A and I are of all parameters, the potential terms with their priors among them; in A and I
+    these are nuisance parameters. E and K are of the model's parameters alone, as the
+    observability indices of the literature are, without those that have a prior.
 
     Attributes:
         criterion: φ.
         units: the units by the parameters that φ is of.
-        prior: (P, P) what is known before of these.
+        prior: (P, P) prior information of these.
         names: of the parameters.
     """
 
@@ -48,17 +48,23 @@ class Question:
     names: tuple[str, ...]
 
 
+def canonical(name: str) -> str:
+    """Return the name of a criterion: I-optimality was called "test" before."""
+    return "I" if name == "test" else name
+
+
 def question(problem: Problem, name: str, work: WorkPoses | None) -> Question:
-    """Return what a criterion asks of a problem.
+    """Return a design problem with a criterion.
 
     Args:
         problem: the design problem.
-        name: "D", "A", "E", "K", "test" or "separate".
-        work: the test poses, for "test".
+        name: one of `CRITERIA`, or "test", the former name of "I".
+        work: the prediction poses, for "I".
 
     Raises:
-        InputError: an unknown name, or "test" without test poses.
+        InputError: an unknown name, or "I" without prediction poses.
     """
+    name = canonical(name)
     names = tuple(t.name for t in problem.terms)
     size = problem.model_size
     whole = Question(D(), problem.units, problem.prior, names)
@@ -66,10 +72,10 @@ def question(problem: Problem, name: str, work: WorkPoses | None) -> Question:
         return whole
     if name == "A":
         return replace(whole, criterion=A(np.arange(size)))
-    if name == "test":
+    if name == "I":
         if work is None:
-            raise InputError('criterion "test" needs test poses; see [planning] work_q_rad')
-        return replace(whole, criterion=Linear(work.matrix(len(names))))
+            raise InputError('criterion "I" needs prediction poses; see [planning] work_q_rad')
+        return replace(whole, criterion=MeanVariance(work.matrix(len(names))))
     if name == "separate":
         apart = discriminated_pairs(problem)
         return replace(whole, criterion=Separate(apart.pairs), prior=apart.prior)
@@ -106,14 +112,6 @@ def promising(asked: Question, budget: float) -> Ints:
     count = min(2 * len(found.index), len(asked.units))
     best_first = np.argsort(-found.price / asked.units.cost, kind="stable")
     return np.union1d(found.index, best_first[:count])
-
-
-def enough(asked: Question, budgets: Sequence[float]) -> Curve:
-    """Return what smaller and larger budgets buy."""
-    return curve(
-        asked.units, asked.criterion, np.asarray(budgets, dtype=float), asked.prior,
-        names=asked.names,
-    )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)

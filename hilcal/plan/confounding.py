@@ -126,45 +126,6 @@ def confounding(
     )
 
 
-def information_kept(rows: Floats, drift: Floats) -> float:
-    """Return the D-efficiency of a plan where a drift has to be estimated as well.
-
-    With M = Σ AᵀA and the Schur complement S = M - AᵀD (DᵀD)⁺ DᵀA it is (det S / det M)^(1/P).
-
-    Args:
-        rows: (N, P) whitened Jacobian A by the parameters, of full column rank.
-        drift: (N, d) whitened Jacobian D by the drift's rates.
-    """
-    basis, _, rank = _orthonormal(drift)
-    left = rows - basis[:, :rank] @ (basis[:, :rank].T @ rows)
-    whole = np.linalg.slogdet(rows.T @ rows)[1]
-    rest = np.linalg.slogdet(left.T @ left)[1]
-    return float(np.exp((rest - whole) / rows.shape[1]))
-
-
-def information_lost(rows: Floats, drift: Floats) -> Floats:
-    """Return (P,) the share of each parameter's information that is lost to a drift.
-
-    1 - (M⁻¹)_kk / (S⁻¹)_kk with M and S of `information_kept`: all parameters are estimated, and
-    the drift's rates as well.
-
-    Args:
-        rows: (N, P) whitened Jacobian by the parameters, of full column rank.
-        drift: (N, d) whitened Jacobian by the drift's rates.
-    """
-    basis, _, rank = _orthonormal(drift)
-    left = rows - basis[:, :rank] @ (basis[:, :rank].T @ rows)
-    alone = np.diagonal(np.linalg.inv(rows.T @ rows))
-    return np.asarray(1.0 - alone / np.diagonal(np.linalg.inv(left.T @ left)))
-
-
-def _orthonormal(columns: Floats) -> tuple[Floats, Floats, int]:
-    """Left singular vectors, singular values and rank."""
-    u, s, _ = np.linalg.svd(columns, full_matrices=False)
-    tiny = s.max(initial=0.0) * max(columns.shape) * np.finfo(float).eps
-    return u, s, int(np.sum(s > tiny))
-
-
 def _regressors(q: Floats, wrench: Floats, *, product: bool) -> tuple[list[str], Floats]:
     """Names and (N, k) columns; cos and sin times the wrench where they are products."""
     joints = range(q.shape[1])

@@ -1,100 +1,137 @@
-"""Criteria of a plan that are smooth: volume and mean variance; the others by their names."""
+"""Smooth criteria of a plan: determinants of information matrices, and mean variances."""
 
-from collections.abc import Callable, Sequence
+from abc import abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from hilcal.errors import InputError
-from hilcal.plan.criterion import (
-    Criterion,
-    Smooth,
-    factors,
-    inverse,
-    require_determined,
-    square,
-)
-from hilcal.plan.eigenvalue_criteria import E, K
-from hilcal.plan.t_optimality import Pair, Separate
-from hilcal.types import Bools, Floats, Ints
-
-__all__ = ["A", "Criterion", "D", "E", "K", "Linear", "Pair", "Separate", "Smooth"]
+from hilcal.plan.criterion import Criterion, Smooth, factors, inverse, square
+from hilcal.types import Floats, Ints
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class D:
-    """φ(M) = det(S)^(1/s), the inverse volume of the confidence ellipsoid.
+class SmoothCriterion(Criterion):
+    """A differentiable criterion: it is its own surrogate, f = log φ."""
 
-    S is M, or with parameters of interest the Schur complement of the others: what is left
-    for s parameters when the others are unknown as well (D_s). Fedorov (1972), Theory of
-    Optimal Experiments; O1 of Borm & Menq (1991), Int. J. Robotics Research 10(6).
-
-    Attributes:
-        interest: indices of the parameters of interest; all by default.
-    """
-
-    interest: Ints | None = None
-    name = "D"
     monotone = True
     kinked = False
-
-    def _others(self, size: int) -> Ints:
-        """Return the indices of the nuisance parameters."""
-        if self.interest is None:
-            return np.empty(0, dtype=np.int64)
-        return np.setdiff1d(np.arange(size), _interest(self.interest, size))
-
-    def value(self, m: Floats) -> Floats:
-        """Return φ of (..., P, P) matrices."""
-        size = m.shape[-1]
-        others = self._others(size)
-        log, good = _log_det(m.reshape(-1, size, size))
-        if len(others):
-            log -= _log_det(m.reshape(-1, size, size)[:, others[:, None], others])[0]
-        found = np.where(good, np.exp(np.where(good, log, 0.0) / (size - len(others))), 0.0)
-        return np.asarray(found.reshape(m.shape[:-2]))
-
-    def gradient(self, m: Floats) -> Floats:
-        """Return (P, P) φ/s (M⁻¹ − the inverse of the nuisance block)."""
-        return _smooth(self(m)).above
-
-    def __call__(self, m: Floats) -> Smooth | None:
-        """Return f = log φ."""
-        whole = inverse(m)
-        if whole is None:
-            return None
-        found, log = whole
-        others = self._others(len(m))
-        s = len(m) - len(others)
-        gradient = found
-        products: tuple[tuple[float, Floats, Floats], ...] = ((-1.0 / s, found, found),)
-        if len(others):
-            block = inverse(m[np.ix_(others, others)])
-            if block is None:
-                return None
-            part = np.zeros_like(m)
-            part[np.ix_(others, others)] = block[0]
-            log -= block[1]
-            gradient = found - part
-            products += ((1.0 / s, part, part),)
-        gradient = gradient / s
-        return Smooth(log / s, gradient, products, (), float(np.exp(log / s)) * gradient)
 
     def surrogate(self, m: Floats, order: float) -> Callable[[Floats], Smooth | None]:
         """Return f = log φ, whatever the order."""
         return self
 
-    def sure(self, m: Floats, names: Sequence[str] | None) -> None:
-        """Refuse a singular M."""
-        require_determined(m, names)
+    @abstractmethod
+    def __call__(self, m: Floats) -> Smooth | None:
+        """Return f = log φ; None where M is singular."""
+
+
+class Determinant(SmoothCriterion):
+    """φ(M) = Π det(M_bb)^c over weighted blocks b of parameters."""
+
+    @abstractmethod
+    def blocks(self, size: int) -> tuple[tuple[float, Ints], ...]:
+        """Return exponents c and indices b, for M of this size."""
+
+    def value(self, m: Floats) -> Floats:
+        """Return φ of (..., P, P) matrices."""
+        flat = m.reshape(-1, *m.shape[-2:])
+        log, good = np.zeros(len(flat)), np.ones(len(flat), dtype=np.bool_)
+        for c, at in self.blocks(m.shape[-1]):
+            factor, regular = factors(flat[:, at[:, None], at])
+            log += 2.0 * c * np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
+            good &= regular | (c < 0.0)
+        found = np.where(good, np.exp(np.where(good, log, 0.0)), 0.0)
+        return np.asarray(found.reshape(m.shape[:-2]))
+
+    def __call__(self, m: Floats) -> Smooth | None:
+        """Return f = log φ with gradient Σ c M_bb⁻¹."""
+        value, gradient = 0.0, np.zeros_like(m)
+        products: list[tuple[float, Floats, Floats]] = []
+        for c, at in self.blocks(len(m)):
+            found = inverse(m[np.ix_(at, at)])
+            if found is None:
+                return None
+            part = np.zeros_like(m)
+            part[np.ix_(at, at)] = found[0]
+            value += c * found[1]
+            gradient += c * part
+            products.append((-c, part, part))
+        return Smooth(value, gradient, tuple(products), (), float(np.exp(value)) * gradient)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Linear:
-    """φ(M) = 1 / tr(C M⁻¹), the inverse of a mean variance.
+class D(Determinant):
+    """φ(M) = det(S)^(1/s), the inverse volume of the confidence ellipsoid.
 
-    With C the mean of VᵀV over test poses, V the Jacobian of the position there, tr(C M⁻¹) is
-    the mean variance of the predicted position at these poses.
+    S is M, or with parameters of interest the Schur complement of the others (D_s). Fedorov
+    (1972), Theory of Optimal Experiments; O1 of Borm & Menq (1991), Int. J. Robotics Research
+    10(6).
+
+    Attributes:
+        interest: indices of the s parameters of interest; all by default.
+    """
+
+    interest: Ints | None = None
+    name = "D"
+
+    def blocks(self, size: int) -> tuple[tuple[float, Ints], ...]:
+        """Return M, and by Schur's formula det S = det M / det M_nn the nuisance n."""
+        every = np.arange(size)
+        if self.interest is None:
+            return ((1.0 / size, every),)
+        chosen = _interest(self.interest, size)
+        rest, share = np.setdiff1d(every, chosen), 1.0 / len(chosen)
+        return ((share, every), (-share, rest)) if len(rest) else ((share, every),)
+
+
+class InverseVariance(SmoothCriterion):
+    """φ(M) = 1 / q with q = Σ tr(C M_bb⁻¹), b the first len(C) parameters."""
+
+    @abstractmethod
+    def parts(self, size: int) -> tuple[Floats, ...]:
+        """Return the matrices C (b, b), for M of this size."""
+
+    def value(self, m: Floats) -> Floats:
+        """Return φ of (..., P, P) matrices; 0 where singular."""
+        flat = m.reshape(-1, *m.shape[-2:])
+        q, good = np.zeros(len(flat)), np.ones(len(flat), dtype=np.bool_)
+        for c in self.parts(m.shape[-1]):
+            factor, regular = factors(flat[:, : len(c), : len(c)])
+            found = np.linalg.inv(factor)
+            q += np.einsum("nij,nij->n", found @ c, found)
+            good &= regular
+        good &= q > 0.0
+        return np.asarray(np.where(good, 1.0 / np.where(good, q, 1.0), 0.0).reshape(m.shape[:-2]))
+
+    def __call__(self, m: Floats) -> Smooth | None:
+        """Return f = −log q with gradient Σ M_bb⁻¹ C M_bb⁻¹ / q."""
+        found: list[tuple[Floats, Floats]] = []
+        q = 0.0
+        for c in self.parts(len(m)):
+            b = len(c)
+            root = inverse(m[:b, :b])
+            if root is None:
+                return None
+            inverted, inner = np.zeros_like(m), np.zeros_like(m)
+            inverted[:b, :b] = root[0]
+            inner[:b, :b] = root[0] @ c @ root[0]
+            q += float(np.sum(c * root[0]))
+            found.append((inner, inverted))
+        if not q > 0.0:
+            return None
+        gradient = sum((inner for inner, _ in found), np.zeros_like(m)) / q
+        products = tuple((-2.0 / q, inner, inverted) for inner, inverted in found)
+        return Smooth(-float(np.log(q)), gradient, products, ((1.0, gradient),), gradient / q)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeanVariance(InverseVariance):
+    """φ(M) = 1 / tr(C M⁻¹), the inverse of a mean variance: I-optimality.
+
+    With C the mean of VᵀV over prediction poses, V the Jacobian of the position there, tr(C M⁻¹)
+    is the mean variance of the predicted position. Atkinson, Donev and Tobias, *Optimum
+    Experimental Designs, with SAS* (2007), chapter 10.
 
     Attributes:
         c: (P, P) positive semidefinite.
@@ -102,40 +139,24 @@ class Linear:
     """
 
     c: Floats
-    name: str = "test"
-    monotone = True
-    kinked = False
+    name: str = "I"
 
     def __post_init__(self) -> None:
         """Refuse a matrix that is no mean of squares."""
-        c = square(self.c, "the matrix of the test poses")
+        c = square(self.c, "the matrix of the prediction poses")
         scale = float(np.trace(c))
         if not scale > 0.0 or np.linalg.eigvalsh(c)[0] < -1e-9 * scale:
-            raise InputError("the matrix of the test poses is not positive semidefinite, or zero")
+            raise InputError(
+                "the matrix of the prediction poses is not positive semidefinite, or zero"
+            )
 
-    def value(self, m: Floats) -> Floats:
-        """Return φ of (..., P, P) matrices."""
-        return _value(m, self.c)
-
-    def gradient(self, m: Floats) -> Floats:
-        """Return (P, P) φ² M⁻¹ C M⁻¹."""
-        return _smooth(self(m)).above
-
-    def __call__(self, m: Floats) -> Smooth | None:
-        """Return f = log φ."""
-        return _log_mean(m, self.c)
-
-    def surrogate(self, m: Floats, order: float) -> Callable[[Floats], Smooth | None]:
-        """Return f = log φ, whatever the order."""
-        return self
-
-    def sure(self, m: Floats, names: Sequence[str] | None) -> None:
-        """Refuse a singular M."""
-        require_determined(m, names)
+    def parts(self, size: int) -> tuple[Floats, ...]:
+        """Return C."""
+        return (self.c,)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class A:
+class A(InverseVariance):
     """φ(M) = s / Σ (M⁻¹)_ii over s parameters, the inverse of their mean variance.
 
     O5 of Sun & Hollerbach (2008), IEEE ICRA, "Observability index selection for robot
@@ -147,35 +168,13 @@ class A:
 
     interest: Ints | None = None
     name = "A"
-    monotone = True
-    kinked = False
 
-    def _c(self, size: int) -> Floats:
-        """Return (P, P) C such that tr(C M⁻¹) is the mean variance."""
+    def parts(self, size: int) -> tuple[Floats, ...]:
+        """Return the diagonal matrix of 1/s at the parameters of interest."""
         chosen = np.arange(size) if self.interest is None else _interest(self.interest, size)
         out = np.zeros((size, size))
         out[chosen, chosen] = 1.0 / len(chosen)
-        return out
-
-    def value(self, m: Floats) -> Floats:
-        """Return φ of (..., P, P) matrices."""
-        return _value(m, self._c(m.shape[-1]))
-
-    def gradient(self, m: Floats) -> Floats:
-        """Return (P, P) φ² M⁻¹ C M⁻¹."""
-        return _smooth(self(m)).above
-
-    def __call__(self, m: Floats) -> Smooth | None:
-        """Return f = log φ."""
-        return _log_mean(m, self._c(len(m)))
-
-    def surrogate(self, m: Floats, order: float) -> Callable[[Floats], Smooth | None]:
-        """Return f = log φ, whatever the order."""
-        return self
-
-    def sure(self, m: Floats, names: Sequence[str] | None) -> None:
-        """Refuse a singular M."""
-        require_determined(m, names)
+        return (out,)
 
 
 def _interest(interest: Ints, size: int) -> Ints:
@@ -192,49 +191,3 @@ def _interest(interest: Ints, size: int) -> Ints:
             f"{size - 1}, at least one"
         )
     return chosen
-
-
-def _smooth(found: Smooth | None) -> Smooth:
-    """Return what exists only where M is regular.
-
-    Raises:
-        InputError: M is singular.
-    """
-    if found is None:
-        raise InputError("the information matrix is singular: the criterion has no gradient there")
-    return found
-
-
-def _log_mean(m: Floats, c: Floats) -> Smooth | None:
-    """Return f = −log tr(C M⁻¹)."""
-    whole = inverse(m)
-    if whole is None:
-        return None
-    found = whole[0]
-    inner = found @ c @ found
-    q = float(np.sum(c * found))
-    if not q > 0.0:
-        return None
-    gradient = inner / q
-    return Smooth(
-        -float(np.log(q)),
-        gradient,
-        ((-2.0 / q, inner, found),),
-        ((1.0, gradient),),
-        gradient / q,
-    )
-
-
-def _log_det(m: Floats) -> tuple[Floats, Bools]:
-    """Return log det of (N, P, P) matrices, and which of them are regular."""
-    factor, good = factors(m)
-    return 2.0 * np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1), good
-
-
-def _value(m: Floats, c: Floats) -> Floats:
-    """Return 1 / tr(C M⁻¹) of (..., P, P) matrices; 0 where singular."""
-    factor, good = factors(m.reshape(-1, *m.shape[-2:]))
-    found = np.linalg.inv(factor)
-    q = np.einsum("nij,nij->n", found @ c, found)
-    good = good & (q > 0.0)
-    return np.asarray(np.where(good, 1.0 / np.where(good, q, 1.0), 0.0).reshape(m.shape[:-2]))

@@ -58,9 +58,6 @@ class Criterion(Protocol):
     def value(self, m: Floats) -> Floats:
         """Return φ of (..., P, P) information matrices; 0 where they are singular."""
 
-    def gradient(self, m: Floats) -> Floats:
-        """Return (P, P) ∂φ/∂M, or a supergradient where φ has a kink."""
-
     def surrogate(self, m: Floats, order: float) -> Callable[[Floats], Smooth | None]:
         """Return f near M = m, which tends to a function of φ alone as `order` tends to 0.
 
@@ -68,8 +65,13 @@ class Criterion(Protocol):
         an M at which it does not exist.
         """
 
-    def sure(self, m: Floats, names: Sequence[str] | None) -> None:
-        """Raise CannotAnswerError where M, the information of all there is, is not enough."""
+    def require(self, m: Floats, names: Sequence[str] | None) -> None:
+        """Refuse an M, the information of all candidates, that does not determine φ.
+
+        Raises:
+            CannotAnswerError: names the parameters that no candidate determines.
+        """
+        require_determined(m, names)
 
 
 def require_determined(m: Floats, names: Sequence[str] | None = None) -> None:
@@ -87,7 +89,7 @@ def require_determined(m: Floats, names: Sequence[str] | None = None) -> None:
     blind = np.flatnonzero(diagonal <= 0.0)
     if len(blind):
         raise CannotAnswerError(
-            f"no candidate tells anything of {_listed([label[int(k)] for k in blind])}; allow "
+            f"no candidate changes with {_listed([label[int(k)] for k in blind])}; allow "
             "other poses or loads, or leave it out of the model"
         )
     root = np.sqrt(diagonal)

@@ -1,11 +1,11 @@
 """Criteria of a plan by its extreme eigenvalues."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.plan.criterion import Smooth, require_determined, soft_least
+from hilcal.plan.criterion import Criterion, Smooth, soft_least
 from hilcal.regression.schur import (
     SchurComplement,
     differentiable_schur_complement,
@@ -17,7 +17,7 @@ _FLOOR = 1e-14
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class E:
+class E(Criterion):
     """φ(M) = λ_min(S): the worst determined direction of the parameters of interest.
 
     O3 of Nahvi & Hollerbach (1996), IEEE ICRA; S is the Schur complement of the other parameters,
@@ -39,12 +39,6 @@ class E:
         s = m if self.interest is None else schur_complement(m, self.interest)
         return np.asarray(np.maximum(np.linalg.eigvalsh(s)[..., 0], 0.0))
 
-    def gradient(self, m: Floats) -> Floats:
-        """Return (P, P) U v vᵀ Uᵀ, v the eigenvector of the least eigenvalue."""
-        s = differentiable_schur_complement(m, self.interest)
-        v = np.linalg.eigh(s.matrix)[1][:, 0]
-        return s.embed(np.outer(v, v))
-
     def surrogate(self, m: Floats, order: float) -> Callable[[Floats], Smooth | None]:
         """Return f = F / λ_min(m) with μ = order · λ_min(m)."""
         values = np.linalg.eigvalsh(differentiable_schur_complement(m, self.interest).matrix)
@@ -62,13 +56,9 @@ class E:
 
         return smooth
 
-    def sure(self, m: Floats, names: Sequence[str] | None) -> None:
-        """Refuse a singular M."""
-        require_determined(m, names)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
-class K:
+class K(Criterion):
     """φ(M) = λ_min(M) / λ_max(M), the inverse of the condition number.
 
     The square of O2 of Driels & Pathre (1990), J. Robotic Systems 7(2). Quasi-concave: the
@@ -86,13 +76,6 @@ class K:
         most = values[..., -1]
         safe = np.where(most > 0, most, 1.0)
         return np.asarray(np.where(most > 0, np.maximum(values[..., 0], 0.0) / safe, 0.0))
-
-    def gradient(self, m: Floats) -> Floats:
-        """Return (P, P) (v vᵀ − φ u uᵀ) / λ_max, of the extreme eigenvectors v and u."""
-        values, vectors = np.linalg.eigh(m)
-        v, u = vectors[:, 0], vectors[:, -1]
-        ratio = values[0] / values[-1]
-        return np.asarray((np.outer(v, v) - ratio * np.outer(u, u)) / values[-1])
 
     def surrogate(self, m: Floats, order: float) -> Callable[[Floats], Smooth | None]:
         """Return f = (F_min − κ F_max) / λ_min(m), widths in proportion to the eigenvalues."""
@@ -121,10 +104,6 @@ class K:
             )
 
         return smooth
-
-    def sure(self, m: Floats, names: Sequence[str] | None) -> None:
-        """Refuse a singular M."""
-        require_determined(m, names)
 
 
 def _least(s: SchurComplement, width: float) -> Smooth:

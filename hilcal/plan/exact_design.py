@@ -75,24 +75,6 @@ def exact(
     return out
 
 
-def rounded(
-    units: Units,
-    criterion: Criterion,
-    budget: float,
-    prior: Floats | None,
-    relaxed: Relaxed,
-    *,
-    most: int | None = None,
-) -> Ints:
-    """Return (K,) whole numbers by greedy completion alone: cheap, some percent less."""
-    prior = checked(units, budget, prior, most)
-    search = _search(units, criterion, budget, prior, relaxed, most)
-    floor = np.floor(search.ideal_weight + 1e-6).astype(np.int64)
-    out = np.zeros(len(units), dtype=np.int64)
-    out[search.index] = search.refilled(np.minimum(floor, search.most)).counts
-    return out
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Plan:
     """Whole numbers (S,) of the pool's units, their information and value."""

@@ -6,11 +6,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilcal.errors import CannotAnswerError
-from hilcal.plan.approximate_design import Relaxed, checked, relax
+from hilcal.plan.approximate_design import KINKED_TOLERANCE, Relaxed, checked, relax
 from hilcal.plan.candidate_set import Units
 from hilcal.plan.criterion import Criterion
-from hilcal.plan.exact_design import exact, rounded
+from hilcal.plan.exact_design import exact
 from hilcal.types import Floats, Ints
+
+TOLERANCE = 1e-4
+"""Relative gap of the continuous optimum: whole numbers lose 1 to 5 % anyway. Study: the demo's
+plan and the benchmark's 40 of 100,000 states keep their certified efficiency to 0.01 %."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,26 +43,6 @@ class Design:
         return min(1.0, self.value / self.bound)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Curve:
-    """What a budget buys.
-
-    Attributes:
-        budget: (N,) budgets.
-        value: (N,) φ of a plan of whole numbers, quickly found; 0 where none determines all.
-        bound: (N,) φ that no plan exceeds.
-    """
-
-    budget: Floats
-    value: Floats
-    bound: Floats
-
-    @property
-    def efficiency(self) -> Floats:
-        """(N,) value / bound: low where whole numbers cost much."""
-        return np.minimum(1.0, self.value / self.bound)
-
-
 def best(
     units: Units,
     criterion: Criterion,
@@ -81,7 +65,7 @@ def best(
         rng: generator; the plan depends on nothing else that is random.
         most: how often a unit may be taken; any number of times by default.
         names: of the parameters, for messages.
-        tolerance: relative gap of the continuous optimum; see `relax`.
+        tolerance: relative gap of the continuous optimum; `TOLERANCE` by default.
         effort: of the search for whole numbers; see `exact`.
 
     Raises:
@@ -89,6 +73,8 @@ def best(
         CannotAnswerError: parameters that no candidate determines, or not within the budget.
     """
     rng = np.random.default_rng(0) if rng is None else rng
+    if tolerance is None:
+        tolerance = KINKED_TOLERANCE if criterion.kinked else TOLERANCE
     relaxed = relax(units, criterion, budget, prior, most=most, names=names, tolerance=tolerance)
     counts = exact(units, criterion, budget, prior, relaxed, rng, most=most, effort=effort)
     known = checked(units, budget, prior, most)
@@ -97,7 +83,7 @@ def best(
     value = float(criterion.value(information))
     cost = float(counts @ units.cost)
     try:
-        criterion.sure(information, names)
+        criterion.require(information, names)
         enough = value > 0.0
     except CannotAnswerError:
         enough = False
@@ -107,54 +93,3 @@ def best(
             f"{units.size} parameters by criterion {criterion.name}; raise the budget"
         )
     return Design(counts, value, max(relaxed.bound, value), information, cost, relaxed)
-
-
-def curve(
-    units: Units,
-    criterion: Criterion,
-    budgets: Floats,
-    prior: Floats | None = None,
-    *,
-    most: int | None = None,
-    names: Sequence[str] | None = None,
-    tolerance: float = 1e-3,
-) -> Curve:
-    """Return what budgets buy: how many readings are enough.
-
-    Without a prior the bound grows in proportion to the budget; what falls short of it at small
-    budgets is the price of whole numbers.
-
-    Args:
-        units: what can be taken.
-        criterion: φ.
-        budgets: (N,) budgets.
-        prior: (P, P) what is known before.
-        most: how often a unit may be taken.
-        names: of the parameters, for messages.
-        tolerance: relative gap of the continuous optima.
-
-    Raises:
-        InputError: as `best`.
-        CannotAnswerError: as `best`.
-    """
-    budgets = np.asarray(budgets, dtype=float)
-    values, bounds = np.zeros(len(budgets)), np.zeros(len(budgets))
-    start: Relaxed | None = None
-    for k in np.argsort(budgets, kind="stable"):
-        budget = float(budgets[k])
-        start = relax(
-            units,
-            criterion,
-            budget,
-            prior,
-            most=most,
-            names=names,
-            tolerance=tolerance,
-            start=start,
-        )
-        counts = rounded(units, criterion, budget, prior, start, most=most)
-        used = np.flatnonzero(counts)
-        known = checked(units, budget, prior, most)
-        information = known + units.information(counts[used].astype(float), used)
-        values[k], bounds[k] = float(criterion.value(information)), start.bound
-    return Curve(budgets, values, np.maximum(values, bounds))

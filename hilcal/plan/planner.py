@@ -17,6 +17,7 @@ from hilcal.plan.choice import (
     EFFORT,
     Loads,
     Question,
+    canonical,
     choose,
     only,
     promising,
@@ -131,7 +132,7 @@ def make(
         CannotAnswerError: the cell leaves too few states, or the readings are too few; says
             which constraint or parameter it is.
     """
-    criterion = request.criterion or config.planning.criterion
+    criterion = canonical(request.criterion or config.planning.criterion)
     say("drawing candidate poses")
     space = Space(cell, config)
     drawn = draw(space, config.planning.candidates, rng, least=2)

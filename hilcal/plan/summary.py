@@ -25,7 +25,7 @@ from hilcal.regression.evidence import VISIBLE
 from hilcal.regression.schur import schur_complement
 from hilcal.types import Floats
 
-COMPARED = ("D", "A", "E", "K", "test")
+COMPARED = ("D", "A", "E", "K", "I")
 """Criteria of the comparison: all but T-optimality, which needs suspects."""
 SHARES = (0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
 """Budgets of the sample-size curve by the plan's own. A choice."""

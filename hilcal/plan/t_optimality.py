@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.plan.criterion import Smooth, soft_least
+from hilcal.plan.criterion import Criterion, Smooth, soft_least
 from hilcal.regression.schur import DETERMINED, inverse_root, nuisance_inverse
 from hilcal.types import Floats, Ints
 
@@ -57,7 +57,7 @@ class Pair:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Separate:
+class Separate(Criterion):
     """φ(M) = the least over pairs of uᵀ M u: the weakest non-centrality.
 
     What an effect of the size β adds to the sum of squares beyond what the model and its rival
@@ -112,11 +112,6 @@ class Separate:
         """Return φ of (..., P, P) matrices."""
         return np.asarray(self.parts(m).min(axis=-1))
 
-    def gradient(self, m: Floats) -> Floats:
-        """Return (P, P) u uᵀ of the weakest pair."""
-        u = self.pairs[int(np.argmin(self.parts(m)))].residual(m)
-        return np.outer(u, u)
-
     def surrogate(self, m: Floats, order: float) -> Callable[[Floats], Smooth | None]:
         """Return f = the smooth least / φ(m)."""
         parts = self.parts(m)
@@ -147,7 +142,7 @@ class Separate:
         ]
         return Smooth(value / scale, gradient / scale, tuple(products), tuple(squares), gradient)
 
-    def sure(self, m: Floats, names: Sequence[str] | None) -> None:
+    def require(self, m: Floats, names: Sequence[str] | None) -> None:
         """Refuse pairs that no candidate separates."""
         for pair in self.pairs:
             u = pair.residual(m)

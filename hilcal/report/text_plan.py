@@ -19,7 +19,7 @@ CRITERIA = {
     "A": "mean variance of the parameters",
     "E": "variance of the worst determined combination of parameters",
     "K": "condition number of the model alone, without effects outside of it",
-    "test": "mean variance of the predicted position (I-optimality)",
+    "I": "mean variance of the predicted position",
     "separate": "power to separate the leading suspects (T-optimality)",
 }
 BAR = 30

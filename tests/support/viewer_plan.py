@@ -67,7 +67,7 @@ SUMMARY = PlanSummary(
     position="deflection under each load at 100 feasible poses",
     criteria=(
         CriterionResult("D", 12e-6, 24e-6, 0.038, 132.0, 0.02, 4.0, 0.98768),
-        CriterionResult("test", 9e-6, 30e-6, None, 66.0, 0.01, 2.0, None),
+        CriterionResult("I", 9e-6, 30e-6, None, 66.0, 0.01, 2.0, None),
     ),
     curve=(CurvePoint(2, 24e-6), CurvePoint(3, 12e-6), CurvePoint(6, 8e-6)),
     detectable=(DetectableEffect("hysteresis", 6e-6), DetectableEffect("tracker_drift", None)),

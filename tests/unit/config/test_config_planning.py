@@ -27,7 +27,7 @@ cable_m = 1.5
 model = ["joint_compliance", "link_compliance"]
 readings = "absolute"
 against = ["thermal"]
-criterion = "test"
+criterion = "I"
 work_q_rad = [[0.0, -1.5, 1.5, 0.0, 0.0, 0.0], [0.1, -1.5, 1.5, 0, 0, 0]]
 work_load = "5kg"
 reading_s = 8.0
@@ -95,6 +95,7 @@ def test_the_work_may_be_a_box(tmp_path: Path) -> None:
         '[planning]\ncriterion = "test"\nwork_min_m = [0, 0, 0]\nwork_max_m = [1, 1, 1]\nagainst=[]'
     )
     planning = load(tmp_path, text).planning
+    assert planning.criterion == "I"  # "test" is its former name
     assert planning.work_max_m == (1, 1, 1)
     assert planning.against == ()
 
@@ -117,7 +118,7 @@ OBSTACLE = ROBOT + "[[obstacles]]\nname = 'a'\n"
 MASS = "[[loads]]\nname = '5kg'\nmass_kg = 5.0\n"
 WRONG = {
     "criterion": (PLAN + "criterion = 'G'", r"\[planning\] criterion = \"G\" is not valid: it mus"),
-    "test without work": (PLAN + "criterion = 'test'", r"\[planning\] criterion = \"test\" needs"),
+    "test without work": (PLAN + "criterion = 'test'", r"\[planning\] criterion = \"I\" needs"),
     "no effect": (PLAN + "model = []", r"\[planning\] model = \[\] is not valid: it must be the e"),
     "against": (PLAN + "against = 'all'", r'\[planning\] against = "all" is not valid.*"catalogue'),
     "half a box": (PLAN + "work_max_m = [1, 1, 1]", r"work_max_m alone; a box needs work_min_m"),

@@ -11,18 +11,20 @@ from hypothesis import strategies as st
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.plan.approximate_design import Relaxed, relax
 from hilcal.plan.candidate_set import Units
-from hilcal.plan.compound_criteria import Compromise
-from hilcal.plan.criteria import A, Criterion, D, E, K, Linear, Pair, Separate
-from hilcal.plan.exact_design import exact, rounded
-from hilcal.plan.optimum import best, curve
-from hilcal.plan.volumes import Volumes
+from hilcal.plan.compound_criteria import CompoundDeterminant, CompoundVariance
+from hilcal.plan.criteria import A, D, MeanVariance
+from hilcal.plan.criterion import Criterion
+from hilcal.plan.eigenvalue_criteria import E, K
+from hilcal.plan.exact_design import exact
+from hilcal.plan.optimum import best
+from hilcal.plan.t_optimality import Pair, Separate
 from hilcal.types import Floats, Ints
 
 
-def compromise() -> Compromise:
+def compound_variance() -> CompoundVariance:
     """Of two parameters, with a third that may be there."""
     c = np.array([[2.0, 0.5, 0.0], [0.5, 1.0, 0.0], [0.0, 0.0, 0.0]])
-    return Compromise(Linear(c), Linear(c[:2, :2]), 1.0, 2.0)
+    return CompoundVariance(c, 2, 1.0, 2.0)
 
 
 CRITERIA: dict[str, Callable[[], Criterion]] = {
@@ -30,9 +32,9 @@ CRITERIA: dict[str, Callable[[], Criterion]] = {
     "D of some": lambda: D(np.array([1])),
     "A": A,
     "A of some": lambda: A(np.array([0, 1])),
-    "test": lambda: Linear(np.outer([1.0, 2.0, -1.0], [1.0, 2.0, -1.0])),
-    "compromise": compromise,
-    "volumes": lambda: Volumes(2),
+    "I": lambda: MeanVariance(np.outer([1.0, 2.0, -1.0], [1.0, 2.0, -1.0])),
+    "compound variance": compound_variance,
+    "compound determinant": lambda: CompoundDeterminant(2),
     "E": E,
     "K": K,
     "E of some": lambda: E(np.array([0, 1])),
@@ -93,7 +95,7 @@ LEGENDRE = np.sort(np.concatenate([GRID, [-np.sqrt(0.2), np.sqrt(0.2)]]))
         (A(np.array([2])), 2, {-1: 1 / 4, 0: 1 / 2, 1: 1 / 4}),
         # the value at 2: Chebyshev points, in proportion to Lagrange's polynomials there
         (
-            Linear(np.outer([1.0, 2.0, 4.0], [1.0, 2.0, 4.0])),
+            MeanVariance(np.outer([1.0, 2.0, 4.0], [1.0, 2.0, 4.0])),
             2,
             {-1: 1 / 7, 0: 3 / 7, 1: 3 / 7},
         ),
@@ -289,8 +291,8 @@ def test_scale_of_a_parameter_does_not_matter_to_d() -> None:
     units = random_units(5, 100, 6)
     factor = 10.0 ** np.arange(-6, 6, 2)
     scaled = Units(units.rows * factor, units.cost)
-    one = best(units, D(), 12.0, None, np.random.default_rng(3))
-    two = best(scaled, D(), 12.0, None, np.random.default_rng(3))
+    one = best(units, D(), 12.0, None, np.random.default_rng(3), tolerance=1e-7)
+    two = best(scaled, D(), 12.0, None, np.random.default_rng(3), tolerance=1e-7)
     assert two.efficiency == pytest.approx(one.efficiency, abs=0.01)
     assert two.bound == pytest.approx(one.bound * np.prod(factor) ** (2 / 6), rel=1e-5)
 
@@ -300,7 +302,7 @@ def test_units_that_are_always_in() -> None:
     points = np.array([-1.0, 0.0, 1.0])
     units = polynomial(2, points)
     fixed = units.information(np.array([4.0, 4.0, 0.0]))
-    design = best(units, D(), 4.0, fixed, np.random.default_rng(0))
+    design = best(units, D(), 4.0, fixed, np.random.default_rng(0), tolerance=1e-7)
     np.testing.assert_array_equal(design.counts, [0, 0, 4])
     assert design.efficiency == pytest.approx(1.0, abs=1e-5)
 
@@ -311,7 +313,7 @@ def test_dear_units_are_taken_where_they_are_worth_it() -> None:
     rows[0, 0, 0] = rows[1, 0, 1] = rows[2, 0, 0] = rows[2, 1, 1] = 1.0
     for price, expected in ((1.5, [0, 0, 4]), (2.5, [3, 3, 0])):
         units = Units(rows, np.array([1.0, 1.0, price]))
-        design = best(units, D(), 6.0, None, np.random.default_rng(0))
+        design = best(units, D(), 6.0, None, np.random.default_rng(0), tolerance=1e-7)
         np.testing.assert_array_equal(design.counts, expected)
         assert design.efficiency == pytest.approx(1.0, abs=1e-5)
 
@@ -327,33 +329,13 @@ def test_exchange_improves_on_rounding() -> None:
             return float(D().value(units.information(counts.astype(float))))
 
         rng = np.random.default_rng(seed)
-        rough = value(rounded(units, D(), 13.0, None, relaxed))
+        rough = value(exact(units, D(), 13.0, None, relaxed, rng, effort=0))
         fine = value(exact(units, D(), 13.0, None, relaxed, rng, effort=500))
         drawn = [value(np.bincount(rng.choice(500, 13), minlength=500)) for _ in range(50)]
         assert max(drawn) < 0.8 * rough
         assert rough <= fine <= relaxed.bound
         gained.append(fine / rough - 1)
     assert max(gained) > 0.01
-
-
-def test_how_many_are_enough() -> None:
-    units = random_units(8, 400, 6)
-    budgets = np.array([60.0, 6.0, 12.0, 3.0, 30.0])
-    found = curve(units, D(), budgets)
-    np.testing.assert_array_equal(found.budget, budgets)
-    # without a prior the bound is in proportion to the budget
-    assert found.bound / budgets == pytest.approx(found.bound[0] / 60.0, rel=2e-3)
-    order = np.argsort(budgets)
-    assert (np.diff(found.value[order]) > 0).all()
-    assert (found.efficiency <= 1).all()
-    assert found.efficiency[0] > 0.98
-    assert found.efficiency[3] < found.efficiency[0]  # whole numbers cost more of few
-    known = curve(units, D(), budgets, 100.0 * np.eye(6))
-    assert (np.diff(known.bound[order]) > 0).all()
-    assert known.bound[3] > found.bound[3]
-    for k, budget in enumerate(budgets):
-        again = best(units, D(), budget, 100.0 * np.eye(6), np.random.default_rng(0), effort=50)
-        assert known.bound[k] == pytest.approx(again.bound, rel=2e-3)
 
 
 def test_budget_too_small_for_the_parameters() -> None:
@@ -368,7 +350,7 @@ def test_budget_too_small_for_the_parameters() -> None:
 def test_names_what_no_candidate_determines() -> None:
     units = random_units(9, 50, 4)
     units.rows[:, :, 2] = 0.0
-    with pytest.raises(CannotAnswerError, match="tells anything of wrist"):
+    with pytest.raises(CannotAnswerError, match="changes with wrist"):
         best(units, D(), 9.0, names=("base", "elbow", "wrist", "tool"))
     prior = np.diag([0.0, 0.0, 1.0, 0.0])
     assert best(units, D(), 9.0, prior).efficiency > 0.9  # known from elsewhere

@@ -17,7 +17,6 @@ from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
 from hilcal.data.plan import REFERENCE, UNLOADED, Plan, Step
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.plan.confounding import information_kept, information_lost
 from hilcal.plan.order import Chosen, Ordered, Ordering, order_plan
 from hilcal.plan.timing import pace, timeline
 from hilcal.types import Bools, Floats
@@ -245,7 +244,6 @@ def test_correlation_is_the_information_that_a_parameter_loses_to_a_drift() -> N
     both = np.stack([column, lag], axis=1)
     alone, beside = 1 / (column @ column), np.linalg.inv(both.T @ both)[0, 0]
     assert alone / beside == pytest.approx(1 - told.correlation**2, rel=1e-9)
-    assert information_kept(column[:, None], lag[:, None]) == pytest.approx(alone / beside)
     assert told.error_m == pytest.approx(told.drift * np.sqrt(np.mean(lag**2)))
     assert told.bias_m == pytest.approx(told.drift * np.mean(lag))
     assert told.deflections == len(rows)
@@ -260,20 +258,6 @@ def test_the_drift_that_returns_tell_is_that_of_a_fit_to_them() -> None:
     design = np.column_stack([times[at], means])
     std = 15e-6 * np.sqrt(np.linalg.inv(design.T @ design)[0, 0])
     assert made[0].confounding.drift_std == pytest.approx(std, rel=1e-6)
-
-
-def test_information_kept_is_that_of_the_whole_covariance() -> None:
-    rng = np.random.default_rng(3)
-    rows, drift = rng.standard_normal((40, 5)), rng.standard_normal((40, 3))
-    both = np.hstack([rows, drift])
-    beside = np.linalg.inv(both.T @ both)[:5, :5]
-    alone = np.linalg.inv(rows.T @ rows)
-    kept = (np.linalg.det(alone) / np.linalg.det(beside)) ** (1 / 5)
-    assert information_kept(rows, drift) == pytest.approx(kept)
-    lost = 1 - np.diagonal(alone) / np.diagonal(beside)
-    np.testing.assert_allclose(information_lost(rows, drift), lost, rtol=1e-9)
-    doubled = np.hstack([drift, drift[:, :1]])  # a rate that is given twice costs nothing more
-    assert information_kept(rows, doubled) == pytest.approx(kept)
 
 
 def test_the_heaviest_of_three_loads_comes_in_the_middle() -> None:

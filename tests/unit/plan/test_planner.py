@@ -89,7 +89,7 @@ def test_every_criterion_gives_a_certified_plan(criterion: str) -> None:
 
 def test_each_criterion_is_best_at_its_own(usual: Planned) -> None:
     of, work = usual.problem, usual.work
-    designs = {name: planned(small(), 6, criterion=name) for name in ("D", "A", "E", "test")}
+    designs = {name: planned(small(), 6, criterion=name) for name in ("D", "A", "E", "I")}
     for name in designs:
         asked = question(of, name, work)
         values = {}
@@ -131,7 +131,7 @@ def test_no_load_is_left_out_where_hanging_one_costs_nothing(usual: Planned) -> 
 def test_the_summary_is_consistent(usual: Planned) -> None:
     told = summarise(usual, small(), np.random.default_rng(2), lambda words: None)
     assert told.readings == len(usual.ordered.plan.steps) == sum(told.loads.values())
-    assert {b.criterion for b in told.criteria} == {"D", "A", "E", "K", "test"}
+    assert {b.criterion for b in told.criteria} == {"D", "A", "E", "K", "I"}
     best = {b.criterion: b for b in told.criteria}
     assert best["E"].o3 >= 0.98 * max(b.o3 for b in told.criteria)
     stds = [point.position_std_m for point in told.curve]
@@ -224,7 +224,7 @@ def test_a_cell_that_leaves_nothing_says_which_limit_it_is(
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--criterion", "best"), "valid: D, A, E, K, test, separate"),
+        (("--criterion", "best"), "valid: D, A, E, K, I, separate"),
         (("--poses", "0"), "valid: a whole number from 1"),
         (("--readings", "0"), "valid: a whole number from 1"),
         (("--seed", "-1"), "0 or more"),

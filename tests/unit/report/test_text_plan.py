@@ -43,7 +43,7 @@ SUMMARY = PlanSummary(
     position="deflection under mass-5kg at 100 poses",
     criteria=(
         CriterionResult("D", 11.4e-6, 15.1e-6, 0.038, 132.0, 0.021, 4.1, 0.98768),
-        CriterionResult("test", 9.1e-6, None, None, 110.0, 0.016, 3.3, None),
+        CriterionResult("I", 9.1e-6, None, None, 110.0, 0.016, 3.3, None),
     ),
     curve=(
         CurvePoint(6, 31e-6),
@@ -87,7 +87,7 @@ def test_everything_is_told_and_fits(width: int) -> None:
         "joint_compliance.j6 0.60 16.0 µrad/(N·m) 3.8 %",
         "base_frame.x 12 µm",
         "D (this) 11.4 µm 15.1 µm 3.8 % 132 0.021 4.10 98.7 %",
-        "test 9.10 µm - - 110 0.016 3.30 -",
+        "I 9.10 µm - - 110 0.016 3.30 -",
         "These readings cannot detect tracker_drift.",
         "note: only 3 candidates are left of load mass-10kg.",
     ):

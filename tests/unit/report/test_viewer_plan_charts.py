@@ -75,7 +75,7 @@ def test_tables_have_the_numbers_of_the_summary(recording):
         assert row in table
     table = rows(recording, "/words/criteria", "TextDocument:text")[0][0].replace("\\", "")
     assert "| D (this) | 12.0 µm | 24.0 µm | 3.8 % | 132 | 0.020 | 4.00 | 98.7 % |" in table
-    assert "| test | 9.00 µm | 30.0 µm | - | 66.0 | 0.010 | 2.00 | - |" in table
+    assert "| I | 9.00 µm | 30.0 µm | - | 66.0 | 0.010 | 2.00 | - |" in table
 
 
 def test_the_overview_has_cost_and_predicted_precision(recording):
