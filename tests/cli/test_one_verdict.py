@@ -1,0 +1,174 @@
+"""One diagnosis: the same verdict and message through every command, the library and the file."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hilcal.campaign import Campaign
+from hilcal.cli.files import open_run
+from hilcal.cli.terminal import terminal
+from hilcal.config import CellConfig, load_config
+from hilcal.data.campaign import Campaign as CampaignFile
+from hilcal.data.readings import Readings
+from hilcal.data.whitening import Mode
+from hilcal.diagnose.diagnosis import Diagnosis
+from hilcal.diagnose.doubt import in_doubt
+from hilcal.diagnose.verdict import diagnose
+from hilcal.identify.baseline import baseline
+from hilcal.refine import refine
+from hilcal.report.build_story import build_story
+from hilcal.report.diagnosis_document import to_json
+from hilcal.report.verdict_words import message
+from hilcal.robot.catalogue import configs_dir
+from studies.diagnosis import judgement
+from studies.study_cases import study_case
+from tests.support.cli_cases import CELL, ok, run
+from tests.support.next_cases import SMALL, doubtful
+
+Capsys = pytest.CaptureFixture[str]
+CELLS = str(configs_dir() / "cells")
+UR5E = load_config(CELL).model_copy(
+    update={"robot": load_config(CELL).robot.model_copy(update={"model": "ur5e"})}
+)
+
+
+def stored(path: Path, config: CellConfig, readings: Readings, mode: Mode) -> Path:
+    """A campaign file with its readings alone."""
+    with CampaignFile.create(path, config.to_json(), CELLS, "a test") as file:
+        file.append_readings(readings)
+    return path
+
+
+def study(mode: Mode, *hidden: str, seed: int = 1, **options: Any) -> tuple[CellConfig, Readings]:
+    c = study_case(UR5E, "ur5e", mode, hidden, options.pop("strength", 3.0), seed, **options)
+    return UR5E, c.readings
+
+
+CASES = {
+    "missing": ("deflection", lambda: study("deflection", "creep")),
+    "ambiguous": (
+        "absolute",
+        lambda: (SMALL, doubtful("base_compliance", 2).rehearsal.readings),
+    ),
+    "unknown": ("absolute", lambda: study("absolute", "swaying bench")),
+    "unknown although tried": ("deflection", lambda: study("deflection", "relaxing bench", seed=0)),
+    "adequate": ("deflection", lambda: study("deflection")),
+    "noise": ("deflection", lambda: study("deflection", stated=0.5, cycles=2)),
+}
+FIRST = {
+    "missing": "missing_effect",
+    "ambiguous": "ambiguous",
+    "unknown": "unknown_effect",
+    "unknown although tried": "unknown_effect",
+    "adequate": "adequate",
+    "noise": "noise_misjudged",
+}
+
+
+def check_document(d: Mapping[str, Any]) -> None:
+    """One document, one verdict; and it is without contradiction."""
+    inner = d.get("diagnosis", d)
+    assert (d["verdict"], d["message"]) == (inner["verdict"], inner["message"])
+    if "revisions" in d:
+        assert d["revisions"][-1]["verdict"] == d["verdict"]
+    suspects = inner["suspects"]
+    words = d["message"]
+    rejected = inner["rejected"]
+    for name in rejected:
+        assert f"{name} is missing" not in words
+    if "does not" in words and "lower the error" in words:
+        assert "is missing" not in words
+    if d["verdict"] == "missing_effect" or inner["beyond"] is not None:
+        assert words.startswith(suspects[0]["effect"])
+    passing = [s["effect"] for s in suspects if s["significant"]]
+    assert passing == [s["effect"] for s in suspects[: len(passing)]]
+    evidence = [s["log_evidence"] for s in suspects[: len(passing)]]
+    assert evidence == sorted(evidence, reverse=True)
+    assert set(passing).isdisjoint(rejected)
+
+
+def latest(path: Path) -> tuple[Mapping[str, Any], Diagnosis]:
+    """The diagnosis as it is in the file, and as the library makes it."""
+    with Campaign.open(path) as campaign:
+        record = campaign.latest()
+        assert record is not None
+        return record.result_json["diagnose"], diagnose(campaign.fit(), campaign.history())
+
+
+def check_doors(path: Path, expected: Mapping[str, Any], capsys: Capsys, tmp_path: Path) -> None:
+    """Every way to the diagnosis of the latest revision ends in the same verdict and message."""
+    said = (expected["verdict"], expected["message"])
+    d = ok(capsys, "diagnose", path, "--json").document
+    check_document(d)
+    assert (d["verdict"], d["message"]) == said
+    with Campaign.open(path) as campaign:
+        judged = diagnose(campaign.fit(), campaign.history())
+    assert (judged.verdict, message(judged)) == said
+    kept = judgement(judged)
+    assert (kept.verdict, kept.message) == said
+    assert kept.lead == d["suspects"][0]["effect"]
+    with open_run(path) as o:
+        story = build_story(o.chapters(terminal(False), lambda text: None))
+    assert (story.revisions[-1].verdict, story.revisions[-1].message) == said
+    result = run(
+        capsys, "next", path, "-o", tmp_path / "n.json", "--quick", "--poses", "1", "--json"
+    )
+    if said[0] == "ambiguous":
+        assert result.code == 0, result.err
+        assert tuple(result.document["suspects"]) == in_doubt(judged)
+    else:
+        assert result.code == 4, result.err
+        assert "no suspects to separate" in result.err
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_one_verdict_through_every_door(case: str, tmp_path: Path, capsys: Capsys) -> None:
+    mode, make = CASES[case]
+    path = stored(tmp_path / "run.hilcal", *make(), mode)
+    ok(capsys, "identify", path, "--readings", mode)
+    first = ok(capsys, "diagnose", path, "--json").document
+    assert first["verdict"] == FIRST[case], first["message"]
+    check_doors(path, first, capsys, tmp_path)
+
+    refined = ok(capsys, "refine", path, "--readings", mode, "--json").document
+    check_document(refined)
+    assert refined["rejected"] == refined["diagnosis"]["rejected"]
+    in_file, judged = latest(path)
+    assert (in_file["verdict"], in_file["message"]) == (refined["verdict"], refined["message"])
+    assert json.loads(json.dumps(to_json(judged)["rejected"])) == refined["rejected"]
+    check_doors(path, refined, capsys, tmp_path)
+    with CampaignFile.open(path) as file:
+        for record, row in zip(file.revisions()[1:], refined["revisions"], strict=True):
+            assert record.result_json["diagnose"]["verdict"] == row["verdict"]
+    again = ok(capsys, "refine", path, "--from-latest", "--json").document
+    assert (again["verdict"], again["message"]) == (refined["verdict"], refined["message"])
+
+
+def test_adding_gives_the_verdict_that_is_stored_and_diagnosed(
+    tmp_path: Path, capsys: Capsys
+) -> None:
+    path = stored(tmp_path / "run.hilcal", *study("deflection", "creep"), "deflection")
+    ok(capsys, "identify", path)
+    for name in ("creep", "hysteresis"):
+        d = ok(capsys, "add", path, name, "--json").document
+        check_document(d)
+        in_file, _ = latest(path)
+        assert (in_file["verdict"], in_file["message"]) == (d["verdict"], d["message"])
+        again = ok(capsys, "diagnose", path, "--json").document
+        assert (again["verdict"], again["message"]) == (d["verdict"], d["message"])
+
+
+def test_the_steps_of_a_refinement_carry_what_it_tried() -> None:
+    """The effect that each step adds is the first suspect of the step before."""
+    c = study_case(UR5E, "ur5e", "deflection", ("relaxing bench",), 3.0, 0)
+    r = refine(baseline(c.cell, c.readings, "deflection"), c.readings, "deflection")
+    assert r.rejected
+    assert r.diagnosis is r.steps[-1].diagnosis
+    for before, after in zip(r.steps, r.steps[1:], strict=False):
+        if after.removed is None:
+            assert before.diagnosis.suspects[0].effect == after.added
+    for step in r.steps:
+        assert set(step.diagnosis.significant).isdisjoint(step.diagnosis.history.rejected)
