@@ -20,8 +20,7 @@ from scipy.stats import chi2
 from hilcal.diagnose.effect_ranking import FALSE_ALARM, catalogue_columns
 from hilcal.diagnose.noise import pure_error
 from hilcal.diagnose.noise_verdict import MISFIT_ALARM, PREDICTABLE, NoiseVerdict, judge_noise
-from hilcal.diagnose.residual_curves import Dependence
-from hilcal.diagnose.residual_regression import residual_regression
+from hilcal.diagnose.residual_regression import Dependence, residual_regression
 from hilcal.identify.fit import Fit
 from hilcal.identify.linearisation import linearise
 from hilcal.regression import forward_selection as selection

@@ -12,7 +12,7 @@ from hilcal.diagnose.effect_ranking import Suspect
 from hilcal.diagnose.misfit_breakdown import MisfitShare
 from hilcal.diagnose.noise import PureError
 from hilcal.diagnose.noise_verdict import NoiseVerdict
-from hilcal.diagnose.residual_curves import Dependence
+from hilcal.diagnose.residual_regression import Dependence
 from hilcal.diagnose.separability import Separability
 from hilcal.diagnose.stepwise_alternatives import Alternative
 from hilcal.identify.fit import Fit

@@ -11,8 +11,7 @@ from hilcal.diagnose.effect_ranking import Suspect, candidates, rank_suspects
 from hilcal.diagnose.misfit_breakdown import MisfitShare, misfit_breakdown
 from hilcal.diagnose.noise import PureError, pure_error
 from hilcal.diagnose.noise_verdict import MISFIT_ALARM
-from hilcal.diagnose.residual_curves import ResidualRegression
-from hilcal.diagnose.residual_regression import residual_regression, tree_share
+from hilcal.diagnose.residual_regression import ResidualRegression, residual_regression, tree_share
 from hilcal.diagnose.stepwise import add
 from hilcal.diagnose.stepwise_alternatives import Alternative, StepwiseAlternatives
 from hilcal.effects.protocol import Effect

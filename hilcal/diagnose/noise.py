@@ -1,4 +1,4 @@
-"""Noise or model? What repeated readings say of the stated covariance.
+"""Pure error: the scatter of repeated readings, against the stated covariance.
 
 Readings repeated at one pose under one load differ by noise alone (pure error), whatever the
 model misses. With y the contrasts of their residuals (see `repeats`), whitened by the joint
@@ -6,7 +6,7 @@ covariance of all readings that they share,
 
     χ²_pure = ‖y‖²,   dof = dim y,   factor = χ²_pure / dof
 
-and what is left of χ² is lack of fit.
+and the rest of χ² is lack of fit.
 """
 
 from dataclasses import dataclass
@@ -19,12 +19,12 @@ from hilcal.diagnose.repeats import contrasts
 from hilcal.identify.fit import Fit, variance_interval
 
 FEWEST = 10
-"""Degrees of freedom of pure error below which the program does not judge by it."""
+"""Degrees of freedom of pure error below which it is not used; a guess."""
 
 
 @dataclass(frozen=True, slots=True)
 class PureError:
-    """What repeats say.
+    """The scatter of repeats.
 
     Attributes:
         factor: variance factor of the repeats, against the stated covariance.

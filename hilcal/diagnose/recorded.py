@@ -1,4 +1,4 @@
-"""What is recorded of the state, as smooth functions, and the ways in which the arm can move."""
+"""Recorded variables of the state as smooth functions, and the possible motions of the target."""
 
 from dataclasses import dataclass, replace
 from itertools import combinations

@@ -20,7 +20,7 @@ from hilcal.diagnose.effect_ranking import FALSE_ALARM, LEAST_SHARE, ranked
 from hilcal.diagnose.evidence import Evidence
 from hilcal.diagnose.misfit_breakdown import MisfitShare
 from hilcal.diagnose.noise_verdict import PREDICTABLE, judge_noise
-from hilcal.diagnose.residual_curves import ResidualRegression
+from hilcal.diagnose.residual_regression import ResidualRegression
 from hilcal.diagnose.separability import Separability, separability
 from hilcal.identify.fit import Fit
 

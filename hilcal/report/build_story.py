@@ -1,4 +1,4 @@
-"""From fits and diagnoses to the story that the viewer tells."""
+"""From fits and diagnoses to the `Story` that the viewer draws."""
 
 import re
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from hilcal.data.revision import change
 from hilcal.data.whitening import Mode
 from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.diagnose.effect_ranking import Suspect, candidates
-from hilcal.diagnose.residual_curves import Dependence
+from hilcal.diagnose.residual_regression import Dependence
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit, mahalanobis2
 from hilcal.identify.fit_document import finite
@@ -38,14 +38,15 @@ MOST_NUMBER = 10**9
 NEAR = 0.99  # component from which a direction is called an axis
 UNDIAGNOSED = "not diagnosed"
 LITTLE = 0.2
-"""A suspect that explains less of what is predictable of the misfit is not what it follows."""
+"""Share of the predictable misfit that the first suspect must explain for its own chart to be
+shown, not those of the variables; a guess."""
 LEAST_CARRIED = 0.02
-"""Share of the misfit below which a variable is not worth a word."""
+"""Share of the misfit below which a variable is not shown; a guess."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chapter:
-    """One revision as it is told.
+    """One revision.
 
     Attributes:
         number: of the revision.
@@ -128,7 +129,7 @@ def _turn(axes: Floats, vectors: Floats) -> Floats:
 def _revision(c: Chapter, e: Everything, axes: Floats, measured: Floats) -> StoryRevision:
     residual = _turn(axes, e.raw[:, :3])
     d = c.diagnosis
-    told = () if d is None else _told(d)
+    shown = () if d is None else _shown(d)
     curves = () if d is None else _curves(d)
     return StoryRevision(
         revision=c.number,
@@ -144,10 +145,10 @@ def _revision(c: Chapter, e: Everything, axes: Floats, measured: Floats) -> Stor
         variance_factor=c.fit.variance_factor,
         suspects=tuple(
             StorySuspect(s.effect, s.share, s.holdout_share, s.score.p_value, s.same_as)
-            for s in told
+            for s in shown
         ),
         parameters=story_parameters(c.fit),
-        regressor=regressor(c.fit, told[0]) if told and not curves else None,
+        regressor=regressor(c.fit, shown[0]) if shown and not curves else None,
         curves=curves,
         rivals=()
         if d is None
@@ -156,7 +157,7 @@ def _revision(c: Chapter, e: Everything, axes: Floats, measured: Floats) -> Stor
     )
 
 
-def _told(d: Diagnosis) -> tuple[Suspect, ...]:
+def _shown(d: Diagnosis) -> tuple[Suspect, ...]:
     """Suspects worth showing: those that pass the test, then those that nearly do, each best first.
 
     None where nothing is wrong.

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.diagnose.minimum_detectable_effect import Strength
 from hilcal.diagnose.noise import PureError
-from hilcal.diagnose.residual_curves import Dependence
+from hilcal.diagnose.residual_regression import Dependence
 from hilcal.report.verdict_words import message
 
 

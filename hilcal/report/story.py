@@ -35,7 +35,7 @@ class StorySuspect:
         share: share of the misfit that it explains on the fitted readings, 0..1.
         holdout_share: the same on readings left out; may be negative.
         p_value: of the joint test on the whitened residual.
-        same_as: effects that the data cannot tell apart from it.
+        same_as: effects that the readings do not separate from it.
     """
 
     effect: str
@@ -102,12 +102,12 @@ class StoryLimit:
 
 @dataclass(frozen=True, slots=True)
 class StoryRival:
-    """An effect that the data do not tell from the leading suspect.
+    """An effect that the readings do not separate from the leading suspect.
 
     Attributes:
         effect: its name.
         unlike: share of what the suspect does that the rival cannot imitate.
-        times: how many times as many readings would tell them apart; infinite where none would.
+        times: how many times as many readings would separate them; infinite where none would.
     """
 
     effect: str
@@ -136,7 +136,7 @@ class StoryRevision:
         regressor: what the leading suspect would bend straight; None when there is none.
         curves: variables that carry the misfit, largest share first, where the leading suspect
             explains little of it or there is none; else empty.
-        rivals: effects that the data do not tell from the leading suspect.
+        rivals: effects that the readings do not separate from the leading suspect.
         limits: from which strength the effects that were not found would have been named.
     """
 

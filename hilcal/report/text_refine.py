@@ -17,7 +17,7 @@ VERDICTS: Mapping[str, str] = {
     "adequate": "adequate: the residual is noise",
     "missing_effect": "an effect is missing",
     "ambiguous": "ambiguous: these readings do not separate the suspects",
-    "unknown_effect": "unknown effect: something is missing that the catalogue does not hold",
+    "unknown_effect": "unknown effect: an effect is missing that the catalogue does not hold",
     "noise_misjudged": "the noise is not what was stated",
 }
 SUSPECTS = 6

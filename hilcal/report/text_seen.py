@@ -1,4 +1,4 @@
-"""What could have been seen: effects that were not found, and from which strength they would be."""
+"""Minimum detectable effects: the strength from which an effect would have been found."""
 
 from collections.abc import Iterator
 

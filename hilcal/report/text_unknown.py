@@ -6,7 +6,7 @@ from rich.console import RenderableType
 from rich.text import Text
 
 from hilcal.diagnose.noise import PureError
-from hilcal.diagnose.residual_curves import Dependence
+from hilcal.diagnose.residual_regression import Dependence
 from hilcal.report import numbers, text
 
 BARS = "▁▂▃▄▅▆▇█"

@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hilcal.data.campaign import Campaign as CampaignFile
 
 from hilcal.campaign import Campaign
 from hilcal.cli.files import open_run
 from hilcal.cli.terminal import terminal
 from hilcal.config import CellConfig, load_config
-from hilcal.data.campaign import Campaign as CampaignFile
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode
 from hilcal.diagnose.diagnosis import Diagnosis
@@ -124,7 +124,12 @@ def check_doors(path: Path, expected: Mapping[str, Any], capsys: Capsys, tmp_pat
         assert "no suspects to separate" in result.err
 
 
-@pytest.mark.parametrize("case", CASES)
+FAST = ("missing", "ambiguous", "unknown although tried")
+
+
+@pytest.mark.parametrize(
+    "case", [pytest.param(c, marks=() if c in FAST else pytest.mark.slow) for c in CASES]
+)
 def test_one_verdict_through_every_door(case: str, tmp_path: Path, capsys: Capsys) -> None:
     mode, make = CASES[case]
     path = stored(tmp_path / "run.hilcal", *make(), mode)

@@ -89,21 +89,21 @@ def _doubt(r: StoryRevision) -> list[str]:
 
 
 def rivals(lead: str, others: tuple[StoryRival, ...]) -> str:
-    """Return what would tell the leading suspect from each of its rivals."""
+    """Return what would separate the leading suspect from each of its rivals."""
     return " ".join(_rival(escaped(lead), r) for r in others[:_RIVALS])
 
 
 def _rival(lead: str, r: StoryRival) -> str:
     alike = style.percent(max(1.0 - r.unlike, 0.0))
-    told = f"**{escaped(r.effect)}** can imitate {alike} of what **{lead}** does"
+    head = f"**{escaped(r.effect)}** can imitate {alike} of what **{lead}** does"
     if not math.isfinite(r.times):
-        return f"{told}: no number of readings like these tells them apart."
+        return f"{head}: no number of readings like these separates them."
     if r.times <= 1.0:
         return (
-            f"{told}; if {lead} were the whole cause, these readings would tell: perhaps it is "
-            "neither."
+            f"{head}; if {lead} were the whole cause, these readings would separate them: perhaps "
+            "it is neither."
         )
-    return f"{told}; {number(r.times, 2)} times as many readings like these would tell them apart."
+    return f"{head}; {number(r.times, 2)} times as many readings like these would separate them."
 
 
 def carriers(r: StoryRevision) -> str:
@@ -120,7 +120,7 @@ def suspects(r: StoryRevision) -> str:
     if not r.suspects and r.verdict == "adequate" and r.limits:
         return f"{visible(r.limits)}\n"
     if not r.suspects:
-        return "No suspect: no effect of the catalogue surely explains what is left.\n"
+        return "No suspect: no effect of the catalogue surely explains the residual.\n"
     rows = [
         "| missing effect | explains | | held out | p-value | not separable from |",
         "|---|---|---|---|---|---|",

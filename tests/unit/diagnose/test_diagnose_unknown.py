@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from hilcal.data.readings import States
-from hilcal.diagnose.residual_curves import Dependence, ResidualRegression
-from hilcal.diagnose.residual_regression import residual_regression
+from hilcal.diagnose.residual_regression import Dependence, ResidualRegression, residual_regression
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import fit
 from hilcal.identify.linearisation import linearise

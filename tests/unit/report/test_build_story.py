@@ -7,7 +7,7 @@ import pytest
 
 from drivers.simulated.rehearsal import Rehearsal
 from hilcal.diagnose.diagnosis import Diagnosis
-from hilcal.diagnose.residual_curves import Dependence
+from hilcal.diagnose.residual_regression import Dependence
 from hilcal.diagnose.verdict import diagnose
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
