@@ -6,12 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hilcal.data.campaign import Campaign as CampaignFile
 
 from hilcal.campaign import Campaign
-from hilcal.cli.files import open_run
-from hilcal.cli.terminal import terminal
 from hilcal.config import CellConfig, load_config
+from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode
 from hilcal.diagnose.diagnosis import Diagnosis
@@ -106,12 +104,11 @@ def check_doors(path: Path, expected: Mapping[str, Any], capsys: Capsys, tmp_pat
     assert (d["verdict"], d["message"]) == said
     with Campaign.open(path) as campaign:
         judged = diagnose(campaign.fit(), campaign.history())
+        story = build_story(campaign.chapters())
     assert (judged.verdict, message(judged)) == said
     kept = judgement(judged)
     assert (kept.verdict, kept.message) == said
     assert kept.lead == d["suspects"][0]["effect"]
-    with open_run(path) as o:
-        story = build_story(o.chapters(terminal(False), lambda text: None))
     assert (story.revisions[-1].verdict, story.revisions[-1].message) == said
     result = run(
         capsys, "next", path, "-o", tmp_path / "n.json", "--quick", "--poses", "1", "--json"
