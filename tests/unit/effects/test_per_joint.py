@@ -6,7 +6,7 @@ import pytest
 from hilcal.data.records import content_hash
 from hilcal.data.revision import from_text, to_text
 from hilcal.effects.per_joint import PerJoint, joint_groups
-from hilcal.effects.protocol import Columns, Effect, Parameter
+from hilcal.effects.protocol import Columns, Effect, Parameter, Response
 from hilcal.errors import InputError
 from hilcal.identify.baseline import with_effects
 from hilcal.identify.fit import fit
@@ -253,6 +253,9 @@ class Builds(Effect):
     def columns(self, s):
         joints = np.arange(s.angle.shape[1])
         return (Columns("dq", 0 * joints, joints, s.compliance * s.torque),)
+
+    def response(self, theta, s, change):
+        return Response(dq=theta[0] * s.compliance * change[:, :, :-1, 5])
 
     def compliance_columns(self, theta, s):
         joints = np.arange(s.angle.shape[1])
