@@ -84,9 +84,9 @@ def next_(
 def separates(found: Next) -> dict[str, object]:
     """Return what a JSON document says of pairs; powers are those with the planned readings."""
     return {
-        "separates": [[t.effect, t.rival, t.then] for t in found.told],
-        "separates_now": [[t.effect, t.rival, t.now] for t in found.told],
-        "inseparable": [[t.effect, t.rival] for t in found.told if t.not_separable],
+        "separates": [[t.effect, t.rival, t.then] for t in found.powers],
+        "separates_now": [[t.effect, t.rival, t.now] for t in found.powers],
+        "inseparable": [[t.effect, t.rival] for t in found.powers if t.not_separable],
         "difference": found.shares,
         "notes": list(found.notes),
     }
@@ -94,7 +94,7 @@ def separates(found: Next) -> dict[str, object]:
 
 def plan_of(found: Next, suspects: tuple[str, ...]) -> Plan:
     """Return the plan with what its file says of it."""
-    told = [[t.effect, t.rival, round(t.then, 4)] for t in found.told]
+    told = [[t.effect, t.rival, round(t.then, 4)] for t in found.powers]
     more = {**about(found.planned), "suspects": list(suspects), "separates": told}
     return replace(found.planned.ordered.plan, about=more)
 

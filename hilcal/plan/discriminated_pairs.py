@@ -170,14 +170,6 @@ def power(pair: Pair, information: Floats) -> float:
     return family_power(s, pair.beta, LEVEL)
 
 
-def powers(of: DiscriminatedPairs, information: Floats) -> dict[tuple[str, str], float]:
-    """Return the least power over the directions of each pair of effects."""
-    out: dict[tuple[str, str], float] = {}
-    for names, pair in zip(of.names, of.pairs, strict=True):
-        out[names] = min(out.get(names, 1.0), power(pair, information))
-    return out
-
-
 def _directions(problem: Problem, effect: str) -> list[Floats]:
     """Directions (E,) of an effect whose RMS over all measured elements is 1 σ."""
     where = problem.of_effect(effect)

@@ -1,6 +1,6 @@
 """The measurements that separate suspects: a plan for them, and the power it will have."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,12 +35,12 @@ FEW = 2
 DRAWS = 24
 """Parameters of each suspect over which a power is averaged."""
 SURE = 0.9
-"""Power from which on two suspects count as told apart."""
+"""Power from which on two suspects count as separated."""
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
-    """How well one suspect is told from another.
+class PairPower:
+    """The power of separating one suspect from another.
 
     Attributes:
         effect: the effect that is there.
@@ -63,7 +63,7 @@ class Next:
 
     Attributes:
         planned: the plan.
-        told: of each pair, both ways round.
+        powers: of each pair, both ways round.
         shares: by load, the share of what separates the weakest pair.
         stretched: how far the arm reaches in the poses that separate it most, by that in an
             ordinary candidate.
@@ -71,7 +71,7 @@ class Next:
     """
 
     planned: Planned
-    told: tuple[Told, ...]
+    powers: tuple[PairPower, ...]
     shares: dict[str, float]
     stretched: float
     notes: tuple[str, ...]
@@ -99,7 +99,7 @@ def measure_next(
         suspects: two effects or more.
         request: how many readings.
         rng: generator.
-        say: told what is being done.
+        say: takes progress, one line each.
         reference: (n,) joints of the campaign's reference pose, rad; a new one where None.
 
     Raises:
@@ -129,10 +129,10 @@ def measure_next(
         raise CannotAnswerError(f"{lines}: no measurement separates them") from None
     if reference is not None and not np.array_equal(reference, made.ordered.plan.q[0]):
         made = _from_reference(cell, config, made, reference, rng, request)
-    say("working out what it will tell")
+    say("predicting the powers")
     of = discriminated_pairs(made.problem)
     then = of.prior + made.problem.units.information(made.counts)
-    told = tuple(_told(made.problem, of, names, then))
+    powers = tuple(_pair_powers(made.problem, of, names, then))
     seen = {e.name for e in made.problem.families}
     lost = [n for n in names if n not in seen]
     notes = tuple(n for n in made.problem.notes if n.split(":")[0] in lost)
@@ -140,48 +140,42 @@ def measure_next(
         notes = (*notes, not_separable_message(of.not_separable))
     weakest = min(of.pairs, key=lambda pair: power(pair, then))
     shares, stretched = _where(made, weakest, then)
-    return Next(made, told, shares, stretched, notes)
+    return Next(made, powers, shares, stretched, notes)
 
 
 def expected(
-    problem: Problem, names: tuple[str, str], of: DiscriminatedPairs, information: Floats
+    problem: Problem, names: tuple[str, str], betas: Sequence[Floats], information: Floats
 ) -> float:
-    """Return the power of a pair, the mean over what its effect could be.
+    """Return the power of a pair, the mean over parameters that its effect may have.
 
     Args:
         problem: the design problem.
         names: effect that is there, rival that is fitted.
-        of: all pairs.
+        betas: (E,) parameters of the effect, in the problem's units.
         information: (P, P) of all readings, with `DiscriminatedPairs.prior`.
     """
-    e, f = names
-    where = problem.of_effect(e)
-    draws = supported_parameters(problem, DRAWS).get(e)
-    if draws is None:
-        betas = [p.beta for p, n in zip(of.pairs, of.names, strict=True) if n[0] == e]
-    else:
-        betas = list(draws / problem.scale[where])
-    each = [power(pair_of(problem, (e, f), b), information) for b in betas]
+    each = [power(pair_of(problem, names, b), information) for b in betas]
     return float(np.mean(each)) if each else LEVEL
 
 
-def _told(
+def _pair_powers(
     problem: Problem, of: DiscriminatedPairs, names: tuple[str, ...], then: Floats
-) -> list[Told]:
-    """All pairs of the suspects, those that need more first."""
+) -> Iterator[PairPower]:
+    """Yield all pairs of the suspects."""
     seen = {e.name for e in problem.families}
-    out = []
+    supported = supported_parameters(problem, DRAWS)
     for e in names:
+        betas = [p.beta for p, n in zip(of.pairs, of.names, strict=True) if n[0] == e]
+        if e in supported:
+            betas = list(supported[e] / problem.scale[problem.of_effect(e)])
         for f in names:
             if e == f:
                 continue
             if e not in seen or f not in seen:
-                out.append(Told(e, f, LEVEL, LEVEL, e not in seen))
+                yield PairPower(e, f, LEVEL, LEVEL, e not in seen)
                 continue
-            now = expected(problem, (e, f), of, of.prior)
-            not_separable = (e, f) in of.not_separable
-            out.append(Told(e, f, now, expected(problem, (e, f), of, then), not_separable))
-    return out
+            now, later = (expected(problem, (e, f), betas, m) for m in (of.prior, then))
+            yield PairPower(e, f, now, later, (e, f) in of.not_separable)
 
 
 def _from_reference(

@@ -6,7 +6,7 @@ from rich.console import RenderableType
 from rich.text import Text
 
 from hilcal.data.plan import UNLOADED
-from hilcal.plan.next import SURE, Next, Told
+from hilcal.plan.next import SURE, Next, PairPower
 from hilcal.report import numbers, text
 
 _STRETCHED = 1.15
@@ -24,7 +24,7 @@ def next_report(found: Next, poses: int, readings: int) -> Iterator[RenderableTy
     """
     yield text.heading("Telling the suspects apart")
     out = text.table("if this is there", "this is ruled out", "now", "then", left=(0, 1))
-    for t in found.told:
+    for t in found.powers:
         then = "never" if t.not_separable else numbers.percent(t.then)
         out.add_row(t.effect, t.rival, numbers.percent(t.now), then)
     yield out
@@ -33,17 +33,17 @@ def next_report(found: Next, poses: int, readings: int) -> Iterator[RenderableTy
         "those planned as well.\n",
         style="dim",
     )
-    yield f"{summary(found.told, poses, readings)} {_difference(found)}\n"
+    yield f"{summary(found.powers, poses, readings)} {_difference(found)}\n"
     for note in found.notes:
         yield f"note: {note}"
 
 
-def summary(told: Sequence[Told], poses: int, readings: int) -> str:
+def summary(powers: Sequence[PairPower], poses: int, readings: int) -> str:
     """Say in a sentence what the plan will settle."""
-    able = [t for t in told if not t.not_separable]
+    able = [t for t in powers if not t.not_separable]
     least = min(able, key=lambda t: t.then)
     head = f"{readings} readings at {poses} poses"
-    if least.then >= SURE and len(able) == len(told):
+    if least.then >= SURE and len(able) == len(powers):
         return f"{head} will tell: whichever is there, the others are ruled out with at least " + (
             f"{numbers.percent(least.then)} chance."
         )

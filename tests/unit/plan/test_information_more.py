@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from hilcal.data.whitening import MODES
 from hilcal.effects.catalogue import installed
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.plan.discriminated_pairs import LEVEL, discriminated_pairs, power, powers
+from hilcal.plan.discriminated_pairs import LEVEL, discriminated_pairs, power
 from hilcal.plan.information import problem
 from hilcal.plan.nominal_model import assumed, nominal_states
 from hilcal.plan.potential import MOST_ORDINARY, MOST_PARAMETERS
@@ -176,10 +176,6 @@ def test_power_is_the_share_of_campaigns_that_find_the_effect():
         found = np.mean(gain > chi2.isf(LEVEL, len(pair.effect)))
         assert 0.05 < found < 0.95  # else the test could not fail
         assert power(pair, m) == pytest.approx(found, abs=0.04)
-    least = powers(of, m)
-    assert set(least) == set(of.names)
-    for names, pair in zip(of.names, of.pairs, strict=True):
-        assert least[names] <= power(pair, m)
 
 
 def test_given_strengths_and_wrong_suspects():

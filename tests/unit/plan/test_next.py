@@ -177,7 +177,7 @@ def test_what_was_ambiguous_is_decided() -> None:
     assert "base_compliance" in first.suspects
     assert len(first.suspects) > 1
     d, found = settled(first)
-    assert all(t.then > t.now for t in found.told)
+    assert all(t.then > t.now for t in found.powers)
     assert (d.suspects[0].effect, d.suspects[0].same_as) == ("base_compliance", ())
     plan = found.planned.ordered.plan
     assert found.planned.design.efficiency > 0.9
