@@ -10,13 +10,13 @@ from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.errors import CannotAnswerError
 from hilcal.plan.choice import choose
-from hilcal.plan.compound_criteria import robust_question
+from hilcal.plan.compound_criteria import compound_objective
 from hilcal.plan.draw import draw
 from hilcal.plan.feasible import Space
 from hilcal.plan.information import Problem, problem
-from hilcal.plan.nominal_model import Assumed, assumed
+from hilcal.plan.nominal_model import NominalModel, nominal_model
 from hilcal.plan.predicted import Predicted, predicted, rms
-from hilcal.plan.prediction_poses import WorkPoses, work_poses
+from hilcal.plan.prediction_poses import PredictionPoses, prediction_poses
 from hilcal.types import Floats, Ints
 
 LEVELS = (3, 4, 5, 6)
@@ -37,7 +37,7 @@ class Scene:
         cell: the cell.
         config: its configuration.
         space: its feasible states.
-        assumed: the model.
+        nominal: the model.
         exact: the design problem of the model alone.
         robust: the same with the potential terms of the configuration; None without any.
         work: test poses; drawn apart from the candidates where the configuration names none.
@@ -46,10 +46,10 @@ class Scene:
     cell: Cell
     config: CellConfig
     space: Space
-    assumed: Assumed
+    nominal: NominalModel
     exact: Problem
     robust: Problem | None
-    work: WorkPoses
+    work: PredictionPoses
 
     def with_others(self, chosen: "Chosen") -> float | None:
         """RMS position, m, where potential terms are estimated too; of the candidates' units."""
@@ -97,11 +97,11 @@ def scene(cell: Cell, config: CellConfig, candidates: int, rng: np.random.Genera
     space = Space(cell, config)
     drawn = draw(space, candidates, rng)
     apart = draw(space, TEST_POSES, rng).q
-    model = assumed(cell, config)
+    model = nominal_model(cell, config)
     alone = without_potential(config)
     exact = problem(model, alone, drawn.q, drawn.allowed)
     robust = problem(model, config, drawn.q, drawn.allowed) if config.planning.against else None
-    work = work_poses(model, config, apart, space.allowed)
+    work = prediction_poses(model, config, apart, space.allowed)
     return Scene(cell, config, space, model, exact, robust, work)
 
 
@@ -124,7 +124,7 @@ def optimal(
         robust: whether it keeps power against the potential terms.
     """
     of_plan = of.robust if robust and of.robust is not None else of.exact
-    asked = robust_question(of_plan, criterion, of.work, float(budget), rng)
+    asked = compound_objective(of_plan, criterion, of.work, float(budget), rng)
     design = choose(asked, float(budget), rng)
     counts = np.asarray(design.counts, dtype=float)
     told = predicted(of_plan, counts, work=of.work)
@@ -161,7 +161,7 @@ def grid(of: Scene, budget: int) -> Chosen:
             break
     if not len(q):
         raise CannotAnswerError("no pose of a regular grid in joint space is feasible")
-    of_grid = problem(of.assumed, without_potential(of.config), q, allowed)
+    of_grid = problem(of.nominal, without_potential(of.config), q, allowed)
     poses = next((n for n in range(1, len(q)) if allowed[_even(len(q), n)].sum() >= budget), len(q))
     order = _even(len(q), poses)
     return _of_poses(of_grid, cycle(order.tolist()), budget, of.work)
@@ -210,7 +210,7 @@ def matching(
     return high
 
 
-def _of_poses(of: Problem, order: Iterable[int], budget: int, work: WorkPoses) -> Chosen:
+def _of_poses(of: Problem, order: Iterable[int], budget: int, work: PredictionPoses) -> Chosen:
     """Take poses in order, each with as many loads as it bears, until the readings are used."""
     counts, left = np.zeros(len(of.units)), float(budget)
     pose = np.array([p for p, _ in of.what])

@@ -37,7 +37,7 @@ COMMANDS = {
         "Run simulated devices for a cell until Ctrl-C, for `check` and `run` to talk to.",
     ),
     "check": Command(
-        "planning:check", "Connect to every device and say who answers; nothing moves."
+        "planning:check", "Connect to every device and report its state; nothing moves."
     ),
     "plan": Command(
         "planning:plan",

@@ -100,14 +100,14 @@ def _known(t: Terminal, path: Path, catalogue: Catalogue, say: Say) -> Fit:
 
 
 def check(cell: CellFile, plan: PlanFile = None, as_json: Json = False) -> None:
-    """Connect to every device and say who answers; nothing moves."""
+    """Connect to every device and report its state; nothing moves."""
     t = terminal(as_json)
     config, numbers = read_cell(cell)
     dry = None
     if plan is not None:
         dry = dry_run(numbers, config, load_plan(plan))
     with working(t.progress) as say:
-        say("asking every device")
+        say("connecting to every device")
         rig, answers = connect(config)
         if rig is not None:
             rig.close()
@@ -146,7 +146,7 @@ def make_plan(
 
 
 def answer_json(answer: ConnectionResult) -> dict[str, object]:
-    """Return what became of a device as a JSON document says it."""
+    """Return the state of a device as a JSON document."""
     report = answer.report
     return {
         "device": answer.device,
@@ -162,7 +162,7 @@ def refuse_unready(answers: tuple[ConnectionResult, ...]) -> None:
     """Refuse to run with devices that are not ready.
 
     Raises:
-        DeviceError: says everything that hinders.
+        DeviceError: lists all problems.
     """
     if lines := [problem for answer in answers for problem in answer.problems]:
         raise DeviceError("; ".join(lines))

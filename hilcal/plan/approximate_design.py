@@ -1,4 +1,4 @@
-"""The best plan if units could be taken in fractions: weights, value and certified bound."""
+"""The approximate design: optimal weights of units, with a certified bound of φ."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -9,23 +9,23 @@ from hilcal.errors import CannotAnswerError, InputError
 from hilcal.plan import barrier as interior
 from hilcal.plan.barrier import Optimum, Program
 from hilcal.plan.bound import best_first, prices, total_information, upper_bound
-from hilcal.plan.candidate_set import Units
+from hilcal.plan.candidate_set import CandidateSet
 from hilcal.plan.criterion import Criterion, Smooth, square
 from hilcal.types import Floats, Ints
 
 TOLERANCE = 1e-7
 """Relative gap between the continuous optimum and its bound."""
 KINKED_TOLERANCE = 1e-3
-"""The same for criteria with kinks."""
+"""The same for criteria with kinks. A choice: the bound closes slowly there."""
 
 _ROUNDS = 200
-_STALE = 4  # rounds in which the gap must fall
+_STALE = 4  # rounds in which the gap must fall; this and the next two are choices
 _SHORT = 2000  # units among which the first ones are sought
 _WARM = 12  # multiplicative steps that find where the weight goes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Relaxed:
+class ApproximateDesign:
     """A continuous optimum with its certificate.
 
     Attributes:
@@ -51,7 +51,7 @@ class Relaxed:
 
 
 def relax(
-    units: Units,
+    units: CandidateSet,
     criterion: Criterion,
     budget: float,
     prior: Floats | None = None,
@@ -59,8 +59,8 @@ def relax(
     most: int | None = None,
     names: Sequence[str] | None = None,
     tolerance: float | None = None,
-    start: Relaxed | None = None,
-) -> Relaxed:
+    start: ApproximateDesign | None = None,
+) -> ApproximateDesign:
     """Return the continuous optimum of φ(M0 + Σ w_k A_kᵀA_k), Σ w_k c_k ≤ B, 0 ≤ w_k ≤ most.
 
     Column generation: the optimum over few units by an interior-point method, then a scan of
@@ -91,7 +91,7 @@ def relax(
     if share == cap and criterion.monotone:
         value = float(criterion.value(spread))  # all there is
         all_of_them = np.arange(len(units))
-        return Relaxed(
+        return ApproximateDesign(
             all_of_them, np.full(len(units), cap), value, value, np.ones(len(units)), spread
         )
     scan = _Scan(units, criterion, min(budget, (1.0 - 1e-9) * cap * _total(units)), cap, prior)
@@ -117,11 +117,11 @@ def relax(
         active, weight = _exchanged(scan, active, found.weight, rate)
         order = max(min(0.5 * gap, order), tolerance)
     if top is None or not top[0].value > 0.0:
-        raise CannotAnswerError("the candidates tell next to nothing: the criterion stays 0")
+        raise CannotAnswerError("the candidates determine too little: the criterion stays 0")
     return _pruned(scan, top[1], top[0].weight, best)
 
 
-def checked(units: Units, budget: float, prior: Floats | None, most: int | None) -> Floats:
+def checked(units: CandidateSet, budget: float, prior: Floats | None, most: int | None) -> Floats:
     """Return the prior information after a check of what a plan is made of.
 
     Raises:
@@ -149,7 +149,7 @@ def checked(units: Units, budget: float, prior: Floats | None, most: int | None)
 class _Scan:
     """All units of a relaxation."""
 
-    units: Units
+    units: CandidateSet
     criterion: Criterion
     budget: float
     cap: float
@@ -168,7 +168,7 @@ class _Scan:
         """Return the optimum over some units; what is not monotone may leave budget."""
         rows, cost = self.units.rows[active], self.units.cost[active]
         start = _feasible(weight, cost, self.budget, self.cap)
-        if not self.criterion.monotone:  # one more unit that tells nothing
+        if not self.criterion.monotone:  # one more unit without information
             rows = np.concatenate([rows, np.zeros((1, *rows.shape[1:]))])
             cost = np.append(cost, self.budget)
             left = min(max(1.0 - float(weight @ cost[:-1]) / self.budget, 0.01), 0.99)
@@ -178,7 +178,7 @@ class _Scan:
         return replace(found, weight=found.weight[: len(active)])
 
 
-def _total(units: Units) -> float:
+def _total(units: CandidateSet) -> float:
     """Return the cost of all units."""
     return float(units.cost.sum())
 
@@ -249,7 +249,7 @@ def _exchanged(scan: _Scan, active: Ints, weight: Floats, rate: Floats) -> tuple
     return index[order], np.concatenate([weight[kept], little])[order]
 
 
-def _pruned(scan: _Scan, active: Ints, weight: Floats, bound: float) -> Relaxed:
+def _pruned(scan: _Scan, active: Ints, weight: Floats, bound: float) -> ApproximateDesign:
     """Return the optimum without weights that change nothing."""
     units, criterion = scan.units, scan.criterion
     share = weight * units.cost[active] / scan.budget
@@ -261,4 +261,4 @@ def _pruned(scan: _Scan, active: Ints, weight: Floats, bound: float) -> Relaxed:
     smooth = criterion.surrogate(m, 1e-3)(m)
     value = float(criterion.value(m))
     price = np.ones(len(units)) if smooth is None else prices(units.rows, smooth.gradient)
-    return Relaxed(index, w, value, max(bound, value), price, m)
+    return ApproximateDesign(index, w, value, max(bound, value), price, m)

@@ -10,6 +10,7 @@ from hilcal.plan.bound import prices, upper_bound
 from hilcal.plan.criterion import Criterion, Smooth
 from hilcal.types import Floats
 
+# Choices, usual in interior-point methods (Wright 1997); none has a study of its own.
 _STEPS = 80
 _BACK = 0.995  # share of the way to the boundary
 _CENTRAL = 1.0  # square of Newton's decrement at which μ may fall

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hilcal.plan.candidate_set import Units
+from hilcal.plan.candidate_set import CandidateSet
 from hilcal.plan.criterion import Smooth
 from hilcal.types import Floats, Ints
 
@@ -32,7 +32,7 @@ def prices(rows: Floats, matrix: Floats) -> Floats:
     return out
 
 
-def total_information(units: Units, weight: Floats) -> Floats:
+def total_information(units: CandidateSet, weight: Floats) -> Floats:
     """Return (P, P) Σ w_k A_kᵀA_k over all units, in chunks."""
     out = np.zeros((units.size, units.size))
     for start in range(0, len(units), _CHUNK):

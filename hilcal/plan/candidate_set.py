@@ -1,4 +1,4 @@
-"""What a plan may take: units of measurement with their information and their cost."""
+"""The candidate set: units of measurement with their information and their cost."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from hilcal.types import Floats, Ints
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Units:
+class CandidateSet:
     """K units, each of which a plan may take any whole number of times.
 
     A unit is one reading (absolute positions), or one pose with its unloaded reading and some

@@ -1,4 +1,4 @@
-"""Candidate states: the derivative and the covariance of what would be read of them."""
+"""Candidate states: derivative and covariance of their readings."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -10,11 +10,11 @@ from hilcal.data.plan import UNLOADED
 from hilcal.data.readings import States
 from hilcal.effects.protocol import Effect
 from hilcal.plan.noise_model import reading_covariance
-from hilcal.plan.nominal_model import Assumed, nominal_states
+from hilcal.plan.nominal_model import NominalModel, nominal_states
 from hilcal.types import Bools, Floats, Ints
 
 CHUNK = 4096
-"""States that are worked off at once."""
+"""States that are evaluated at once. A choice, of memory."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,7 +50,7 @@ class Candidates:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sensed:
+class ReadingDerivatives:
     """What would be read of a chunk of N poses under 1 + L loads.
 
     Attributes:
@@ -65,17 +65,17 @@ class Sensed:
 
 
 def candidates(
-    assumed: Assumed, config: CellConfig, q: Floats, allowed: Bools | None = None
+    nominal: NominalModel, config: CellConfig, q: Floats, allowed: Bools | None = None
 ) -> Candidates:
     """Return the states of poses under the loads of a configuration.
 
     Args:
-        assumed: the model that is planned for.
+        nominal: the model that is planned for.
         config: its loads.
         q: (N, n) joint angles, rad.
         allowed: (N, 1 + L) which states may be taken, unloaded first; all by default.
     """
-    gravity = assumed.cell.gravity
+    gravity = nominal.cell.gravity
     names = (UNLOADED, *(load.name for load in config.loads))
     wrench = np.array([np.zeros(6), *(load.wrench(gravity) for load in config.loads)])
     if allowed is None:
@@ -83,33 +83,33 @@ def candidates(
     return Candidates(np.asarray(q, dtype=float), names, wrench, allowed)
 
 
-def sense(
-    assumed: Assumed,
+def reading_derivatives(
+    nominal: NominalModel,
     config: CellConfig,
     of: Candidates,
     more: tuple[Effect, ...],
     scale: Floats,
-) -> Iterator[Sensed]:
+) -> Iterator[ReadingDerivatives]:
     """Yield derivatives and covariances of candidates, some poses at a time.
 
     Args:
-        assumed: the model, whose live parameters come first.
-        config: tells the noise.
+        nominal: the model, whose live parameters come first.
+        config: its noise.
         of: the candidates.
         more: effects that are not in the model.
         scale: (P,) what one unit of each parameter is, SI.
     """
-    model, m, loads = assumed.model, assumed.m, len(of.loads)
+    model, m, loads = nominal.model, nominal.m, len(of.loads)
     states = of.states()
-    live = np.concatenate([assumed.live, np.arange(model.size, model.size + sizes(more))])
+    live = np.concatenate([nominal.live, np.arange(model.size, model.size + sizes(more))])
     step = max(CHUNK // loads, 1)
     for start in range(0, len(of), step):
         rows = slice(start, min(start + step, len(of)))
         count = rows.stop - rows.start
-        p = model.predict(states[slice(rows.start * loads, rows.stop * loads)], assumed.theta)
-        jacobian = model.jacobian_of((*model.effects, *more), p, assumed.theta, m, live)
-        covariance = reading_covariance(assumed, config, p)
-        yield Sensed(
+        p = model.predict(states[slice(rows.start * loads, rows.stop * loads)], nominal.theta)
+        jacobian = model.jacobian_of((*model.effects, *more), p, nominal.theta, m, live)
+        covariance = reading_covariance(nominal, config, p)
+        yield ReadingDerivatives(
             rows,
             (jacobian * scale).reshape(count, loads, m, len(scale)),
             covariance.reshape(count, loads, m, m),
@@ -121,12 +121,12 @@ def sizes(effects: tuple[Effect, ...]) -> int:
     return sum(len(e.parameters) for e in effects)
 
 
-def absolute_rows(of: Sensed) -> Floats:
+def absolute_rows(of: ReadingDerivatives) -> Floats:
     """Whitened derivatives S⁻¹ J (N, 1 + L, m, P) of single readings, V = S Sᵀ."""
     return np.asarray(np.linalg.solve(np.linalg.cholesky(of.covariance), of.jacobian))
 
 
-def deflection_rows(of: Sensed, which: Ints, loads: tuple[int, ...]) -> Floats:
+def deflection_rows(of: ReadingDerivatives, which: Ints, loads: tuple[int, ...]) -> Floats:
     """Whitened derivatives (N, S·m, P) of S deflections that share one unloaded reading.
 
     Block (i, j) of their covariance is δ_ij V_i + V_u: the unloaded reading's error is in all.

@@ -1,4 +1,4 @@
-"""Choosing units by a criterion, and the loads that are worth hanging."""
+"""Criteria by name, the choice of units, and of the loads that are worth their change."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -7,28 +7,29 @@ import numpy as np
 
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.plan.approximate_design import relax
-from hilcal.plan.candidate_set import Units
+from hilcal.plan.candidate_set import CandidateSet
 from hilcal.plan.criteria import A, D, MeanVariance
 from hilcal.plan.criterion import Criterion
 from hilcal.plan.discriminated_pairs import discriminated_pairs
 from hilcal.plan.eigenvalue_criteria import E, K
 from hilcal.plan.information import Problem
 from hilcal.plan.optimum import Design, best
-from hilcal.plan.prediction_poses import WorkPoses
+from hilcal.plan.prediction_poses import PredictionPoses
 from hilcal.plan.t_optimality import Separate
 from hilcal.types import Bools, Floats, Ints
 
 CRITERIA = ("D", "A", "E", "K", "I", "separate")
 LOOSE = 3e-3
-"""Relative gap at which sets of loads are compared."""
+"""Relative gap at which sets of loads are compared. A choice."""
 EFFORT = 200
-"""Of the search for whole numbers: 98 % of the best in a second; more gains a part per thousand."""
+"""Of the exchange search. Read from the demo's plan: 98 % of the bound in a second; more effort
+gains a part per thousand."""
 SAMPLE = 150
-"""Poses by which sets of loads are compared."""
+"""Poses by which sets of loads are compared. A choice."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Question:
+class Objective:
     """A design problem with its criterion.
 
     D, A and I are of all parameters, the potential terms with their priors among them; in A and I
@@ -43,7 +44,7 @@ class Question:
     """
 
     criterion: Criterion
-    units: Units
+    units: CandidateSet
     prior: Floats
     names: tuple[str, ...]
 
@@ -53,7 +54,7 @@ def canonical(name: str) -> str:
     return "I" if name == "test" else name
 
 
-def question(problem: Problem, name: str, work: WorkPoses | None) -> Question:
+def objective_of(problem: Problem, name: str, work: PredictionPoses | None) -> Objective:
     """Return a design problem with a criterion.
 
     Args:
@@ -67,7 +68,7 @@ def question(problem: Problem, name: str, work: WorkPoses | None) -> Question:
     name = canonical(name)
     names = tuple(t.name for t in problem.terms)
     size = problem.model_size
-    whole = Question(D(), problem.units, problem.prior, names)
+    whole = Objective(D(), problem.units, problem.prior, names)
     if name == "D":
         return whole
     if name == "A":
@@ -83,28 +84,28 @@ def question(problem: Problem, name: str, work: WorkPoses | None) -> Question:
         return replace(whole, criterion=E(unknown(problem)))
     if name == "K":  # of the model alone: more information, also of the others, may make it worse
         free = unknown(problem)
-        own = Units(np.ascontiguousarray(problem.units.rows[:, :, free]), problem.units.cost)
+        own = CandidateSet(np.ascontiguousarray(problem.units.rows[:, :, free]), problem.units.cost)
         known = problem.measured[np.ix_(free, free)]
-        return Question(K(), own, known, tuple(names[k] for k in free))
+        return Objective(K(), own, known, tuple(names[k] for k in free))
     raise InputError(f"criterion {name!r}; valid: {', '.join(CRITERIA)}")
 
 
 def unknown(problem: Problem) -> Ints:
     """Return the indices of the model's parameters that have no prior."""
-    live = problem.assumed.live
-    return np.flatnonzero(np.isinf(problem.assumed.prior_std[live]))
+    live = problem.nominal.live
+    return np.flatnonzero(np.isinf(problem.nominal.prior_std[live]))
 
 
 def choose(
-    asked: Question, budget: float, rng: np.random.Generator, effort: int = EFFORT
+    asked: Objective, budget: float, rng: np.random.Generator, effort: int = EFFORT
 ) -> Design:
-    """Return the units to take; see `optimum.best`."""
+    """Return the exact design; see `optimum.best`."""
     return best(
         asked.units, asked.criterion, budget, asked.prior, rng, names=asked.names, effort=effort
     )
 
 
-def promising(asked: Question, budget: float) -> Ints:
+def promising(asked: Objective, budget: float) -> Ints:
     """Return the units that a plan is likely to be made of: those of the best prices."""
     found = relax(
         asked.units, asked.criterion, budget, asked.prior, names=asked.names, tolerance=LOOSE
@@ -130,7 +131,7 @@ class Loads:
 
 
 def worthwhile(
-    asked: Question, problem: Problem, budget: float, change: float, rng: np.random.Generator
+    asked: Objective, problem: Problem, budget: float, change: float, rng: np.random.Generator
 ) -> Loads:
     """Leave out loads, one after the other, while the same time buys more without them.
 
@@ -164,9 +165,9 @@ def worthwhile(
     return Loads(keep, float(np.floor(budget + 1e-9)), tuple(left))
 
 
-def only(asked: Question, wanted: Bools) -> Question:
+def only(asked: Objective, wanted: Bools) -> Objective:
     """Return the question with some of the units."""
-    return replace(asked, units=Units(asked.units.rows[wanted], asked.units.cost[wanted]))
+    return replace(asked, units=CandidateSet(asked.units.rows[wanted], asked.units.cost[wanted]))
 
 
 def within(problem: Problem, loads: Sequence[str]) -> Bools:
@@ -180,7 +181,7 @@ def _uses(problem: Problem, load: str) -> Bools:
 
 
 def _value(
-    asked: Question, problem: Problem, sample: Bools, loads: tuple[str, ...], budget: float
+    asked: Objective, problem: Problem, sample: Bools, loads: tuple[str, ...], budget: float
 ) -> float:
     """φ of the continuous optimum; 0 where these loads do not determine everything."""
     some = only(asked, sample & within(problem, loads))

@@ -16,11 +16,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilcal.plan.approximate_design import relax
-from hilcal.plan.candidate_set import Units
-from hilcal.plan.choice import LOOSE, SAMPLE, Question, canonical, only, question
+from hilcal.plan.candidate_set import CandidateSet
+from hilcal.plan.choice import LOOSE, SAMPLE, Objective, canonical, objective_of, only
 from hilcal.plan.criteria import Determinant, InverseVariance, MeanVariance
 from hilcal.plan.information import Problem
-from hilcal.plan.prediction_poses import WorkPoses
+from hilcal.plan.prediction_poses import PredictionPoses
 from hilcal.types import Floats, Ints
 
 BOTH = ("A", "I")
@@ -66,24 +66,28 @@ class CompoundVariance(InverseVariance):
         return self.a * self.c, self.b * self.c[: self.size, : self.size]
 
 
-def robust_question(
-    problem: Problem, name: str, work: WorkPoses | None, budget: float, rng: np.random.Generator
-) -> Question:
+def compound_objective(
+    problem: Problem,
+    name: str,
+    work: PredictionPoses | None,
+    budget: float,
+    rng: np.random.Generator,
+) -> Objective:
     """Return a design problem with a criterion; D, A and I are compound with potential terms.
 
     Args:
         problem: the design problem.
-        name: as for `question`.
+        name: as for `objective_of`.
         work: the prediction poses, for "I".
         budget: readings, for which the two optima are found.
         rng: generator; they are found among some of the poses.
 
     Raises:
         CannotAnswerError: so many readings do not determine the model.
-        InputError: from `question`.
+        InputError: from `objective_of`.
     """
     name = canonical(name)
-    asked, size = question(problem, name, work), problem.model_size
+    asked, size = objective_of(problem, name, work), problem.model_size
     if size == len(problem.terms):
         return asked
     if name == "D":
@@ -96,13 +100,13 @@ def robust_question(
     whole, own = MeanVariance(c, name), MeanVariance(c[:size, :size], name)
     poses = np.array([pose for pose, _ in problem.what])
     some = only(asked, np.isin(poses, rng.permutation(len(problem.candidates))[:SAMPLE]))
-    units = Units(some.units.rows[:, :, :size], some.units.cost)
-    alone = Question(own, units, asked.prior[:size, :size], asked.names[:size])
+    units = CandidateSet(some.units.rows[:, :, :size], some.units.cost)
+    alone = Objective(own, units, asked.prior[:size, :size], asked.names[:size])
     a, b = (_best(q, budget) / 2.0 for q in (replace(some, criterion=whole), alone))
     return replace(asked, criterion=CompoundVariance(c, size, a, b, name))
 
 
-def _best(asked: Question, budget: float) -> float:
+def _best(asked: Objective, budget: float) -> float:
     """φ of the continuous optimum."""
     found = relax(
         asked.units, asked.criterion, budget, asked.prior, names=asked.names, tolerance=LOOSE

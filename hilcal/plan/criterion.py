@@ -1,4 +1,4 @@
-"""What a criterion of a plan is: a concave measure of information, and its smooth surrogate."""
+"""The protocol of a design criterion: concave in the information, with a smooth surrogate."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -75,7 +75,7 @@ class Criterion(Protocol):
 
 
 def require_determined(m: Floats, names: Sequence[str] | None = None) -> None:
-    """Refuse a singular information matrix, and say what is not determined.
+    """Refuse a singular information matrix, and name what is not determined.
 
     Args:
         m: (P, P) of all candidates, and of what is known before.

@@ -112,7 +112,7 @@ def supported_parameters(problem: Problem, count: int) -> dict[str, Floats]:
 
     Draws from their posterior, its mean first; see `effect_estimate`.
     """
-    fit, out = problem.assumed.fit, {}
+    fit, out = problem.nominal.fit, {}
     if fit is None:
         return {}
     linear = linearise(fit)
@@ -174,7 +174,7 @@ def _directions(problem: Problem, effect: str) -> list[Floats]:
     """Directions (E,) of an effect whose RMS over all measured elements is 1 σ."""
     where = problem.of_effect(effect)
     rows = problem.units.rows[:, :, where]
-    elements = problem.assumed.m * sum(
+    elements = problem.nominal.m * sum(
         len([name for name in loads if name != UNLOADED or problem.mode == "absolute"])
         for _, loads in problem.what
     )

@@ -17,6 +17,7 @@ from hilcal.robot.chain import Chain, evaluate, joint_jacobian
 from hilcal.robot.statics import Load, slot_wrenches
 from hilcal.types import Bools, Floats, Ints
 
+# Margins of safety: choices, no study behind them.
 INSIDE = 0.01  # m, kept from every side of the workspace
 MARGIN = 0.02  # m, kept between arm, obstacles, floor and what hangs
 MARGIN_SELF = 0.01  # m, kept between parts of the arm
@@ -86,7 +87,7 @@ class Space:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What is not checked, or is guessed, since the cell does not tell it."""
+        """What is not checked, or is guessed, since it is not configured."""
         out = [] if self.sight is not None else [UNKNOWN]
         if not is_known(self.cell.arm):
             out.append(f"the shape of {self.cell.arm.name} is not known; its links are guessed")

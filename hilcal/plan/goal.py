@@ -105,8 +105,8 @@ class Goal:
         if self.of_position:
             if position is None:
                 raise InputError(
-                    f'goal "{self.text}": where is the robot to work? [planning] work_q_rad, or '
-                    "work_min_m and work_max_m, tell it"
+                    f'goal "{self.text}": no prediction poses; give [planning] work_q_rad, or '
+                    "work_min_m and work_max_m"
                 )
             ratio = _ratio(float(position), self.limit)
             return self._status(ratio, "position", float(position), "m")

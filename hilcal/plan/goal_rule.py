@@ -19,9 +19,9 @@ from hilcal.identify.full_covariance import with_joint_scatter
 from hilcal.identify.gauss_newton import scales_of
 from hilcal.plan.feasible import Space
 from hilcal.plan.goal import Goal, figures, parse_goal
-from hilcal.plan.nominal_model import after, assumed
+from hilcal.plan.nominal_model import after, nominal_model
 from hilcal.plan.predicted import positions_of, rms
-from hilcal.plan.prediction_poses import work_poses
+from hilcal.plan.prediction_poses import prediction_poses
 from hilcal.types import Floats
 
 SHARE = 0.1
@@ -71,7 +71,7 @@ class GoalRule:
         self._cell, self._config, self._now = cell, config, now
         self._catalogue = catalogue or installed()
         self._scatter = config.repeatability.per_joint(cell.arm.n)
-        model = assumed(cell, config, 3, catalogue)
+        model = nominal_model(cell, config, 3, catalogue)
         effects = model.model.effects
         self.goal.check({f"{e.name}.{p.name}": p.unit for e in effects for p in e.parameters})
         self._work_q: tuple[tuple[float, ...], ...] = ()
@@ -79,7 +79,9 @@ class GoalRule:
             planning = config.planning
             if not planning.work_q_rad and planning.work_min_m is None:
                 self.goal.met({}, {})  # raises: names the missing keys
-            some = work_poses(model, config, np.zeros((0, cell.arm.n)), Space(cell, config).clear)
+            some = prediction_poses(
+                model, config, np.zeros((0, cell.arm.n)), Space(cell, config).clear
+            )
             self._work_q = tuple(dict.fromkeys(tuple(q) for q in some.q.tolist()))
         self._good = False  # whether the fit before met the goal
         self._ended = self._took = -np.inf
@@ -140,7 +142,7 @@ class GoalRule:
         planning = self._config.planning.model_copy(update=where)
         config = self._config.model_copy(update={"planning": planning})
         model = after(found, config)
-        work = work_poses(model, config, np.zeros((0, self._cell.arm.n)))
+        work = prediction_poses(model, config, np.zeros((0, self._cell.arm.n)))
         solution, u = found.solution, found.uncertainty
         basis, scale = solution.equations.basis, scales_of(found.model)
         least = np.sqrt(max(found.variance_factor, 1.0)) if u.inflated else 1.0

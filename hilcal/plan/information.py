@@ -1,4 +1,4 @@
-"""The design problem: what each unit of measurement tells of the parameters, and at what cost."""
+"""The design problem: information and cost of each unit of measurement."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,24 +11,24 @@ from hilcal.data.plan import UNLOADED
 from hilcal.data.whitening import Mode
 from hilcal.effects.protocol import Effect
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.plan.candidate_set import Units
+from hilcal.plan.candidate_set import CandidateSet
 from hilcal.plan.candidates import (
     Candidates,
-    Sensed,
+    ReadingDerivatives,
     absolute_rows,
     candidates,
     deflection_rows,
-    sense,
+    reading_derivatives,
 )
-from hilcal.plan.nominal_model import Assumed
+from hilcal.plan.nominal_model import NominalModel
 from hilcal.plan.potential import Potential, potential
 from hilcal.plan.prior_information import information_of
 from hilcal.types import Bools, Floats, Ints
 
 PAIRS_UP_TO = 4
-"""Pairs of loads are units of their own where there are no more loads than this."""
+"""Pairs of loads are units of their own where there are no more loads than this. A choice."""
 MOST_BYTES = 600_000_000
-"""Memory that the rows of all units may take."""
+"""Memory that the rows of all units may take. A choice."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,7 @@ class Problem:
     """Everything that a plan is chosen by.
 
     Attributes:
-        assumed: the model that is planned for.
+        nominal: the model that is planned for.
         mode: "deflection" or "absolute".
         candidates: the states.
         units: K units; their parameters are those of the model, then potential terms.
@@ -71,10 +71,10 @@ class Problem:
         notes: what was assumed and left out, one line each.
     """
 
-    assumed: Assumed
+    nominal: NominalModel
     mode: Mode
     candidates: Candidates
-    units: Units
+    units: CandidateSet
     what: tuple[tuple[int, tuple[str, ...]], ...]
     terms: tuple[Term, ...]
     families: tuple[Effect, ...]
@@ -104,7 +104,7 @@ class Problem:
 
 
 def problem(
-    assumed: Assumed, config: CellConfig, q: Floats, allowed: Bools | None = None
+    nominal: NominalModel, config: CellConfig, q: Floats, allowed: Bools | None = None
 ) -> Problem:
     """Return the design problem of candidate poses under the loads of a cell.
 
@@ -113,7 +113,7 @@ def problem(
     there are few loads. It costs as many readings as it takes, the unloaded one included.
 
     Args:
-        assumed: the model.
+        nominal: the model.
         config: loads, noise, and `[planning]`: kind of readings, potential terms.
         q: (N, n) candidate poses, rad.
         allowed: (N, 1 + L) which states may be taken, the unloaded ones first; all by default.
@@ -127,39 +127,39 @@ def problem(
         raise InputError(
             '[planning] readings = "deflection" needs [[loads]]; give one, or readings = "absolute"'
         )
-    of = candidates(assumed, config, q, allowed)
-    against = potential(assumed, config, of) if len(of) else Potential((), (), ())
-    terms = _terms(assumed, against)
+    of = candidates(nominal, config, q, allowed)
+    against = potential(nominal, config, of) if len(of) else Potential((), (), ())
+    terms = _terms(nominal, against)
     scale = np.array([t.scale for t in terms])
-    layout = _layout(of, mode, assumed.m, len(terms))
+    layout = _layout(of, mode, nominal.m, len(terms))
     rows = np.zeros((len(layout.what), layout.height, len(terms)))
-    for part in sense(assumed, config, of, against.effects, scale):
+    for part in reading_derivatives(nominal, config, of, against.effects, scale):
         for place, block in _blocks(part, layout, mode):
             rows[place, : block.shape[1]] = block
-    measured = information_of(assumed, against.effects, scale)
-    count = len(assumed.live)
+    measured = information_of(nominal, against.effects, scale)
+    count = len(nominal.live)
     precision = np.ones(len(terms))
-    precision[:count] = (scale[:count] / assumed.prior_std[assumed.live]) ** 2
+    precision[:count] = (scale[:count] / nominal.prior_std[nominal.live]) ** 2
     return Problem(
-        assumed=assumed,
+        nominal=nominal,
         mode=mode,
         candidates=of,
-        units=Units(rows, layout.cost),
+        units=CandidateSet(rows, layout.cost),
         what=layout.what,
         terms=terms,
         families=against.effects,
         prior=measured + np.diag(precision),
         measured=measured,
-        notes=(*assumed.notes, *against.notes, *layout.notes),
+        notes=(*nominal.notes, *against.notes, *layout.notes),
     )
 
 
-def _terms(assumed: Assumed, against: Potential) -> tuple[Term, ...]:
-    model = [(e.name, p) for e in assumed.model.effects for p in e.parameters]
+def _terms(nominal: NominalModel, against: Potential) -> tuple[Term, ...]:
+    model = [(e.name, p) for e in nominal.model.effects for p in e.parameters]
     known = [
-        Term(effect, f"{effect}.{p.name}", p.unit, p.scale, float(assumed.theta[k]), False)
+        Term(effect, f"{effect}.{p.name}", p.unit, p.scale, float(nominal.theta[k]), False)
         for k, (effect, p) in enumerate(model)
-        if k in set(assumed.live.tolist())
+        if k in set(nominal.live.tolist())
     ]
     extra = [(e.name, p) for e in against.effects for p in e.parameters]
     return tuple(known) + tuple(
@@ -246,7 +246,7 @@ def _subsets(allowed: Ints, mode: Mode, kinds: set[str]) -> Iterator[tuple[int, 
         yield tuple(loads)
 
 
-def _blocks(part: Sensed, layout: _Layout, mode: Mode) -> Iterator[tuple[Ints, Floats]]:
+def _blocks(part: ReadingDerivatives, layout: _Layout, mode: Mode) -> Iterator[tuple[Ints, Floats]]:
     """Yield units of a chunk of poses and their rows."""
     pattern, first = layout.pattern[part.rows], layout.first[part.rows]
     single = absolute_rows(part) if mode == "absolute" else np.empty(0)

@@ -21,21 +21,21 @@ from hilcal.plan.discriminated_pairs import (
 )
 from hilcal.plan.feasible import Space
 from hilcal.plan.information import Problem, readings_of
-from hilcal.plan.order import Chosen, Ordering, order_plan
 from hilcal.plan.planner import Planned, Request, Say, make
 from hilcal.plan.predicted import predicted
+from hilcal.plan.run_order import Chosen, Ordering, order_plan
 from hilcal.plan.t_optimality import Pair
 from hilcal.robot.chain import evaluate
 from hilcal.types import Floats
 
 CANDIDATES = 600
-"""Most poses to choose from: more cost time, and hardly help."""
+"""Most poses to choose from. A choice: more cost time and hardly raise the power."""
 FEW = 2
-"""Suspects up to which loads are looked through one by one."""
+"""Suspects up to which loads are left out one by one. A choice: more take minutes."""
 DRAWS = 24
-"""Parameters of each suspect over which a power is averaged."""
+"""Parameters of each suspect over which a power is averaged. A choice."""
 SURE = 0.9
-"""Power from which on two suspects count as separated."""
+"""Power from which on two suspects count as separated. A choice."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +108,7 @@ def measure_next(
     """
     names = tuple(dict.fromkeys(suspects))
     if len(names) < 2:
-        raise InputError(f"{len(names)} suspects; two or more are needed to tell them apart")
+        raise InputError(f"{len(names)} suspects; two or more are needed to separate them")
     asked = {
         "readings": fit.mode,
         "against": names,
@@ -239,14 +239,14 @@ def _where(made: Planned, pair: Pair, then: Floats) -> tuple[dict[str, float], f
     shares: dict[str, float] = {}
     for k, value in zip(taken, worth, strict=True):
         loads = of.what[k][1]
-        m = of.assumed.m
+        m = of.nominal.m
         rows = of.units.rows[k][: m * len(loads)] @ u
         by = np.sum(rows.reshape(len(loads), m) ** 2, axis=1)
         for load, part in zip(loads, by, strict=True):
             share = float(part / max(float(by.sum()), 1e-300) * value / total)
             shares[load] = shares.get(load, 0.0) + share
 
-    arm, cell = of.assumed.cell.arm, of.assumed.cell
+    arm, cell = of.nominal.cell.arm, of.nominal.cell
     at = np.linalg.norm(evaluate(arm, of.candidates.q).point(cell.target[:3, 3])[:, :2], axis=1)
     poses = np.array([of.what[k][0] for k in taken])
     reach = float(at[poses] @ worth) / total

@@ -10,12 +10,12 @@ from hilcal.data.covariance import (
     tracker_noise,
 )
 from hilcal.model import Prediction
-from hilcal.plan.nominal_model import Assumed
+from hilcal.plan.nominal_model import NominalModel
 from hilcal.robot.chain import joint_jacobian
 from hilcal.types import Floats
 
 
-def reading_covariance(assumed: Assumed, config: CellConfig, predicted: Prediction) -> Floats:
+def reading_covariance(nominal: NominalModel, config: CellConfig, predicted: Prediction) -> Floats:
     """Covariance of the mean of K samples at predicted states, and of the arm's return to them.
 
         V = (s + (1 − s)/K) Σ + R J Σ_q Jᵀ Rᵀ
@@ -25,17 +25,17 @@ def reading_covariance(assumed: Assumed, config: CellConfig, predicted: Predicti
     repeatability as identification adds it.
 
     Args:
-        assumed: the model, with the tracker in its place.
+        nominal: the model, with the tracker in its place.
         config: `[tracker]`, `[acquire]` and `[repeatability]`.
         predicted: N states.
 
     Returns:
         (N, m, m) covariances in sensor axes; m², m·rad, rad².
     """
-    a, o, m = config.acquire, predicted.observation, assumed.m
-    stated = tracker_covariance(o.position, tracker_noise(config.tracker), assumed.station, m)
+    a, o, m = config.acquire, predicted.observation, nominal.m
+    stated = tracker_covariance(o.position, tracker_noise(config.tracker), nominal.station, m)
     out = expected_share_of_mean(a.samples, a.systematic_share) * stated
-    joint_std = config.repeatability.per_joint(assumed.cell.arm.n)
+    joint_std = config.repeatability.per_joint(nominal.cell.arm.n)
     if np.any(joint_std):
         jac = joint_jacobian(predicted.situation.chain, o.base_position)
         out = out + joint_scatter(jac, joint_std, o.axes, m)

@@ -1,4 +1,4 @@
-"""What a plan takes for granted: the model that will be fitted, and its parameters."""
+"""The nominal model of a plan: what will be fitted, at ordinary parameters."""
 
 from dataclasses import dataclass, replace
 
@@ -17,7 +17,7 @@ from hilcal.model import Model
 from hilcal.types import Floats, Ints
 
 DISTANCE = 2.0
-"""Reaches from the base to a tracker whose place is not given."""
+"""Reaches from the base to a tracker whose place is not given. A choice."""
 FRAME_PRIOR = {"prior_m": 3e-3, "prior_rad": 6e-3}
 """In deflections the frames act only by turning them; they are known from the positions, about
 as well as the arm's elastic sag lets them be."""
@@ -29,7 +29,7 @@ _SEED = 20240607
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Assumed:
+class NominalModel:
     """The model that is planned for.
 
     Attributes:
@@ -58,9 +58,9 @@ class Assumed:
         return self.model.cell
 
 
-def assumed(
+def nominal_model(
     cell: Cell, config: CellConfig, m: int = 3, catalogue: Catalogue | None = None
-) -> Assumed:
+) -> NominalModel:
     """Return the model of `[planning]` with ordinary parameters.
 
     What is planned hardly depends on the parameters: deflections are linear in them to about
@@ -81,7 +81,7 @@ def assumed(
     if not given:
         notes.append(
             f"the tracker's place is not configured: taken to be {_metres(place)} in base axes "
-            "([sight] tracker_m tells it)"
+            "(give [sight] tracker_m)"
         )
     registered, station = _registered(cell, config, place)
     frames = known.unknown_frames(cell)
@@ -95,10 +95,12 @@ def assumed(
     notes += random_columns(effects)
     theta = np.concatenate(parts)
     prior_std = _prior_std(model)
-    return Assumed(model, theta, np.arange(model.size), prior_std, station, m, None, tuple(notes))
+    return NominalModel(
+        model, theta, np.arange(model.size), prior_std, station, m, None, tuple(notes)
+    )
 
 
-def after(fit: Fit, config: CellConfig) -> Assumed:
+def after(fit: Fit, config: CellConfig) -> NominalModel:
     """Return the model and the parameters of what has been measured already.
 
     Args:
@@ -106,8 +108,8 @@ def after(fit: Fit, config: CellConfig) -> Assumed:
         config: the configuration of the cell that is planned for.
 
     Raises:
-        InputError: a fit whose residual is not whitened, or an effect that needs what no plan
-            tells, as a temperature.
+        InputError: a fit whose residual is not whitened, or an effect that needs what a plan
+            does not determine, as a temperature.
     """
     if fit.scaling != "gc":
         raise InputError(f"planning on needs a fit with scaling gc, this one has {fit.scaling}")
@@ -122,7 +124,7 @@ def after(fit: Fit, config: CellConfig) -> Assumed:
         *random_columns(fit.model.effects),
     )
     live = np.flatnonzero(prior > 0)
-    return Assumed(fit.model, fit.theta, live, std, station, fit.readings.m, fit, notes)
+    return NominalModel(fit.model, fit.theta, live, std, station, fit.readings.m, fit, notes)
 
 
 def build(
@@ -138,13 +140,14 @@ def random_columns(effects: tuple[Effect, ...]) -> tuple[str, ...]:
     """Say of which effects a plan has to guess what they need, one line each.
 
     Raises:
-        InputError: an effect that needs what no plan tells, as a temperature.
+        InputError: an effect that needs what a plan does not determine, as a temperature.
     """
     known = nominal_states(np.zeros((1, 1)), np.zeros((1, 6)))
     for e in effects:
         if not type(e).computable(known):
             raise InputError(
-                f"effect {e.name} needs {', '.join(e.needs)}, which no plan tells; leave it out"
+                f"effect {e.name} needs {', '.join(e.needs)}, which a plan does not determine; leave "
+                "it out"
             )
     return tuple(
         f"{e.name}: {', '.join(e.needs)} of the readings taken at random, as a shuffled order "
@@ -169,9 +172,9 @@ def checked(names: tuple[str, ...], key: str, catalogue: Catalogue) -> tuple[str
 
 
 def potential_names(config: CellConfig, model: Model) -> tuple[str, ...]:
-    """Names of the effects that `[planning] against` asks for, without those of the model.
+    """Names of the effects of `[planning] against`, without those of the model.
 
-    Of the whole catalogue those are left out that need what only the order of a plan tells, as
+    Of the whole catalogue those are left out that need what only the order of a plan determines, as
     the time or the side of approach.
 
     Raises:

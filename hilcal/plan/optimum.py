@@ -1,4 +1,4 @@
-"""The plan of whole numbers that is nearly the best, with the proof that it is."""
+"""Exact designs with a certified lower bound of their efficiency."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilcal.errors import CannotAnswerError
-from hilcal.plan.approximate_design import KINKED_TOLERANCE, Relaxed, checked, relax
-from hilcal.plan.candidate_set import Units
+from hilcal.plan.approximate_design import KINKED_TOLERANCE, ApproximateDesign, checked, relax
+from hilcal.plan.candidate_set import CandidateSet
 from hilcal.plan.criterion import Criterion
 from hilcal.plan.exact_design import exact
 from hilcal.types import Floats, Ints
@@ -35,7 +35,7 @@ class Design:
     bound: float
     information: Floats
     cost: float
-    relaxed: Relaxed
+    relaxed: ApproximateDesign
 
     @property
     def efficiency(self) -> float:
@@ -44,7 +44,7 @@ class Design:
 
 
 def best(
-    units: Units,
+    units: CandidateSet,
     criterion: Criterion,
     budget: float,
     prior: Floats | None = None,

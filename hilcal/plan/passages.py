@@ -13,7 +13,8 @@ Passable = Callable[[Floats, Floats, str], Bools]
 """passable(start (n,), ends (M, n), load) -> (M,): which straight motions in joint space are
 clear under a load."""
 NEAR = 24
-"""Neighbours of a pose to which motions are tested; to others the arm goes by the reference."""
+"""Neighbours of a pose to which motions are tested; to others the arm goes by the reference.
+A choice."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

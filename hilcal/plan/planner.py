@@ -16,7 +16,7 @@ from hilcal.identify.registration import MIN_POSES
 from hilcal.plan.choice import (
     EFFORT,
     Loads,
-    Question,
+    Objective,
     canonical,
     choose,
     only,
@@ -24,34 +24,34 @@ from hilcal.plan.choice import (
     within,
     worthwhile,
 )
-from hilcal.plan.compound_criteria import robust_question
+from hilcal.plan.compound_criteria import compound_objective
 from hilcal.plan.draw import Drawn, draw
 from hilcal.plan.feasible import Space
 from hilcal.plan.information import Problem, problem, readings_of
 from hilcal.plan.noise_model import reading_covariance
-from hilcal.plan.nominal_model import after, assumed
+from hilcal.plan.nominal_model import after, nominal_model
 from hilcal.plan.optimum import Design
-from hilcal.plan.order import Chosen, Ordered, Ordering, order_plan
 from hilcal.plan.predicted import Predicted, predicted
-from hilcal.plan.prediction_poses import WorkPoses, work_poses
+from hilcal.plan.prediction_poses import PredictionPoses, prediction_poses
+from hilcal.plan.run_order import Chosen, Ordered, Ordering, order_plan
 from hilcal.plan.timing import pace
 from hilcal.types import Bools, Floats, Ints
 
 HOMES = 4
-"""Central poses of which one becomes the reference."""
+"""Central poses of which one becomes the reference. A choice."""
 PROBES = 60
-"""Poses by which the reference is judged."""
+"""Poses by which the reference is judged. A choice."""
 SAMPLE = 50
-"""Poses by which the noise of a reading is judged."""
+"""Poses by which the noise of a reading is judged. A choice."""
 ROUNDS = 6
-"""How often poses that are not reached from the reference may be replaced."""
+"""How often poses that are not reached from the reference may be replaced. A choice."""
 
 Say = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What somebody wants of a plan.
+    """Size and criterion of a plan.
 
     Attributes:
         poses: as many readings as so many poses take unloaded and under each load.
@@ -70,16 +70,16 @@ class Request:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Planned:
-    """A plan with everything that it was chosen by.
+    """A plan with its design problem.
 
     Attributes:
         ordered: the plan in order, with what the order costs.
         design: the units that were chosen, with the certificate.
         loads: which loads are worth hanging.
         problem: the design problem.
-        asked: the question that the design answers.
+        asked: the design problem with its criterion.
         usable: (K,) which units were to choose from.
-        work: the test poses.
+        work: the prediction poses.
         drawn: the candidates.
         budget: readings of the design.
         criterion: name of the criterion.
@@ -90,9 +90,9 @@ class Planned:
     design: Design
     loads: Loads
     problem: Problem
-    asked: Question
+    asked: Objective
     usable: Bools
-    work: WorkPoses
+    work: PredictionPoses
     drawn: Drawn
     budget: float
     criterion: str
@@ -123,14 +123,14 @@ def make(
         request: how many readings, and the criterion.
         rng: generator.
         known: fit of what has been measured already.
-        say: told what is being done.
+        say: progress callback.
         catalogue: the effects that a model can have; the installed ones unless given, or those
             of `known`.
 
     Raises:
         InputError: numbers or names that cannot be.
-        CannotAnswerError: the cell leaves too few states, or the readings are too few; says
-            which constraint or parameter it is.
+        CannotAnswerError: the cell leaves too few states, or the readings are too few; names
+            the constraint or the parameter.
     """
     criterion = canonical(request.criterion or config.planning.criterion)
     say("drawing candidate poses")
@@ -139,11 +139,11 @@ def make(
     home, poses = _reference(space, drawn, rng)
     drawn = replace(drawn, q=drawn.q[poses], allowed=drawn.allowed[poses])
     say("computing the information of each pose")
-    model = assumed(cell, config, 3, catalogue) if known is None else after(known, config)
+    model = nominal_model(cell, config, 3, catalogue) if known is None else after(known, config)
     of = problem(model, config, drawn.q, drawn.allowed)
-    work = work_poses(model, config, drawn.q, space.clear)
+    work = prediction_poses(model, config, drawn.q, space.clear)
     budget = _budget(request, of)
-    asked = robust_question(of, criterion, work, budget, rng)
+    asked = compound_objective(of, criterion, work, budget, rng)
     say("choosing loads")
     seconds = pace(config)
     # so many readings and no more: then there is nothing to be had for a load's time
@@ -253,7 +253,7 @@ def _ordered(
 
 def _reading_std(space: Space, of: Problem) -> float:
     """Typical standard uncertainty of a reading in one coordinate, m."""
-    model, theta = of.assumed.model, of.assumed.theta
+    model, theta = of.nominal.model, of.nominal.theta
     some = of.candidates[slice(0, SAMPLE)].states()
-    covariance = reading_covariance(of.assumed, space.config, model.predict(some, theta))
+    covariance = reading_covariance(of.nominal, space.config, model.predict(some, theta))
     return float(np.sqrt(np.mean(np.diagonal(covariance[:, :3, :3], axis1=1, axis2=2))))

@@ -18,17 +18,18 @@ from hilcal.plan.candidates import (
     Candidates,
     absolute_rows,
     deflection_rows,
-    sense,
+    reading_derivatives,
     sizes,
 )
-from hilcal.plan.nominal_model import Assumed, build, potential_names, random_columns
+from hilcal.plan.nominal_model import NominalModel, build, potential_names, random_columns
 from hilcal.types import Floats
 
 MOST_PARAMETERS = 200
 SAMPLE = 300
-"""Candidate poses by which strengths are judged."""
+"""Candidate poses by which strengths are judged. A choice."""
 MOST_ORDINARY = 5.0
-"""A family that reaches one σ only with more than so many ordinary magnitudes is left out."""
+"""A family that reaches one σ only with more than so many ordinary magnitudes is left out.
+A choice."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,19 +50,19 @@ class Potential:
         return np.concatenate([np.zeros(0), *parts])
 
 
-def potential(assumed: Assumed, config: CellConfig, of: Candidates) -> Potential:
+def potential(nominal: NominalModel, config: CellConfig, of: Candidates) -> Potential:
     """Choose the families of `[planning] against` and how strong they could be.
 
     Raises:
         InputError: an unknown effect (lists the valid ones).
     """
-    names = potential_names(config, assumed.model)
-    known = assumed.model.catalogue
-    families = tuple(build(known, name, assumed.cell, assumed.m) for name in names)
-    strength = _strengths(assumed, config, of, families)
+    names = potential_names(config, nominal.model)
+    known = nominal.model.catalogue
+    families = tuple(build(known, name, nominal.cell, nominal.m) for name in names)
+    strength = _strengths(nominal, config, of, families)
     chosen: list[tuple[Effect, float]] = []
     notes = [*random_columns(families)]
-    room = MOST_PARAMETERS - len(assumed.live)
+    room = MOST_PARAMETERS - len(nominal.live)
     order = sorted(range(len(families)), key=lambda k: len(families[k].parameters))
     for k in order:
         family, rms = families[k], strength[k]
@@ -83,18 +84,18 @@ def potential(assumed: Assumed, config: CellConfig, of: Candidates) -> Potential
 
 
 def _strengths(
-    assumed: Assumed, config: CellConfig, of: Candidates, families: tuple[Effect, ...]
+    nominal: NominalModel, config: CellConfig, of: Candidates, families: tuple[Effect, ...]
 ) -> list[float]:
     """RMS of each family's whitened readings (single deflections) at ordinary magnitudes."""
     if not families:
         return []
     sample = of[slice(None, None, -(-len(of) // SAMPLE))]
     ordinary = np.array(
-        [p.scale for e in (*assumed.model.effects, *families) for p in e.parameters]
+        [p.scale for e in (*nominal.model.effects, *families) for p in e.parameters]
     )
-    live = np.concatenate([assumed.live, assumed.model.size + np.arange(sizes(families))])
+    live = np.concatenate([nominal.live, nominal.model.size + np.arange(sizes(families))])
     squares, count = np.zeros(len(live)), 0
-    for part in sense(assumed, config, sample, families, ordinary[live]):
+    for part in reading_derivatives(nominal, config, sample, families, ordinary[live]):
         allowed = sample.allowed[part.rows]
         if config.planning.readings == "absolute":
             rows = [absolute_rows(part)[allowed]]
@@ -106,6 +107,6 @@ def _strengths(
         for r in rows:
             squares += np.sum(r**2, axis=(0, 1))
             count += r.shape[0] * r.shape[1]
-    ends = len(assumed.live) + np.cumsum([0, *(len(e.parameters) for e in families)])
+    ends = len(nominal.live) + np.cumsum([0, *(len(e.parameters) for e in families)])
     sums = [float(squares[a:b].sum()) for a, b in pairwise(ends)]
     return [float(np.sqrt(s / max(count, 1))) for s in sums]

@@ -1,4 +1,4 @@
-"""What a plan will know: standard uncertainties of the parameters, and of positions."""
+"""Predicted precision of a plan: standard uncertainties of parameters and positions."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from hilcal.identify.uncertainty import LEARNT, MEANINGLESS, NULL_SHARE
 from hilcal.plan.information import Problem
-from hilcal.plan.prediction_poses import WorkPoses
+from hilcal.plan.prediction_poses import PredictionPoses
 from hilcal.regression.normal_equations import INFORMATION, ROUNDING
 from hilcal.types import Bools, Floats
 
@@ -48,9 +48,9 @@ def predicted(
     counts: Floats | None = None,
     *,
     information: Floats | None = None,
-    work: WorkPoses | None = None,
+    work: PredictionPoses | None = None,
 ) -> Predicted:
-    """Predict what a plan will know.
+    """Predict the standard uncertainties that a plan reaches.
 
     Args:
         problem: the design problem.
@@ -62,13 +62,13 @@ def predicted(
         information = problem.prior if counts is None else problem.information(counts)
     size = problem.model_size
     own = information[:size, :size]
-    flat = np.isinf(problem.assumed.prior_std[problem.assumed.live])
+    flat = np.isinf(problem.nominal.prior_std[problem.nominal.live])
     scale = problem.scale
     closed, null = covariance(own, flat)
     whole = np.append(flat, np.zeros(len(scale) - size, dtype=bool))
     opened, null_open = covariance(information, whole)
     opened, null_open = opened[:size, :size], null_open[:size]
-    prior = problem.assumed.prior_std[problem.assumed.live] / scale[:size]
+    prior = problem.nominal.prior_std[problem.nominal.live] / scale[:size]
     terms = problem.terms[:size]
     positions = np.zeros(0) if work is None else positions_of(work, closed, null)
     return Predicted(
@@ -113,14 +113,14 @@ def covariance(information: Floats, flat: Bools) -> tuple[Floats, Floats]:
     return np.asarray(transform @ inner @ transform.T), null
 
 
-def positions_of(work: WorkPoses, covariance: Floats, null: Floats) -> Floats:
-    """Return (T,) standard deviations of positions, m; infinite where the data cannot tell.
+def positions_of(work: PredictionPoses, covariance: Floats, null: Floats) -> Floats:
+    """Return (T,) standard deviations of positions, m; infinite where not determined.
 
     Args:
         work: the poses.
         covariance: (L, L) of the model's live parameters.
         null: (L, U) directions that were left out: a position that one of them moves at an
-            ordinary magnitude by a tenth of its standard deviation is not told.
+            ordinary magnitude by a tenth of its standard deviation is not determined.
     """
     std = work.std(covariance)
     unseen = np.linalg.norm(work.derivative @ null, axis=(1, 2))

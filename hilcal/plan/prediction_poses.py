@@ -1,4 +1,4 @@
-"""Where the robot will work, and how the parameters move it there."""
+"""Prediction poses, where the robot will work, and the derivative of its position there."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,19 +8,19 @@ import numpy as np
 from hilcal.config import CellConfig
 from hilcal.data.plan import UNLOADED
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.plan.nominal_model import Assumed, nominal_states
+from hilcal.plan.nominal_model import NominalModel, nominal_states
 from hilcal.robot.chain import evaluate
 from hilcal.types import Bools, Floats
 
 COUNT = 100
-"""Test poses that are drawn where the configuration names none."""
+"""Prediction poses that are drawn where the configuration names none. A choice."""
 _DRAWN = 4096
 _ROUNDS = 60
 _SEED = 20240608
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class WorkPoses:
+class PredictionPoses:
     """T states at which the position, or the deflection, is predicted.
 
     Attributes:
@@ -54,29 +54,29 @@ class WorkPoses:
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
-def work_poses(
-    assumed: Assumed,
+def prediction_poses(
+    nominal: NominalModel,
     config: CellConfig,
     feasible: Floats,
     may: Callable[[Floats], Bools] | None = None,
-) -> WorkPoses:
+) -> PredictionPoses:
     """Return the test poses of `[planning]`: named, within a box, or of the candidates.
 
     In deflections it is the deflection under `work_load` that is predicted; under "none" there
     is no deflection, and it is that under each of the loads in turn.
 
     Args:
-        assumed: the model that is planned for.
+        nominal: the model that is planned for.
         config: `[planning] work_*`, loads.
         feasible: (N, n) states that are feasible, rad; test poses are drawn from them.
-        may: tells of (N, n) states which are feasible, where a box needs more of them.
+        may: predicate of feasible states (N, n), for a box that needs more of them.
 
     Raises:
         InputError: joint vectors of the wrong length; no load to work under.
         CannotAnswerError: no feasible pose with the target in the box; no feasible state.
     """
-    q, where = _poses(assumed, config, feasible, may)
-    cell, planning = assumed.cell, config.planning
+    q, where = _poses(nominal, config, feasible, may)
+    cell, planning = nominal.cell, config.planning
     pulls = {load.name: load.wrench(cell.gravity) for load in config.loads}
     deflection = planning.readings == "deflection"
     if planning.work_load == UNLOADED:
@@ -89,25 +89,30 @@ def work_poses(
         raise InputError(f"[planning] work_load = {planning.work_load!r}; valid: {valid}")
     if not wanted:
         raise InputError('[planning] readings = "deflection" needs [[loads]]')
-    unloaded = _positions(assumed, q, np.zeros(6)) if deflection else np.zeros(1)
-    derivative = [_positions(assumed, q, pull) - unloaded for pull in wanted.values()]
+    unloaded = _positions(nominal, q, np.zeros(6)) if deflection else np.zeros(1)
+    derivative = [_positions(nominal, q, pull) - unloaded for pull in wanted.values()]
     what = ("deflection" if deflection else "position") + (f" under {under}" if under else "")
-    return WorkPoses(np.tile(q, (len(wanted), 1)), np.concatenate(derivative), f"{what} {where}")
+    return PredictionPoses(
+        np.tile(q, (len(wanted), 1)), np.concatenate(derivative), f"{what} {where}"
+    )
 
 
-def _positions(assumed: Assumed, q: Floats, pull: Floats) -> Floats:
+def _positions(nominal: NominalModel, q: Floats, pull: Floats) -> Floats:
     """Derivative (T, 3, L) of the target's position under a wrench (6,)."""
-    model, theta, live = assumed.model, assumed.theta, assumed.live
+    model, theta, live = nominal.model, nominal.theta, nominal.live
     states = nominal_states(q, np.broadcast_to(pull, (len(q), 6)))
     scale = np.array([p.scale for e in model.effects for p in e.parameters])[live]
     return np.asarray(model.jacobian(model.predict(states, theta), theta, 3, live) * scale)
 
 
 def _poses(
-    assumed: Assumed, config: CellConfig, feasible: Floats, may: Callable[[Floats], Bools] | None
+    nominal: NominalModel,
+    config: CellConfig,
+    feasible: Floats,
+    may: Callable[[Floats], Bools] | None,
 ) -> tuple[Floats, str]:
     """Test poses (T, n), and where they are in words."""
-    planning, cell = config.planning, assumed.cell
+    planning, cell = config.planning, nominal.cell
     n = cell.arm.n
     if planning.work_q_rad:
         q = np.array(planning.work_q_rad, dtype=float)
@@ -124,13 +129,13 @@ def _poses(
         chosen = rng.permutation(len(feasible))[:COUNT]
         return feasible[np.sort(chosen)], f"at {len(chosen)} feasible poses"
     box = np.array(planning.work_min_m), np.array(planning.work_max_m)
-    found = _inside(assumed, feasible, *box)
+    found = _inside(nominal, feasible, *box)
     low = np.maximum(cell.arm.q_min, -np.pi) + config.limits.joint_margin_rad
     high = np.minimum(cell.arm.q_max, np.pi) - config.limits.joint_margin_rad
     for _ in range(_ROUNDS if may is not None else 0):
         if len(found) >= COUNT:
             break
-        drawn = _inside(assumed, rng.uniform(low, high, (_DRAWN, n)), *box)
+        drawn = _inside(nominal, rng.uniform(low, high, (_DRAWN, n)), *box)
         if may is not None and len(drawn):
             found = np.concatenate([found, drawn[may(drawn)]])
     if not len(found):
@@ -142,8 +147,8 @@ def _poses(
     return found[np.sort(chosen)], f"at {len(chosen)} poses in the work box"
 
 
-def _inside(assumed: Assumed, q: Floats, low: Floats, high: Floats) -> Floats:
+def _inside(nominal: NominalModel, q: Floats, low: Floats, high: Floats) -> Floats:
     """Those of the states (N, n) whose target lies in a box, base axes."""
-    cell = assumed.cell
+    cell = nominal.cell
     at = evaluate(cell.arm, q).point(cell.target[:3, 3])
     return np.asarray(q[np.all((at >= low) & (at <= high), axis=1)])

@@ -5,27 +5,27 @@ import numpy as np
 from hilcal.effects.protocol import Effect
 from hilcal.identify.gauss_newton import scales_of
 from hilcal.identify.linearisation import computable, effect_columns, model_columns
-from hilcal.plan.nominal_model import Assumed
+from hilcal.plan.nominal_model import NominalModel
 from hilcal.types import Floats
 
 
-def information_of(assumed: Assumed, more: tuple[Effect, ...], scale: Floats) -> Floats:
+def information_of(nominal: NominalModel, more: tuple[Effect, ...], scale: Floats) -> Floats:
     """Return AᵀA (P, P) of the readings that the assumed model was fitted to; zero without any.
 
     A is the Jacobian at the fit, whitened by the readings' own covariances: what the fit's normal
     equations hold, without its priors.
 
     Args:
-        assumed: the model, whose live parameters come first.
+        nominal: the model, whose live parameters come first.
         more: effects that are not in the model. Those that cannot be computed from these readings,
             which lack a column, have no information.
         scale: (P,) what one unit of each parameter is, SI.
     """
-    fit = assumed.fit
+    fit = nominal.fit
     if fit is None:
         return np.zeros((len(scale), len(scale)))
-    ordinary = [scales_of(fit.model)[assumed.live]]
-    columns = [model_columns(fit)[:, assumed.live]]
+    ordinary = [scales_of(fit.model)[nominal.live]]
+    columns = [model_columns(fit)[:, nominal.live]]
     for e in more:
         ordinary.append(np.array([p.scale for p in e.parameters]))
         missing = np.zeros((len(fit.white), len(e.parameters)))

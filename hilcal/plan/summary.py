@@ -13,9 +13,9 @@ from hilcal.data.plan import REFERENCE
 from hilcal.effects.protocol import FRAME_ROLES, Role
 from hilcal.errors import CannotAnswerError
 from hilcal.plan.approximate_design import relax
-from hilcal.plan.candidates import sense
+from hilcal.plan.candidates import reading_derivatives
 from hilcal.plan.choice import choose, only, unknown
-from hilcal.plan.compound_criteria import robust_question
+from hilcal.plan.compound_criteria import compound_objective
 from hilcal.plan.confounding import Confounding
 from hilcal.plan.information import Problem
 from hilcal.plan.planner import Planned, Say
@@ -266,7 +266,7 @@ def _criteria(planned: Planned, rng: np.random.Generator) -> Iterator[CriterionR
             yield _result(planned, name, planned.counts, planned.design.efficiency)
             continue
         try:
-            whole = robust_question(of, name, planned.work, planned.budget, rng)
+            whole = compound_objective(of, name, planned.work, planned.budget, rng)
             design = choose(only(whole, planned.usable), planned.budget, rng, 1)
         except CannotAnswerError:
             continue
@@ -299,7 +299,7 @@ def _result(planned: Planned, name: str, counts: Floats, efficiency: float) -> C
 
 def _prefixes(of: Problem, *roles: Role) -> tuple[str, ...]:
     """Return what the names of the parameters of some roles begin with."""
-    return tuple(f"{e.name}." for e in of.assumed.model.effects if e.role in roles)
+    return tuple(f"{e.name}." for e in of.nominal.model.effects if e.role in roles)
 
 
 def _joint_share(knows: Predicted, joints: tuple[str, ...]) -> float | None:
@@ -353,7 +353,7 @@ def _detectable(planned: Planned, config: CellConfig) -> Iterator[DetectableEffe
     )
     moves = [
         part.jacobian[:, 1:] - part.jacobian[:, :1] if of.mode == "deflection" else part.jacobian
-        for part in sense(of.assumed, config, chosen, of.families, of.scale)
+        for part in reading_derivatives(of.nominal, config, chosen, of.families, of.scale)
     ]
     moved = np.concatenate([block[..., :3, :].reshape(-1, len(of.terms)) for block in moves])
     rng = np.random.default_rng(_SEED)

@@ -1,4 +1,4 @@
-"""The criterion that separates effects: the power to tell one from another."""
+"""T-optimality: the criterion of plans that separate effects."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

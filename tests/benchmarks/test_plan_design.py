@@ -19,7 +19,7 @@ from hilcal.effects.link_geometry import LinkGeometry
 from hilcal.identify.gauss_newton import scales_of
 from hilcal.model import Model
 from hilcal.plan.approximate_design import relax
-from hilcal.plan.candidate_set import Units
+from hilcal.plan.candidate_set import CandidateSet
 from hilcal.plan.criteria import D
 from hilcal.plan.optimum import best
 from hilcal.types import Floats
@@ -34,7 +34,7 @@ WRENCHES = np.array([[0, 0, 0], [0, 0, -98], [80, 0, 0], [0, 80, 0]])  # none, h
 SIGMA = 2e-5  # m
 
 
-def arm_units(count: int, size: int) -> Units:
+def arm_units(count: int, size: int) -> CandidateSet:
     """Readings of a UR10e: six joint compliances and those geometric errors that are separate."""
     rng = np.random.default_rng(2)
     cell = cell_of(arm_of("ur10e"))
@@ -49,15 +49,15 @@ def arm_units(count: int, size: int) -> Units:
     basis = np.linalg.qr(flat[:, :6])[0]
     order = sl.qr(geometry - basis @ (basis.T @ geometry), mode="r", pivoting=True)[1]
     chosen = np.concatenate([np.arange(6), np.sort(order[: size - 6]) + 6])
-    return Units(np.ascontiguousarray(jacobian[:, :, chosen]), np.ones(count))
+    return CandidateSet(np.ascontiguousarray(jacobian[:, :, chosen]), np.ones(count))
 
 
-def gauss_units(count: int, size: int) -> Units:
+def gauss_units(count: int, size: int) -> CandidateSet:
     """Rows without any structure: the hardest for whole numbers."""
-    return Units(np.random.default_rng(1).normal(size=(count, 3, size)), np.ones(count))
+    return CandidateSet(np.random.default_rng(1).normal(size=(count, 3, size)), np.ones(count))
 
 
-KINDS: dict[str, Callable[[int, int], Units]] = {"arm": arm_units, "gauss": gauss_units}
+KINDS: dict[str, Callable[[int, int], CandidateSet]] = {"arm": arm_units, "gauss": gauss_units}
 
 
 def shortest(work: Callable[[], object], rounds: int) -> float:
@@ -69,7 +69,7 @@ def shortest(work: Callable[[], object], rounds: int) -> float:
     return min(times)
 
 
-def leverage(units: Units) -> Floats:
+def leverage(units: CandidateSet) -> Floats:
     """One scan of all candidates."""
     root = np.linalg.cholesky(np.linalg.inv(units.information(np.ones(len(units)))))
     return np.asarray(np.sum((units.rows @ root) ** 2, axis=(1, 2)))
@@ -97,7 +97,7 @@ def test_states_out_of_many(benchmark: Any, claim: Claim, kind: str) -> None:
     assert efficiency > least
 
 
-def multiplicative(units: Units, rounds: int) -> float:
+def multiplicative(units: CandidateSet, rounds: int) -> float:
     """Log det of the D-optimal shares by the multiplicative algorithm."""
     w = np.full(len(units), 1 / len(units))
     for _ in range(rounds):
@@ -110,7 +110,7 @@ def multiplicative(units: Units, rounds: int) -> float:
 def test_peer_problem(benchmark: Any, claim: Claim, kind: str) -> None:
     """300 poses, 24 parameters: the continuous optimum to 1e-6, against another algorithm."""
     units = KINDS[kind](2000, 24)
-    units = Units(units.rows[:300], units.cost[:300])
+    units = CandidateSet(units.rows[:300], units.cost[:300])
     seconds = shortest(lambda: relax(units, D(), 1.0), 5)
     scan = shortest(lambda: leverage(units), 5)
     found = relax(units, D(), 1.0)

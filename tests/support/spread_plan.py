@@ -7,7 +7,7 @@ from hilcal.config import CellConfig
 from hilcal.data.plan import Plan
 from hilcal.plan.draw import draw
 from hilcal.plan.feasible import Space
-from hilcal.plan.order import Chosen, Ordering, order_plan
+from hilcal.plan.run_order import Chosen, Ordering, order_plan
 
 
 def spread_plan(

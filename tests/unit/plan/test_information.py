@@ -17,9 +17,9 @@ from hilcal.identify.baseline import baseline, with_effects
 from hilcal.identify.fit import fit
 from hilcal.plan.information import problem
 from hilcal.plan.noise_model import reading_covariance
-from hilcal.plan.nominal_model import after, assumed, nominal_states
+from hilcal.plan.nominal_model import after, nominal_model, nominal_states
 from hilcal.plan.predicted import predicted
-from hilcal.plan.prediction_poses import work_poses
+from hilcal.plan.prediction_poses import prediction_poses
 from tests.support.arm_cases import ARMS, arm_of
 from tests.support.arm_cases import cell_of as odd_cell
 from tests.support.campaigns import (
@@ -53,7 +53,7 @@ def test_prediction_is_what_identification_states(mode, known):
         place = tuple(float(x) for x in -r[:3, :3].T @ r[:3, 3])
         sight = config.sight.model_copy(update={"tracker_m": place})
         config = config.model_copy(update={"sight": sight})
-    p = problem(assumed(c.cell, config), config, poses_in(c.readings))
+    p = problem(nominal_model(c.cell, config), config, poses_in(c.readings))
     stated = dict(zip(p_names(p), found.uncertainty.formal, strict=True))
     foreseen = joints(predicted(p, everything_once(p)).by_name())
     assert len(foreseen) == c.cell.arm.n
@@ -70,9 +70,9 @@ def test_parameters_and_positions_scatter_as_predicted(mode):
     cell = cell_of(registration_known=True)
     config = config_of(mode, work_load="10kg")
     q = poses_of(10, 5)
-    a = assumed(cell, config)
+    a = nominal_model(cell, config)
     p = problem(a, config, q)
-    work = work_poses(a, config, poses_of(12, 6))
+    work = prediction_poses(a, config, poses_of(12, 6))
     expected = predicted(p, everything_once(p), work=work)
     clean = read(a.model, noiseless(world_of(cell, np.random.default_rng(0)), plan(10, 5)), a.theta)
     thetas = []
@@ -100,8 +100,8 @@ def test_a_deflection_unit_is_a_pose_whose_place_is_unknown(name, seed):
     cell = odd_cell(arm_of(name))
     q = rng.uniform(-2, 2, (2, cell.arm.n))
     d = config_of("deflection", against=("joint_tilt_compliance", "base_compliance"))
-    units = problem(assumed(cell, d), d, q)
-    a = assumed(cell, d)
+    units = problem(nominal_model(cell, d), d, q)
+    a = nominal_model(cell, d)
     # The same readings as positions, in the deflections' scales.
     ab = config_of("absolute")
     states = nominal_states(np.repeat(q, 5, axis=0), np.tile(units.candidates.wrench, (2, 1)))
@@ -173,7 +173,7 @@ def test_averaging_leaves_the_systematic_share(m):
     acquire = config.acquire.model_copy(update={"systematic_share": 0.3, "samples": 5})
     still = config.repeatability.model_copy(update={"joint_std_rad": 0.0})
     config = config.model_copy(update={"acquire": acquire, "repeatability": still})
-    a = assumed(cell_of(registration_known=True), config, m)
+    a = nominal_model(cell_of(registration_known=True), config, m)
     states = nominal_states(poses_of(1), np.zeros((1, 6)))
     prediction = a.model.predict(states, a.theta)
     one = config.model_copy(
@@ -195,11 +195,11 @@ def test_the_tracker_stands_where_the_configuration_says():
     config = config_of()
     cell = cell_of()
     assert tracker_place(cell, config) is None
-    assert any("tracker_m" in note for note in assumed(cell, config).notes)
+    assert any("tracker_m" in note for note in nominal_model(cell, config).notes)
     there = config.model_copy(
         update={"sight": config.sight.model_copy(update={"tracker_m": (0.5, -3.0, 1.0)})}
     )
-    a = assumed(cell, there)
+    a = nominal_model(cell, there)
     assert a.notes == ()
     o = a.model.predict(nominal_states(poses_of(4), np.zeros((4, 6))), a.theta).observation
     noise = tracker_noise(config.tracker)
@@ -222,7 +222,7 @@ def test_the_tracker_stands_where_the_configuration_says():
 def test_what_is_assumed_of_the_compliances_matters_little():
     config = config_of("deflection", model=("joint_compliance", "joint_tilt_compliance"))
     cell, q = cell_of(registration_known=True), poses_of(15)
-    a = assumed(cell, config)
+    a = nominal_model(cell, config)
     stds = []
     for factor in (0.3, 1.5):
         p = problem(replace(a, theta=factor * a.theta), config, q)
@@ -232,7 +232,7 @@ def test_what_is_assumed_of_the_compliances_matters_little():
 
 def test_units_are_what_may_be_taken():
     config, cell = config_of("deflection"), cell_of(registration_known=True)
-    a = assumed(cell, config)
+    a = nominal_model(cell, config)
     names = [load.name for load in config.loads]
     allowed = np.ones((4, 5), dtype=bool)
     allowed[1, 2] = False  # not the 10 kg
@@ -253,7 +253,7 @@ def test_units_are_what_may_be_taken():
             assert np.any(other)
             assert p.units.rows[k] == pytest.approx(other, abs=1e-12)
     ab = config_of("absolute")
-    single = problem(assumed(cell, ab), ab, poses_of(4), allowed)
+    single = problem(nominal_model(cell, ab), ab, poses_of(4), allowed)
     assert sum(1 for _ in single.what) == allowed.sum()
     assert single.units.cost == pytest.approx(np.ones(len(single.units)))
     assert (2, ("none",)) not in single.what
@@ -261,7 +261,7 @@ def test_units_are_what_may_be_taken():
 
 def test_problems_that_cannot_be():
     config, cell = config_of("deflection"), cell_of(registration_known=True)
-    a = assumed(cell, config)
+    a = nominal_model(cell, config)
     with pytest.raises(CannotAnswerError, match="both unloaded and under a load"):
         problem(a, config, poses_of(3), np.zeros((3, 5), dtype=bool))
     with pytest.raises(CannotAnswerError, match="no candidate pose may be taken"):
@@ -270,19 +270,19 @@ def test_problems_that_cannot_be():
     with pytest.raises(InputError, match=r"needs \[\[loads\]\]"):
         problem(a, bare, poses_of(3))
     with pytest.raises(InputError, match=r"model: unknown effect 'joint_complience'.*valid:"):
-        assumed(cell, config_of(model=("joint_complience",)))
+        nominal_model(cell, config_of(model=("joint_complience",)))
     wrong = config_of(against=("ghost",))
     with pytest.raises(InputError, match="against: unknown effect 'ghost'"):
-        problem(assumed(cell, wrong), wrong, poses_of(3))
+        problem(nominal_model(cell, wrong), wrong, poses_of(3))
 
 
 def test_what_cannot_be_seen_has_no_uncertainty():
     """One load along one axis: some joints are never turned by it."""
     config, cell = config_of("deflection"), cell_of(registration_known=True)
-    a = assumed(cell, config)
+    a = nominal_model(cell, config)
     p = problem(a, config, poses_of(1))
     only = np.array([float(loads == ("5kg",)) for _, loads in p.what])
-    work = work_poses(a, config, poses_of(5))
+    work = prediction_poses(a, config, poses_of(5))
     mine = predicted(p, only, work=work)
     assert np.isinf(mine.std).any()  # three numbers measured, six compliances
     assert np.isinf(mine.position)

@@ -11,10 +11,10 @@ from hilcal.effects.catalogue import installed
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.plan.discriminated_pairs import LEVEL, discriminated_pairs, power
 from hilcal.plan.information import problem
-from hilcal.plan.nominal_model import assumed, nominal_states
+from hilcal.plan.nominal_model import nominal_model, nominal_states
 from hilcal.plan.potential import MOST_ORDINARY, MOST_PARAMETERS
 from hilcal.plan.predicted import predicted
-from hilcal.plan.prediction_poses import work_poses
+from hilcal.plan.prediction_poses import prediction_poses
 from hilcal.robot.chain import evaluate
 from tests.support.campaigns import cell_of
 from tests.support.plan_cases import config_of, everything_once, poses_of
@@ -24,7 +24,7 @@ CELL = cell_of(registration_known=True)
 
 def made(mode="deflection", against="catalogue", poses=40, **planning):
     config = config_of(mode, against=against, **planning)
-    return problem(assumed(CELL, config), config, poses_of(poses))
+    return problem(nominal_model(CELL, config), config, poses_of(poses))
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -70,9 +70,9 @@ def test_a_load_that_no_pose_bears_is_as_good_as_none():
     q, loads = poses_of(30), len(config.loads)
     allowed = np.ones((30, 1 + loads), dtype=bool)
     allowed[:, -1] = False
-    borne = problem(assumed(CELL, config), config, q, allowed)
+    borne = problem(nominal_model(CELL, config), config, q, allowed)
     less = config.model_copy(update={"loads": config.loads[:-1]})
-    without = problem(assumed(CELL, less), less, q)
+    without = problem(nominal_model(CELL, less), less, q)
     assert borne.what == without.what
     assert borne.terms == without.terms
     np.testing.assert_allclose(
@@ -97,9 +97,9 @@ def test_asked_for_effects_that_the_order_tells_are_taken_at_random():
 def test_derivatives_where_the_robot_works():
     for mode, load in (("absolute", "none"), ("absolute", "10kg"), ("deflection", "10kg")):
         config = config_of(mode, work_load=load)
-        a = assumed(CELL, config)
+        a = nominal_model(CELL, config)
         q = poses_of(3)
-        work = work_poses(a, config, q)
+        work = prediction_poses(a, config, q)
         wrench = next((x.wrench(CELL.gravity) for x in config.loads if x.name == load), np.zeros(6))
 
         def at(theta, a=a, work=work, wrench=wrench, mode=mode):
@@ -126,8 +126,8 @@ def test_derivatives_where_the_robot_works():
 
 def test_unloaded_work_with_deflections_is_under_each_load():
     config = config_of("deflection")
-    a = assumed(CELL, config)
-    work = work_poses(a, config, poses_of(3))
+    a = nominal_model(CELL, config)
+    work = prediction_poses(a, config, poses_of(3))
     assert work.what == "deflection under each load at 3 feasible poses"
     assert len(work.q) == 12
     assert np.all(np.abs(work.derivative).max(axis=(1, 2)) > 0)
@@ -136,21 +136,21 @@ def test_unloaded_work_with_deflections_is_under_each_load():
 def test_named_work_and_a_box():
     q = poses_of(2)
     named = config_of("absolute", work_q_rad=tuple(tuple(x) for x in q))
-    a = assumed(CELL, named)
-    assert work_poses(a, named, poses_of(9, 3)).q == pytest.approx(q)
+    a = nominal_model(CELL, named)
+    assert prediction_poses(a, named, poses_of(9, 3)).q == pytest.approx(q)
     short = config_of("absolute", work_q_rad=((0.0, 1.0),))
     with pytest.raises(InputError, match="2 values; ur10e has 6 joints"):
-        work_poses(a, short, q)
+        prediction_poses(a, short, q)
     low, high = (0.3, -0.6, 0.2), (1.0, 0.6, 0.9)
     box = config_of("absolute", work_min_m=low, work_max_m=high)
-    work = work_poses(a, box, np.empty((0, 6)), lambda x: x[:, 0] > 0.1)
+    work = prediction_poses(a, box, np.empty((0, 6)), lambda x: x[:, 0] > 0.1)
     at = evaluate(CELL.arm, work.q).point(CELL.target[:3, 3])
     assert len(work.q) >= 50
     assert np.all((at >= low) & (at <= high))
     assert np.all(work.q[:, 0] > 0.1)
     away = config_of("absolute", work_min_m=(5.0, 5.0, 5.0), work_max_m=(6.0, 6.0, 6.0))
     with pytest.raises(CannotAnswerError, match="widen the box"):
-        work_poses(a, away, q, lambda x: x[:, 0] > 0.1)
+        prediction_poses(a, away, q, lambda x: x[:, 0] > 0.1)
 
 
 def test_power_is_the_share_of_campaigns_that_find_the_effect():

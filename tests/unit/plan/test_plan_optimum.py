@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.plan.approximate_design import Relaxed, relax
-from hilcal.plan.candidate_set import Units
+from hilcal.plan.approximate_design import ApproximateDesign, relax
+from hilcal.plan.candidate_set import CandidateSet
 from hilcal.plan.compound_criteria import CompoundDeterminant, CompoundVariance
 from hilcal.plan.criteria import A, D, MeanVariance
 from hilcal.plan.criterion import Criterion
@@ -49,19 +49,21 @@ CRITERIA: dict[str, Callable[[], Criterion]] = {
 every = pytest.mark.parametrize("name", CRITERIA)
 
 
-def polynomial(degree: int, points: Floats) -> Units:
+def polynomial(degree: int, points: Floats) -> CandidateSet:
     """Readings of a polynomial at points, one row each."""
-    return Units(np.vander(points, degree + 1, increasing=True)[:, None, :], np.ones(len(points)))
+    return CandidateSet(
+        np.vander(points, degree + 1, increasing=True)[:, None, :], np.ones(len(points))
+    )
 
 
-def random_units(seed: int, count: int, size: int = 3, costs: bool = False) -> Units:
+def random_units(seed: int, count: int, size: int = 3, costs: bool = False) -> CandidateSet:
     rng = np.random.default_rng(seed)
     rows = rng.normal(size=(count, 2, size))
     rows[rng.random(count) < 0.3, 1] = 0.0  # units of fewer rows
-    return Units(rows, rng.integers(1, 4, count).astype(float) if costs else np.ones(count))
+    return CandidateSet(rows, rng.integers(1, 4, count).astype(float) if costs else np.ones(count))
 
 
-def at(points: Floats, found: Relaxed) -> dict[float, float]:
+def at(points: Floats, found: ApproximateDesign) -> dict[float, float]:
     """Shares of the weight by point, without what is near 0."""
     total = found.weight.sum()
     shares = {float(points[k]): w / total for k, w in zip(found.index, found.weight, strict=True)}
@@ -73,7 +75,7 @@ def prior_of(seed: int, size: int = 3) -> Floats:
     return root.T @ root
 
 
-def largest(criterion: Criterion, units: Units, weights: Floats, prior: Floats) -> float:
+def largest(criterion: Criterion, units: CandidateSet, weights: Floats, prior: Floats) -> float:
     """The best of many plans (N, K)."""
     each = np.swapaxes(units.rows, 1, 2) @ units.rows
     return float(criterion.value(prior + np.tensordot(weights, each, axes=1)).max())
@@ -144,7 +146,7 @@ def test_small_problems_against_all_shares(name: str) -> None:
     shares = np.column_stack([n, steps - n.sum(axis=1)]) / steps
     for seed in range(3):
         units = random_units(seed, 4, costs=True)
-        units = Units(units.rows + 0.2, units.cost)
+        units = CandidateSet(units.rows + 0.2, units.cost)
         for prior in (np.zeros((3, 3)), prior_of(seed)):
             most = largest(criterion, units, 6.0 * shares / units.cost, prior)
             found = relax(units, criterion, 6.0, prior)
@@ -223,7 +225,7 @@ def test_tiny_plans_against_all_plans(name: str) -> None:
     assert np.median(shares) > 1 - 1e-9
 
 
-def multiplicative(units: Units, rounds: int) -> float:
+def multiplicative(units: CandidateSet, rounds: int) -> float:
     """det^(1/P) of the D-optimal shares by the multiplicative algorithm alone (Titterington)."""
     w = np.full(len(units), 1 / len(units))
     for _ in range(rounds):
@@ -236,7 +238,7 @@ def multiplicative(units: Units, rounds: int) -> float:
 def test_peer_problem_against_another_algorithm() -> None:
     """300 poses, 24 parameters."""
     rng = np.random.default_rng(6)
-    units = Units(rng.normal(size=(300, 3, 24)) * np.exp(rng.normal(size=24)), np.ones(300))
+    units = CandidateSet(rng.normal(size=(300, 3, 24)) * np.exp(rng.normal(size=24)), np.ones(300))
     found = relax(units, D(), 1.0)
     reference = np.exp(multiplicative(units, 2000) / 24)
     assert found.value >= reference * (1 - 1e-6)
@@ -290,7 +292,7 @@ def test_the_plan_depends_on_the_generator_alone() -> None:
 def test_scale_of_a_parameter_does_not_matter_to_d() -> None:
     units = random_units(5, 100, 6)
     factor = 10.0 ** np.arange(-6, 6, 2)
-    scaled = Units(units.rows * factor, units.cost)
+    scaled = CandidateSet(units.rows * factor, units.cost)
     one = best(units, D(), 12.0, None, np.random.default_rng(3), tolerance=1e-7)
     two = best(scaled, D(), 12.0, None, np.random.default_rng(3), tolerance=1e-7)
     assert two.efficiency == pytest.approx(one.efficiency, abs=0.01)
@@ -312,7 +314,7 @@ def test_dear_units_are_taken_where_they_are_worth_it() -> None:
     rows = np.zeros((3, 2, 2))
     rows[0, 0, 0] = rows[1, 0, 1] = rows[2, 0, 0] = rows[2, 1, 1] = 1.0
     for price, expected in ((1.5, [0, 0, 4]), (2.5, [3, 3, 0])):
-        units = Units(rows, np.array([1.0, 1.0, price]))
+        units = CandidateSet(rows, np.array([1.0, 1.0, price]))
         design = best(units, D(), 6.0, None, np.random.default_rng(0), tolerance=1e-7)
         np.testing.assert_array_equal(design.counts, expected)
         assert design.efficiency == pytest.approx(1.0, abs=1e-5)
@@ -324,7 +326,7 @@ def test_exchange_improves_on_rounding() -> None:
         units = random_units(seed, 500, 10)
         relaxed = relax(units, D(), 13.0)
 
-        def value(counts: Ints, units: Units = units) -> float:
+        def value(counts: Ints, units: CandidateSet = units) -> float:
             assert counts.sum() == 13
             return float(D().value(units.information(counts.astype(float))))
 
@@ -370,10 +372,10 @@ def test_names_what_no_candidate_determines() -> None:
         ({"prior": -np.eye(3)}, "semidefinite"),
         ({"prior": np.full((3, 3), np.nan)}, "finite"),
         ({"most": 0}, "at most 0 times"),
-        ({"units": Units(np.zeros((2, 1, 3)), np.array([1.0, 0.0]))}, "over 0"),
-        ({"units": Units(np.full((2, 1, 3), np.inf), np.ones(2))}, "not finite"),
-        ({"units": Units(np.zeros((2, 1, 3)), np.ones(3))}, "shape"),
-        ({"units": Units(np.zeros((0, 1, 3)), np.ones(0))}, "shape"),
+        ({"units": CandidateSet(np.zeros((2, 1, 3)), np.array([1.0, 0.0]))}, "over 0"),
+        ({"units": CandidateSet(np.full((2, 1, 3), np.inf), np.ones(2))}, "not finite"),
+        ({"units": CandidateSet(np.zeros((2, 1, 3)), np.ones(3))}, "shape"),
+        ({"units": CandidateSet(np.zeros((0, 1, 3)), np.ones(0))}, "shape"),
     ],
 )
 def test_refusals(change: dict[str, object], words: str) -> None:

@@ -17,7 +17,7 @@ from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
 from hilcal.data.plan import REFERENCE, UNLOADED, Plan, Step
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.plan.order import Chosen, Ordered, Ordering, order_plan
+from hilcal.plan.run_order import Chosen, Ordered, Ordering, order_plan
 from hilcal.plan.timing import pace, timeline
 from hilcal.types import Bools, Floats
 from tests.support.campaigns import configuration

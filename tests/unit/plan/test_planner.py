@@ -14,7 +14,7 @@ from hilcal.config import CellConfig, load_config
 from hilcal.config.write import to_toml
 from hilcal.data.plan import REFERENCE, UNLOADED, load_plan, read_plan
 from hilcal.data.table import write_table
-from hilcal.plan.choice import CRITERIA, question, worthwhile
+from hilcal.plan.choice import CRITERIA, objective_of, worthwhile
 from hilcal.plan.planner import Planned, Request, make
 from hilcal.plan.predicted import predicted
 from hilcal.plan.summary import remarks, summarise
@@ -91,10 +91,10 @@ def test_each_criterion_is_best_at_its_own(usual: Planned) -> None:
     of, work = usual.problem, usual.work
     designs = {name: planned(small(), 6, criterion=name) for name in ("D", "A", "E", "I")}
     for name in designs:
-        asked = question(of, name, work)
+        asked = objective_of(of, name, work)
         values = {}
         for other, made in designs.items():
-            own = question(made.problem, name, made.work)
+            own = objective_of(made.problem, name, made.work)
             taken = np.flatnonzero(made.counts)
             m = own.prior + own.units.information(made.counts[taken], taken)
             values[other] = float(asked.criterion.value(m))

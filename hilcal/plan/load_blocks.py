@@ -1,4 +1,4 @@
-"""Blocks of a plan: loops from the reference under one load, and their sequence."""
+"""Load blocks of a plan: loops from the reference under one load, and their sequence."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
