@@ -146,7 +146,7 @@ def random_columns(effects: tuple[Effect, ...]) -> tuple[str, ...]:
     for e in effects:
         if not type(e).computable(known):
             raise InputError(
-                f"effect {e.name} needs {', '.join(e.needs)}, which a plan does not determine; leave "
+                f"effect {e.name} needs {', '.join(e.needs)}, which a plan does not fix; leave "
                 "it out"
             )
     return tuple(
