@@ -58,7 +58,7 @@ def test_next_in_json_and_in_words(ambiguous: Path, tmp_path: Path, capsys: Caps
         f"In doubt: {BASE} or {TILT}.",
         "this is ruled out",
         "What separates the weakest pair comes from ",
-        "telling the leading suspects apart",
+        "power to separate the leading suspects",
         f"--append --plan {again}",
     ):
         assert part in " ".join(words.split())
