@@ -1,6 +1,6 @@
 """A fit: parameters, what can be said of them, and how far the model is from the data."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -27,6 +27,9 @@ Frame = Literal["sensor", "base"]
 CONFIDENCE = 0.95
 OUTLIER_ROUNDS = 6
 MAX_OUTLIER_SHARE = 0.05
+
+_Solved = tuple[Whitening, Solution, Floats]
+"""Scaling, solution, and the Jacobian (D, m, L) of the measurements by the live parameters."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -187,20 +190,21 @@ def fit(
         CannotAnswerError: fewer measured elements than identifiable parameters.
         InputError: from `whitening`, where a deflection lacks its unloaded reading.
     """
-    used, solution, w = _set_aside(model, readings, mode, start, prior)
+    used, solved = _set_aside(model, readings, mode, start, prior)
     if scaling != "gc":
-        solution, w = _solve(model, readings[used], mode, scaling, start, prior)
-    return _assemble(model, readings, ~used, mode, scaling, w, solution)
+        solved = _solve(model, readings[used], mode, scaling, start, prior)
+    return _assemble(model, readings, ~used, mode, scaling, *solved)
 
 
 def _set_aside(
     model: Model, readings: Readings, mode: Mode, start: Floats | None, prior: Floats | None
-) -> tuple[Bools, Solution, Whitening]:
+) -> tuple[Bools, _Solved]:
     """Readings (N,) without gross errors, and their solution in scaling gc."""
     used = np.ones(len(readings), dtype=bool)
-    solution, w = _solve(model, readings, mode, "gc", start, prior)
+    solved = _solve(model, readings, mode, "gc", start, prior)
     left = int(MAX_OUTLIER_SHARE * len(readings))
     for _ in range(OUTLIER_ROUNDS):
+        w, solution, _jacobian = solved
         distance2 = mahalanobis2(solution.raw, w.covariance)
         if distance2.max() <= limit(w.m, len(distance2)):
             break
@@ -209,8 +213,8 @@ def _set_aside(
             break
         used[np.flatnonzero(used)[found.drop]] = False
         left -= found.count
-        solution, w = _solve(model, readings[used], mode, "gc", solution.theta, prior)
-    return used, solution, w
+        solved = _solve(model, readings[used], mode, "gc", solution.theta, prior)
+    return used, solved
 
 
 def _solve(
@@ -220,16 +224,16 @@ def _solve(
     scaling: Scaling,
     start: Floats | None,
     prior: Floats | None,
-) -> tuple[Solution, Whitening]:
+) -> _Solved:
     w = whitening(readings, mode, scaling)
-    solution = solve(model, readings, w, start, prior)
+    solution, jacobian = solve(model, readings, w, start, prior)
     free = solution.equations.basis.structural
     if w.rank <= free:
         raise CannotAnswerError(
             f"{w.rank} measured elements for {free} parameters: nothing is left to judge the model "
             f"by; measure at least {free // w.m + 2} {_what(mode)}, better {3 * free // w.m + 1}"
         )
-    return solution, w
+    return w, solution, jacobian
 
 
 def _what(mode: Mode) -> str:
@@ -244,43 +248,43 @@ def _assemble(
     scaling: Scaling,
     fitted: Whitening,
     solution: Solution,
+    jacobian: Floats,
 ) -> Fit:
     kept, raw = readings[~outlier], solution.raw
     w = fitted if scaling == "gc" else whitening(kept, mode, "gc")
     white = w.whiten(raw).reshape(-1)
     pose = distinct_poses(kept)[w.reading]
-    folds = leave_out(model, solution, random_folds(pose), fitted)
+    left_out = leave_out(model, solution, jacobian, random_folds(pose), fitted)
     total = float(white @ white)
     dof = max(w.rank - solution.effective, 1.0)
-    # Readings that were set aside count in the errors: they are data, predicted unseen.
-    everything, all_raw, all_left_out = w, raw, folds.raw
+    # Readings that were set aside count in the errors: they are data, and took no part in the fit.
+    whole, all_raw, all_left_out = w, raw, left_out
     if outlier.any():
-        everything = whitening(readings, mode, "gc")
+        whole = whitening(readings, mode, "gc")
         prediction = model.predict(readings.states, solution.theta)
-        all_raw = residual(readings, prediction, everything)
+        all_raw = residual(readings, prediction, whole)
         all_left_out = all_raw.copy()
         place = {int(r): i for i, r in enumerate(np.flatnonzero(~outlier)[w.reading])}
-        for i, r in enumerate(everything.reading):
+        for i, r in enumerate(whole.reading):
             if int(r) in place:
-                all_left_out[i] = folds.raw[place[int(r)]]
+                all_left_out[i] = left_out[place[int(r)]]
     return Fit(
         model=model,
         readings=readings,
         mode=mode,
         scaling=scaling,
         whitening=w,
-        # The folds are done; the largest array of the fit is not needed any more.
-        solution=replace(solution, jacobian=np.empty((0, w.m, 0))),
+        solution=solution,
         uncertainty=uncertainty(model, kept, fitted, solution, pose, total, dof),
         pose=pose,
         raw=raw,
         white=white,
-        left_out=folds.raw,
+        left_out=left_out,
         outlier=outlier,
         chi2=total,
         dof=dof,
-        error=_block(all_raw, everything),
-        holdout=_block(all_left_out, everything),
+        error=_block(all_raw, whole),
+        holdout=_block(all_left_out, whole),
     )
 
 

@@ -9,28 +9,14 @@ standard deviation is their ordinary magnitude, or the rms of the effect's param
 fit where that is more.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from hilcal.data.whitening import Whitening
-from hilcal.identify.gauss_newton import Solution, scales_of
+from hilcal.identify.gauss_newton import Solution
+from hilcal.identify.priors import scales_of
 from hilcal.model import Model
 from hilcal.regression.leave_out import Fold, folds
 from hilcal.types import Floats, Ints
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Folds:
-    """Refits without each fold.
-
-    Attributes:
-        raw: (D, m) residual of each measurement, predicted without its fold.
-        change: (F, P) parameters without the fold minus those with it.
-    """
-
-    raw: Floats
-    change: Floats
 
 
 def folds_of(model: Model, solution: Solution, fold: Ints) -> tuple[Fold, ...]:
@@ -54,15 +40,15 @@ def folds_of(model: Model, solution: Solution, fold: Ints) -> tuple[Fold, ...]:
 
 
 def ordinary(model: Model, theta: Floats) -> Floats:
-    """Magnitude (P,) of each parameter: the ordinary one, or the rms of its effect's."""
+    """Magnitude (P,) of each parameter: the ordinary one, or the rms over its effect if more."""
     out = scales_of(model)
     for mine in model.slices():
         out[mine] *= max(1.0, float(np.sqrt(np.mean((theta[mine] / out[mine]) ** 2))))
     return out
 
 
-def leave_out(model: Model, solution: Solution, fold: Ints, w: Whitening) -> Folds:
-    """Refit without each fold and predict it.
+def changes(model: Model, solution: Solution, fold: Ints, w: Whitening) -> Floats:
+    """Return the parameters without each fold minus those with it (F, P).
 
     Args:
         model: the model.
@@ -70,13 +56,23 @@ def leave_out(model: Model, solution: Solution, fold: Ints, w: Whitening) -> Fol
         fold: (D,) fold of each measurement.
         w: the scaling of the fit.
     """
-    basis = solution.equations.basis
-    live = basis.transform[solution.live]
+    steps = [one.step() for one in folds_of(model, solution, w.rows_of(fold))]
+    return np.asarray(np.array(steps) @ solution.equations.basis.transform.T)
+
+
+def leave_out(
+    model: Model, solution: Solution, jacobian: Floats, fold: Ints, w: Whitening
+) -> Floats:
+    """Return the residual (D, m) of each measurement, predicted without its fold.
+
+    Args:
+        model: the model.
+        solution: the full fit.
+        jacobian: (D, m, L) of the measurements by its live parameters.
+        fold: (D,) fold of each measurement.
+        w: the scaling of the fit.
+    """
     predicted = solution.raw.copy()
-    change = np.empty((int(fold.max()) + 1, basis.transform.shape[0]))
-    for f, equations in enumerate(folds_of(model, solution, w.rows_of(fold))):
-        step = equations.step()
-        change[f] = basis.transform @ step
-        mine = fold == f
-        predicted[mine] -= solution.jacobian[mine] @ (live @ step)
-    return Folds(predicted, change)
+    for f, change in enumerate(changes(model, solution, fold, w)):
+        predicted[fold == f] -= jacobian[fold == f] @ change[solution.live]
+    return predicted

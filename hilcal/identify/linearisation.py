@@ -12,8 +12,8 @@ import numpy as np
 from hilcal.effects.protocol import Effect
 from hilcal.identify.fit import Fit
 from hilcal.identify.folds import random_folds
-from hilcal.identify.gauss_newton import scales_of
 from hilcal.identify.holdout import folds_of
+from hilcal.identify.priors import scales_of
 from hilcal.regression.backward_elimination import ReducedModel, eliminate_columns
 from hilcal.regression.evidence import FamilyScore, score_family
 from hilcal.regression.leave_out import Fold, left_out_residual

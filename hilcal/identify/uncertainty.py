@@ -22,8 +22,9 @@ from scipy.stats import chi2
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Whitening
 from hilcal.identify.folds import block_folds, region_folds
-from hilcal.identify.gauss_newton import Solution, prior_of, scales_of, whitened_jacobian
-from hilcal.identify.holdout import leave_out
+from hilcal.identify.gauss_newton import Solution, whitened_jacobian
+from hilcal.identify.holdout import changes
+from hilcal.identify.priors import prior_of, scales_of
 from hilcal.model import Model
 from hilcal.regression.hyperparameter_uncertainty import widened, with_dropped
 from hilcal.types import Bools, Floats, Ints
@@ -81,9 +82,9 @@ def uncertainty(
         std = formal * np.sqrt(total / dof)
         angle = readings.states.q[w.reading]
         for fold in (block_folds(pose), region_folds(angle, pose)):
-            folds = leave_out(model, solution, fold, w)
-            count = len(folds.change)
-            away = folds.change - folds.change.mean(axis=0)
+            change = changes(model, solution, fold, w)
+            count = len(change)
+            away = change - change.mean(axis=0)
             jackknife = np.sqrt((count - 1) / count * np.sum(away**2, axis=0))
             std = np.maximum(std, jackknife)
     identifiable = _identifiable(solution, scale, std)

@@ -16,7 +16,7 @@ from hilcal.errors import HilcalError
 from hilcal.identify.baseline import with_effects
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.full_covariance import with_joint_scatter
-from hilcal.identify.gauss_newton import scales_of
+from hilcal.identify.priors import scales_of
 from hilcal.plan.feasible import Space
 from hilcal.plan.goal import Goal, figures, parse_goal
 from hilcal.plan.nominal_model import after, nominal_model

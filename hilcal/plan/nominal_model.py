@@ -12,7 +12,7 @@ from hilcal.effects.options import Options
 from hilcal.effects.protocol import Effect
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit
-from hilcal.identify.gauss_newton import prior_of
+from hilcal.identify.priors import prior_of
 from hilcal.model import Model
 from hilcal.types import Floats, Ints
 

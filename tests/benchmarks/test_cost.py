@@ -23,7 +23,8 @@ from hilcal.effects.encoder_offset import EncoderOffset
 from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.effects.joint_tilt_compliance import JointTiltCompliance
 from hilcal.effects.target_offset import TargetOffset
-from hilcal.identify.gauss_newton import prior_of, scales_of, whitened_jacobian
+from hilcal.identify.gauss_newton import whitened_jacobian
+from hilcal.identify.priors import prior_of, scales_of
 from hilcal.identify.residual import residual
 from hilcal.model import Model, Prediction
 from hilcal.regression.normal_equations import find_basis, normal_equations

@@ -16,7 +16,7 @@ import scipy.linalg as sl
 from hilcal.data.readings import States
 from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.effects.link_geometry import LinkGeometry
-from hilcal.identify.gauss_newton import scales_of
+from hilcal.identify.priors import scales_of
 from hilcal.model import Model
 from hilcal.plan.approximate_design import relax
 from hilcal.plan.candidate_set import CandidateSet

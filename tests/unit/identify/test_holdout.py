@@ -13,7 +13,7 @@ from hilcal.identify.baseline import baseline, with_effects
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.folds import block_folds, distinct_poses, random_folds, region_folds
 from hilcal.identify.gauss_newton import solve
-from hilcal.identify.holdout import leave_out, ordinary
+from hilcal.identify.holdout import changes, leave_out, ordinary
 from hilcal.identify.residual import residual
 from hilcal.robot.catalogue import configs_dir
 from studies.study_cases import study_case
@@ -35,27 +35,28 @@ def test_leaving_out_is_refitting_without(mode, m):
     readings, w = found.readings, found.whitening
     assert not found.outlier.any()
     fold = random_folds(found.pose)
-    solution = solve(found.model, readings, w, found.theta)
-    folds = leave_out(found.model, solution, fold, w)
-    np.testing.assert_allclose(folds.raw, found.left_out, rtol=0, atol=1e-9)
+    solution, jacobian = solve(found.model, readings, w, found.theta)
+    left_out = leave_out(found.model, solution, jacobian, fold, w)
+    changed = changes(found.model, solution, fold, w)
+    np.testing.assert_allclose(left_out, found.left_out, rtol=0, atol=1e-9)
     noise = found.uncertainty.formal
     of_reading = random_folds(distinct_poses(readings))
-    assert len(folds.change) == 10
+    assert len(changed) == 10
     known = ordinary(found.model, found.theta)
     prior = np.where(np.isinf(solution.prior), known, solution.prior)
     moved = []
-    for f in range(len(folds.change)):
+    for f in range(len(changed)):
         rest = readings[of_reading != f]
         refit = fit(found.model, rest, mode, start=found.theta, prior=prior)
         change = (refit.theta - found.theta) / noise
         # One linear step: right to a few per cent of a standard uncertainty, where leaving out
         # moves parameters by one.
-        np.testing.assert_allclose(folds.change[f] / noise, change, rtol=0, atol=0.06)
+        np.testing.assert_allclose(changed[f] / noise, change, rtol=0, atol=0.06)
         prediction = found.model.predict(readings.states, refit.theta)
         off = residual(readings, prediction, w)
         sigma = np.sqrt(np.einsum("dii->di", w.covariance))
         mine = fold == f
-        np.testing.assert_allclose((folds.raw - off)[mine] / sigma[mine], 0, atol=0.02)
+        np.testing.assert_allclose((left_out - off)[mine] / sigma[mine], 0, atol=0.02)
         moved.append((found.raw - off)[mine] / sigma[mine])
     assert np.abs(np.concatenate(moved)).max() > 0.3
 

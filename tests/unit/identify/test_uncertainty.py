@@ -10,7 +10,7 @@ from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
-from hilcal.identify.gauss_newton import prior_of
+from hilcal.identify.priors import prior_of
 from hilcal.model import Model
 from tests.support.campaigns import campaign, with_noise
 from tests.support.effect_cases import make

@@ -1,0 +1,30 @@
+"""Prior standard deviations and ordinary magnitudes that the effects of a model declare."""
+
+import numpy as np
+
+from hilcal.model import Model
+from hilcal.types import Floats, Ints
+
+FIRST_GUESS = 0.3
+"""Prior standard deviation that a shrunk family starts from, in ordinary magnitudes; a choice."""
+
+
+def prior_of(model: Model) -> tuple[Floats, Ints]:
+    """Starting prior (P,) of a model, and the shrinkage group (P,) of each parameter or −1."""
+    prior, groups, used = [np.zeros(0)], [np.zeros(0, dtype=np.int64)], 0
+    for e in model.effects:
+        size = len(e.parameters)
+        own, fixed = e.groups(), e.prior_std()
+        if own is not None:
+            prior.append(FIRST_GUESS * np.array([p.scale for p in e.parameters]))
+            groups.append(own + used)
+            used += int(own.max()) + 1
+        else:
+            prior.append(np.full(size, np.inf) if fixed is None else fixed)
+            groups.append(np.full(size, -1))
+    return np.concatenate(prior), np.concatenate(groups)
+
+
+def scales_of(model: Model) -> Floats:
+    """(P,) ordinary magnitudes of the parameters."""
+    return np.array([p.scale for e in model.effects for p in e.parameters])

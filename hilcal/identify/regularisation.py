@@ -1,0 +1,165 @@
+"""Priors, noise factor and rank of a Gauss-Newton step, chosen from its linear problem.
+
+Priors of shrunk families maximise the evidence (`regression.empirical_bayes`). The noise factor β
+is the variance of the residual in units of the stated noise, at least 1, that the priors are
+weighed against. The rank counts the flat directions that the data determine against the residual.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hilcal.regression.empirical_bayes import shrink
+from hilcal.regression.normal_equations import Basis, NormalEquations, find_basis, normal_equations
+from hilcal.types import Floats, Ints
+
+NOISE_STEPS = 50
+"""Most fixed-point iterations of the noise factor; a choice, no study set it."""
+NOISE_TOLERANCE = 1e-9
+"""Relative change of the noise factor at which it has converged; a choice, no study set it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinearProblem:
+    """The whitened linear problem at one point: minimise ‖y − A (θ − θ_0)‖² over live parameters.
+
+    Attributes:
+        live: (L,) indices of the parameters that are not held at zero.
+        origin: (P,) θ_0: the point for flat parameters, zero for those with a prior.
+        a: (R, L) A.
+        gram: (L, L) AᵀA.
+        target: (R,) y.
+        rank: number of rows that carry information.
+        noise: variance of the rows: 1 where the scaling whitens, else that of the residual.
+        whitened: whether rows are in units of the stated noise.
+    """
+
+    live: Ints
+    origin: Floats
+    a: Floats
+    gram: Floats
+    target: Floats
+    rank: int
+    noise: float
+    whitened: bool
+
+    def restricted(self, prior: Floats) -> "LinearProblem":
+        """Return the problem without the parameters that a prior (P,) of zero holds at zero."""
+        kept = prior[self.live] > 0
+        if kept.all():
+            return self
+        gram = self.gram[np.ix_(kept, kept)]
+        return replace(self, live=self.live[kept], a=self.a[:, kept], gram=gram)
+
+    def basis(self, scale: Floats, prior: Floats, spread: float) -> Basis:
+        """Return identifiable coordinates for magnitudes (P,), priors (P,), and the residual's σ.
+
+        Without whitening only rounding decides the rank.
+        """
+        threshold = spread if self.whitened else None
+        return find_basis(self.a, scale[self.live], prior[self.live], threshold)
+
+    def equations(self, basis: Basis) -> NormalEquations:
+        """Return the normal equations in the coordinates of a basis."""
+        return normal_equations(self.a, self.target, basis, self.gram)
+
+    def rss(self, equations: NormalEquations, beta: float) -> float:
+        """Return ‖y − A (θ − θ_0)‖² at the solution of normal equations."""
+        z = equations.solve(beta)
+        yy = float(self.target @ self.target)
+        return yy - 2 * float(equations.rhs @ z) + float(z @ equations.gram @ z)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Regularisation:
+    """What a linear problem is solved with.
+
+    Attributes:
+        prior: (P,) prior standard deviations (infinite: flat, zero: held at zero).
+        beta: noise variance factor that the priors are weighed against.
+        basis: identifiable coordinates of the parameters that are not held at zero.
+    """
+
+    prior: Floats
+    beta: float
+    basis: Basis
+
+
+def regularise(
+    p: LinearProblem, scale: Floats, prior: Floats, groups: Ints, choose: bool
+) -> Regularisation:
+    """Choose priors, noise factor and rank for a linear problem.
+
+    Args:
+        p: the problem.
+        scale: (P,) ordinary magnitudes of the parameters.
+        prior: (P,) prior standard deviations so far.
+        groups: (P,) shrinkage group of each parameter, or −1.
+        choose: whether the evidence chooses the priors of the shrunk families.
+    """
+    spread = attainable_spread(p, scale, prior)
+    beta = 1.0 if p.whitened else spread**2
+    if choose:
+        prior, beta = _maximise_evidence(p, scale, prior, groups, spread)
+    return Regularisation(prior, beta, p.restricted(prior).basis(scale, prior, spread))
+
+
+def attainable_spread(p: LinearProblem, scale: Floats, prior: Floats) -> float:
+    """Root mean square of the residual at the solution of the linear problem.
+
+    It does not depend on where the linearisation started, as the residual itself does.
+    """
+    basis = p.basis(scale, prior, 1.0)
+    rss = p.rss(p.equations(basis), p.noise)
+    return float(np.sqrt(max(rss, 1e-30) / max(p.rank - len(basis.singular), 1)))
+
+
+def noise_factor(p: LinearProblem, equations: NormalEquations) -> float:
+    """Fixed point of β = max(1, RSS(β) / (R − effective parameters)), given the priors."""
+    beta = 1.0
+    for _ in range(NOISE_STEPS):
+        free = max(p.rank - effective_parameters(equations, beta), 1.0)
+        beta, before = max(1.0, p.rss(equations, beta) / free), beta
+        if abs(beta - before) < NOISE_TOLERANCE * beta:
+            break
+    return beta
+
+
+def effective_parameters(equations: NormalEquations, beta: float) -> float:
+    """Effective number of parameters: flat directions + Σ (1 − β Λ_kk H⁻¹_kk) over the others."""
+    flat, precision = len(equations.basis.singular), equations.basis.prior_precision
+    if flat == len(precision):
+        return float(flat)
+    covariance = np.diag(equations.inverse(beta))[flat:]
+    return flat + float(np.sum(1 - beta * precision[flat:] * covariance))
+
+
+def _maximise_evidence(
+    p: LinearProblem, scale: Floats, prior: Floats, groups: Ints, spread: float
+) -> tuple[Floats, float]:
+    """Priors (P,) with those of the shrunk families chosen, and the noise factor."""
+    beta = max(spread**2, 1.0)
+    family = np.isin(np.arange(len(prior)), p.live) & (groups >= 0)
+    if not family.any():
+        return prior, beta
+    # The families' columns unscaled, all others in well-conditioned coordinates.
+    basis = p.basis(scale, np.where(family, 1.0, prior), spread)
+    equations = p.equations(basis)
+    of_family = np.append(np.zeros(len(basis.singular), dtype=bool), family[p.live[basis.held]])
+    order = np.argsort(of_family, kind="stable")
+    others = int(np.sum(~of_family))
+    gram = equations.gram[np.ix_(order, order)]
+    gram[np.arange(others), np.arange(others)] += beta * basis.prior_precision[order[:others]]
+    found = shrink(
+        gram,
+        equations.rhs[order],
+        float(p.target @ p.target),
+        p.rank,
+        others,
+        groups[family],
+        prior[family],
+        beta,
+    )
+    out = prior.copy()
+    out[family] = found.std
+    return out, found.beta
