@@ -8,6 +8,9 @@ import typer
 from hilcal.cli import application, execute
 from studies.diagnosis_command import diagnosis
 from studies.plans_command import plans
+from studies.real_command import real
+from studies.records import results
+from studies.scaling_command import scaling
 
 
 def _group() -> None:
@@ -19,6 +22,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     app: typer.Typer = application("Evaluate the program itself on simulated campaigns.")
     app.command("diagnosis")(diagnosis)
     app.command("plans")(plans)
+    app.command("scaling")(scaling)
+    app.command("real")(real)
+    app.command("results")(results)
     app.callback()(_group)
     execute(lambda: app, "studies", sys.argv[1:] if arguments is None else arguments)
 

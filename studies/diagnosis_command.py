@@ -17,10 +17,12 @@ from hilcal.report.progress import counting
 from hilcal.robot.catalogue import configs_dir, robot_names
 from hilcal.toml import suggest
 from studies.diagnosis import KINDS, Asked, Kind, Sample, run_case
+from studies.diagnosis_claims import claims
 from studies.diagnosis_document import document
 from studies.diagnosis_pool import run_all
 from studies.diagnosis_questions import Extent, questions
 from studies.diagnosis_table import CAPTION, report
+from studies.records import Figure, Keep, keep
 from studies.study_cases import StudyCase, effects_shown, laws_shown, study_case
 from studies.study_more import measure_more
 
@@ -66,6 +68,7 @@ def diagnosis(
         typer.Option("--next", help="At 0.5 σ, also plan and measure what separates suspects."),
     ] = False,
     jobs: Annotated[int, typer.Option("--jobs", help="Processes.")] = 2,
+    keep_file: Keep = None,
     as_json: Json = False,
 ) -> None:
     """Hide effects in simulated campaigns, and count how often the diagnosis is right.
@@ -100,6 +103,16 @@ def diagnosis(
         t.show(report(outcomes))
         t.show("")
         t.show(CAPTION)
+    figures = [
+        Figure(
+            c.words,
+            f"{100 * c.rate.share:.1f} % of {c.rate.cases}",
+            "" if c.least is None else f"{100 * c.least:g} to {100 * c.most:g} %",
+            c.met,
+        )
+        for c in claims(outcomes)
+    ]
+    keep(keep_file, "How often the diagnosis is right", figures)
     t.document(document(outcomes, complete))
     if not complete:
         raise typer.Exit(_INTERRUPTED)

@@ -1,6 +1,6 @@
 """`python -m studies plans`: planned, random and hand-made campaigns on simulated arms."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated
@@ -25,6 +25,7 @@ from hilcal.types import Floats
 from studies.plans import MakeArm, PlansStudy, kinds_of, plans_study
 from studies.plans_errors import Asked
 from studies.plans_table import CAPTION, as_predicted, halved, report
+from studies.records import Figure, Keep, keep
 
 ROBOTS = ("ur10e", "ur5e")
 FRAMES = ("base_frame", "target_offset")
@@ -48,6 +49,7 @@ def plans(
         int | None, typer.Option("--candidates", help="Poses to choose from; as configured.")
     ] = None,
     seed: Annotated[int, typer.Option("--seed", help="Of everything that is random.")] = 0,
+    keep_file: Keep = None,
     as_json: Json = False,
 ) -> None:
     """Carry out planned, random and grid plans on simulated arms and compare their true errors."""
@@ -78,7 +80,21 @@ def plans(
         t.show(report(study))
         t.show("")
     t.show(CAPTION)
+    keep(keep_file, "What planning buys", [f for study in studies for f in _figures(study)])
     t.document({"robots": [document(study) for study in studies]})
+
+
+def _figures(study: PlansStudy) -> Iterator[Figure]:
+    for line in study.lines:
+        of = f"{study.robot}, {study.readings} {study.mode} readings, plan {line.kind}"
+        spread = line.result.spread
+        ratio = f"{spread.value:.2f} ± {spread.std:.2f}"
+        yield Figure(f"{of}: true over predicted error of the parameters", ratio)
+        if line.efficiency is not None:
+            yield Figure(f"{of}: certified efficiency", f"{100 * line.efficiency:.1f} %")
+        if line.random_readings is not None:
+            times = line.random_readings / study.readings
+            yield Figure(f"{of}: readings that a random plan needs", f"{times:.1f} times")
 
 
 def document(study: PlansStudy) -> dict[str, object]:

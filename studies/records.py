@@ -1,0 +1,115 @@
+"""What a study measured, kept as a file, and the page that is made of these files."""
+
+import json
+import shlex
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hilcal import __version__
+from hilcal.errors import InputError
+
+Keep = Annotated[
+    Path | None,
+    typer.Option("--keep", metavar="F.json", help="Keep what was measured, for `results`."),
+]
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """One figure of a study.
+
+    Attributes:
+        what: what was counted or measured.
+        measured: the figure in words.
+        required: what is required of it; empty where nothing is.
+        met: whether it is reached; None where nothing is required.
+    """
+
+    what: str
+    measured: str
+    required: str = ""
+    met: bool | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """The figures of one run of a study.
+
+    Attributes:
+        title: of the study.
+        command: that measured it.
+        date: when, ISO 8601.
+        version: of the program.
+        figures: what it measured.
+    """
+
+    title: str
+    command: str
+    date: str
+    version: str
+    figures: tuple[Figure, ...]
+
+
+def keep(path: Path | None, title: str, figures: Sequence[Figure]) -> None:
+    """Write the figures of the study that runs in this process, where asked for.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    if path is None:
+        return
+    words = [word for word in sys.argv[1:] if word not in ("--keep", str(path))]
+    command = f"python -m studies {shlex.join(words)}"
+    date = datetime.now(UTC).date().isoformat()
+    record = Record(title, command, date, __version__, tuple(figures))
+    _write(path, json.dumps(asdict(record), indent=1, ensure_ascii=False) + "\n")
+
+
+def results(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Kept figures, *.json.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="F.md", help="The page.")],
+) -> None:
+    """Make the page of results from what the studies kept."""
+    _write(output, page(folder))
+
+
+def page(folder: Path) -> str:
+    """Return the page of results, Markdown, from all records in a folder.
+
+    Raises:
+        InputError: no record, or a file that is not one.
+    """
+    paths = sorted(folder.glob("*.json"))
+    if not paths:
+        raise InputError(f"{folder}: no *.json; keep figures with --keep {folder}/NAME.json")
+    out = [
+        "# Results",
+        "",
+        "Made by `python -m studies results`; every section names the command that measured it.",
+        "The simulated cell's mechanics share no code with the effects.",
+    ]
+    for path in paths:
+        try:
+            record = json.loads(path.read_text(encoding="utf-8"))
+            head = f"`{record['command']}`, {record['date']}, hilcal {record['version']}"
+            rows = [Figure(**figure) for figure in record["figures"]]
+            out += ["", f"## {record['title']}", "", head, ""]
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(f"{path}: not a record of a study ({error})") from error
+        out += ["| what | measured | required | met |", "|---|---|---|---|"]
+        met = {True: "yes", False: "**no**", None: ""}
+        out += [f"| {f.what} | {f.measured} | {f.required} | {met[f.met]} |" for f in rows]
+    return "\n".join(out) + "\n"
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from None

@@ -1,0 +1,41 @@
+"""`python -m studies scaling`: the figures of `hilcal study scaling`, kept for the results."""
+
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from hilcal.cli.terminal import terminal
+from hilcal.data.whitening import SCALINGS
+from hilcal.report.progress import working
+from hilcal.study.scaling import scaling_study
+from hilcal.study.scaling_table import table
+from studies.records import Figure, Keep, keep
+
+
+def scaling(
+    runs: Annotated[int, typer.Option("--runs", help="Monte-Carlo runs.")] = 2000,
+    keep_file: Keep = None,
+) -> None:
+    """Show what the scalings none, gu and gc do to the same data."""
+    t = terminal(False)
+    with working(t.progress) as say:
+        say(f"simulating {runs} campaigns, each with every scaling")
+        study = scaling_study(np.random.default_rng(1), runs)
+    t.show(table(study))
+    figures = []
+    for name in SCALINGS:
+        mine = [c for c in study.cells if c.scaling == name]
+        ratios = [c.error_over_bound for c in mine]
+        coverage = [100 * c.coverage for c in mine]
+        figures += [
+            Figure(
+                f"{name}: error over the Cramér-Rao bound",
+                f"{min(ratios):.2f} to {max(ratios):.2f}",
+            ),
+            Figure(
+                f"{name}: coverage of 95 % intervals",
+                f"{min(coverage):.1f} to {max(coverage):.1f} %",
+            ),
+        ]
+    keep(keep_file, "What scaling does", figures)
