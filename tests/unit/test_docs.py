@@ -1,0 +1,73 @@
+"""The documents: links lead somewhere, and the Python in them runs."""
+
+import re
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+import hilcal as hc
+from hilcal.config import load_config
+from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.table import write_table
+from hilcal.robot.catalogue import configs_dir
+from studies.random_campaigns import rehearse
+from tests.support.paths import ROOT
+
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+def blocks(path: Path, language: str = "python") -> list[str]:
+    """Fenced code of a document."""
+    return re.findall(
+        rf"^ *```{language}\n(.*?)^ *```$", path.read_text(), re.DOTALL | re.MULTILINE
+    )
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda p: str(p.relative_to(ROOT)))
+def test_links_lead_to_files_of_the_tree(path: Path) -> None:
+    links = re.findall(r"\]\(([^)#:]+)\)", path.read_text())
+    missing = [link for link in links if not (path.parent / link).exists()]
+    assert missing == []
+
+
+def test_the_effect_of_the_guide_is_a_working_effect() -> None:
+    code = blocks(ROOT / "docs" / "how-to" / "add-an-effect.md")
+    known: dict[str, object] = {"__name__": "cable_pull"}
+    exec(code[0], known)
+    effect = known["CablePull"]
+    assert isinstance(effect, type)
+    assert issubclass(effect, hc.Effect)
+    hc.check_effect(effect)
+
+
+def test_the_guide_to_the_library_runs_as_it_stands(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cell = configs_dir() / "cells" / "demo_ur10e.toml"
+    config = load_config(cell)
+    readings = rehearse(config, "creep", 3, 10).readings
+    monkeypatch.chdir(tmp_path)
+    Path("CELL.toml").write_bytes(cell.read_bytes())
+    write_table(readings, Path("readings.csv"))
+    with CampaignFile.create("run.hilcal", config.to_json(), str(cell.parent), "test") as file:
+        file.append_readings(readings)
+    pyplot = ModuleType("matplotlib.pyplot")
+    drawn: list[object] = []
+    monkeypatch.setattr(pyplot, "plot", lambda *given: drawn.append(given), raising=False)
+    monkeypatch.setitem(sys.modules, "matplotlib", ModuleType("matplotlib"))
+    monkeypatch.setitem(sys.modules, "matplotlib.pyplot", pyplot)
+    known: dict[str, object] = {}
+    for code in blocks(ROOT / "docs" / "how-to" / "use-the-library.md"):
+        exec(code, known)
+    assert len(drawn) == 1
+    assert Path("plan.json").is_file()
+    with hc.Campaign.open("run.hilcal") as run:
+        assert "creep" in run.fit().model.names
+
+
+def test_the_first_example_of_the_library_is_short() -> None:
+    """A fit, its diagnosis and a plot of the residuals with one import of hilcal."""
+    first = blocks(ROOT / "docs" / "how-to" / "use-the-library.md")[0]
+    assert len([line for line in first.splitlines() if line.strip()]) <= 8
