@@ -42,6 +42,7 @@ _PLACES = {
     "plan": "hilcal.library",
     "read_table": "hilcal.library",
     "refine": "hilcal.library",
+    "view": "hilcal.library",
 }
 
 __all__ = ["__version__", *_PLACES]
@@ -58,7 +59,7 @@ if TYPE_CHECKING:
     from hilcal.effects.spec import effect
     from hilcal.errors import CannotAnswerError, DeviceError, HilcalError, InputError
     from hilcal.identify.fit import Fit
-    from hilcal.library import baseline, fit, plan, read_table, refine
+    from hilcal.library import baseline, fit, plan, read_table, refine, view
     from hilcal.model import Model
     from hilcal.refine import Refinement
 

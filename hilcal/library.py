@@ -1,10 +1,13 @@
 """The functions of `import hilcal`: thin, with defaults that suit a script."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from hilcal.campaign import Campaign
 from hilcal.cell import Cell
 from hilcal.data.covariance import tracker_noise
 from hilcal.data.readings import Readings
@@ -21,6 +24,7 @@ from hilcal.plan.planner import Request, make
 from hilcal.plan.summary import about, summarise
 from hilcal.refine import Refinement
 from hilcal.refine import refine as refine_model
+from hilcal.report.build_story import build_story
 from hilcal.types import Floats
 
 
@@ -156,6 +160,27 @@ def plan(
     planned = make(cell, config, Request(poses, criterion=criterion), rng, given)
     file = replace(planned.ordered.plan, about=about(planned))
     return checked(cell, config, file, summarise(planned, config, rng, compare=False))
+
+
+@contextmanager
+def view(run: Campaign, port: int = 9876) -> Iterator[str]:
+    """Serve the story of a campaign's latest revisions to rerun viewers while the block lasts.
+
+    >>> with hc.Campaign.open(RUN) as run, hc.view(run, port=PORT) as url:
+    ...     url
+    'rerun+http://127.0.0.1:.../proxy'
+
+    Args:
+        run: the campaign, with at least one revision.
+        port: on this machine.
+
+    Raises:
+        InputError: no revision, the port is taken, or rerun-sdk is not installed.
+    """
+    from hilcal.report.viewer import serve
+
+    with serve(build_story(run.chapters()), port=port) as served:
+        yield served.url
 
 
 def _mode(asked: str | None, data: Readings) -> Mode:

@@ -116,3 +116,10 @@ class Diagnosis:
     def residual_is_noise(self) -> bool:
         """Whether the stated noise explains the residual."""
         return self.reason in ("residual_is_noise", "inseparable_addition")
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the JSON document of `hilcal diagnose --json`, the sentence included."""
+        # The one import upwards: words are written in `report`, and a script has only this value.
+        from hilcal.report.diagnosis_document import to_json
+
+        return to_json(self)

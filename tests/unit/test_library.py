@@ -3,6 +3,7 @@
 import ast
 import doctest
 import inspect
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -47,7 +48,14 @@ def names() -> list[str]:
 @pytest.mark.parametrize("name", names())
 def test_the_examples_of_a_docstring_run(name: str, site: SimpleNamespace) -> None:
     thing = getattr(hc, name)
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
     known = {"hc": hc, "np": np, "CELL": site.cell, "TABLE": site.table, "RUN": site.run}
+    known["PORT"] = port
+    if name == "view":
+        with hc.Campaign.open(site.run) as run:
+            run.latest_fit()
     finder = doctest.DocTestFinder(recurse=True)
     tests = [t for t in finder.find(thing, name, module=False, globs=known) if t.examples]
     if name in WITHOUT_EXAMPLE:
@@ -78,6 +86,28 @@ def test_functions_are_not_hidden_by_the_packages_of_their_names(first: str) -> 
         "assert tour.__name__ == 'hilcal.plan.tour'"
     )
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
+
+
+def test_an_absent_viewer_is_named(site: SimpleNamespace) -> None:
+    code = (
+        "import sys; sys.modules['rerun'] = None\nimport hilcal as hc\n"
+        f"with hc.Campaign.open({str(site.run)!r}) as run:\n"
+        "    run.latest_fit()\n"
+        "    try:\n        hc.view(run).__enter__()\n"
+        "    except hc.InputError as error:\n        print(error)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True, text=True
+    )
+    assert done.stdout.startswith("the viewer needs rerun-sdk, which is not installed")
+
+
+def test_a_diagnosis_as_a_dictionary_is_what_the_command_prints(site: SimpleNamespace) -> None:
+    with hc.Campaign.open(site.run) as run:
+        d = hc.diagnose(hc.fit(hc.baseline(run.cell, run.readings), run.readings))
+    told = d.to_dict()
+    assert told["verdict"] == d.verdict
+    assert str(told["message"]).startswith(d.suspects[0].effect)
 
 
 def test_an_unknown_name_is_an_attribute_error() -> None:
