@@ -34,7 +34,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--hardware",
         metavar="CELL.toml",
         default=None,
-        help="run tests/test_devices.py on the real devices of this cell; the arm moves",
+        help="run tests/wire/test_devices.py on the real devices of this cell; the arm moves",
     )
 
 

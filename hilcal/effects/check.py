@@ -112,6 +112,7 @@ def _class(kind: type[Effect]) -> None:
         ),
         ("summary", "the law in one line", lambda v: _is_text(v) and "\n" not in v),
         ("elastic", "True, False", lambda v: isinstance(v, bool)),
+        ("local_response", "True, False", lambda v: isinstance(v, bool)),
         (
             "needs",
             f"a tuple of some of {', '.join(NEEDS)}",
@@ -147,6 +148,8 @@ def _try(kind: type[Effect], cell: Cell) -> None:
     _results(effect, theta, s)
     _states(effect, theta, s)
     _elastic(effect, theta, s)
+    if effect.local_response:
+        _local(effect, theta, s)
     _load(effect, theta, s, scale)
     _compliance(effect, theta, s)
     _needs(kind, cell, states)
@@ -251,6 +254,27 @@ def _elastic(effect: Effect, theta: Floats, s: Situation) -> None:
         given = getattr(response, key, None)
         found = np.zeros(1) if given is None else given[:, 0]
         _agree("response", f"of columns by the wrenches: {key}", found, quotient)
+
+
+def _local(effect: Effect, theta: Floats, s: Situation) -> None:
+    """Check `local_response`: each slot deviates with its own wrench alone, (1, ...) is taken."""
+    n = s.angle.shape[1]
+    for slot in range(n + 1):
+        one = np.zeros((1, 6, n + 1, 6))
+        one[0, :, slot] = np.eye(6)
+        found = effect.response(theta, s, one)
+        every = effect.response(theta, s, np.repeat(one, len(s.angle), axis=0))
+        for key in ("dq", "twist"):
+            given, full = getattr(found, key), getattr(every, key)
+            if given is None:
+                continue
+            good = given.ndim == full.ndim and np.allclose(given, full, rtol=1e-12, atol=0.0)
+            _need(
+                good, f"response to changes (1, P, n + 1, 6) has another {key}; expected the same"
+            )
+            others = np.arange(given.shape[2]) != slot
+            wrong = f"response moves other slots than {slot} by its wrench"
+            _need(not np.any(given[:, :, others]), f"{wrong}; set local_response = False")
 
 
 def _compliance(effect: Effect, theta: Floats, s: Situation) -> None:

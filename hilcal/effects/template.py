@@ -38,6 +38,8 @@ class Template(Effect):
     # Whether the law depends on forces and torques; then `response` must be there, too. Leave
     # both out where it does not.
     elastic = True
+    # Whether each slot deviates with the wrench through itself alone; Jacobians then cost less.
+    local_response = True
     # Columns of the readings without which the law cannot be computed, of: time, load_time,
     # air_temperature, joint_temperature, approach, q_actual; e.g. ("time", "joint_temperature").
     # Where readings lack one of them, the effect is not among the suspects.
