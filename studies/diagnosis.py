@@ -19,7 +19,7 @@ from hilcal.diagnose.verdict import diagnose
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
-from hilcal.identify.full_prediction import everything
+from hilcal.identify.full_prediction import full_prediction
 from hilcal.refine import Refinement, refine
 from hilcal.report.verdict_words import message
 from hilcal.types import Floats
@@ -278,7 +278,7 @@ def _same_as(d: Diagnosis, effect: str) -> tuple[str, ...]:
 
 def _floors(f: Fit, sample: Sample) -> tuple[float, float]:
     """Root mean square position error of the stated noise, and of what the noise was, m."""
-    e = everything(f)
+    e = full_prediction(f)
     noise = e.whitening.raw(sample.noise)[:, :3]
     return e.noise_floor, float(np.sqrt(np.mean(np.sum(noise**2, axis=1))))
 

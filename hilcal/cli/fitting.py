@@ -25,7 +25,7 @@ from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline, with_effects
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.fit_document import to_json
-from hilcal.identify.full_prediction import everything
+from hilcal.identify.full_prediction import full_prediction
 from hilcal.identify.linearisation import linearise
 from hilcal.identify.validation import validate as predict_other
 from hilcal.report import numbers, text
@@ -109,7 +109,7 @@ def compare(run: Run, effects_from: EffectsFrom = None, as_json: Json = False) -
             )
         say("looking where it fails")
         places = misfit_breakdown(linearise(found))
-    e = everything(found)
+    e = full_prediction(found)
     worst = text.worst_poses(e)
     name = text.model_name(titles(found.model, found.readings))
     t.show(text.heading(f"Revision {number}: {name}"))

@@ -7,7 +7,7 @@ from scipy.stats import chi2
 
 from hilcal.data.readings import Readings
 from hilcal.identify.fit import Fit
-from hilcal.identify.full_prediction import Everything, everything, names
+from hilcal.identify.full_prediction import FullPrediction, full_prediction, names
 from hilcal.types import Floats
 
 ALIKE = 1e-3
@@ -42,7 +42,7 @@ def gross_errors(fit: Fit) -> tuple[GrossError, ...]:
     """List what was set aside, in order; of deflections that share a bad unloaded reading, that."""
     if not fit.outlier.any():
         return ()
-    e = everything(fit)
+    e = full_prediction(fit)
     found: dict[int, GrossError] = {}
     first = 0
     for b in e.whitening.buckets:
@@ -61,7 +61,7 @@ def gross_errors(fit: Fit) -> tuple[GrossError, ...]:
     return tuple(found[row] for row in sorted(found))
 
 
-def _shared(e: Everything, row: int, measurements: Floats, alone: bool) -> GrossError:
+def _shared(e: FullPrediction, row: int, measurements: Floats, alone: bool) -> GrossError:
     """Judge an unloaded reading by the deflections that are taken from it."""
     rows = e.whitening.reading[measurements]
     v = e.readings.covariance
@@ -75,7 +75,7 @@ def _shared(e: Everything, row: int, measurements: Floats, alone: bool) -> Gross
     return GrossError(row, one.pose, one.load, one.sigma, f"{told} set aside with it")
 
 
-def _one(e: Everything, row: int, off: Floats, covariance: Floats) -> GrossError:
+def _one(e: FullPrediction, row: int, off: Floats, covariance: Floats) -> GrossError:
     sigma = _distance(off, covariance)
     reason = _stale(e.readings, row) or _like_another(e.readings, row) or _off(off, covariance)
     return GrossError(row, *names(e.readings, row), sigma, reason)

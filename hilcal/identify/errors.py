@@ -1,6 +1,6 @@
 """Error blocks: how far the model is from the measurements."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -25,7 +25,7 @@ class ErrorBlock:
 
     def to_json(self) -> dict[str, float]:
         """Keys and values of the contract."""
-        return {k: getattr(self, k) for k in ("rms_m", "mean_m", "max_m", "rms_sigma")}
+        return asdict(self)
 
 
 def error_block(raw: Floats, whitened: Floats, rank: int) -> ErrorBlock:
@@ -37,3 +37,8 @@ def error_block(raw: Floats, whitened: Floats, rank: int) -> ErrorBlock:
         max_m=float(distance.max()),
         rms_sigma=float(np.sqrt(whitened @ whitened / max(rank, 1))),
     )
+
+
+def noise_floor(covariance: Floats) -> float:
+    """Root mean square of the 3-D position error under covariances (D, m, m) alone, m."""
+    return float(np.sqrt(np.mean(np.trace(covariance[:, :3, :3], axis1=1, axis2=2))))

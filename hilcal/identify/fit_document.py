@@ -6,7 +6,7 @@ import numpy as np
 
 from hilcal.identify.data_snooping_reason import gross_errors
 from hilcal.identify.fit import Fit
-from hilcal.identify.full_prediction import everything
+from hilcal.identify.full_prediction import full_prediction
 from hilcal.robot import se3
 from hilcal.types import Floats
 
@@ -38,7 +38,7 @@ def to_json(fit: Fit) -> dict[str, object]:
         "variance_factor": fit.variance_factor,
         "variance_factor_interval": list(fit.variance_factor_interval),
         "error": {"fit": fit.error.to_json(), "holdout": fit.holdout.to_json()},
-        "noise_floor_m": everything(fit).noise_floor,
+        "noise_floor_m": full_prediction(fit).noise_floor,
         "outliers": outliers(fit),
         "registration": registration(fit).tolist(),
         "notes": list(notes(fit)),

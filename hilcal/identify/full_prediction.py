@@ -1,11 +1,10 @@
-"""All measurements of a fit: those that were set aside as gross errors included."""
+"""Prediction of all readings of a fit, those set aside as gross errors included."""
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Whitening, whitening
+from hilcal.identify.errors import noise_floor
 from hilcal.identify.fit import Fit, mahalanobis2
 from hilcal.identify.residual import residual
 from hilcal.model import Prediction
@@ -13,8 +12,8 @@ from hilcal.types import Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Everything:
-    """D measurements, whatever became of them in the fit; equal for all fits of equal readings.
+class FullPrediction:
+    """D measurements, fitted or set aside; the same ones for all fits of equal readings.
 
     Attributes:
         readings: all readings.
@@ -35,9 +34,8 @@ class Everything:
 
     @property
     def noise_floor(self) -> float:
-        """Root mean square of the 3-D position error that the stated noise alone leaves, m."""
-        trace = np.trace(self.whitening.covariance[:, :3, :3], axis1=1, axis2=2)
-        return float(np.sqrt(np.mean(trace)))
+        """Root mean square of the 3-D position error under the stated noise alone, m."""
+        return noise_floor(self.whitening.covariance)
 
     def name(self, measurement: int) -> tuple[str, str]:
         """Pose and load of a measurement."""
@@ -49,10 +47,10 @@ def names(readings: Readings, row: int) -> tuple[str, str]:
     return readings.pose_names[readings.pose[row]], readings.load_names[readings.load[row]]
 
 
-def everything(fit: Fit) -> Everything:
+def full_prediction(fit: Fit) -> FullPrediction:
     """Predict all readings of a fit."""
     if not fit.outlier.any():
-        return Everything(fit.readings, fit.whitening, fit.solution.prediction, fit.raw)
+        return FullPrediction(fit.readings, fit.whitening, fit.solution.prediction, fit.raw)
     w = whitening(fit.readings, fit.mode, "gc")
     prediction = fit.model.predict(fit.readings.states, fit.theta)
-    return Everything(fit.readings, w, prediction, residual(fit.readings, prediction, w))
+    return FullPrediction(fit.readings, w, prediction, residual(fit.readings, prediction, w))

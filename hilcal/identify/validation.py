@@ -8,14 +8,16 @@ from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode, Whitening, whitening
 from hilcal.effects.protocol import Effect
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identify.errors import ErrorBlock, error_block
+from hilcal.identify.errors import ErrorBlock, error_block, noise_floor
 from hilcal.identify.registration import register
 from hilcal.identify.residual import residual
 from hilcal.model import Model
 from hilcal.types import Floats
 
 STEPS = 10
+"""Most Gauss-Newton steps of a registration; a choice, no study set it."""
 CONVERGED = 1e-6
+"""Step of a registration that ends it, in σ per whitened element; a choice, no study set it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,9 +43,8 @@ class Validation:
 
     @property
     def noise_floor(self) -> float:
-        """Root mean square of the 3-D position error that the stated noise alone leaves, m."""
-        trace = np.trace(self.whitening.covariance[:, :3, :3], axis1=1, axis2=2)
-        return float(np.sqrt(np.mean(trace)))
+        """Root mean square of the 3-D position error under the stated noise alone, m."""
+        return noise_floor(self.whitening.covariance)
 
 
 def validate(
@@ -68,7 +69,7 @@ def validate(
 
     Raises:
         InputError: an effect of the model needs a column that the other readings lack.
-        CannotAnswerError: the registration does not settle.
+        CannotAnswerError: the registration does not converge.
     """
     for effect in model.effects:
         if not effect.computable(other.states):

@@ -15,7 +15,7 @@ from hilcal.diagnose.residual_regression import Dependence
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit, mahalanobis2
 from hilcal.identify.fit_document import finite
-from hilcal.identify.full_prediction import Everything, everything
+from hilcal.identify.full_prediction import FullPrediction, full_prediction
 from hilcal.identify.linearisation import linearise
 from hilcal.model import Model
 from hilcal.report import numbers
@@ -75,7 +75,7 @@ def build_story(chapters: Sequence[Chapter]) -> Story:
     """
     if not chapters:
         raise InputError("no revision to show; run hilcal identify first")
-    parts = [everything(c.fit) for c in chapters]
+    parts = [full_prediction(c.fit) for c in chapters]
     last = parts[-1]
     mode: Mode = chapters[-1].fit.mode
     for c, part in zip(chapters, parts, strict=True):
@@ -116,7 +116,7 @@ def pose_numbers(names: Sequence[str]) -> Ints:
     return np.array(numbers, dtype=np.int64)
 
 
-def _nominal(cell: Cell, e: Everything) -> Floats:
+def _nominal(cell: Cell, e: FullPrediction) -> Floats:
     """Target positions (N, 3) of the rigid nominal arm, base axes."""
     prediction = Model(cell, ()).predict(e.readings.states, np.zeros(0))
     return prediction.observation.base_position
@@ -126,7 +126,7 @@ def _turn(axes: Floats, vectors: Floats) -> Floats:
     return np.asarray(np.einsum("dij,dj->di", axes, vectors))
 
 
-def _revision(c: Chapter, e: Everything, axes: Floats, measured: Floats) -> StoryRevision:
+def _revision(c: Chapter, e: FullPrediction, axes: Floats, measured: Floats) -> StoryRevision:
     residual = _turn(axes, e.raw[:, :3])
     d = c.diagnosis
     shown = () if d is None else _shown(d)

@@ -14,7 +14,7 @@ from hilcal.effects.protocol import Effect
 from hilcal.identify.data_snooping_reason import gross_errors
 from hilcal.identify.fit import Fit
 from hilcal.identify.fit_document import notes, registration
-from hilcal.identify.full_prediction import Everything, everything
+from hilcal.identify.full_prediction import FullPrediction, full_prediction
 from hilcal.report import numbers
 from hilcal.robot import se3
 from hilcal.types import Ints
@@ -138,7 +138,7 @@ def errors(fit: Fit) -> RenderableType:
             numbers.length(e.max_m),
             f"{e.rms_sigma:.2f}",
         )
-    out.add_row("noise alone", numbers.length(everything(fit).noise_floor), "", "", "1.00")
+    out.add_row("noise alone", numbers.length(full_prediction(fit).noise_floor), "", "", "1.00")
     return out
 
 
@@ -200,7 +200,7 @@ def scaling_remark(fit: Fit) -> str:
 
 def misses(fit: Fit) -> str:
     """Say in a sentence how far the model is from the measurements."""
-    floor = everything(fit).noise_floor
+    floor = full_prediction(fit).noise_floor
     what = "deflections" if fit.mode == "deflection" else "positions"
     return (
         f"On poses left out, predicted {what} are off by {numbers.length(fit.holdout.rms_m)} rms; "
@@ -250,7 +250,7 @@ class Worst:
     sigma: float
 
 
-def worst_poses(e: Everything, most: int = 6) -> list[Worst]:
+def worst_poses(e: FullPrediction, most: int = 6) -> list[Worst]:
     """Measurements of the poses that err most in units of the noise, worst first."""
     distance = np.sqrt(e.mahalanobis2)
     found: dict[str, Worst] = {}

@@ -7,7 +7,7 @@ from rich.text import Text
 
 from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.identify.fit import Fit
-from hilcal.identify.full_prediction import everything
+from hilcal.identify.full_prediction import full_prediction
 from hilcal.report import numbers, text
 from hilcal.report.text_seen import could_have_been_seen, redundant_line
 from hilcal.report.text_unknown import curves, repeats
@@ -115,7 +115,7 @@ def revisions_table(rows: Sequence[tuple[int, str, Fit, str]]) -> RenderableType
             numbers.digits(fit.variance_factor),
             verdict.replace("_", " "),
         )
-    floor = numbers.length(everything(rows[-1][2]).noise_floor)
+    floor = numbers.length(full_prediction(rows[-1][2]).noise_floor)
     out.add_row("", "noise alone", floor, "1.00", floor, "1.00", "1", "", style="dim")
     return out
 

@@ -12,7 +12,7 @@ from hilcal.diagnose.verdict import diagnose
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import fit
-from hilcal.identify.full_prediction import everything
+from hilcal.identify.full_prediction import full_prediction
 from hilcal.refine import add
 from hilcal.report.build_story import Chapter, build_story, curve, pose_numbers
 from hilcal.report.story import Story, StoryRevision, check
@@ -70,7 +70,7 @@ def test_a_story_holds_together(
 def test_vectors_are_in_base_axes(deflections: tuple[Rehearsal, Story]) -> None:
     r, story = deflections
     turned = np.swapaxes(r.world.registration[:3, :3], 0, 1)
-    e = everything(chapters_of(r)[-1].fit)
+    e = full_prediction(chapters_of(r)[-1].fit)
     expected = e.whitening.raw(r.readings.value) @ turned.T
     # Deflections leave the base's turning open by what the closed form knows, some mrad.
     off = np.linalg.norm(story.measured - expected, axis=1)
