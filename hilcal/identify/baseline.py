@@ -1,4 +1,4 @@
-"""The model that every campaign starts from: the frames, and the joints where loads act."""
+"""The starting model of a campaign: unknown frames, and joint compliance where loads act."""
 
 from collections.abc import Iterable, Mapping
 
@@ -14,14 +14,14 @@ from hilcal.identify.registration import register
 from hilcal.model import Model
 
 ARM = 0.5
-"""Lever by which a registration that is off by a length is off by an angle, m. A guess: half of
-the reach of a middle-sized arm."""
+"""Lever from the length to the angle of a registration's prior, m. A guess: half of the reach of a
+middle-sized arm."""
 
 
 def baseline(
     cell: Cell, readings: Readings, mode: Mode, catalogue: Catalogue | None = None
 ) -> Model:
-    """Return the starting model: unknown frames, and where a load acts the joints' compliance.
+    """Return the starting model: unknown frames, and joint compliance where a load acts.
 
     They are found by the `role` of the catalogue's effects.
 
@@ -51,7 +51,7 @@ def with_effects(
     """Return frames where unknown, and the named effects.
 
     In deflections the frames act only by turning them, so their closed-form estimate from the
-    positions enters as a prior as wide as that estimate was off.
+    positions enters as a prior, with the rms error of that estimate as standard deviation.
 
     Args:
         cell: the cell.

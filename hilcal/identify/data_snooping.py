@@ -1,13 +1,14 @@
-"""Data snooping (Baarda): which readings, shifted, explain what nothing smooth does.
+"""Data snooping (Baarda): gross errors, by a test of a shift of each reading.
 
-With P the projection off the columns of the model and of generic smooth functions (those with a
+With P the projection off the columns of the model and of smooth nuisance functions (those with a
 prior by their marginal covariance, see `regression.projection`), and S_k (R, m) the whitened
-effect of a shift of reading k, of a loaded one or of the unloaded one that deflections share,
+effect of a shift of reading k, loaded or the unloaded one that deflections share,
 
     t²_k = (S_kᵀ P r)ᵀ (S_kᵀ P S_k)⁻¹ (S_kᵀ P r)
 
-is χ²_m for a good reading, whatever its leverage. The reading with the largest t² is taken out,
-its columns join P, and so on: a gross error cannot hide others, nor make good readings look bad.
+is χ²_m for a good reading, whatever its leverage. The search is a forward selection: the shift of
+the reading with the largest t² joins the columns that P projects off, and t² is computed anew, so
+that gross errors neither mask each other nor raise t² of good readings.
 
 Source: Baarda, *A testing procedure for use in geodetic networks* (1968).
 """
@@ -21,25 +22,26 @@ from hilcal.data.readings import Readings
 from hilcal.data.whitening import Whitening
 from hilcal.identify.gauss_newton import Solution
 from hilcal.identify.outliers import bulk, limit
-from hilcal.identify.smooth_nuisance import generic_columns
+from hilcal.identify.smooth_nuisance import smooth_nuisance_columns
 from hilcal.model import Model
 from hilcal.regression.projection import projection
 from hilcal.types import Bools, Floats, Ints
 
 SMALLEST = 3e-3
-"""Errors with less than this share of the largest t² wait until the model is fitted again."""
+"""Share of the largest t² below which errors wait for a new fit; a choice, no study set it."""
 LEVERAGE = 1e-6
-"""A reading of which less than this share is left after the fit cannot be judged."""
-
+"""Share of a reading's information that P must leave for a test; a choice, no study set it."""
 ACCIDENT = 1e-3
-"""Gross errors that fall on unloaded readings more often than chance would have it are none."""
+"""Binomial probability of so many shared unloaded readings among the gross errors, below which the
+cause is a misfit; a choice, the tests of effects on unloaded readings confirm it."""
 PATIENCE = 10
-"""So many readings, and half of what may be set aside, are taken out in vain before it ends."""
+"""Selections beyond the last gross error after which the search ends, with half of the most that
+may be set aside; a choice, no study set it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Suspected:
-    """Gross errors that were found.
+class SetAside:
+    """Gross errors of a solution.
 
     Attributes:
         drop: rows of the readings to set aside.
@@ -50,36 +52,36 @@ class Suspected:
     count: int
 
 
-def find_gross(
+def find_gross_errors(
     model: Model, solution: Solution, readings: Readings, w: Whitening, most: int
-) -> Suspected:
+) -> SetAside:
     """Search a gc-scaled solution for at most `most` gross errors.
 
-    Where there are more than twice as many, or too many of them are shared unloaded readings,
-    they are no accident, and none is returned.
+    More than twice as many, or too large a share of unloaded readings, is a misfit of the model:
+    none is returned.
     """
     e, q = _projection(model, solution, readings, w)
     c = _candidates(w)
     g, a = c.gradients(e[:, None])[:, :, 0], c.information(q)
-    whole = np.trace(a, axis1=1, axis2=2)
+    trace = np.trace(a, axis1=1, axis2=2)
     drop: list[Ints] = []
     taken: list[int] = []
-    largest, found, open_ = 0.0, 0, np.ones(len(c.row), dtype=bool)
-    t2 = _t2(g, a, whole)
+    largest, found, candidate = 0.0, 0, np.ones(len(c.row), dtype=bool)
+    t2 = _t2(g, a, trace)
     least, patience = limit(w.m, len(c.row)), most // 2 + PATIENCE
     added = np.empty((len(e), 0))
-    while len(drop) <= min(2 * most, found + patience) and (open_ & c.loaded).any():
-        k = int(np.argmax(np.where(open_, t2, 0.0)))
+    while len(drop) <= min(2 * most, found + patience) and (candidate & c.loaded).any():
+        k = int(np.argmax(np.where(candidate, t2, 0.0)))
         top = float(t2[k])
         largest = max(largest, top)
         if top <= max(least, SMALLEST * largest):
             break
         drop.append(c.drops[k])
         taken.append(k)
-        open_ &= ~np.isin(c.row, c.drops[k])
+        candidate &= ~np.isin(c.row, c.drops[k])
         # P becomes P − P S (Sᵀ P S)⁻¹ Sᵀ P; it is no projection where parts have a prior.
         shift = c.column(k, len(e))
-        inverse_root = _inverse_root(a[k], float(whole[k]))
+        inverse_root = _inverse_root(a[k], float(trace[k]))
         freed = shift - q @ (q.T @ shift) - added @ (added.T @ shift)
         new = freed @ inverse_root
         slope = c.gradients(new)
@@ -87,9 +89,9 @@ def find_gross(
         added = np.concatenate([added, new], axis=1)
         g = g - slope @ size
         a = a - slope @ np.swapaxes(slope, 1, 2)
-        t2 = _t2(g, a, whole)
-        # The bulk is judged without the suspects: they are in everyone's residual.
-        if top > limit(w.m, len(c.row), bulk(t2[c.loaded & open_], w.m)):
+        t2 = _t2(g, a, trace)
+        # The scale of the bulk is that without the selected shifts, which act on all residuals.
+        if top > limit(w.m, len(c.row), bulk(t2[c.loaded & candidate], w.m)):
             found = len(drop)
     shared = int(np.count_nonzero(~c.loaded[taken[:found]]))
     chance = float(binom.sf(shared - 1, found, np.mean(~c.loaded))) if shared else 1.0
@@ -97,38 +99,38 @@ def find_gross(
         found = 0
     found = min(found, most)
     rows = np.unique(np.concatenate(drop[:found])) if found else np.zeros(0, dtype=np.int64)
-    return Suspected(rows, found)
+    return SetAside(rows, found)
 
 
 def _projection(
     model: Model, solution: Solution, readings: Readings, w: Whitening
 ) -> tuple[Floats, Floats]:
-    """Residual (R,) and Q (R, K) with P = I − Q Qᵀ, off the model and generic smooth columns."""
+    """Residual (R,) and Q (R, K) with P = I − Q Qᵀ, off model and smooth nuisance columns."""
     own = solution.projection()
-    x = generic_columns(model, solution.prediction, readings, w)
+    x = smooth_nuisance_columns(model, solution.prediction, readings, w)
     p = projection(np.hstack([own.rows, x]), np.append(own.ridge, np.ones(x.shape[1])))
     z = np.append(solution.coordinates(), np.zeros(x.shape[1]))
     return p.residual(solution.white, z), p.root()
 
 
-def _inverse_root(a: Floats, whole: float) -> Floats:
-    """Root (m, r) of the inverse of (m, m), of the part that is left to judge a reading by."""
+def _inverse_root(a: Floats, trace: float) -> Floats:
+    """Root (m, r) of the pseudo-inverse of (m, m), of eigenvalues above `LEVERAGE`."""
     values, vectors = np.linalg.eigh(a)
-    seen = values > LEVERAGE * max(whole, 1e-300)
-    return np.asarray(vectors[:, seen] / np.sqrt(values[seen]))
+    kept = values > LEVERAGE * max(trace, 1e-300)
+    return np.asarray(vectors[:, kept] / np.sqrt(values[kept]))
 
 
-def _t2(g: Floats, a: Floats, whole: Floats) -> Floats:
-    """(N,) squared distances; zero where nothing of a reading is left to judge it by."""
+def _t2(g: Floats, a: Floats, trace: Floats) -> Floats:
+    """(N,) t²; zero for a reading without eigenvalues above `LEVERAGE`."""
     values, vectors = np.linalg.eigh(a)
     c = np.einsum("kij,ki->kj", vectors, g)
-    seen = values > LEVERAGE * np.maximum(whole, 1e-300)[:, None]
-    return np.asarray(np.sum(np.where(seen, c**2 / np.where(seen, values, 1.0), 0.0), axis=1))
+    kept = values > LEVERAGE * np.maximum(trace, 1e-300)[:, None]
+    return np.asarray(np.sum(np.where(kept, c**2 / np.where(kept, values, 1.0), 0.0), axis=1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Shifts:
-    """Effects of shifts of all readings that can be judged.
+    """Whitened effects of shifts of N candidate readings.
 
     Attributes:
         row: (N,) the reading.

@@ -1,4 +1,4 @@
-"""A fit: parameters, what can be said of them, and how far the model is from the data."""
+"""A fit: parameters, their uncertainties, residuals and errors."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from hilcal.data.readings import Readings, States
 from hilcal.data.whitening import Mode, Scaling, Whitening, inverse_root, whitening
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identify.data_snooping import find_gross
+from hilcal.identify.data_snooping import find_gross_errors
 from hilcal.identify.errors import ErrorBlock, error_block
 from hilcal.identify.estimates import Estimate, Estimates
 from hilcal.identify.folds import distinct_poses, random_folds
@@ -26,7 +26,9 @@ from hilcal.types import Bools, Floats, Ints
 Frame = Literal["sensor", "base"]
 CONFIDENCE = 0.95
 OUTLIER_ROUNDS = 6
+"""Most searches for gross errors, each followed by a new fit; a choice, no study set it."""
 MAX_OUTLIER_SHARE = 0.05
+"""Most readings that are set aside, as a share; a choice: more is a misfit."""
 
 _Solved = tuple[Whitening, Solution, Floats]
 """Scaling, solution, and the Jacobian (D, m, L) of the measurements by the live parameters."""
@@ -34,7 +36,7 @@ _Solved = tuple[Whitening, Solution, Floats]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """A model fitted to readings; nothing in it changes any more.
+    """A model fitted to readings.
 
     D is the number of measurements (readings or deflections), m their elements, P the
     number of parameters.
@@ -45,8 +47,8 @@ class Fit:
         mode: "deflection" or "absolute".
         scaling: "none", "gu" or "gc".
         whitening: gc-scaling of the readings that were fitted.
-        solution: where Gauss-Newton came to rest.
-        uncertainty: standard uncertainties and what is identifiable.
+        solution: the minimum that Gauss-Newton reached.
+        uncertainty: standard uncertainties and identifiable parameters.
         pose: (D,) distinct pose of each fitted measurement.
         raw: (D, m) residual.
         white: (R,) gc-whitened residual.
@@ -181,10 +183,10 @@ def fit(
 ) -> Fit:
     """Fit a model to readings.
 
-    With `start` and `prior` of an earlier fit the same fit is found again, quickly.
+    `start` and `prior` of an earlier fit reproduce it in few steps.
 
-    Gross errors are set aside first: they keep their place in the file and are listed, but
-    take no part. At most 5 % of the readings can be; more is not an outlier but a misfit.
+    Gross errors, at most `MAX_OUTLIER_SHARE` of the readings, are set aside: they stay in the file
+    and are listed, but are not fitted.
 
     Raises:
         CannotAnswerError: fewer measured elements than identifiable parameters.
@@ -208,7 +210,7 @@ def _set_aside(
         distance2 = mahalanobis2(solution.raw, w.covariance)
         if distance2.max() <= limit(w.m, len(distance2)):
             break
-        found = find_gross(model, solution, readings[used], w, left)
+        found = find_gross_errors(model, solution, readings[used], w, left)
         if not found.count:
             break
         used[np.flatnonzero(used)[found.drop]] = False

@@ -4,9 +4,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from hilcal.identify.data_snooping_reason import gross_errors
 from hilcal.identify.fit import Fit
 from hilcal.identify.full_prediction import full_prediction
+from hilcal.identify.gross_errors import gross_errors
 from hilcal.robot import se3
 from hilcal.types import Floats
 

@@ -13,7 +13,9 @@ from hilcal.data.readings import Readings
 from hilcal.types import Floats, Ints
 
 SAME_POSE = 2e-3
+"""Difference of joint angles within which two poses are one, rad; a choice, no study set it."""
 FOLDS = 10
+"""Number of folds; a choice, the usual one."""
 
 
 def distinct_poses(readings: Readings) -> Ints:
@@ -27,23 +29,23 @@ def distinct_poses(readings: Readings) -> Ints:
 
 
 def random_folds(pose: Ints, count: int = FOLDS) -> Ints:
-    """Fold of each measurement from its distinct pose: dealt at random, always the same."""
+    """Fold of each measurement from its distinct pose: at random, from a fixed seed."""
     total = int(pose.max()) + 1
     deal = np.random.default_rng(20240607).permutation(total) % min(count, total)
     return np.asarray(deal[pose])
 
 
 def block_folds(pose: Ints, count: int = FOLDS) -> Ints:
-    """Fold of each measurement: poses that were measured one after the other stay together."""
+    """Fold of each measurement: consecutive poses are in one fold."""
     total = int(pose.max()) + 1
     return np.asarray(np.arange(total) * min(count, total) // total)[pose]
 
 
 def region_folds(angle: Floats, pose: Ints, count: int = FOLDS) -> Ints:
-    """Fold of each measurement: poses close to each other in joint space stay together.
+    """Fold of each measurement: poses close to each other in joint space are in one fold.
 
-    The poses are cut into halves, over and over, across the direction in which their joint
-    angles spread most.
+    The largest group of poses is halved, repeatedly, across the first principal component of its
+    joint angles.
 
     Args:
         angle: (D, n) joint angles.

@@ -19,7 +19,8 @@ def campaign_readings(campaign: CampaignFile, cell: Cell, config: CellConfig) ->
     """Return all readings of a campaign with their full covariance, see `data.covariance`.
 
     The arm's repeatability is added where the stored covariances cover the instrument alone, that
-    is, for measured campaigns; an imported one is taken as it is, whatever `[repeatability]` is.
+    is, for measured campaigns; the covariances of an imported one include it, so `[repeatability]`
+    is not used.
 
     Raises:
         InputError: there are no readings yet, or they are damaged.
@@ -31,7 +32,7 @@ def campaign_readings(campaign: CampaignFile, cell: Cell, config: CellConfig) ->
 
 
 def with_joint_scatter(cell: Cell, readings: Readings, joint_std: Floats) -> Readings:
-    """Return the readings with the scatter of the joints added to what the instrument states.
+    """Return the readings with the scatter of the joints added to the instrument's covariance.
 
     V = V_instrument + R J Σ_q Jᵀ Rᵀ with the Jacobian of the nominal arm and R the orientation of
     the base in the sensor's frame, estimated from the readings where it is unknown. With too few

@@ -1,4 +1,4 @@
-"""The linearisation of a fit: what effects beside the model would explain, by algebra alone.
+"""The linearisation of a fit: evidence and predictions of effects that are not in the model.
 
 The ranking of effects that could be missing and the planning of measurements that separate them
 both use it, so that the planner's power and the diagnosis's test are of the same information.
@@ -44,7 +44,7 @@ class EffectColumns:
 
 @dataclass(frozen=True, slots=True)
 class HeldOut:
-    """What a family explains on poses left out.
+    """Reduction of the held-out error by a family.
 
     Attributes:
         share: of the misfit; negative where it makes predictions worse.
@@ -62,7 +62,7 @@ class Linearisation:
     Attributes:
         fit: the fit.
         projection: M, off the columns of the fitted model.
-        residual: (R,) whitened residual r, after the step that the model could still take.
+        residual: (R,) whitened residual r, after the remaining step of the model.
     """
 
     fit: Fit
@@ -109,7 +109,7 @@ class Linearisation:
         return score_family(s, x.T @ self.residual, self.rss, self.fit.dof)
 
     def misfit(self) -> float:
-        """‖r‖² − dof, the part that noise does not explain, at least `LEAST_MISFIT` of its σ."""
+        """‖r‖² − dof, the misfit beyond the noise, at least `LEAST_MISFIT` of its σ."""
         dof = self.fit.dof
         return float(max(self.rss - dof, LEAST_MISFIT * np.sqrt(2 * dof)))
 
@@ -118,7 +118,7 @@ class Linearisation:
         return float(np.clip(gain / self.misfit(), 0.0, 1.0))
 
     def held_out(self, x: Floats, found: FamilyScore) -> HeldOut:
-        """Return what a family explains on poses left out; see `leave_out`.
+        """Return the reduction of the error on left-out poses by a family; see `regression.leave_out`.
 
         Args:
             x: (R, P) whitened columns of the family.

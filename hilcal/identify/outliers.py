@@ -1,4 +1,4 @@
-"""Gross errors: readings that no noise and no smooth misfit explains."""
+"""Limit of the squared Mahalanobis distance from which on a reading is a gross error."""
 
 import numpy as np
 from scipy.stats import chi2
@@ -6,11 +6,12 @@ from scipy.stats import chi2
 from hilcal.types import Floats
 
 FALSE_ALARMS = 1e-3
-"""Expected number of good readings set aside in a whole campaign, when the model is right."""
+"""Expected number of good readings set aside per campaign under the right model; a choice."""
 MISFIT_FACTOR = 6.25
-"""While the model is wrong, the limit is 2.5 times as far: a misfit has heavier tails ..."""
+"""Factor of the limit with a misfit, 2.5 in distance: its tails are heavier. A choice, no study set
+it ..."""
 MISFIT = (1.25, 1.5)
-"""... gradually so from the scale that chance allows to one that it does not."""
+"""... reached gradually between these scales of the bulk, of noise alone and of a sure misfit."""
 
 
 def bulk(distance2: Floats, m: int) -> float:
@@ -21,8 +22,8 @@ def bulk(distance2: Floats, m: int) -> float:
 def limit(m: int, count: int, scale: float = 1.0) -> float:
     """Squared distance from which on one of `count` measurements is a gross error.
 
-    It is the χ²_m quantile that all good readings together exceed once in a thousand
-    campaigns, times the scale of the bulk where that is wider than the stated noise.
+    It is the χ²_m quantile that a good reading exceeds in one of a thousand campaigns, times the
+    scale of the bulk where that is wider than the stated noise.
     """
     far = float(chi2.isf(FALSE_ALARMS / count, m)) * max(1.0, scale)
     chance, sure = MISFIT

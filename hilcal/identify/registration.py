@@ -19,9 +19,10 @@ from hilcal.robot import se3
 from hilcal.types import Floats
 
 ALTERNATIONS = 200
+"""Most alternations between rotation and translations; a choice, no study set it."""
 MIN_POSES = 4
 NARROW = 1e-3
-"""Positions whose rms spread across a line is less than this, m, are on the line."""
+"""Rms distance from a line, m, below which positions are collinear; a choice."""
 
 
 def register(cell: Cell, readings: Readings) -> Cell:
@@ -109,7 +110,7 @@ def _translations(
 
 
 def _alternate(r: Floats, p: Floats, y: Floats, cell: Cell) -> tuple[Floats, Floats, Floats]:
-    """Positions only: Procrustes for R, then linear for τ and t, until nothing moves."""
+    """Positions only: Procrustes for R, then linear for τ and t, until convergence."""
     tau = cell.target[:3, 3]
     base = cell.registration[:3, :3]
     t = cell.registration[:3, 3]

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilcal.regression.empirical_bayes import shrink
+from hilcal.regression.empirical_bayes import maximise_evidence
 from hilcal.regression.normal_equations import Basis, NormalEquations, find_basis, normal_equations
 from hilcal.types import Floats, Ints
 
@@ -100,7 +100,7 @@ def regularise(
     spread = attainable_spread(p, scale, prior)
     beta = 1.0 if p.whitened else spread**2
     if choose:
-        prior, beta = _maximise_evidence(p, scale, prior, groups, spread)
+        prior, beta = _family_priors(p, scale, prior, groups, spread)
     return Regularisation(prior, beta, p.restricted(prior).basis(scale, prior, spread))
 
 
@@ -134,7 +134,7 @@ def effective_parameters(equations: NormalEquations, beta: float) -> float:
     return flat + float(np.sum(1 - beta * precision[flat:] * covariance))
 
 
-def _maximise_evidence(
+def _family_priors(
     p: LinearProblem, scale: Floats, prior: Floats, groups: Ints, spread: float
 ) -> tuple[Floats, float]:
     """Priors (P,) with those of the shrunk families chosen, and the noise factor."""
@@ -150,7 +150,7 @@ def _maximise_evidence(
     others = int(np.sum(~of_family))
     gram = equations.gram[np.ix_(order, order)]
     gram[np.arange(others), np.arange(others)] += beta * basis.prior_precision[order[:others]]
-    found = shrink(
+    found = maximise_evidence(
         gram,
         equations.rhs[order],
         float(p.target @ p.target),

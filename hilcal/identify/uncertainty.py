@@ -1,15 +1,14 @@
-"""Standard uncertainties that are true, and which parameters deserve a number.
+"""Standard uncertainties of the parameters, also with a misfit, and which are identifiable.
 
-While the residual is what the noise explains, Cov(θ) = T H⁻¹ Tᵀ. Where it is not, errors of
-neighbouring readings have causes in common and that formula is far too optimistic. Then the
-larger of three is stated: the formal one times the variance factor, and two delete-a-group
-jackknives, with groups of readings taken one after the other and with groups close in joint
-space:
+While the residual is within the noise, Cov(θ) = T H⁻¹ Tᵀ. With a misfit, errors of neighbouring
+readings are correlated and that formula is far too optimistic. Then the standard uncertainty is
+the largest of three: the formal one times the root of the variance factor, and two delete-a-group
+jackknives, with groups of consecutive readings and with groups close in joint space:
 
     Var(θ_p) = (G − 1)/G Σ_g (θ_p without g − mean)²
 
-Parameters of shrunk families are less certain by what is not known of their strength; see
-`hyperparameter_uncertainty`.
+For shrunk families the uncertainty of their prior variance adds; see
+`regression.hyperparameter_uncertainty`.
 
 Source: Efron and Tibshirani, *An Introduction to the Bootstrap*, chapter 11.
 """
@@ -26,30 +25,35 @@ from hilcal.identify.gauss_newton import Solution, whitened_jacobian
 from hilcal.identify.holdout import changes
 from hilcal.identify.priors import prior_of, scales_of
 from hilcal.model import Model
-from hilcal.regression.hyperparameter_uncertainty import widened, with_dropped
+from hilcal.regression.hyperparameter_uncertainty import (
+    dropped_group_factors,
+    hyperparameter_factors,
+)
 from hilcal.types import Bools, Floats, Ints
 
 NULL_SHARE = 0.1
-"""A direction that the data cannot see may move an identifiable parameter by this share of
-its standard uncertainty when it is off by an ordinary magnitude."""
+"""Share of its standard uncertainty by which an unidentifiable direction, off by an ordinary
+magnitude, may move an identifiable parameter; a choice, no study set it."""
 LEARNT = 0.7
-"""A parameter with a prior is identified where the data shrink its spread below this share."""
+"""Ratio of posterior to prior standard deviation below which a parameter with a prior is
+identifiable; a choice, no study set it."""
 MEANINGLESS = 10.0
-"""A parameter whose standard uncertainty is this many ordinary magnitudes tells nothing."""
+"""Standard uncertainty, in ordinary magnitudes, from which on a parameter is not identifiable; a
+choice, no study set it."""
 MISFIT_CHANCE = 0.01
+"""p-value of χ² below which the residual is a misfit; a choice, no study set it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Uncertainty:
-    """What can be said of the parameters.
+    """Uncertainty and identifiability of the parameters.
 
     Attributes:
         std: (P,) standard uncertainties; infinite where not identifiable.
-        formal: (P,) what independent noise of the stated size alone would give.
+        formal: (P,) standard uncertainties under independent noise of the stated size alone.
         identifiable: (P,) which parameters the data determine.
-        inflated: whether the residual is larger than noise, so that `std` comes from
-            leaving out groups of poses.
-        null: names of the directions that the data cannot see.
+        inflated: whether the residual is larger than noise, so that `std` is that of a misfit.
+        null: names of the unidentifiable directions.
     """
 
     std: Floats
@@ -84,11 +88,11 @@ def uncertainty(
         for fold in (block_folds(pose), region_folds(angle, pose)):
             change = changes(model, solution, fold, w)
             count = len(change)
-            away = change - change.mean(axis=0)
-            jackknife = np.sqrt((count - 1) / count * np.sum(away**2, axis=0))
+            off = change - change.mean(axis=0)
+            jackknife = np.sqrt((count - 1) / count * np.sum(off**2, axis=0))
             std = np.maximum(std, jackknife)
     identifiable = _identifiable(solution, scale, std)
-    std = std * _of_strength(model, w, solution, covariance)
+    std = std * _hyperparameter_factors(model, w, solution, covariance)
     return Uncertainty(
         np.where(identifiable, std, np.inf),
         formal,
@@ -98,23 +102,27 @@ def uncertainty(
     )
 
 
-def _of_strength(model: Model, w: Whitening, solution: Solution, covariance: Floats) -> Floats:
-    """Factors (P,) by which not knowing the strength of shrunk families widens."""
+def _hyperparameter_factors(
+    model: Model, w: Whitening, solution: Solution, covariance: Floats
+) -> Floats:
+    """Factors (P,) by which the unknown prior variances of shrunk families widen `std`."""
     groups, beta = prior_of(model)[1], solution.beta
-    factor = widened(beta * covariance, solution.theta, solution.prior, groups)
+    factor = hyperparameter_factors(beta * covariance, solution.theta, solution.prior, groups)
     dropped = np.flatnonzero((groups >= 0) & (solution.prior == 0))
     if w.scaling == "none" or not len(dropped) or not solution.rows.shape[1]:
         return factor
     columns = whitened_jacobian(model, solution.prediction, solution.theta, w, dropped)
     transform = solution.equations.basis.transform
-    return factor * with_dropped(transform, solution.projection(), columns, groups[dropped], beta)
+    return factor * dropped_group_factors(
+        transform, solution.projection(), columns, groups[dropped], beta
+    )
 
 
 def _identifiable(solution: Solution, scale: Floats, std: Floats) -> Bools:
-    """A parameter is identifiable where what cannot be seen hardly moves it."""
+    """(P,) parameters that unidentifiable directions hardly move, and that the data determine."""
     basis = solution.equations.basis
-    unseen = scale * np.linalg.norm(basis.null, axis=1)
-    flat = (unseen <= NULL_SHARE * std) & (std < MEANINGLESS * scale)
+    null = scale * np.linalg.norm(basis.null, axis=1)
+    flat = (null <= NULL_SHARE * std) & (std < MEANINGLESS * scale)
     learnt = std < LEARNT * np.where(np.isinf(solution.prior), np.inf, solution.prior)
     return np.where(basis.flat, flat, learnt & (solution.prior > 0))
 

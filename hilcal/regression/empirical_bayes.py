@@ -33,7 +33,7 @@ PATIENCE = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Shrinkage:
+class EmpiricalPrior:
     """Result of the evidence maximisation.
 
     Attributes:
@@ -47,7 +47,7 @@ class Shrinkage:
     effective: float
 
 
-def shrink(
+def maximise_evidence(
     gram: Floats,
     rhs: Floats,
     target_norm2: float,
@@ -56,7 +56,7 @@ def shrink(
     groups: Ints,
     start: Floats,
     beta: float = 1.0,
-) -> Shrinkage:
+) -> EmpiricalPrior:
     """Maximise the evidence over the group variances.
 
     Args:
@@ -116,4 +116,4 @@ def shrink(
         if not weighty.any() or change[weighty].max() < TOLERANCE:
             break
     std_all = np.sqrt(np.where(active, variance, 0.0))[groups]
-    return Shrinkage(std_all, float(beta), effective)
+    return EmpiricalPrior(std_all, float(beta), effective)

@@ -1,16 +1,16 @@
-"""What not knowing the strength of a shrunk family adds to the uncertainty of its parameters.
+"""Uncertainty of the parameters of a shrunk family due to that of its prior variance.
 
-A group's prior N(0, τ²) is chosen from the data (`empirical_bayes`), but a handful of parameters
-determine their own spread badly: stated for that one τ, intervals of weak groups would be too
-short. The uncertainty is that of the mixture over τ, around the estimate that is used:
+A group's prior N(0, τ²) is estimated from the data (`empirical_bayes`), from few parameters and
+therefore badly: intervals for that τ alone would be too short for weak groups. The uncertainty is
+that of the mixture over τ, around the estimate that is used:
 
     E[(θ − θ̂)²] = Σ_τ w_τ [ V_τ + (m_τ − θ̂)² ],   w_τ ∝ p(τ) |I + τ² L|^(−1/2) exp(½ bᵀ V_τ b)
 
 with L and b the precision and the right-hand side of the group alone, V_τ = (L + I/τ²)⁻¹ and
 m_τ = V_τ b. p(τ) is half-Cauchy; its scale is the spread at which noise alone is as large as the
-group, so that "nothing there" and "something there" have equal chances. Other groups are kept.
+group, so that a zero and a nonzero group are equally probable. Other groups keep their τ.
 
-Parameters of groups that were dropped may differ from zero, by as much as the noise hides. They are
+Parameters of dropped groups may differ from zero by as much as the noise allows. They are
 integrated out with a prior of that size: with M the projection off their columns D with its ridge
 β Λ (`projection`), A the columns of the others and Λ_z the ridge of these,
 
@@ -30,11 +30,13 @@ GRID = np.logspace(-2.0, 3.0, 101)
 """Values of τ in units of the half-Cauchy's scale."""
 ROUNDING = 1e-9
 HIDDEN = 2.0
-"""Variance that a dropped group may have, in units of what noise alone makes of its parameters:
+"""Variance that a dropped group may have, in units of that by noise alone:
 the mean over τ of a group at the limit of being dropped."""
 
 
-def widened(covariance: Floats, theta: Floats, prior: Floats, groups: Ints) -> Floats:
+def hyperparameter_factors(
+    covariance: Floats, theta: Floats, prior: Floats, groups: Ints
+) -> Floats:
     """Return the factors (P,), at least 1, by which standard uncertainties grow.
 
     Args:
@@ -73,7 +75,7 @@ def _of_group(covariance: Floats, theta: Floats, prior: float) -> Floats:
     return np.asarray(np.sqrt(np.maximum(mixed / np.diag(covariance), 1.0)))
 
 
-def with_dropped(
+def dropped_group_factors(
     transform: Floats, p: Projection, columns: Floats, groups: Ints, beta: float
 ) -> Floats:
     """Return the factors (P,), at least 1, by which groups that were dropped widen all others.
@@ -88,7 +90,7 @@ def with_dropped(
     free = np.maximum(np.diag(p.information(columns)), 0.0)
     norm2 = np.sum(columns**2, axis=0)
     reach = np.bincount(groups, weights=free) / np.maximum(np.bincount(groups), 1)
-    # Columns that the others explain altogether have no information of their own: left out.
+    # Columns in the span of the others have no information of their own: left out.
     seen = reach[groups] > ROUNDING * np.maximum(norm2, 1e-300)
     if not seen.any():
         return np.ones(len(transform))

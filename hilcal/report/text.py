@@ -11,10 +11,10 @@ from rich.text import Text
 
 from hilcal.diagnose.misfit_breakdown import MisfitShare
 from hilcal.effects.protocol import Effect
-from hilcal.identify.data_snooping_reason import gross_errors
 from hilcal.identify.fit import Fit
 from hilcal.identify.fit_document import notes, registration
 from hilcal.identify.full_prediction import FullPrediction, full_prediction
+from hilcal.identify.gross_errors import gross_errors
 from hilcal.report import numbers
 from hilcal.robot import se3
 from hilcal.types import Ints

@@ -5,12 +5,14 @@ import pytest
 
 from hilcal.identify.baseline import baseline, with_effects
 from hilcal.identify.fit import Fit, fit
-from hilcal.regression.empirical_bayes import Shrinkage, shrink
+from hilcal.regression.empirical_bayes import EmpiricalPrior, maximise_evidence
 from tests.support.campaigns import campaign, noiseless, plan
 from tests.support.effect_cases import make
 
 
-def linear(strength, count, rows=1200, flat=3, noise=1.0, seed=0) -> tuple[Shrinkage, np.ndarray]:
+def linear(
+    strength, count, rows=1200, flat=3, noise=1.0, seed=0
+) -> tuple[EmpiricalPrior, np.ndarray]:
     """A random regression: flat columns, then groups of `count` of the given strengths."""
     rng = np.random.default_rng(seed)
     groups = np.repeat(np.arange(len(strength)), count)
@@ -18,7 +20,7 @@ def linear(strength, count, rows=1200, flat=3, noise=1.0, seed=0) -> tuple[Shrin
     a = rng.normal(size=(rows, flat + len(groups)))
     y = a @ np.concatenate([10 * rng.normal(size=flat), theta]) + noise * rng.normal(size=rows)
     start = np.full(len(groups), 1.0)
-    found = shrink(a.T @ a, a.T @ y, float(y @ y), rows, flat, groups, start)
+    found = maximise_evidence(a.T @ a, a.T @ y, float(y @ y), rows, flat, groups, start)
     return found, groups
 
 
@@ -57,7 +59,7 @@ def test_an_empty_family_leaves_the_rest():
     a = rng.normal(size=(50, 4))
     y = rng.normal(size=50)
     none = np.zeros(0)
-    found = shrink(a.T @ a, a.T @ y, float(y @ y), 50, 4, none.astype(np.int64), none)
+    found = maximise_evidence(a.T @ a, a.T @ y, float(y @ y), 50, 4, none.astype(np.int64), none)
     assert found.effective == 0
     assert len(found.std) == 0
 

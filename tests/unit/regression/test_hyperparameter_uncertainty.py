@@ -3,7 +3,11 @@
 import numpy as np
 import pytest
 
-from hilcal.regression.hyperparameter_uncertainty import HIDDEN, widened, with_dropped
+from hilcal.regression.hyperparameter_uncertainty import (
+    HIDDEN,
+    dropped_group_factors,
+    hyperparameter_factors,
+)
 from hilcal.regression.projection import projection
 
 LEARNT = 0.7
@@ -26,7 +30,9 @@ def covered(truth: np.ndarray, campaigns: int = 4000) -> tuple[float, float]:
         if std >= LEARNT * np.sqrt(variance):
             continue
         prior = np.full(2, np.sqrt(variance))
-        factor = widened(shrunk * np.eye(2), shrunk * z, prior, np.zeros(2, dtype=np.int64))
+        factor = hyperparameter_factors(
+            shrunk * np.eye(2), shrunk * z, prior, np.zeros(2, dtype=np.int64)
+        )
         off = np.abs(shrunk * z - truth)
         count += 2
         inside += int((off < 1.96 * std).sum())
@@ -46,7 +52,7 @@ def test_intervals_hold_the_truth_about_as_often_as_stated(truth):
 def test_a_strong_group_is_hardly_widened_and_a_flat_parameter_not_at_all():
     covariance, theta = np.diag([0.01, 0.01, 1.0]), np.array([30.0, -20.0, 2.0])
     prior, groups = np.array([25.0, 25.0, np.inf]), np.array([0, 0, -1])
-    factor = widened(covariance, theta, prior, groups)
+    factor = hyperparameter_factors(covariance, theta, prior, groups)
     np.testing.assert_allclose(factor, 1.0, atol=2e-3)
     assert factor[2] == 1.0
 
@@ -56,8 +62,8 @@ def test_a_change_of_units_changes_nothing():
     a = rng.normal(size=(4, 3))
     covariance = np.linalg.inv(a.T @ a + np.eye(3) / 0.5**2)
     theta, prior, groups = rng.normal(size=3), np.full(3, 0.5), np.zeros(3, dtype=np.int64)
-    plain = widened(covariance, theta, prior, groups)
-    scaled = widened(1e-10 * covariance, 1e-5 * theta, 1e-5 * prior, groups)
+    plain = hyperparameter_factors(covariance, theta, prior, groups)
+    scaled = hyperparameter_factors(1e-10 * covariance, 1e-5 * theta, 1e-5 * prior, groups)
     np.testing.assert_allclose(plain, scaled, rtol=1e-9)
     assert (plain > 1.0).any()
 
@@ -65,10 +71,12 @@ def test_a_change_of_units_changes_nothing():
 def test_groups_are_taken_one_by_one():
     covariance = np.diag([0.3, 0.2, 0.4, 0.1])
     theta, prior = np.array([0.5, 0.4, 1.0, -0.8]), np.array([0.7, 0.7, 1.1, 1.1])
-    together = widened(covariance, theta, prior, np.array([0, 0, 1, 1]))
-    first = widened(covariance[:2, :2], theta[:2], prior[:2], np.array([0, 0]))
+    together = hyperparameter_factors(covariance, theta, prior, np.array([0, 0, 1, 1]))
+    first = hyperparameter_factors(covariance[:2, :2], theta[:2], prior[:2], np.array([0, 0]))
     np.testing.assert_allclose(together[:2], first)
-    dropped = widened(covariance, theta, np.where([1, 1, 0, 0], prior, 0.0), np.array([0, 0, 1, 1]))
+    dropped = hyperparameter_factors(
+        covariance, theta, np.where([1, 1, 0, 0], prior, 0.0), np.array([0, 0, 1, 1])
+    )
     np.testing.assert_allclose(dropped[2:], 1.0)
 
 
@@ -80,7 +88,7 @@ def test_what_a_dropped_group_could_do_widens_what_it_is_confused_with():
     apart -= kept @ np.linalg.lstsq(kept, apart, rcond=None)[0]
     dropped, groups = np.hstack([like_first, apart]), np.array([0, 1])
     h = kept.T @ kept
-    factor = with_dropped(np.eye(3), projection(kept, np.zeros(3)), dropped, groups, 1.0)
+    factor = dropped_group_factors(np.eye(3), projection(kept, np.zeros(3)), dropped, groups, 1.0)
     assert factor[0] > 1.5
     assert np.all(factor[1:] < 1.1)
     # As if the dropped ones were in the model, with a prior of their size.
@@ -95,5 +103,5 @@ def test_what_a_dropped_group_could_do_widens_what_it_is_confused_with():
 def test_a_dropped_column_that_others_stand_for_altogether_changes_nothing():
     kept = np.random.default_rng(3).normal(size=(50, 2))
     p, copy = projection(kept, np.zeros(2)), kept @ np.array([[1.0], [2.0]])
-    factor = with_dropped(np.eye(2), p, copy, np.array([0]), 1.0)
+    factor = dropped_group_factors(np.eye(2), p, copy, np.array([0]), 1.0)
     np.testing.assert_allclose(factor, 1.0)

@@ -1,4 +1,4 @@
-"""Readings that were set aside as gross errors, and what they look like."""
+"""Readings that were set aside as gross errors, with the likely reason."""
 
 from dataclasses import dataclass
 
@@ -11,11 +11,11 @@ from hilcal.identify.full_prediction import FullPrediction, full_prediction, nam
 from hilcal.types import Floats
 
 ALIKE = 1e-3
-"""Two readings are alike where noise differs by more once in a thousand times."""
+"""Two readings are alike where their distance is below the χ² quantile of this chance; a choice."""
 SAME = 1e-3
-"""A reading that repeats another to this share of σ was not taken anew."""
+"""A reading that repeats another to this share of σ was not taken anew; a choice."""
 MOSTLY = 0.8
-"""Share of the error that an axis must have to be named."""
+"""Share of the whitened error that an axis must have to be named; a choice."""
 AXES = ("x", "y", "z", "rotation about x", "rotation about y", "rotation about z")
 
 
@@ -27,8 +27,8 @@ class GrossError:
         row: of the readings.
         pose: its name.
         load: its name.
-        sigma: Mahalanobis distance from what the fit predicts.
-        reason: what it looks like, in a phrase.
+        sigma: Mahalanobis distance from the prediction of the fit.
+        reason: likely cause, or the error by axes, in a phrase.
     """
 
     row: int
@@ -39,7 +39,10 @@ class GrossError:
 
 
 def gross_errors(fit: Fit) -> tuple[GrossError, ...]:
-    """List what was set aside, in order; of deflections that share a bad unloaded reading, that."""
+    """List the readings set aside, in order.
+
+    Of deflections that share an unloaded reading that was set aside, only that one is listed.
+    """
     if not fit.outlier.any():
         return ()
     e = full_prediction(fit)
@@ -62,7 +65,7 @@ def gross_errors(fit: Fit) -> tuple[GrossError, ...]:
 
 
 def _shared(e: FullPrediction, row: int, measurements: Floats, alone: bool) -> GrossError:
-    """Judge an unloaded reading by the deflections that are taken from it."""
+    """Gross error of an unloaded reading, from the deflections that are taken from it."""
     rows = e.whitening.reading[measurements]
     v = e.readings.covariance
     off = -np.median(e.raw[measurements], axis=0)
@@ -71,8 +74,10 @@ def _shared(e: FullPrediction, row: int, measurements: Floats, alone: bool) -> G
     if not alone:
         return one
     many = len(rows)
-    told = f"{one.reason}; its {many} deflections" if many > 1 else f"{one.reason}; its deflection"
-    return GrossError(row, one.pose, one.load, one.sigma, f"{told} set aside with it")
+    reason = (
+        f"{one.reason}; its {many} deflections" if many > 1 else f"{one.reason}; its deflection"
+    )
+    return GrossError(row, one.pose, one.load, one.sigma, f"{reason} set aside with it")
 
 
 def _one(e: FullPrediction, row: int, off: Floats, covariance: Floats) -> GrossError:
@@ -91,7 +96,7 @@ def _stale(r: Readings, row: int) -> str:
 
 
 def _like_another(r: Readings, row: int) -> str:
-    """Whether it reads as under another load at the same pose."""
+    """Phrase for a reading that agrees with one under another load at the same pose, or ''."""
     best, found = float(chi2.isf(ALIKE, r.m)), -1
     for other in np.flatnonzero((r.pose == r.pose[row]) & (r.load != r.load[row])):
         away = _distance(r.value[row] - r.value[other], r.covariance[row] + r.covariance[other])
@@ -118,6 +123,6 @@ def _off(off: Floats, covariance: Floats) -> str:
 
 
 def _distance(off: Floats, covariance: Floats) -> float:
-    """Mahalanobis distance, of the part that has noise."""
+    """Mahalanobis distance in the range of a covariance, which may be singular."""
     square = float(off @ np.linalg.pinv(covariance, hermitian=True) @ off)
     return float(np.sqrt(max(square, 0.0)))
