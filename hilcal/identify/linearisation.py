@@ -118,7 +118,7 @@ class Linearisation:
         return float(np.clip(gain / self.misfit(), 0.0, 1.0))
 
     def held_out(self, x: Floats, found: FamilyScore) -> HeldOut:
-        """Return the reduction of the error on left-out poses by a family; see `regression.leave_out`.
+        """Return the reduction of the held-out error by a family; see `regression.leave_out`.
 
         Args:
             x: (R, P) whitened columns of the family.
