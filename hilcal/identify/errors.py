@@ -4,6 +4,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from hilcal.data.whitening import Whitening
 from hilcal.types import Floats
 
 
@@ -28,14 +29,14 @@ class ErrorBlock:
         return asdict(self)
 
 
-def error_block(raw: Floats, whitened: Floats, rank: int) -> ErrorBlock:
-    """Summarise raw residuals (D, m) and their whitened rows (R,) of given rank."""
+def error_block(raw: Floats, w: Whitening) -> ErrorBlock:
+    """Summarise residuals (D, m) and their whitened elements."""
     distance = np.linalg.norm(raw[:, :3], axis=1)
     return ErrorBlock(
         rms_m=float(np.sqrt(np.mean(distance**2))),
         mean_m=float(distance.mean()),
         max_m=float(distance.max()),
-        rms_sigma=float(np.sqrt(whitened @ whitened / max(rank, 1))),
+        rms_sigma=float(np.linalg.norm(w.whiten(raw)) / np.sqrt(max(w.rank, 1))),
     )
 
 

@@ -285,10 +285,6 @@ def _assemble(
         outlier=outlier,
         chi2=total,
         dof=dof,
-        error=_block(all_raw, whole),
-        holdout=_block(all_left_out, whole),
+        error=error_block(all_raw, whole),
+        holdout=error_block(all_left_out, whole),
     )
-
-
-def _block(raw: Floats, w: Whitening) -> ErrorBlock:
-    return error_block(raw, w.whiten(raw).reshape(-1), w.rank)

@@ -97,14 +97,14 @@ def regularise(
         groups: (P,) shrinkage group of each parameter, or −1.
         choose: whether the evidence chooses the priors of the shrunk families.
     """
-    spread = attainable_spread(p, scale, prior)
+    spread = _attainable_spread(p, scale, prior)
     beta = 1.0 if p.whitened else spread**2
     if choose:
         prior, beta = _family_priors(p, scale, prior, groups, spread)
     return Regularisation(prior, beta, p.restricted(prior).basis(scale, prior, spread))
 
 
-def attainable_spread(p: LinearProblem, scale: Floats, prior: Floats) -> float:
+def _attainable_spread(p: LinearProblem, scale: Floats, prior: Floats) -> float:
     """Root mean square of the residual at the solution of the linear problem.
 
     It does not depend on where the linearisation started, as the residual itself does.

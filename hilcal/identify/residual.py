@@ -9,18 +9,6 @@ from hilcal.robot import se3
 from hilcal.types import Floats
 
 
-def predicted(prediction: Prediction, w: Whitening) -> Floats:
-    """Predicted measurements (D, m); rotation vectors of poses are relative (see `residual`)."""
-    o = prediction.observation
-    position = w.raw(o.position)
-    if w.m == 3:
-        return position
-    if w.mode == "deflection":
-        return np.concatenate([position, relative_rotation(o.rotation, w)], axis=1)
-    turn = w.raw(se3.rotation_vector(o.rotation))
-    return np.concatenate([position, turn], axis=1)
-
-
 def residual(readings: Readings, prediction: Prediction, w: Whitening) -> Floats:
     """Measured − predicted (D, m).
 

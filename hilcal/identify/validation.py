@@ -87,7 +87,7 @@ def validate(
         readings=other,
         whitening=w,
         raw=raw,
-        error=error_block(raw, white, w.rank),
+        error=error_block(raw, w),
         variance_factor=float(white @ white) / max(w.rank - free, 1),
         registered=registered,
     )
