@@ -18,7 +18,10 @@ from studies.records import Figure, Keep, keep
 
 
 def real(
-    series: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Series_B, Series_C.")],
+    series: Annotated[
+        list[Path],
+        typer.Argument(metavar="F.csv...", help="measurements_joint_configurations.csv."),
+    ],
     keep_file: Keep = None,
     as_json: Json = False,
 ) -> None:
@@ -29,7 +32,7 @@ def real(
     for path in series:
         begun = time.monotonic()
         with working(t.progress) as say:
-            say(f"reading {path.name}")
+            say(f"reading {path}")
             readings = read_ipa_ur10(path, cell.arm).readings
             found = refine(baseline(cell, readings, "absolute"), readings, "absolute", say)
         first, last = found.steps[0].fit, found.fit
@@ -38,14 +41,14 @@ def real(
         seconds = time.monotonic() - begun
         figures += [
             Figure(
-                f"{path.name}, {len(readings)} readings: mean error of poses left out",
+                f"{path.parent.name}, {len(readings)} readings: mean error of poses left out",
                 f"{errors[0]} → {errors[1]} ({seconds:.0f} s)",
             ),
-            Figure(f"{path.name}: last model, verdict", f"{model}: {found.verdict}"),
+            Figure(f"{path.parent.name}: last model, verdict", f"{model}: {found.verdict}"),
         ]
         document.append(
             {
-                "series": path.name,
+                "series": path.parent.name,
                 "mean_m": [f.holdout.mean_m for f in (first, last)],
                 "model": list(last.model.names),
                 "verdict": found.verdict,

@@ -64,7 +64,8 @@ def keep(path: Path | None, title: str, figures: Sequence[Figure]) -> None:
     """
     if path is None:
         return
-    words = [word for word in sys.argv[1:] if word not in ("--keep", str(path))]
+    words = [Path(w).name if Path(w).is_file() else w for w in sys.argv[1:]]
+    words = [word for word in words if word not in ("--keep", path.name, str(path))]
     command = f"python -m studies {shlex.join(words)}"
     date = datetime.now(UTC).date().isoformat()
     record = Record(title, command, date, __version__, tuple(figures))
