@@ -112,7 +112,8 @@ def diagnosis(
         )
         for c in claims(outcomes)
     ]
-    keep(keep_file, "How often the diagnosis is right", figures)
+    kinds = ", ".join(what or KINDS)
+    keep(keep_file, f"How often the diagnosis is right: {kinds}", figures)
     t.document(document(outcomes, complete))
     if not complete:
         raise typer.Exit(_INTERRUPTED)
