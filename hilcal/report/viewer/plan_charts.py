@@ -52,11 +52,12 @@ def curve_unit(s: PlanSummary) -> tuple[str, float]:
 
 
 def curve(rec: rr.RecordingStream, s: PlanSummary) -> None:
-    """Log the sample-size curve as bars; the plan's own number of poses is a series of its own."""
+    """Log the sample-size curve as bars; the one nearest to the plan is a series of its own."""
     poses = np.array([p.poses for p in s.curve], dtype=float)
     height = curve_unit(s)[1] * np.array([p.position_std_m for p in s.curve])
     width = 0.6 * float(np.diff(poses).min(initial=poses.max(initial=1.0)))
-    own = poses == s.poses
+    own = np.zeros(len(poses), dtype=np.bool_)
+    own[np.argmin(np.abs(poses - s.poses))] = True
     for name, bars, color in (("other", ~own, style.GREY), ("plan", own, style.MEASURED)):
         if bars.any():
             chart = rr.BarChart(

@@ -54,7 +54,7 @@ def blueprint(d: PlanDigest) -> rrb.Blueprint:
 def curve_title(d: PlanDigest) -> str:
     """Return the title of the sample-size curve, with its unit."""
     unit = plan_charts.curve_unit(d.summary)[0]
-    return f"Position ± [{unit}] by number of poses; blue: this plan"
+    return f"Position ± [{unit}] by number of poses; blue: nearest to this plan"
 
 
 def _details(d: PlanDigest) -> list[rrb.View]:
