@@ -29,8 +29,11 @@ def record_of(r: Rehearsal, found: Fit, added: str | None = None) -> RevisionRec
     return to_record(found, None, added, content_hash(r.readings))
 
 
-@pytest.mark.parametrize("effect", ["hysteresis", "transmission_error", "link_geometry"])
-def test_the_same_fit_comes_back(effect: str) -> None:
+@pytest.mark.parametrize(
+    ("effect", "held_out"),
+    [("hysteresis", 1e-5), ("transmission_error", 1e-5), ("link_geometry", 1e-4)],
+)
+def test_the_same_fit_comes_back(effect: str, held_out: float) -> None:
     r = rehearsal(effect)
     found = add(baseline_fit(r), effect)
     text = to_text(
@@ -47,7 +50,7 @@ def test_the_same_fit_comes_back(effect: str) -> None:
     assert again.dof == pytest.approx(found.dof, rel=1e-6)
     # The rank is analysed again at the converged parameters. Directions that are hardly determined
     # (0.27 σ per ordinary magnitude for link_geometry) turn a little: 6e-5 of the held-out error.
-    assert again.holdout.rms_m == pytest.approx(found.holdout.rms_m, rel=1e-4)
+    assert again.holdout.rms_m == pytest.approx(found.holdout.rms_m, rel=held_out)
     assert again.solution.iterations <= 2
     np.testing.assert_array_equal(again.outlier, found.outlier)
 
