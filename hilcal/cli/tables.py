@@ -17,7 +17,7 @@ from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.covariance import tracker_noise
 from hilcal.data.ipa_ur10 import read_ipa_ur10
 from hilcal.data.readings import Readings
-from hilcal.data.table import read_table, write_table
+from hilcal.data.table import FROM_TRACKER, import_table, write_table
 from hilcal.errors import InputError
 from hilcal.report import text
 from hilcal.report.progress import working
@@ -86,13 +86,9 @@ def _read(
         found = read_ipa_ur10(table, arm)
         return found.readings, found.notes
     s = settings.tracker
-    readings = read_table(table, arm, tracker_noise(s), s.station_m)
-    with table.open(encoding="utf-8-sig", errors="replace") as stream:
-        stated = "cov_x_x" in stream.readline()
-    if stated:
-        return readings, ("covariance: from the table",)
+    result = import_table(table, arm, tracker_noise(s), s.station_m)
     where = "" if s.frame == "tracker" or s.station_m else ", as if it stood at the arm's base"
-    return readings, (f"covariance: from the tracker's noise in [tracker]{where}",)
+    return result.readings, tuple(n + where * (n == FROM_TRACKER) for n in result.notes)
 
 
 def export(

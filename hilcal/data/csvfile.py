@@ -2,7 +2,7 @@
 
 import csv
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 
@@ -48,6 +48,7 @@ class CsvTable:
         rows: (N,) row of each record as a spreadsheet counts, the header being row 1.
         text: text columns by name, N cells each, without blanks around.
         number: (N,) number columns by name.
+        alias: what the file itself calls a column, where it is another name than here.
     """
 
     path: str
@@ -55,11 +56,12 @@ class CsvTable:
     rows: Ints
     text: dict[str, list[str]]
     number: dict[str, Floats]
+    alias: dict[str, str] = field(default_factory=dict)
 
     def at(self, index: int, column: str | None = None) -> str:
         """Where a record (and a cell) is, for messages."""
         where = f"{self.path}: row {self.rows[index]}"
-        return where if column is None else f"{where}, column '{column}'"
+        return where if column is None else f"{where}, column '{self.alias.get(column, column)}'"
 
     def matrix(self, names: Sequence[str]) -> Floats:
         """(N, k) number columns side by side."""

@@ -2,10 +2,10 @@
 
 Source: Landgraf et al., IEEE CASE 2021, data set `christianlandgraf/ipa-robot-accuracy`.
 One row per pose: commanded joints in rad, a 6-D tracker reading of a T-Mac on the flange in
-mm and as intrinsic X-Y'-Z'' angles in deg, and the standard deviation of each averaged element.
+mm and as intrinsic X-Y'-Z'' angles in deg, and in most series the standard deviation of each
+averaged element and the temperature of the air.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ import numpy as np
 from hilcal.data import checks
 from hilcal.data.covariance import TrackerNoise, tracker_covariance
 from hilcal.data.csvfile import CsvTable, Dialect, read_columns
+from hilcal.data.imported import ImportResult
 from hilcal.data.readings import Readings, States
 from hilcal.errors import InputError
 from hilcal.robot import se3
@@ -31,7 +32,8 @@ _ELEMENTS = ("x", "y", "z", "rx", "ry", "rz")
 MEASURED = tuple(f"measurement_{e}" for e in _ELEMENTS)
 SPREAD = tuple(f"measurement_std_{e}" for e in _ELEMENTS)
 AIR = "measurement_temperature"
-COLUMNS = (*JOINTS, AIR, *MEASURED, *SPREAD)
+NEEDED = (*JOINTS, *MEASURED)
+COLUMNS = (*NEEDED, AIR, *SPREAD)
 
 TRACKER = TrackerNoise(
     range_std=5e-6,
@@ -60,19 +62,6 @@ _REPEAT = 2e-4
 _TOOL = 0.5
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ImportResult:
-    """Readings, and what was decided on the way.
-
-    Attributes:
-        readings: the readings that can be used.
-        notes: one sentence per decision; left out rows are named as a spreadsheet counts them.
-    """
-
-    readings: Readings
-    notes: tuple[str, ...]
-
-
 def read_ipa_ur10(path: str | Path, arm: Arm) -> ImportResult:
     """Read `measurements_*.csv`; poses are named by their rows, the load is `none`.
 
@@ -81,7 +70,8 @@ def read_ipa_ur10(path: str | Path, arm: Arm) -> ImportResult:
         V = blockdiag(diag(s_p²), E diag(s_a²) Eᵀ) + V_tracker
 
     with s_p, s_a the standard deviations of the file, not less than the floors, and E the
-    axes about which the three angles turn: e_x, R_x e_y, R_x R_y e_z.
+    axes about which the three angles turn: e_x, R_x e_y, R_x R_y e_z. A series without columns of
+    standard deviations has the floors in their place.
 
     Rows are left out where a cell is empty; where the reading is the previous row's within
     noise though the joints were commanded elsewhere (the arm did not follow, or the tracker did
@@ -94,8 +84,10 @@ def read_ipa_ur10(path: str | Path, arm: Arm) -> ImportResult:
     table = read_columns(
         path, lambda h: _choose(str(path), h, arm), Dialect(delimiter=";", decimal=",", blank=True)
     )
-    q, value, spread = table.matrix(JOINTS), table.matrix(MEASURED), table.matrix(SPREAD)
-    everything = np.hstack([q, value, spread, table.matrix((AIR,))])
+    q, value, spread = table.matrix(JOINTS), table.matrix(MEASURED), _spread(table)
+    everything = np.hstack([q, value, spread])
+    if AIR in table.number:
+        everything = np.hstack([everything, table.matrix((AIR,))])
     whole: Bools = np.asarray(np.isfinite(everything).all(axis=1))
     if np.mean(~whole) > _MAX_LOST:
         raise InputError(
@@ -113,7 +105,7 @@ def read_ipa_ur10(path: str | Path, arm: Arm) -> ImportResult:
     if len(keep) == 0:
         raise InputError(f"{table.path}: no row can be used; expected one measured pose per row")
     readings = _readings(table, keep, q, value[keep], spread[keep], approach)
-    return ImportResult(readings, _notes(table.rows, whole, stale, odd))
+    return ImportResult(readings, _notes(table, whole, stale, odd))
 
 
 def _choose(path: str, header: list[str], arm: Arm) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -125,12 +117,24 @@ def _choose(path: str, header: list[str], arm: Arm) -> tuple[tuple[str, ...], tu
             f"{path}: not a measurement file of the ipa-ur10 format; expected columns separated "
             f"by ';' with the names {JOINTS[0]} ... {SPREAD[-1]} in row 1"
         )
-    if missing:
-        raise InputError(f"{path}: column '{missing[0]}' is missing; needed: {', '.join(COLUMNS)}")
-    for name in COLUMNS:
+    if lacking := [c for c in NEEDED if c in missing]:
+        raise InputError(f"{path}: column '{lacking[0]}' is missing; needed: {', '.join(NEEDED)}")
+    if 0 < len(lacking := [c for c in SPREAD if c in missing]) < len(SPREAD):
+        raise InputError(
+            f"{path}: column '{lacking[0]}' is missing; give all of {', '.join(SPREAD)}, or none"
+        )
+    present = tuple(c for c in COLUMNS if c not in missing)
+    for name in present:
         if header.count(name) > 1:
             raise InputError(f"{path}: column '{name}' appears {header.count(name)} times")
-    return (), COLUMNS
+    return (), present
+
+
+def _spread(table: CsvTable) -> Floats:
+    """(N, 6) standard deviations in mm and deg; zero, to be raised to the floors, where absent."""
+    if SPREAD[0] not in table.number:
+        return np.zeros((len(table.rows), len(SPREAD)))
+    return table.matrix(SPREAD)
 
 
 def _check(table: CsvTable, whole: Bools, arm: Arm) -> None:
@@ -142,7 +146,7 @@ def _check(table: CsvTable, whole: Bools, arm: Arm) -> None:
         {},
         {name: column[whole] for name, column in table.number.items()},
     )
-    q, value, spread = good.matrix(JOINTS), good.matrix(MEASURED), good.matrix(SPREAD)
+    q, value, spread = good.matrix(JOINTS), good.matrix(MEASURED), _spread(good)
     checks.check_joints(good, JOINTS, q, arm)
     metres = np.linalg.norm(value[:, :3], axis=1) > 1e3 * checks.MAX_DISTANCE
     good.refuse(
@@ -154,6 +158,8 @@ def _check(table: CsvTable, whole: Bools, arm: Arm) -> None:
             f"{np.ptp(value[:, :3], axis=0).max():.3g} mm (looks like metres); expected mm"
         )
     good.refuse(np.abs(value[:, 3:]) > 360, MEASURED[3:], lambda v: f"{v:g} is not in deg")
+    if SPREAD[0] not in good.number:
+        return
     good.refuse(spread < 0, SPREAD, lambda v: f"{v:g}: a standard deviation is >= 0")
     limit = np.repeat([1e3 * checks.MAX_STD, 1.0], 3)
     good.refuse(spread > limit, SPREAD, lambda v: f"{v:g}: not at rest; expected mm and deg")
@@ -228,7 +234,7 @@ def _readings(
     states = States(
         q=q[keep],
         wrench=np.zeros((n, 6)),
-        air_temperature=table.number[AIR][keep],
+        air_temperature=table.number[AIR][keep] if AIR in table.number else None,
         approach=approach[keep],
     )
     return Readings(
@@ -243,7 +249,9 @@ def _readings(
     )
 
 
-def _notes(rows: Ints, whole: Bools, stale: Bools, odd: Bools) -> tuple[str, ...]:
+def _notes(table: CsvTable, whole: Bools, stale: Bools, odd: Bools) -> tuple[str, ...]:
+    rows = table.rows
+
     def left_out(bad: Bools, why: str) -> list[str]:
         if not bad.any():
             return []
@@ -251,6 +259,9 @@ def _notes(rows: Ints, whole: Bools, stale: Bools, odd: Bools) -> tuple[str, ...
         more = ", ..." if bad.sum() > 10 else ""
         return [f"{int(bad.sum())} of {len(rows)} rows left out ({named}{more}): {why}"]
 
+    floors = f"{1e6 * POSITION_FLOOR:g} µm, {np.rad2deg(ORIENTATION_FLOOR):g}°"
+    instrument = "an AT500-class tracker's typical errors and 0.005° for the T-Mac"
+    stated = SPREAD[0] in table.number
     return (
         *left_out(~whole, "empty cells"),
         *left_out(stale, "the same reading as the row before, though the joints were sent on"),
@@ -258,7 +269,9 @@ def _notes(rows: Ints, whole: Bools, stale: Bools, odd: Bools) -> tuple[str, ...
         "timestamps are not used: they are ruined by rounding in the file",
         f"approach: side of the move from the row before; moves below {STILL:g} rad keep the last "
         f"side, the first row counts as +1",
-        "covariance: the file's standard deviations (at least "
-        f"{1e6 * POSITION_FLOOR:g} µm, {np.rad2deg(ORIENTATION_FLOOR):g}°) plus an AT500-class "
-        "tracker's typical errors and 0.005° for the T-Mac",
+        f"covariance: the file's standard deviations (at least {floors}) plus {instrument}"
+        if stated
+        else f"covariance: the file has no standard deviations ({SPREAD[0]} ...); {instrument}, "
+        f"and {floors} for the scatter of a mean",
+        *([] if AIR in table.number else [f"no air temperature: the file has no column {AIR}"]),
     )

@@ -10,10 +10,14 @@ import numpy as np
 from hilcal.data import checks, columns
 from hilcal.data.covariance import TrackerNoise, tracker_covariance
 from hilcal.data.csvfile import CsvTable, read_columns
+from hilcal.data.imported import ImportResult
 from hilcal.data.readings import Readings, States
 from hilcal.errors import InputError
 from hilcal.robot.arm import Arm
 from hilcal.types import Floats, Ints
+
+FROM_TABLE = "covariance: from the table"
+FROM_TRACKER = "covariance: from the tracker's noise in [tracker]"
 
 
 def read_table(
@@ -36,7 +40,43 @@ def read_table(
     Raises:
         InputError: anything that cannot be right.
     """
+    return import_table(path, arm, noise, station).readings
+
+
+def import_table(
+    path: str | Path,
+    arm: Arm,
+    noise: TrackerNoise | None,
+    station: Floats | Sequence[float] | None = None,
+) -> ImportResult:
+    """Read an exchange table as `read_table` does, with notes on where its covariances come from.
+
+    Raises:
+        InputError: anything that cannot be right.
+    """
     table = read_columns(path, lambda header: _choose(str(path), header, arm))
+    return readings_of(table, arm, noise, station)
+
+
+def readings_of(
+    table: CsvTable,
+    arm: Arm,
+    noise: TrackerNoise | None,
+    station: Floats | Sequence[float] | None = None,
+    covariance: Floats | None = None,
+) -> ImportResult:
+    """Check a table with the exchange table's columns, in SI units, and make readings of it.
+
+    Args:
+        table: the parsed columns.
+        arm: its number of joints, their limits and its reach are checked.
+        noise: gives the covariances where there are none.
+        station: (3,) where the tracker's beam starts, m; the origin where None.
+        covariance: (N, m, m) in place of the table's columns, checked like them.
+
+    Raises:
+        InputError: anything that cannot be right.
+    """
     checks.check_names(table)
     pose, pose_names = _index(table.text["pose"])
     load, load_names = _index(table.text["load"])
@@ -49,16 +89,23 @@ def read_table(
         rotation = table.matrix(columns.ROTATION)
         checks.check_rotations(table, rotation)
         value = np.hstack([value, rotation])
-    return Readings(
+    stated = _stated(table, value.shape[1]) if covariance is None else covariance
+    if stated is None:
+        cov, notes = _instrument(table, value, noise, station), (FROM_TRACKER,)
+    else:
+        checks.check_covariances(table, stated)
+        cov, notes = stated, (FROM_TABLE,)
+    readings = Readings(
         states=states,
         pose=pose,
         load=load,
         cycle=_cycles(table),
         value=value,
-        covariance=_covariances(table, value, noise, station),
+        covariance=cov,
         load_names=tuple(load_names),
         pose_names=tuple(pose_names),
     )
+    return ImportResult(readings, notes)
 
 
 def _choose(path: str, header: list[str], arm: Arm) -> tuple[Sequence[str], Sequence[str]]:
@@ -138,21 +185,27 @@ def _cycles(table: CsvTable) -> Ints:
     return cycle[:, 0].astype(np.int64)
 
 
-def _covariances(
+def _stated(table: CsvTable, m: int) -> Floats | None:
+    """Covariances (N, m, m) that the table states, None where it states none."""
+    names = columns.covariance_columns(m)
+    if names[0] not in table.number:
+        return None
+    i, j = np.triu_indices(m)
+    cov = np.zeros((len(table.rows), m, m))
+    cov[:, i, j] = cov[:, j, i] = table.matrix(names)
+    return cov
+
+
+def _instrument(
     table: CsvTable,
     value: Floats,
     noise: TrackerNoise | None,
     station: Floats | Sequence[float] | None,
 ) -> Floats:
+    """Covariances (N, m, m) of the instrument in [tracker]."""
     m = value.shape[1]
-    names = columns.covariance_columns(m)
-    if names[0] in table.number:
-        i, j = np.triu_indices(m)
-        cov = np.zeros((len(value), m, m))
-        cov[:, i, j] = cov[:, j, i] = table.matrix(names)
-        checks.check_covariances(table, cov)
-        return cov
     if noise is None:
+        names = columns.covariance_columns(m)
         raise InputError(
             f"{table.path}: no covariance columns ({names[0]} ... {names[-1]}) and no noise in "
             f"the section [tracker] of the configuration; give one of them"

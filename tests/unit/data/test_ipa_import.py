@@ -181,14 +181,36 @@ def test_too_much_is_missing(tmp_path: Path) -> None:
         read(tmp_path, table)
 
 
+def test_a_series_without_standard_deviations_and_temperature(tmp_path: Path) -> None:
+    whole = read(tmp_path, rows()).readings
+    path = tmp_path / "m.csv"
+    kept = [k for k, name in enumerate(HEADER) if "_std_" not in name and "temperature" not in name]
+    lines = [line.split(";") for line in path.read_text().splitlines()]
+    path.write_text("\n".join(";".join(line[k] for k in kept) for line in lines))
+    result = read_ipa_ur10(path, ARM)
+    np.testing.assert_array_equal(result.readings.value, whole.value)
+    own = result.readings.covariance - tracker_covariance(whole.value[:, :3], TRACKER, m=6)
+    np.testing.assert_allclose(own[:, range(3), range(3)], (2e-6) ** 2, rtol=1e-6)
+    assert result.readings.states.air_temperature is None
+    assert any("the file has no standard deviations" in note for note in result.notes)
+    assert any("no air temperature" in note for note in result.notes)
+
+
+def test_some_of_the_standard_deviations(tmp_path: Path) -> None:
+    path = write(tmp_path / "m.csv", rows())
+    path.write_text(path.read_text().replace("measurement_std_rx", "std"))
+    with pytest.raises(InputError, match=r"'measurement_std_rx' is missing; give all of .* none"):
+        read_ipa_ur10(path, ARM)
+
+
 def test_other_formats(tmp_path: Path) -> None:
     path = tmp_path / "m.csv"
     path.write_text("pose,load,q1_rad\na,none,1\n")
     with pytest.raises(InputError, match="not a measurement file of the ipa-ur10 format"):
         read_ipa_ur10(path, ARM)
     write(path, rows())
-    path.write_text(path.read_text().replace("measurement_std_rx", "std"))
-    with pytest.raises(InputError, match="column 'measurement_std_rx' is missing"):
+    path.write_text(path.read_text().replace("measurement_rx", "rx"))
+    with pytest.raises(InputError, match="column 'measurement_rx' is missing"):
         read_ipa_ur10(path, ARM)
     with pytest.raises(InputError, match="test-arm has 7"):
         read_ipa_ur10(path, make_arm(7))
