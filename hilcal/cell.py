@@ -1,6 +1,7 @@
 """The cell as numbers: arm, target, load point, tool, registration."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from hilcal.errors import InputError
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.se3 import rotation
-from hilcal.types import Floats
+from hilcal.types import Floats, Ints
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,6 +30,10 @@ class Cell:
         target_known: False where the target's offset has to be estimated.
         config: the configuration that the cell was made from: instruments, loads, limits; None
             for a cell that was made from numbers alone.
+        targets: (T, 4, 4) T_flange_target of several targets, in the order of `target_names`;
+            `target` is the first of them. None where the tool carries one.
+        target_names: their names.
+        targets_known: which of their offsets are known; `target_known` where all are.
     """
 
     arm: Arm
@@ -41,6 +46,35 @@ class Cell:
     registration_known: bool
     target_known: bool
     config: CellConfig | None = None
+    targets: Floats | None = None
+    target_names: tuple[str, ...] = ()
+    targets_known: tuple[bool, ...] = ()
+
+    @property
+    def all_targets(self) -> Floats:
+        """(T, 4, 4) T_flange_target of all targets."""
+        return self.target[None] if self.targets is None else self.targets
+
+    @property
+    def known_targets(self) -> tuple[bool, ...]:
+        """Whether the offset is known, for each of the T targets."""
+        return (self.target_known,) if self.targets is None else self.targets_known
+
+    def target_of(self, number: Ints | None) -> Floats:
+        """Targets (N, 4, 4) by their number (N,), see `States.target`; (4, 4) for None."""
+        return self.target if number is None else self.all_targets[number]
+
+    def with_targets(self, poses: Floats, known: Sequence[bool] | None = None) -> "Cell":
+        """Return the cell with other T_flange_target (T, 4, 4), and which of them are known."""
+        found = tuple(self.known_targets if known is None else known)
+        several = self.targets is not None
+        return replace(
+            self,
+            target=poses[0],
+            target_known=all(found),
+            targets=poses if several else None,
+            targets_known=found if several else (),
+        )
 
     @classmethod
     def load(cls, path: str | Path) -> "Cell":
@@ -87,17 +121,23 @@ def cell_from_config(config: CellConfig, base_dir: Path | None = None) -> Cell:
     robot, tool, tracker = config.robot, config.tool, config.tracker
     arm = load_arm(robot.model, base_dir, base_link=robot.base_link, tip_link=robot.tip_link)
     config.repeatability.per_joint(arm.n)
+    described = tool.targets or (tool,)
+    poses = np.stack([_pose(t.target_m, t.target_rotvec_rad) for t in described])
+    known = tuple(t.target_m is not None for t in described)
     return Cell(
         arm=arm,
-        target=_pose(tool.target_m, tool.target_rotvec_rad),
+        target=poses[0],
         load_point=np.array(tool.load_point_m),
         tool_mass=tool.mass_kg,
         tool_com=np.array(tool.com_m),
         gravity=np.array(robot.gravity_m_s2),
         registration=_pose(tracker.base_xyz_m, tracker.base_rotvec_rad),
         registration_known=tracker.frame == "base" or tracker.base_xyz_m is not None,
-        target_known=tool.target_m is not None,
+        target_known=all(known),
         config=config,
+        targets=poses if len(poses) > 1 else None,
+        target_names=tuple(t.name for t in tool.targets),
+        targets_known=known if len(poses) > 1 else (),
     )
 
 

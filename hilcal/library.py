@@ -45,7 +45,8 @@ def read_table(path: str | Path, cell: Cell) -> Readings:
         InputError: anything that cannot be right, with row and column.
     """
     tracker = cell.configured().tracker
-    return read_exchange_table(path, cell.arm, tracker_noise(tracker), tracker.station_m)
+    noise, station = tracker_noise(tracker), tracker.station_m
+    return read_exchange_table(path, cell.arm, noise, station, cell.target_names)
 
 
 def baseline(

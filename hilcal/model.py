@@ -166,7 +166,7 @@ class Model:
                 "poses and loads that determine them, or leave an effect out"
             )
         s = replace(s, chain=chain)
-        return Prediction(s, deviation, observe(cell, chain, deviation))
+        return Prediction(s, deviation, observe(cell, chain, deviation, states.target))
 
     def jacobian(
         self, prediction: Prediction, theta: Floats, m: int, live: Ints | None = None

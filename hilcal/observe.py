@@ -15,7 +15,7 @@ from hilcal.robot.batch import along_states, empty, zeros
 from hilcal.robot.chain import Chain, joint_jacobian, twist_jacobian
 from hilcal.robot.deviation import Deviation
 from hilcal.robot.geometric_stiffness import MotionGradient, rows_times
-from hilcal.types import Floats
+from hilcal.types import Floats, Ints
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,9 +35,12 @@ class Observation:
     axes: Floats
 
 
-def observe(cell: Cell, chain: Chain, deviation: Deviation) -> Observation:
-    """Read the target of a deviated chain."""
-    offset, turn = cell.target[:3, 3], cell.target[:3, :3]
+def observe(
+    cell: Cell, chain: Chain, deviation: Deviation, target: Ints | None = None
+) -> Observation:
+    """Read the target of a deviated chain; `target` (N,) numbers it where there are several."""
+    pose = cell.target_of(target)
+    offset, turn = pose[..., :3, 3], pose[..., :3, :3]
     axes, origin = cell.registration[:3, :3], cell.registration[:3, 3]
     rotation = chain.rotation[-1]
     if deviation.target is not None:

@@ -65,6 +65,7 @@ def to_record(
             "prior": [fit_document.finite(s) for s in found.solution.prior],
             "registration": cell.registration.tolist(),
             "target": cell.target.tolist(),
+            **({} if cell.targets is None else {"targets": cell.targets.tolist()}),
             "outliers": np.flatnonzero(found.outlier).tolist(),
         },
         result_json=result,
@@ -106,9 +107,13 @@ def restore_model(
         InputError: the parameters are not those of the model.
     """
     stored: Mapping[str, Any] = record.parameters_json
-    cell = replace(
-        cell, registration=np.array(stored["registration"]), target=np.array(stored["target"])
-    )
+    targets = np.array(stored.get("targets", [stored["target"]]))
+    if len(targets) != len(cell.known_targets):
+        raise InputError(
+            f"revision {record.number} is of {len(targets)} targets, the cell has "
+            f"{len(cell.known_targets)}; run hilcal identify again"
+        )
+    cell = replace(cell.with_targets(targets), registration=np.array(stored["registration"]))
     options, known = record.options["effects"], catalogue or installed()
     effects = (known.make(e, cell, readings.states, options.get(e)) for e in record.effects)
     model = Model(cell, tuple(effects), known, readings)

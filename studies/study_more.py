@@ -1,6 +1,7 @@
 """A further round in the study of the diagnosis: what `next` plans, measured in the same world."""
 
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -96,7 +97,9 @@ def _joined(a: Readings, b: Readings, poses: tuple[str, ...]) -> Readings:
         parts = [getattr(r.states, name) for r in (a, b)]
         return None if any(part is None for part in parts) else np.concatenate(parts)
 
-    optional = {f.name: both(f.name) for f in fields(States) if f.name not in ("q", "wrench")}
+    optional: dict[str, Any] = {
+        f.name: both(f.name) for f in fields(States) if f.name not in ("q", "wrench")
+    }
     return Readings(
         states=States(
             q=np.concatenate([a.states.q, b.states.q]),

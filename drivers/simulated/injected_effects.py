@@ -86,7 +86,11 @@ def nothing_hidden(
     registration, station = stand(cell, rng)
     truth = Truth.rigid(cell.arm)
     truth = truth.with_effect("joint_compliance", joint_compliance(cell.arm, rng))
-    if not cell.target_known:
+    offsets: Floats | None = None
+    if cell.targets is not None:
+        unknown = ~np.array(cell.known_targets)
+        offsets = _TARGET_SCATTER * rng.standard_normal((len(unknown), 3)) * unknown[:, None]
+    elif not cell.target_known:
         truth = truth.with_effect("target_offset", _TARGET_SCATTER * rng.standard_normal(3))
     return World(
         cell=cell,
@@ -95,6 +99,7 @@ def nothing_hidden(
         station=station,
         noise=noise or SimulatedNoise(),
         joint_std=np.broadcast_to(np.asarray(joint_std, dtype=float), (cell.arm.n,)).copy(),
+        offsets=offsets,
     )
 
 

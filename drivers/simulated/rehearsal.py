@@ -176,13 +176,20 @@ def simulate(
     """
     if m not in (3, 6):
         raise InputError(f"a reading has {m} elements; valid: 3 (position) or 6 (pose)")
-    return Readings(
+    made = Readings(
         states=states,
         pose=np.asarray(pose, dtype=np.int64),
         load=np.asarray(load, dtype=np.int64),
         cycle=np.asarray(cycle, dtype=np.int64),
-        value=world.observe(states, rng, m),
-        covariance=world.covariance(world.sight(states), m),
+        value=np.zeros((len(states), m)),
+        covariance=np.zeros((len(states), m, m)),
         load_names=tuple(load_names),
         pose_names=tuple(f"p{i + 1}" for i in range(int(np.max(pose)) + 1)),
+        target_names=world.cell.target_names if states.target is not None else (),
     )
+    arrival, sight = None, world.sight(states)
+    if states.target is not None:
+        arrival = made.arrivals
+        made = replace(made, common=sight.jacobian[:, :m] * world.joint_std)
+    value = world.observe(states, rng, m, arrival)
+    return replace(made, value=value, covariance=world.covariance(sight, m))

@@ -51,6 +51,8 @@ class World:
         noise: the tracker's noise.
         joint_std: (n,) the arm's repeatability at each joint, rad.
         joint_reference: temperature at which joints do not drift, °C.
+        offsets: (T, 3) where each of several targets truly is beyond its configured place, flange
+            axes, m; None for none. `physics.target_offset` moves all of them.
     """
 
     cell: Cell
@@ -60,6 +62,7 @@ class World:
     noise: SimulatedNoise
     joint_std: Floats
     joint_reference: float = 22.0
+    offsets: Floats | None = None
     _tree: ElasticTree = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -169,13 +172,15 @@ class World:
                 tracker without time stamps.
         """
         hidden, rest = self.physics, self.rest(states, slip)
-        target = self.cell.target.copy()
-        target[:3, 3] += hidden.target_offset
+        target = np.array(self.cell.target_of(states.target))
+        target[..., :3, 3] += hidden.target_offset
+        if self.offsets is not None:
+            target[..., :3, 3] += self.offsets[0 if states.target is None else states.target]
         frame = self.registration @ displacement(hidden.base_frame)
         view = frame[:3, :3]
         pose = frame @ rest.flange @ target
         position, rotation = pose[:, :3, 3], pose[:, :3, :3]
-        jac = moved_by(rest.jacobian, rest.flange[:, :3, :3] @ target[:3, 3])
+        jac = moved_by(rest.jacobian, (rest.flange[:, :3, :3] @ target[..., :3, 3:])[:, :, 0])
         jac = np.concatenate([view @ jac[:, :3], view @ jac[:, 3:]], axis=1)
         if np.any(hidden.tracker_drift):
             if states.time is None:
@@ -199,13 +204,23 @@ class World:
         jac = sight.jacobian[:, :m] * self.joint_std
         return np.asarray(cov + jac @ np.swapaxes(jac, 1, 2))
 
-    def observe(self, states: States, rng: np.random.Generator, m: int = 3) -> Floats:
+    def observe(
+        self, states: States, rng: np.random.Generator, m: int = 3, arrival: Ints | None = None
+    ) -> Floats:
         """Return the (N, m) readings of N states, with all noise.
 
         The arm's repeatability is drawn in joint space and goes through the equilibrium, so
         that it is correlated over all elements; then the tracker adds its own.
+
+        Args:
+            states: N states.
+            rng: generator.
+            m: elements per reading, 3 or 6.
+            arrival: (N,) number of the arrival in which each reading is taken: those of one
+                arrival share the arm's scatter. Each reading is one of its own where None.
         """
-        slip = self.joint_std * rng.standard_normal(states.q.shape)
+        each = np.arange(len(states)) if arrival is None else arrival
+        slip = self.joint_std * rng.standard_normal((int(each.max()) + 1, states.q.shape[1]))[each]
         sight = self.sight(states, slip)
         seen = self.noise.observe(self._from_station(sight.position), rng)
         back = inverse(self.station)

@@ -86,7 +86,8 @@ def _read(
         found = read_ipa_ur10(table, arm)
         return found.readings, found.notes
     s = settings.tracker
-    result = import_table(table, arm, tracker_noise(s), s.station_m)
+    targets = [t.name for t in settings.tool.targets]
+    result = import_table(table, arm, tracker_noise(s), s.station_m, targets)
     where = "" if s.frame == "tracker" or s.station_m else ", as if it stood at the arm's base"
     return result.readings, tuple(n + where * (n == FROM_TRACKER) for n in result.notes)
 

@@ -68,6 +68,30 @@ class Robot(Section):
         return self
 
 
+class Target(Section):
+    """[[tool.targets]]: one of several targets that the tool carries (flange axes)."""
+
+    name: str = Field(min_length=1, description='the name of a target, e.g. "R1"')
+    target_m: Vector3 | None = Field(
+        None, description=VECTOR_M + "; leave it out to have it estimated"
+    )
+    target_rotvec_rad: Vector3 | None = Field(None, description=ROTVEC)
+
+    @model_validator(mode="after")
+    def _sound(self) -> "Target":
+        if self.name != self.name.strip() or not self.name.isprintable():
+            raise ValueError(f"name = {self.name!r}: a name must be printable and not padded")
+        _check_target(self.target_m, self.target_rotvec_rad)
+        return self
+
+
+def _check_target(xyz: tuple[float, ...] | None, rotvec: tuple[float, ...] | None) -> None:
+    if xyz is not None and max(map(abs, xyz)) > 5.0:
+        raise ValueError(f"target_m = {list(xyz)} lies over 5 m off the flange; is it in m?")
+    if rotvec is not None and xyz is None:
+        raise ValueError("target_rotvec_rad without target_m; give both or neither")
+
+
 class Tool(Section):
     """[tool]: what the flange carries, where the target sits and the load acts (flange axes)."""
 
@@ -75,18 +99,33 @@ class Tool(Section):
         None, description=VECTOR_M + "; leave it out to have it estimated"
     )
     target_rotvec_rad: Vector3 | None = Field(None, description=ROTVEC)
+    targets: tuple[Target, ...] = Field(
+        (), description="sections [[tool.targets]], one per target, in the order of measurement"
+    )
     load_point_m: Vector3 = Field((0.0, 0.0, 0.0), description=VECTOR_M)
     mass_kg: NonNegative = Field(0.0, description="a mass in kg, 0 or more")
     com_m: Vector3 = Field((0.0, 0.0, 0.0), description=VECTOR_M)
 
     @model_validator(mode="after")
     def _metres(self) -> "Tool":
-        for key in ("target_m", "load_point_m", "com_m"):
+        for key in ("load_point_m", "com_m"):
             value = getattr(self, key)
-            if value is not None and max(map(abs, value)) > 5.0:
+            if max(map(abs, value)) > 5.0:
                 raise ValueError(f"{key} = {list(value)} lies over 5 m off the flange; is it in m?")
-        if self.target_rotvec_rad is not None and self.target_m is None:
-            raise ValueError("target_rotvec_rad without target_m; give both or neither")
+        _check_target(self.target_m, self.target_rotvec_rad)
+        return self
+
+    @model_validator(mode="after")
+    def _one_description(self) -> "Tool":
+        if self.targets and (self.target_m or self.target_rotvec_rad):
+            raise ValueError(
+                "target_m together with [[tool.targets]]; give the offset of each target in its "
+                "own section"
+            )
+        names = [t.name for t in self.targets]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f'two [[tool.targets]] have the name "{name}"; names must differ')
         return self
 
 

@@ -4,9 +4,12 @@ import json
 import os
 import sqlite3
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Self
+
+import numpy as np
 
 from hilcal import __version__
 from hilcal.data import rows, schema
@@ -15,6 +18,7 @@ from hilcal.data.records import Layout, content_hash, layout_of
 from hilcal.data.revision import RevisionRecord, from_text, to_text, utc_now
 from hilcal.errors import InputError
 
+_TARGETS = "targets"
 _META = ("config", "base_dir", "source", "created", "program_version")
 
 
@@ -171,6 +175,7 @@ class CampaignFile:
         """Do the same inside a transaction that the caller has begun."""
         if len(readings):
             self._claim_layout(layout_of(readings))
+            readings = self._numbered_targets(readings)
         rows.check_poses(self._connection, self.path, readings)
         return rows.insert_readings(self._connection, readings)
 
@@ -184,7 +189,8 @@ class CampaignFile:
         if layout is None:
             raise InputError(f"{self.path}: the campaign holds no readings yet")
         with schema.sqlite_errors(self.path):
-            return rows.fetch_readings(self._connection, self.path, layout)
+            names = json.loads(self._read_meta().get(_TARGETS, "[]"))
+            return rows.fetch_readings(self._connection, self.path, layout, names)
 
     def data_hash(self) -> str:
         """SHA-256 of the readings; see `content_hash`."""
@@ -263,6 +269,25 @@ class CampaignFile:
                 f"{self.path}: the readings differ from those before in {', '.join(differ)}; "
                 f"a campaign holds one kind of reading, start another for these"
             )
+
+    def _numbered_targets(self, readings: Readings) -> Readings:
+        """Return the readings with targets numbered as in the file; the first ones name them."""
+        if readings.states.target is None:
+            return readings
+        text = self._read_meta().get(_TARGETS)
+        if text is None:
+            text = json.dumps(readings.target_names)
+            rows.insert_meta(self._connection, _TARGETS, text)
+            self._connection.execute(f"PRAGMA user_version = {schema.SEVERAL_TARGETS}")
+        names = list(json.loads(text))
+        new = [name for name in readings.target_names if name not in names]
+        if new:
+            raise InputError(
+                f"{self.path}: target {new[0]!r} is not one of this campaign: {', '.join(names)}"
+            )
+        number = np.array([names.index(name) for name in readings.target_names])
+        states = replace(readings.states, target=number[readings.target])
+        return replace(readings, states=states, target_names=tuple(names))
 
 
 def _sidecars(path: Path) -> tuple[Path, ...]:

@@ -10,6 +10,7 @@ POSITION = ("x_m", "y_m", "z_m")
 ROTATION = ("rx_rad", "ry_rad", "rz_rad")
 WRENCH = ("fx_N", "fy_N", "fz_N", "mx_Nm", "my_Nm", "mz_Nm")
 TEXT = ("pose", "load")
+TARGET = "target"
 OWN_PREFIX = "x_"
 _AXES = ("x", "y", "z", "rx", "ry", "rz")
 
@@ -53,6 +54,7 @@ def known_columns(n: int) -> tuple[str, ...]:
     """All columns that have a meaning for an arm of n joints."""
     return (
         *required_columns(n),
+        TARGET,
         *covariance_columns(6),
         *WRENCH,
         *("cycle", "time_s", "load_time_s", "air_degC"),

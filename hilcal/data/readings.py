@@ -21,6 +21,8 @@ class States:
         joint_temperature: (N, n) °C.
         approach: (N, n) side from which each joint arrived, -1 or +1.
         q_actual: (N, n) joint angles that the encoders reported, rad.
+        target: (N,) number of the target that is read, in the order of `Cell.target_names`; None
+            where the tool carries one target.
     """
 
     q: Floats
@@ -31,6 +33,7 @@ class States:
     joint_temperature: Floats | None = None
     approach: Floats | None = None
     q_actual: Floats | None = None
+    target: Ints | None = None
 
     def __len__(self) -> int:
         """Return the number of states N."""
@@ -56,6 +59,10 @@ class Readings:
             the covariance of a small rotation about the sensor's axes.
         load_names: names of the loads.
         pose_names: names of the poses, as in the table.
+        target_names: names of the targets that `states.target` numbers; empty where it is None.
+        common: (N, m, n) factors F of the error that all readings of one arrival have in common:
+            Cov(i, j) = F_i F_jᵀ for two readings i, j of one arrival (see `arrivals`); F_i F_iᵀ
+            is part of `covariance`. None where no such error is known.
     """
 
     states: States
@@ -66,6 +73,8 @@ class Readings:
     covariance: Floats
     load_names: tuple[str, ...]
     pose_names: tuple[str, ...]
+    target_names: tuple[str, ...] = ()
+    common: Floats | None = None
 
     def __len__(self) -> int:
         """Return the number of readings N."""
@@ -81,6 +90,7 @@ class Readings:
             cycle=self.cycle[rows],
             value=self.value[rows],
             covariance=self.covariance[rows],
+            common=None if self.common is None else self.common[rows],
         )
 
     @property
@@ -93,3 +103,27 @@ class Readings:
         """(N,) which readings were taken without a load."""
         none = [i for i, name in enumerate(self.load_names) if name == "none"]
         return np.isin(self.load, none)
+
+    @property
+    def target(self) -> Ints:
+        """(N,) number of the target that is read; 0 where there is one."""
+        given = self.states.target
+        return np.zeros(len(self), dtype=np.int64) if given is None else given
+
+    @property
+    def arrivals(self) -> Ints:
+        """(N,) number of the arrival of the arm in which each reading was taken.
+
+        Readings of different targets at one pose, under one load, in one cycle are of one arrival:
+        the arm did not move between them. A target that was read several times there was read in
+        as many arrivals, in the order of the readings.
+        """
+        keys = np.stack([self.pose, self.load, self.cycle, self.target], axis=1)
+        _, of = np.unique(keys, axis=0, return_inverse=True)
+        of = of.reshape(-1)
+        order = np.argsort(of, kind="stable")
+        first = np.flatnonzero(np.diff(of[order], prepend=-1))
+        visit = np.empty(len(self), dtype=np.int64)
+        visit[order] = np.arange(len(self)) - np.repeat(first, np.diff(np.append(first, len(self))))
+        keys[:, 3] = visit
+        return np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)

@@ -3,6 +3,7 @@
 import hashlib
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -21,6 +22,7 @@ _STATE = {
     "joint_temperature": 2,
     "approach": 2,
     "q_actual": 2,
+    "target": 1,
 }
 
 
@@ -58,6 +60,7 @@ def unpack(
     index: Ints,
     pose_names: Sequence[str],
     load_names: Sequence[str],
+    target_names: Sequence[str] = (),
 ) -> Readings:
     """Readings from (N, K) records and (N, 3) indices of pose, load and cycle."""
     count, at = len(records), 0
@@ -68,8 +71,10 @@ def unpack(
         at += width
     value, covariance = fields.pop("value"), fields.pop("covariance")
     m = value.shape[1]
+    target = fields.pop("target", None)
+    number = None if target is None else target.astype(np.int64)
     return Readings(
-        states=States(**fields),
+        states=States(**fields, target=number),
         pose=index[:, 0].copy(),
         load=index[:, 1].copy(),
         cycle=index[:, 2].copy(),
@@ -77,21 +82,23 @@ def unpack(
         covariance=covariance.reshape(count, m, m),
         load_names=tuple(load_names),
         pose_names=tuple(pose_names),
+        target_names=() if target is None else tuple(target_names),
     )
 
 
 def content_hash(readings: Readings) -> str:
     """SHA-256 (hex) of what was measured, in order.
 
-    Depends on every number and on the names of poses and loads, but not on how names are
+    Depends on every number and on the names of poses, loads and targets, but not on how names are
     numbered, on names without readings, or on how the readings were appended.
     """
     sha = hashlib.sha256()
     columns = []
-    for index, names in (
-        (readings.pose, readings.pose_names),
-        (readings.load, readings.load_names),
-    ):
+    named = [(readings.pose, readings.pose_names), (readings.load, readings.load_names)]
+    if readings.states.target is not None:
+        named.append((readings.target, readings.target_names))
+        readings = replace(readings, states=replace(readings.states, target=None))
+    for index, names in named:
         used = list(dict.fromkeys(index.tolist()))
         order = {k: i for i, k in enumerate(dict.fromkeys(names[k] for k in used))}
         sha.update(json.dumps(list(order)).encode() + b"\n")

@@ -87,7 +87,9 @@ def insert_readings(connection: sqlite3.Connection, readings: Readings) -> int:
     return int(last) + len(readings)
 
 
-def fetch_readings(connection: sqlite3.Connection, path: Path, layout: Layout) -> Readings:
+def fetch_readings(
+    connection: sqlite3.Connection, path: Path, layout: Layout, target_names: Sequence[str] = ()
+) -> Readings:
     """All readings, in order.
 
     Raises:
@@ -110,7 +112,7 @@ def fetch_readings(connection: sqlite3.Connection, path: Path, layout: Layout) -
     index = np.array([row[1:4] for row in rows], dtype=np.int64)
     if np.any(index[:, :2].max(axis=0) >= [len(n) for n in names]):
         raise InputError(f"{path}: the campaign file is damaged (names are missing)")
-    return unpack(records, layout, index, *names)
+    return unpack(records, layout, index, names[0], names[1], target_names)
 
 
 def check_poses(connection: sqlite3.Connection, path: Path, readings: Readings) -> None:

@@ -14,7 +14,10 @@ from pathlib import Path
 from hilcal.errors import DeviceError, InputError
 
 APPLICATION_ID = 0x68696C63  # "hilc"
-VERSION = 2
+VERSION = 3
+SEVERAL_TARGETS = 3
+"""Version of a file whose readings are of several targets; all others stay at `ONE_TARGET`."""
+ONE_TARGET = 2
 HEADER = b"SQLite format 3\x00"
 
 _TABLES = """
@@ -60,7 +63,7 @@ def statements() -> list[str]:
             f"WHEN EXISTS (SELECT 1 FROM {table} WHERE {key} = NEW.{key}) BEGIN {refuse}; END"
         )
     made.append(f"PRAGMA application_id = {APPLICATION_ID}")
-    made.append(f"PRAGMA user_version = {VERSION}")
+    made.append(f"PRAGMA user_version = {ONE_TARGET}")
     return made
 
 

@@ -3,6 +3,7 @@
 import csv
 import os
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from hilcal.data.imported import ImportResult
 from hilcal.data.readings import Readings, States
 from hilcal.errors import InputError
 from hilcal.robot.arm import Arm
+from hilcal.toml import suggest
 from hilcal.types import Floats, Ints
 
 FROM_TABLE = "covariance: from the table"
@@ -25,6 +27,7 @@ def read_table(
     arm: Arm,
     noise: TrackerNoise | None,
     station: Floats | Sequence[float] | None = None,
+    targets: Sequence[str] = (),
 ) -> Readings:
     """Read an exchange table; every unit is SI, every complaint names row and column.
 
@@ -33,6 +36,7 @@ def read_table(
         arm: its number of joints, their limits and its reach are checked.
         noise: gives the covariances where the table has none.
         station: (3,) where the tracker's beam starts, m; the origin where None.
+        targets: names of the cell's targets, see `Cell.target_names`.
 
     Returns:
         The readings in the table's order; poses and loads are numbered as they appear.
@@ -40,7 +44,7 @@ def read_table(
     Raises:
         InputError: anything that cannot be right.
     """
-    return import_table(path, arm, noise, station).readings
+    return import_table(path, arm, noise, station, targets).readings
 
 
 def import_table(
@@ -48,6 +52,7 @@ def import_table(
     arm: Arm,
     noise: TrackerNoise | None,
     station: Floats | Sequence[float] | None = None,
+    targets: Sequence[str] = (),
 ) -> ImportResult:
     """Read an exchange table as `read_table` does, with notes on where its covariances come from.
 
@@ -55,7 +60,7 @@ def import_table(
         InputError: anything that cannot be right.
     """
     table = read_columns(path, lambda header: _choose(str(path), header, arm))
-    return readings_of(table, arm, noise, station)
+    return readings_of(table, arm, noise, station, targets=targets)
 
 
 def readings_of(
@@ -64,6 +69,7 @@ def readings_of(
     noise: TrackerNoise | None,
     station: Floats | Sequence[float] | None = None,
     covariance: Floats | None = None,
+    targets: Sequence[str] = (),
 ) -> ImportResult:
     """Check a table with the exchange table's columns, in SI units, and make readings of it.
 
@@ -73,6 +79,7 @@ def readings_of(
         noise: gives the covariances where there are none.
         station: (3,) where the tracker's beam starts, m; the origin where None.
         covariance: (N, m, m) in place of the table's columns, checked like them.
+        targets: names of the cell's targets, see `Cell.target_names`.
 
     Raises:
         InputError: anything that cannot be right.
@@ -80,7 +87,8 @@ def readings_of(
     checks.check_names(table)
     pose, pose_names = _index(table.text["pose"])
     load, load_names = _index(table.text["load"])
-    states = _states(table, arm)
+    target = _targets(table, targets)
+    states = replace(_states(table, arm), target=target)
     checks.check_same_pose(table, pose, pose_names, states.q)
     checks.check_wrenches(table, states.wrench, load, load_names, arm)
     value = table.matrix(columns.POSITION)
@@ -104,6 +112,7 @@ def readings_of(
         covariance=cov,
         load_names=tuple(load_names),
         pose_names=tuple(pose_names),
+        target_names=() if target is None else tuple(targets),
     )
     return ImportResult(readings, notes)
 
@@ -122,13 +131,50 @@ def _choose(path: str, header: list[str], arm: Arm) -> tuple[Sequence[str], Sequ
         )
     columns.check_header(path, header, arm.n, arm.name)
     columns.covariance_size(path, header)
-    return columns.TEXT, [name for name in header if name in known and name not in columns.TEXT]
+    text = (*columns.TEXT, *(name for name in header if name == columns.TARGET))
+    return text, [name for name in header if name in known and name not in text]
 
 
 def _index(names: list[str]) -> tuple[Ints, list[str]]:
     """Numbers of names in order of first appearance, and those names."""
     order = {name: k for k, name in enumerate(dict.fromkeys(names))}
     return np.fromiter((order[n] for n in names), dtype=np.int64, count=len(names)), list(order)
+
+
+def _targets(table: CsvTable, names: Sequence[str]) -> Ints | None:
+    """(N,) numbers of the targets by the cell's names; None where there is one target.
+
+    Raises:
+        InputError: table and cell name different targets.
+    """
+    given = table.text.get(columns.TARGET)
+    if given is None:
+        if len(names) > 1:
+            raise InputError(
+                f"{table.path}: no column '{columns.TARGET}', but the cell's targets are "
+                f"{', '.join(names)} ([[tool.targets]]); name in each row the one that was read"
+            )
+        return None
+    if "" in given:
+        raise InputError(
+            f"{table.at(given.index(''), columns.TARGET)}: the cell is empty; name the target"
+        )
+    used = list(dict.fromkeys(given))
+    if not names and len(used) > 1:
+        raise InputError(
+            f"{table.path}: column '{columns.TARGET}' names {', '.join(map(repr, used))}, but the "
+            f"cell has one target; give each a section [[tool.targets]] with its name (and "
+            f"target_m, where its offset is known)"
+        )
+    for name in used if names else ():
+        if name not in names:
+            raise InputError(
+                f"{table.at(given.index(name), columns.TARGET)}: target {name!r} is not in the "
+                f"cell's [[tool.targets]]{suggest(name, names)}; valid: {', '.join(names)}"
+            )
+    if len(names) < 2:
+        return None
+    return np.array([names.index(name) for name in given], dtype=np.int64)
 
 
 def _states(table: CsvTable, arm: Arm) -> States:
@@ -227,12 +273,16 @@ def write_table(readings: Readings, path: str | Path) -> None:
     """
     text = [_names(readings.pose_names, readings.pose, "pose")]
     text.append(_names(readings.load_names, readings.load, "load"))
+    text_names: tuple[str, ...] = columns.TEXT
+    if readings.states.target is not None:
+        text.append(_names(readings.target_names, readings.target, columns.TARGET))
+        text_names = (*text_names, columns.TARGET)
     header, numbers = _number_columns(readings)
     cells = [list(map(repr, column.tolist())) for column in numbers]
     _write(
         Path(path),
         lambda out: (
-            out.writerow((*columns.TEXT, *header)),
+            out.writerow((*text_names, *header)),
             out.writerows(zip(*text, *cells, strict=True)),
         ),
     )

@@ -55,7 +55,8 @@ def example_states(cell: Cell, count: int = 30) -> States:
         q_actual=q + 1e-5 * rng.normal(size=q.shape),
     )
     for field in fields(states):
-        getattr(states, field.name).flags.writeable = False
+        if (given := getattr(states, field.name)) is not None:
+            given.flags.writeable = False
     return states
 
 

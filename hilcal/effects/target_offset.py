@@ -1,5 +1,6 @@
 """`target_offset`: the tracked target sits elsewhere than configured."""
 
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -12,7 +13,11 @@ from hilcal.types import Floats
 
 
 class TargetOffset(Effect):
-    """Displacement of the target in flange axes [m]; with `rotation`, its rotation too [rad]."""
+    """Displacement of the target in flange axes [m]; with `rotation`, its rotation too [rad].
+
+    Of several targets, each whose offset is not known is displaced by itself; where all are known,
+    each of them.
+    """
 
     name = "target_offset"
     summary = "the tracked target sits elsewhere on the flange than configured"
@@ -28,18 +33,40 @@ class TargetOffset(Effect):
         if not isinstance(rotation, bool):
             raise InputError(f"effect {self.name}: rotation = {rotation!r}; valid: true, false")
         self.size = 6 if rotation else 3
+        known = self.cell.known_targets
+        self.moved = [k for k in range(len(known)) if all(known) or not known[k]]
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """Displacement along, and with `rotation` rotation about, the flange's axes."""
         lengths = [Parameter(a, "m", 1e-3, f"offset along flange {a}") for a in "xyz"]
         turns = [Parameter(f"r{a}", "rad", 1e-3, f"turn about flange {a}") for a in "xyz"]
-        return tuple((lengths + turns)[: self.size])
+        each = (lengths + turns)[: self.size]
+        if self.cell.targets is None:
+            return tuple(each)
+        names = [self.cell.target_names[k] for k in self.moved]
+        return tuple(
+            replace(p, name=f"{name}.{p.name}", meaning=f"{name}: {p.meaning}")
+            for name in names
+            for p in each
+        )
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:
-        """Unit displacements of the target."""
-        index = np.arange(self.size)
-        return (Columns("target", index, 0 * index, np.eye(6)[None, : self.size]),)
+        """Unit displacements of each target, in the readings of it."""
+        index = np.arange(self.size * len(self.moved))
+        unit = np.eye(6)[None, : self.size]
+        if self.cell.targets is None:
+            return (Columns("target", index, 0 * index, unit),)
+        number = s.states.target
+        read = np.zeros(len(s.angle), dtype=np.int64) if number is None else number
+        parts = [(read == k)[:, None, None] * unit for k in self.moved]
+        return (Columns("target", index, 0 * index, np.concatenate(parts, axis=1)),)
+
+    def displaced(self, theta: Floats) -> Floats:
+        """T_flange_target (T, 4, 4) with displacements theta (P,); turns are not applied."""
+        poses = self.cell.all_targets.copy()
+        poses[self.moved, :3, 3] += theta.reshape(len(self.moved), self.size)[:, :3]
+        return poses
 
     @classmethod
     def usual_options(cls, m: int) -> Options:
@@ -48,4 +75,5 @@ class TargetOffset(Effect):
 
     def prior_std(self) -> Floats | None:
         """Prior of displacement and rotation, where given."""
-        return prior_of_lengths_and_turns(self.name, self.options, self.size)
+        one = prior_of_lengths_and_turns(self.name, self.options, self.size)
+        return None if one is None else np.tile(one, len(self.moved))

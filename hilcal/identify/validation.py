@@ -7,6 +7,7 @@ import numpy as np
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode, Whitening, whitening
 from hilcal.effects.protocol import Effect
+from hilcal.effects.target_offset import TargetOffset
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.errors import ErrorBlock, error_block, noise_floor
 from hilcal.identify.registration import register
@@ -98,11 +99,12 @@ def _register(
 ) -> tuple[Model, Floats]:
     """Closed-form registration to the other readings, then Gauss-Newton on `base_frame`."""
     parts = [(e, theta[s]) for e, s in zip(model.effects, model.slices(), strict=True)]
-    target = model.cell.target.copy()
+    targets = model.cell.all_targets
     for e, offset in parts:
-        if e.role == "target":
-            target[:3, 3] += offset[:3]
-    unknown = replace(model.cell, target=target, registration_known=False, target_known=True)
+        if isinstance(e, TargetOffset):
+            targets = e.displaced(offset)
+    held = model.cell.with_targets(targets, known=(True,) * len(targets))
+    unknown = replace(held, registration_known=False)
     cell = replace(model.cell, registration=register(unknown, other).registration)
     kept = [(e, t) for e, t in parts if e.role != "registration"]
     effects: list[Effect] = [type(e)(cell, fitted.states, e.options) for e, _ in kept]

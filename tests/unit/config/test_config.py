@@ -162,7 +162,7 @@ WRONG = {
     "unknown key": (
         ROBOT + "[tool]\ntaget_m = [0, 0, 0]\n",
         r'^cell.toml: \[tool\] has no key "taget_m" \(did you mean "target_m"\?\); valid here: '
-        r"target_m, target_rotvec_rad, load_point_m, mass_kg, com_m$",
+        r"target_m, target_rotvec_rad, targets, load_point_m, mass_kg, com_m$",
     ),
     "unknown section": (
         ROBOT + "[trackers]\nframe = 'base'\n",

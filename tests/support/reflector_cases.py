@@ -1,0 +1,55 @@
+"""Campaigns with several reflectors per pose, simulated by the world's own mechanics."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from drivers.simulated.injected_effects import hide
+from hilcal.cell import Cell
+from hilcal.data.readings import States
+from hilcal.types import Floats, Ints
+from tests.support.campaigns import NOTHING, Campaign, Plan, cell_of, measured, plan, world_of
+
+NAMES = ("R1", "R2", "R3")
+OFFSETS = np.array([[0.06, 0.02, 0.12], [-0.09, 0.05, 0.10], [0.02, -0.11, 0.15]])
+
+
+def plate(*, known: tuple[bool, ...] = (True, True, True), **told: bool) -> Cell:
+    """The demo's cell with three reflectors on a plate; unknown ones are told near the flange."""
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, :3, 3] = OFFSETS
+    cell = replace(cell_of(**told), targets=poses, target_names=NAMES, targets_known=(True,) * 3)
+    return cell.with_targets(poses, known)
+
+
+def each_target(p: Plan, count: int = 3) -> Plan:
+    """The plan with every state read once per target, one after the other."""
+    rows: Ints = np.repeat(np.arange(len(p.states)), count)
+    states: States = replace(p.states[rows], target=np.tile(np.arange(count), len(p.states)))
+    return Plan(states, p.pose[rows], p.load[rows], p.cycle[rows], p.load_names)
+
+
+def reflectors(
+    effect: str = NOTHING,
+    seed: int = 0,
+    *,
+    mode: str = "absolute",
+    poses: int = 12,
+    strength: float = 3.0,
+    cycles: int = 1,
+    joint_std: Floats | float | None = None,
+    known: tuple[bool, ...] = (True, True, True),
+    m: int = 3,
+    **told: bool,
+) -> Campaign:
+    """Measure a campaign of three reflectors in a world that hides one effect."""
+    cell = plate(known=known, **told)
+    p = each_target(plan(poses, 3, cycles))
+    rng = np.random.default_rng(seed)
+    world = world_of(cell, rng)
+    if joint_std is not None:
+        spread = np.broadcast_to(np.asarray(joint_std, dtype=float), (cell.arm.n,)).copy()
+        world = replace(world, joint_std=spread)
+    if effect != NOTHING:
+        world = hide(effect, cell, p.states, strength, mode, rng, world=world, m=m)
+    return Campaign(cell, world, measured(world, p, rng, m), mode)  # type: ignore[arg-type]
