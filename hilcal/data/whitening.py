@@ -102,20 +102,21 @@ class Whitening:
         """Measurements (D, m, ...) from values at the readings (N, m, ...)."""
         if self.mode == "absolute":
             return x
-        parts = [_difference(b, x).reshape(-1, *x.shape[1:]) for b in self.buckets]
+        parts = [_difference(b, x).reshape(b.loaded.size, *x.shape[1:]) for b in self.buckets]
         return np.concatenate(parts)
 
     def whiten(self, raw: Floats) -> Floats:
         """Whitened rows (D·m, P) of measurements (D, m) or (D, m, P)."""
         tail = raw.shape[2:]
-        flat = raw.reshape(len(raw) * self.m, -1)
+        width = int(np.prod(tail))
+        flat = raw.reshape(len(raw) * self.m, width)
         out = np.empty_like(flat)
         start = 0
         for b in self.buckets:
             groups, size = len(b.loaded), b.factor.shape[-1]
             stop = start + groups * size
-            block = flat[start:stop].reshape(groups, size, -1)
-            np.matmul(b.factor, block, out=out[start:stop].reshape(groups, size, -1))
+            block = flat[start:stop].reshape(groups, size, width)
+            np.matmul(b.factor, block, out=out[start:stop].reshape(groups, size, width))
             start = stop
         return out.reshape(len(out), *tail)
 

@@ -19,6 +19,7 @@ from hilcal.identify.gauss_newton import Solution, solve
 from hilcal.identify.priors import scales_of
 from hilcal.identify.residual import residual
 from hilcal.model import Model
+from hilcal.regression.schur import inverse_root
 from hilcal.types import Floats
 
 LEAST = 8
@@ -101,7 +102,8 @@ def _covariance(model: Model, found: Solution, rows: Floats) -> Floats:
     scale = ORDINARY * scales_of(model)
     a = np.zeros((len(rows), model.size))
     a[:, found.live] = rows * scale[found.live]
-    return np.asarray(scale[:, None] * np.linalg.inv(a.T @ a + np.eye(model.size)) * scale)
+    root = inverse_root(a.T @ a + np.eye(model.size)) * scale
+    return np.asarray(root.T @ root)
 
 
 def _compared(known: _Known, last: Readings) -> LiveResidual:

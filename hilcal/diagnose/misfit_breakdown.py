@@ -129,8 +129,10 @@ def _poses(p: Linearisation, axes: Floats) -> list[MisfitShare]:
     u, s, _ = np.linalg.svd(free, full_matrices=False)
     u = u[:, s > 1e-6 * s.max(initial=0.0)]
     rank = u.shape[1]
+    if rank == 0 or fit.dof - rank <= 0:
+        return []
     gain = float(np.sum((u.T @ p.residual) ** 2))
-    within = (p.rss - gain) / (fit.dof - rank)
+    within = max((p.rss - gain) / (fit.dof - rank), 1e-300)
     p_value = float(f_distribution.sf(gain / rank / within, rank, fit.dof - rank))
     return [MisfitShare("pose", p.share(gain - rank * within), p_value)]
 
@@ -140,7 +142,7 @@ def _axes(p: Linearisation) -> list[MisfitShare]:
     fit, w = p.fit, p.fit.whitening
     o = fit.solution.prediction.observation
     x = o.base_position[w.reading]
-    across = np.hypot(x[:, 0], x[:, 1])
+    across = np.maximum(np.hypot(x[:, 0], x[:, 1]), 1e-300)
     up = np.tile([0.0, 0.0, 1.0], (len(x), 1))
     radial = np.stack([x[:, 0] / across, x[:, 1] / across, 0 * across], axis=1)
     around = np.cross(up, radial)

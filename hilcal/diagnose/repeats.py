@@ -129,7 +129,7 @@ def contrasts(fit: Fit) -> Contrasts | None:
         w.m,
     ).dq
     y = _apply(blocks, w.whiten(fit.raw).reshape(-1, 1))[:, 0]
-    other = w.whiten(w.raw(_differences(fit, readings, kind, moves))).reshape(w.m * len(w), -1)
+    other = w.whiten(w.raw(_differences(fit, readings, kind, moves)))
     nuisance = _orthonormal(_apply(blocks, other))
     return Contrasts(readings, w, blocks, y - nuisance @ (nuisance.T @ y), nuisance, bias, moves)
 

@@ -111,7 +111,9 @@ def tree_share(p: Linearisation) -> float:
     fit, w = p.fit, p.fit.whitening
     std = np.sqrt(np.trace(w.covariance[:, :3, :3], axis1=1, axis2=2) / 3)
     axes = fit.solution.prediction.observation.axes[w.reading]
-    target = np.einsum("dji,dj->di", axes, fit.raw[:, :3]) / std[:, None]
+    # A measurement without any stated noise has no weight, as in whitening.
+    weight = np.where(std > 0, 1.0, 0.0) / np.where(std > 0, std, 1.0)
+    target = np.einsum("dji,dj->di", axes, fit.raw[:, :3]) * weight[:, None]
     features = _features(p)
     chosen = np.arange(len(target))
     if len(chosen) > MOST_MEASUREMENTS:
@@ -125,7 +127,7 @@ def tree_share(p: Linearisation) -> float:
             continue
         trees = ExtraTreesRegressor(TREES, min_samples_leaf=LEAF, random_state=0)
         left[mine] -= trees.fit(features[~mine], target[~mine]).predict(features[mine])
-    total = float(np.sum(target**2))
+    total = max(float(np.sum(target**2)), 1e-300)
     gain = (total - float(np.sum(left**2))) / total
     return float(np.clip(gain * p.rss / p.misfit(), 0.0, 1.0))
 
@@ -166,6 +168,8 @@ def smooth_laws(p: Linearisation) -> ResidualRegression:
     lost: dict[str, float] = {}
     for f in range(int(of_row.max()) + 1):
         mine = of_row == f
+        if mine.all():  # one pose: nothing to learn from
+            continue
         chosen = _choose(p, laws, ~mine)
         model, plain = _refit(p, laws, chosen, ~mine), _refit(p, laws, [], ~mine)
         bare = white[mine] - p.rows[mine] @ plain[0]

@@ -144,7 +144,7 @@ def solve(
     point, by, iterations, converged = _minimise(problem, start, prior)
     live = np.flatnonzero(by.prior > 0)
     jacobian = w.raw(model.jacobian(point.prediction, point.theta, w.m, live))
-    rows = w.whiten(jacobian).reshape(-1, len(live)) @ by.basis.transform
+    rows = w.whiten(jacobian).reshape(point.white.size, len(live)) @ by.basis.transform
     beta = point.mean_square(len(by.basis.singular)) if w.scaling == "none" else by.beta
     # Formed anew at the solution, so that folds can be taken out of them exactly.
     basis = _all_parameters(by.basis, live, model.size)
@@ -217,7 +217,7 @@ def whitened_jacobian(
 ) -> Floats:
     """Whitened derivative (R, L) of the measurements by the live parameters."""
     jacobian = model.jacobian(prediction, theta, w.m, live)
-    return w.whiten(w.raw(jacobian)).reshape(-1, len(live))
+    return w.whiten(w.raw(jacobian)).reshape(w.m * len(w), len(live))
 
 
 def _step(linear: LinearProblem, by: Regularisation, groups: Ints) -> tuple[Regularisation, Floats]:

@@ -150,14 +150,14 @@ def effect_columns(fit: Fit, effect: Effect) -> EffectColumns:
     jacobian = fit.model.jacobian_of((effect,), s.prediction, s.theta, w.m)
     scale = np.array([q.scale for q in effect.parameters])
     raw = w.raw(jacobian * scale)
-    return EffectColumns(effect, scale, w.whiten(raw).reshape(-1, len(scale)), raw[:, :3])
+    return EffectColumns(effect, scale, w.whiten(raw).reshape(w.m * len(w), len(scale)), raw[:, :3])
 
 
 def model_columns(fit: Fit) -> Floats:
     """Whitened Jacobian (R, P) of all parameters of a fit, in ordinary magnitudes."""
     scale, s, w = scales_of(fit.model), fit.solution, fit.whitening
     jacobian = fit.model.jacobian(s.prediction, s.theta, w.m) * scale
-    return w.whiten(w.raw(jacobian)).reshape(-1, len(scale))
+    return w.whiten(w.raw(jacobian)).reshape(w.m * len(w), len(scale))
 
 
 def eliminate_effect(fit: Fit, columns: Floats, effect: str) -> ReducedModel:

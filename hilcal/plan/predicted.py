@@ -8,6 +8,7 @@ from hilcal.identify.uncertainty import LEARNT, MEANINGLESS, NULL_SHARE
 from hilcal.plan.information import Problem
 from hilcal.plan.prediction_poses import PredictionPoses
 from hilcal.regression.normal_equations import INFORMATION, ROUNDING
+from hilcal.regression.schur import inverse_root
 from hilcal.types import Bools, Floats
 
 
@@ -107,10 +108,10 @@ def covariance(information: Floats, flat: Bools) -> tuple[Floats, Floats]:
     transform[held, int(seen.sum()) + np.arange(len(held))] = 1.0 / np.sqrt(
         np.maximum(np.diag(information)[held], 1e-300)
     )
-    inner = np.linalg.inv(transform.T @ information @ transform)
+    root = transform @ inverse_root(transform.T @ information @ transform).T
     null = np.zeros((size, int((~seen).sum())))
     null[columns] = vectors[:, ~seen]
-    return np.asarray(transform @ inner @ transform.T), null
+    return np.asarray(root @ root.T), null
 
 
 def positions_of(work: PredictionPoses, covariance: Floats, null: Floats) -> Floats:

@@ -88,9 +88,7 @@ def maximise_evidence(
         group = groups[keep]
         std = np.sqrt(variance[group])
         h = std[:, None] * g * (std / beta)
-        h[np.diag_indices_from(h)] += 1.0
-        low = sl.cholesky(h, lower=True, check_finite=False, overwrite_a=True)
-        inverse = sl.lapack.dtrtri(low, lower=1)[0]
+        inverse = _inverse_root(h)
         posterior = np.einsum("ij,ij->j", inverse, inverse)
         z = inverse.T @ (inverse @ (std * b / beta))
         gamma = np.bincount(group, weights=1 - posterior, minlength=count)
@@ -117,3 +115,15 @@ def maximise_evidence(
             break
     std_all = np.sqrt(np.where(active, variance, 0.0))[groups]
     return EmpiricalPrior(std_all, float(beta), effective)
+
+
+def _inverse_root(h: Floats) -> Floats:
+    """Return T (K, K) with Tᵀ T = (1 + H)⁻¹ of a positive semidefinite H, however large.
+
+    Where H is so large that 1 is below its rounding, by its eigenvalues, which are at least zero.
+    """
+    low, failed = sl.lapack.dpotrf(h + np.eye(len(h)), lower=1)
+    if not failed:
+        return np.asarray(sl.lapack.dtrtri(low, lower=1)[0])
+    values, vectors = np.linalg.eigh(h)
+    return np.asarray((vectors / np.sqrt(1.0 + np.maximum(values, 0.0))).T)

@@ -24,6 +24,7 @@ prior for a global scale parameter*, Bayesian Analysis 7 (2012) 887-902.
 import numpy as np
 
 from hilcal.regression.projection import Projection, projection
+from hilcal.regression.schur import inverse_root
 from hilcal.types import Floats, Ints
 
 GRID = np.logspace(-2.0, 3.0, 101)
@@ -57,8 +58,9 @@ def hyperparameter_factors(
 def _of_group(covariance: Floats, theta: Floats, prior: float) -> Floats:
     """Factors (n,) of one group whose covariance (n, n) is that at its prior."""
     values, axes = np.linalg.eigh(covariance)
+    values = np.maximum(values, ROUNDING**2 * max(float(values[-1]), 1e-300))
     # Precision of the data alone, along the axes of the covariance.
-    data = np.maximum(1.0 / np.maximum(values, 1e-300) - prior**-2.0, 0.0)
+    data = np.maximum(1.0 / values - prior**-2.0, 0.0)
     if not data.any():
         return np.ones(len(theta))
     estimate = axes.T @ theta
@@ -95,8 +97,8 @@ def dropped_group_factors(
     if not seen.any():
         return np.ones(len(transform))
     dropped = projection(columns[:, seen], beta * reach[groups][seen] / HIDDEN)
-    wide = np.linalg.inv(dropped.information(p.rows) + np.diag(p.ridge))
-    before = np.einsum("pk,pk->p", transform, p.solve(transform.T).T)
-    after = np.einsum("pk,kl,pl->p", transform, wide, transform)
+    wide = inverse_root(dropped.information(p.rows) + np.diag(p.ridge))
+    before = np.sum((transform @ p.inverse_root.T) ** 2, axis=1)
+    after = np.sum((transform @ wide.T) ** 2, axis=1)
     there = before > 0
     return np.sqrt(np.where(there, np.maximum(after / np.where(there, before, 1.0), 1.0), 1.0))

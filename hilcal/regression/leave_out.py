@@ -15,10 +15,10 @@ the model without it where it is not.
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg as sl
 
 from hilcal.regression.normal_equations import NormalEquations
 from hilcal.regression.projection import Projection
+from hilcal.regression.schur import inverse_root, positive_solve
 from hilcal.types import Bools, Floats, Ints
 
 ROUNDING = 1e-6
@@ -33,17 +33,21 @@ class Fold:
 
     Attributes:
         out: (R,) rows of the fold.
-        factor: Cholesky factor of H without them.
+        inverse_root: (K, K) T with Tᵀ T = H⁻¹ without them.
         rhs: (K,) right-hand side without them, for a step from the fit.
     """
 
     out: Bools
-    factor: tuple[Floats, bool]
+    inverse_root: Floats
     rhs: Floats
+
+    def solve(self, rhs: Floats) -> Floats:
+        """Return H⁻¹ times (K,) or (K, P)."""
+        return np.asarray(self.inverse_root.T @ (self.inverse_root @ rhs))
 
     def step(self) -> Floats:
         """Return (K,) coordinates without the fold minus those with it."""
-        return np.asarray(sl.cho_solve(self.factor, self.rhs, check_finite=False))
+        return self.solve(self.rhs)
 
 
 def folds(
@@ -81,8 +85,8 @@ def folds(
     for f in range(int(fold.max()) + 1):
         mine = fold == f
         rows = p.rows[mine]
-        factor, low = sl.cho_factor(h - rows.T @ rows, check_finite=False)
-        out.append(Fold(mine, (factor, bool(low)), rhs - rows.T @ white[mine]))
+        root = inverse_root(h - rows.T @ rows)
+        out.append(Fold(mine, root, rhs - rows.T @ white[mine]))
     return tuple(out)
 
 
@@ -105,9 +109,9 @@ def left_out_residual(
         out, own, r = x[fold.out], p.rows[fold.out], white[fold.out]
         # Eliminate the model's own coordinates, then solve for the family.
         c = cross - own.T @ out
-        solved = sl.cho_solve(fold.factor, np.column_stack([c, fold.rhs]), check_finite=False)
+        solved = fold.solve(np.column_stack([c, fold.rhs]))
         h = gram - out.T @ out - c.T @ solved[:, :-1]
         b = rhs - out.T @ r - c.T @ solved[:, -1]
-        step = sl.solve(h, b, assume_a="pos", check_finite=False)
+        step = positive_solve(h, b)
         left[fold.out] = r - own @ (solved[:, -1] - solved[:, :-1] @ step) - out @ step
     return left

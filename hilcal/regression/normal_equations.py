@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg as sl
 
+from hilcal.regression.schur import inverse_root
 from hilcal.types import Bools, Floats, Ints
 
 INFORMATION = 0.2
@@ -112,20 +113,19 @@ class NormalEquations:
     gram: Floats
     rhs: Floats
 
-    def factor(self, beta: float) -> tuple[Floats, bool]:
-        """Cholesky factor of H, as SciPy's `cho_solve` takes it."""
-        h = self.gram + np.diag(beta * self.basis.prior_precision)
-        c, low = sl.cho_factor(h, check_finite=False)
-        return c, bool(low)
+    def inverse_root(self, beta: float) -> Floats:
+        """T (K, K) with Tᵀ T = H⁻¹, by the rule of `schur` where H is singular."""
+        return inverse_root(self.gram + np.diag(beta * self.basis.prior_precision))
 
     def solve(self, beta: float = 1.0) -> Floats:
         """Solution z (K,)."""
-        return np.asarray(sl.cho_solve(self.factor(beta), self.rhs, check_finite=False))
+        root = self.inverse_root(beta)
+        return np.asarray(root.T @ (root @ self.rhs))
 
     def inverse(self, beta: float = 1.0) -> Floats:
         """H⁻¹ (K, K): covariance of z for unit noise variance."""
-        eye = np.eye(len(self.rhs))
-        return np.asarray(sl.cho_solve(self.factor(beta), eye, check_finite=False))
+        root = self.inverse_root(beta)
+        return np.asarray(root.T @ root)
 
 
 def normal_equations(a: Floats, target: Floats, basis: Basis, gram: Floats) -> NormalEquations:

@@ -7,13 +7,14 @@ column without one,
 
 is the marginal precision of the data when the model's parameters are integrated out. Without
 priors it is the orthogonal projection off the columns of B; with priors it is none: M M ≠ M.
+Columns may depend on each other: H⁻¹ is then the inverse where they are determined, see `schur`.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg as sl
 
+from hilcal.regression.schur import inverse_root
 from hilcal.types import Floats
 
 
@@ -24,18 +25,16 @@ class Projection:
     Attributes:
         rows: (R, K) B.
         ridge: (K,) Λ.
-        low: (K, K) lower Cholesky factor of H.
+        inverse_root: (K, K) T with Tᵀ T = H⁻¹.
     """
 
     rows: Floats
     ridge: Floats
-    low: Floats
+    inverse_root: Floats
 
     def solve(self, rhs: Floats) -> Floats:
         """Return H⁻¹ times (K,) or (K, P)."""
-        if not len(self.low):
-            return rhs
-        return np.asarray(sl.cho_solve((self.low, True), rhs, check_finite=False))
+        return np.asarray(self.inverse_root.T @ (self.inverse_root @ rhs))
 
     def project_out(self, x: Floats) -> Floats:
         """Return M X = X − B H⁻¹ Bᵀ X of whitened columns (R,) or (R, P)."""
@@ -68,27 +67,22 @@ class Projection:
     def effective(self) -> float:
         """Effective number of parameters of the model, tr(H⁻¹ BᵀB)."""
         held = self.ridge > 0
-        if not held.any():
-            return float(len(self.ridge))
-        covariance = np.diag(self.solve(np.eye(len(self.ridge))))
-        return float(len(held) - np.sum(self.ridge[held] * covariance[held]))
+        determined = np.count_nonzero(np.any(self.inverse_root, axis=1))
+        variance = np.sum(self.inverse_root[:, held] ** 2, axis=0)
+        return float(determined - np.sum(self.ridge[held] * variance))
 
     def root(self) -> Floats:
         """Return Q (R, K) with M = 1 − Q Qᵀ."""
-        if not len(self.low):
-            return self.rows
-        solved = sl.solve_triangular(self.low, self.rows.T, lower=True, check_finite=False)
-        return np.asarray(solved.T)
+        return np.asarray(self.rows @ self.inverse_root.T)
 
 
 def projection(rows: Floats, ridge: Floats, gram: Floats | None = None) -> Projection:
     """Return M of the columns B (R, K) with the ridge Λ (K,).
 
     Args:
-        rows: B; with the ridge of full column rank.
+        rows: B.
         ridge: Λ, at least zero.
         gram: (K, K) BᵀB where it is known.
     """
     h = (rows.T @ rows if gram is None else gram) + np.diag(ridge)
-    low = sl.cholesky(h, lower=True, check_finite=False) if len(h) else h
-    return Projection(rows, ridge, np.asarray(low))
+    return Projection(rows, ridge, inverse_root(h))

@@ -23,7 +23,7 @@ def ratio_tail(eigenvalues: Floats, dimension: float, c: float) -> float:
 
     Args:
         eigenvalues: (K,) non-zero eigenvalues λ of the numerator.
-        dimension: R, dimension of z; the other R − K eigenvalues are zero.
+        dimension: R, dimension of z, at least K; the other R − K eigenvalues are zero.
         c: the observed ratio.
     """
     top = float(eigenvalues.max(initial=0.0))
@@ -32,7 +32,10 @@ def ratio_tail(eigenvalues: Floats, dimension: float, c: float) -> float:
     if c >= top:
         return 0.0
     d = np.append(eigenvalues - c, -c)
-    weight = np.append(np.ones(len(eigenvalues)), dimension - len(eigenvalues))
+    weight = np.append(np.ones(len(eigenvalues)), max(dimension - len(eigenvalues), 0.0))
+    d, weight = d[weight > 0], weight[weight > 0]
+    if d.min() >= 0:
+        return 1.0
     scale = np.abs(d).max()
     d = d / scale
 
@@ -41,16 +44,17 @@ def ratio_tail(eigenvalues: Floats, dimension: float, c: float) -> float:
 
     # The cumulant generating function lives on 1/(2 d_min) < t < 1/(2 d_max).
     low, high = 0.5 / d.min(), 0.5 / d.max()
-    edge = 1e-9 * (high - low)
-    t = float(brentq(slope, low + edge, high - edge, xtol=1e-14, maxiter=500))
+    inside = 1 - 1e-9
+    t = float(brentq(slope, low * inside, high * inside, xtol=1e-14, maxiter=500))
     cumulant = -0.5 * float(np.sum(weight * np.log1p(-2 * t * d)))
     curvature = 2 * float(np.sum(weight * (d / (1 - 2 * t * d)) ** 2))
     w = np.sign(t) * np.sqrt(max(-2 * cumulant, 0.0))
     v = t * np.sqrt(curvature)
     if abs(w) < NEAR_MEAN:
         # The formula is 0/0 at the mean: go straight from one side of it to the other.
-        mean = float(eigenvalues.sum()) / dimension
-        spread = np.sqrt(2 * float(np.sum(weight * (scale * d + c - mean) ** 2))) / dimension
+        total = float(weight.sum())
+        mean = float(eigenvalues.sum()) / total
+        spread = np.sqrt(2 * float(np.sum(weight * (scale * d + c - mean) ** 2))) / total
         low, high = mean - 3 * NEAR_MEAN * spread, mean + 3 * NEAR_MEAN * spread
         p_low, p_high = (ratio_tail(eigenvalues, dimension, at) for at in (low, high))
         return float(p_low + (p_high - p_low) * (c - low) / (high - low))

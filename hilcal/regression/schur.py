@@ -19,8 +19,9 @@ Source: Pukelsheim, *Optimal Design of Experiments* (1993), chapter 3.
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg as sl
 
-from hilcal.types import Floats, Ints
+from hilcal.types import Bools, Floats, Ints
 
 DETERMINED = 1e-12
 """Least eigenvalue of an information matrix of unit diagonal that counts as information.
@@ -35,7 +36,7 @@ _SOUND = 1e-2
 def inverse_root(block: Floats) -> Floats:
     """Return T (..., F, F) with Tᵀ T = M⁻ of blocks M (..., F, F), by the rule for singular blocks.
 
-    Directions without information have zero rows in T.
+    Directions without information have zero rows in T. The number of the other rows is the rank.
     """
     size = block.shape[-1]
     if not size:
@@ -44,19 +45,36 @@ def inverse_root(block: Floats) -> Floats:
     root = np.sqrt(np.maximum(np.diagonal(flat, axis1=1, axis2=2), 0.0))
     root[root == 0.0] = 1.0
     scaled = flat / (root[:, :, None] * root[:, None, :])
-    try:
-        out = np.linalg.inv(np.linalg.cholesky(scaled))
-        # The trace of the inverse is at least the inverse of the least eigenvalue.
-        sound = np.einsum("nij,nij->n", out, out) < _SOUND / DETERMINED
-    except np.linalg.LinAlgError:
-        out = np.zeros_like(scaled)
-        sound = np.zeros(len(flat), dtype=np.bool_)
+    out, sound = _triangular(scaled)
     for k in np.flatnonzero(~sound):
         values, vectors = np.linalg.eigh(scaled[k])
         kept = values > DETERMINED
         inverse = np.where(kept, 1.0 / np.sqrt(np.where(kept, values, 1.0)), 0.0)
         out[k] = inverse[:, None] * vectors.T
     return np.asarray((out / root[:, None, :]).reshape(block.shape))
+
+
+def _triangular(scaled: Floats) -> tuple[Floats, Bools]:
+    """Inverse Cholesky factors of blocks (N, F, F), and which of them serve."""
+    if len(scaled) == 1:
+        low, failed = sl.lapack.dpotrf(scaled[0], lower=1)
+        out = np.zeros_like(low) if failed else sl.lapack.dtrtri(low, lower=1)[0]
+        out = np.asarray(out)[None]
+    else:
+        try:
+            out = np.linalg.inv(np.linalg.cholesky(scaled))
+        except np.linalg.LinAlgError:  # one of them is singular: all by eigenvalues
+            return np.zeros_like(scaled), np.zeros(len(scaled), dtype=np.bool_)
+        failed = 0
+    # The trace of the inverse is at least the inverse of the least eigenvalue.
+    trace = np.einsum("nij,nij->n", out, out)
+    return out, np.asarray((trace < _SOUND / DETERMINED) & (failed == 0))
+
+
+def positive_solve(m: Floats, rhs: Floats) -> Floats:
+    """Return M⁻ times (P,) or (P, K), M (P, P) positive semidefinite."""
+    root = inverse_root(m)
+    return np.asarray(root.T @ (root @ rhs))
 
 
 def nuisance_inverse(m: Floats, nuisance: Ints) -> Floats:

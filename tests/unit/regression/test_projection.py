@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from hilcal.regression.projection import projection
 from tests.support.regression_cases import KINDS, problem
 
 
@@ -31,3 +32,13 @@ def test_the_residual_does_not_depend_on_where_the_model_stands(kind: str, off: 
     z = of.estimate + off
     found = of.projection.residual(of.y - of.rows @ z, z)
     np.testing.assert_allclose(found, of.dense @ of.y, atol=1e-12)
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
+def test_columns_that_depend_on_each_other_count_once(scale: float) -> None:
+    rng = np.random.default_rng(0)
+    own, y = rng.standard_normal((30, 3)), rng.standard_normal(30)
+    double = scale * np.hstack([own, own @ rng.standard_normal((3, 2)), np.zeros((30, 1))])
+    p, q = projection(double, np.zeros(6)), np.linalg.qr(own)[0]
+    np.testing.assert_allclose(p.project_out(y), y - q @ (q.T @ y), atol=1e-10)
+    assert p.effective() == pytest.approx(3.0)

@@ -88,3 +88,13 @@ def test_nothing_to_test_is_no_evidence():
     assert ratio_tail(np.zeros(3), 10, 0.1) == 1.0
     assert ratio_tail(np.ones(3), 10, 0.0) == 1.0
     assert ratio_tail(np.ones(3), 10, 1.0) == 0.0
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
+def test_no_more_dimensions_than_eigenvalues_and_any_scale(scale: float) -> None:
+    lam = scale * np.array([1e-9, 0.5, 1.0, 1.0, 2.0])
+    drawn = np.random.default_rng(0).standard_normal((20000, 5)) ** 2
+    ratio = (drawn @ lam) / drawn.sum(axis=1)
+    for c in scale * np.array([0.3, 0.9, 1.4]):
+        assert ratio_tail(lam, 4.0, c) == pytest.approx(np.mean(ratio > c), abs=0.02)
+    assert ratio_tail(np.full(5, scale), 5.0, 0.5 * scale) == 1.0
