@@ -7,6 +7,7 @@ from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode
 from hilcal.diagnose.diagnosis import Diagnosis, History, Verdict
 from hilcal.diagnose.evidence import Evidence
+from hilcal.diagnose.promise import LEAST_KEPT, kept_by_refit
 from hilcal.diagnose.stepwise import Refits, add, exchange, predicts_better, remove
 from hilcal.diagnose.stepwise_alternatives import Alternative
 from hilcal.diagnose.verdict import NOTHING, judge
@@ -76,7 +77,8 @@ def refine(
 ) -> Refinement:
     """Fit, diagnose, add the first suspect, and repeat.
 
-    An effect stays only if the error on poses left out falls. Where the readings do not separate
+    An effect stays only if the error on poses left out falls, and the refit keeps what the
+    linearisation promised (see `diagnose.promise`). Where the readings do not separate
     the first suspect from others it is added all the same, since any of them lowers the error.
     When no suspect is left, every addition is reconsidered: a redundant one is removed, one that
     others replace better is exchanged for them. Effects that were tried or taken out enter the
@@ -151,7 +153,9 @@ class Path:
                 continue
             self._say(f"adding {name}")
             trial = self._refits.add(last.fit, name)
-            if predicts_better(last.fit, trial):
+            score = next(s.score for s in last.diagnosis.suspects if s.effect == name)
+            kept = kept_by_refit(last.fit, trial, score) >= LEAST_KEPT
+            if kept and predicts_better(last.fit, trial):
                 found = trial, name
                 break
             self._rejected.append(name)

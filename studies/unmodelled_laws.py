@@ -96,6 +96,29 @@ def _turned(s: States, torque: Floats) -> Floats:
     return _of_joint(2, s, pull * np.cos(2.0 * s.q[:, 0]))
 
 
+def _crosswise(s: States, torque: Floats) -> Floats:
+    return _of_joint(3, s, torque[:, 1])
+
+
+def _one_sided(s: States, torque: Floats) -> Floats:
+    return _of_joint(2, s, np.maximum(torque[:, 1], 0.0))
+
+
+def _saturating(s: States, torque: Floats) -> Floats:
+    typical = float(np.median(np.abs(torque[:, 1])))
+    return _of_joint(2, s, np.tanh(torque[:, 1] / max(typical, 1e-9)))
+
+
+def _elsewhere(s: States, torque: Floats) -> Floats:
+    return _of_joint(3, s, torque[:, 2] * np.cos(s.q[:, 3]))
+
+
+def _hose(s: States, torque: Floats) -> Floats:
+    """A hose from forearm to tool, whose spring the load's pull along it stretches."""
+    pull = np.linalg.norm(s.wrench[:, :3], axis=1)
+    return _of_joint(5, s, pull * s.q[:, 5])
+
+
 LAWS: tuple[UnmodelledLaw, ...] = (
     UnmodelledLaw("crossed gear", "dq_2 = a sin 3 q_4", ("joint 4 angle",), (ABSOLUTE,), _crossed),
     UnmodelledLaw("slip in time", "dq_3 = a tanh of time", ("time",), (ABSOLUTE,), _settled),
@@ -129,6 +152,25 @@ LAWS: tuple[UnmodelledLaw, ...] = (
         ("joint 1 angle", "load"),
         (DEFLECTION,),
         _turned,
+    ),
+    UnmodelledLaw(
+        "crosswise compliance", "dq_3 = a tau_2", ("joint 2 torque",), (DEFLECTION,), _crosswise
+    ),
+    UnmodelledLaw(
+        "one-sided stop", "dq_2 = a max(tau_2, 0)", ("joint 2 torque",), (DEFLECTION,), _one_sided
+    ),
+    UnmodelledLaw(
+        "saturating gear", "dq_2 = a tanh tau_2", ("joint 2 torque",), (DEFLECTION,), _saturating
+    ),
+    UnmodelledLaw(
+        "compliance by another joint",
+        "dq_3 = a tau_3 cos q_4",
+        ("joint 4 angle", "joint 3 torque"),
+        (DEFLECTION,),
+        _elsewhere,
+    ),
+    UnmodelledLaw(
+        "hose spring", "dq_5 = a |f| q_6", ("joint 6 angle", "load"), (DEFLECTION,), _hose
     ),
 )
 """Every law, by what shows it."""

@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 from rich.table import Table
 from rich.text import Text
@@ -84,6 +85,9 @@ def _document(e: Effect, defaults: dict[str, object], catalogue: Catalogue) -> d
         "defaults": plain(defaults),
         "option_help": dict(e.option_help),
         "parameters": shown,
+        "plausible": None
+        if not np.isfinite(e.most())
+        else {q.unit: e.most() * q.scale for q in e.parameters},
         "source": _source(type(e), catalogue),
     }
 

@@ -29,6 +29,7 @@ from hilcal.cli.fitting import Readings, options_json, options_line
 from hilcal.cli.terminal import Json, Record, Run, terminal
 from hilcal.data.revision import change
 from hilcal.diagnose.diagnosis import History
+from hilcal.diagnose.effect_ranking import addition
 from hilcal.diagnose.verdict import NOTHING
 from hilcal.diagnose.verdict import diagnose as judge
 from hilcal.effects.catalogue import Catalogue
@@ -43,7 +44,7 @@ from hilcal.refine import refine as refine_model
 from hilcal.refine import remove as remove_effect
 from hilcal.report import numbers, text, text_refine
 from hilcal.report.build_story import Chapter, build_story
-from hilcal.report.diagnosis_document import to_json
+from hilcal.report.diagnosis_document import suspect_json, to_json
 from hilcal.report.progress import working
 from hilcal.report.text_unknown import curves
 from hilcal.report.verdict_words import message
@@ -148,6 +149,8 @@ def _change(
         ]
         t.show([text_refine.revisions_table([r.shown for r in rows]), text_refine.key()])
         t.show(_fell(before, after, named) if adds else _rose(before, after, effect))
+        expected = addition(before, after) if adds and before.scaling == "gc" else None
+        t.show([] if expected is None else text_refine.addition_lines(expected))
         t.show(["", text_refine.verdict_line(d)])
         if record is not None:
             with working(t.progress) as say:
@@ -158,6 +161,7 @@ def _change(
             "revisions": revisions_json(rows),
             "verdict": d.verdict,
             "message": message(d),
+            **({} if expected is None else {"addition": suspect_json(expected)}),
             "diagnosis": to_json(d),
         }
     )

@@ -256,6 +256,11 @@ class CellConfig(Section):
     )
     sight: Sight = Field(default_factory=Sight, description="a section [sight]")
     simulation: Simulation = Field(default_factory=Simulation, description="a section [simulation]")
+    plausible: dict[str, Positive] = Field(
+        default_factory=dict,
+        description="a section [plausible]: how many times as large as stated an effect may be, "
+        "by its name, e.g. link_geometry = 4.0",
+    )
 
     @model_validator(mode="after")
     def _distinct_names(self) -> "CellConfig":

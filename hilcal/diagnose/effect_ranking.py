@@ -1,19 +1,27 @@
 """Which effects of the catalogue could be missing, best first.
 
 A suspect passes all tests where the F-test over the whole catalogue rejects that it is absent,
-its evidence is positive, it explains a share of the misfit on poses left out, and the error there
-falls by more than it scatters from pose to pose.
+its evidence is positive, it explains a share of the misfit on poses left out, the error there
+falls by more than it scatters from pose to pose, its parameters need not be larger than is
+plausible, and the exact model keeps what the linearisation promised (see `promise`).
+
+All is scored at plausible sizes: the standard deviation of the parameters is at most the effect's
+`most`. Where the evidence is larger by more than `SAME_EVIDENCE` beyond that, the effect is
+implausible, and the size that it would need is stated.
 """
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hilcal.diagnose.minimum_detectable_effect import Strength, least_strength
+from hilcal.diagnose.promise import LEAST_KEPT, kept, kept_by_refit
+from hilcal.diagnose.stepwise import add
 from hilcal.effects.protocol import Effect
+from hilcal.errors import InputError
 from hilcal.identify.fit import Fit
-from hilcal.identify.linearisation import EffectColumns, Linearisation, effect_columns
+from hilcal.identify.linearisation import EffectColumns, Linearisation, effect_columns, linearise
 from hilcal.regression.evidence import FamilyScore
 from hilcal.types import Floats
 
@@ -38,6 +46,10 @@ class Suspect:
         sure: whether the error on poses left out falls by more than it scatters from pose to
             pose; not so where a refit has shown that it does not fall.
         least: the smallest strength of it that these readings would reveal.
+        needs: where it is implausible, its size: (unit, rms of the parameters that it would need,
+            rms that is plausible), SI.
+        kept: share of what the linearisation promised that the exact model keeps; 1 where that
+            was not looked at, since the suspect fails other tests.
         same_as: other suspects that these readings do not separate from it.
     """
 
@@ -48,18 +60,38 @@ class Suspect:
     explains: bool
     sure: bool
     least: Strength
+    needs: tuple[tuple[str, float, float], ...] = ()
+    kept: float = 1.0
     same_as: tuple[str, ...] = ()
 
     @property
     def passes(self) -> bool:
         """Whether it passes all tests."""
-        return self.explains and self.sure
+        return self.explains and self.sure and self.plausible and self.keeps
+
+    @property
+    def plausible(self) -> bool:
+        """Whether parameters of plausible size explain as much as any."""
+        return not self.needs
+
+    @property
+    def keeps(self) -> bool:
+        """Whether the exact model keeps what the linearisation promised."""
+        return self.kept >= LEAST_KEPT
 
 
 def candidates(fit: Fit) -> tuple[Effect, ...]:
-    """Effects that are not in the model and can be computed from these readings."""
+    """Effects that are not in the model and can be computed from these readings.
+
+    Raises:
+        InputError: `[plausible]` of the cell names an effect that the catalogue does not hold.
+    """
     states = fit.readings[~fit.outlier].states
     model, out = fit.model, []
+    for name in model.cell.config.plausible if model.cell.config else ():
+        if name not in model.catalogue.names:
+            valid = ", ".join(model.catalogue.names)
+            raise InputError(f"[plausible] {name}: no such effect; valid: {valid}")
     for kind in model.catalogue.effects:
         if kind.name not in model.names and kind.computable(states):
             effect = model.catalogue.make(kind.name, model.cell, states, m=fit.whitening.m)
@@ -67,19 +99,23 @@ def candidates(fit: Fit) -> tuple[Effect, ...]:
     return tuple(out)
 
 
-def catalogue_columns(fit: Fit) -> tuple[Floats, dict[str, slice]]:
-    """Return the columns (R, P) of all `candidates`, and which are whose."""
+def catalogue_columns(fit: Fit) -> tuple[Floats, dict[str, slice], dict[str, float]]:
+    """Return the columns (R, P) of all `candidates`, which are whose, and `Effect.most`."""
     families = [effect_columns(fit, e) for e in candidates(fit)]
     ends = np.cumsum([0] + [f.white.shape[1] for f in families])
     columns = np.hstack([np.zeros((len(fit.white), 0)), *(f.white for f in families)])
-    return columns, {
+    of = {
         f.effect.name: slice(int(a), int(b))
         for f, a, b in zip(families, ends[:-1], ends[1:], strict=True)
     }
+    return columns, of, {f.effect.name: f.effect.most() for f in families}
 
 
 def rank_suspects(
-    p: Linearisation, effects: Sequence[Effect], level: float = FALSE_ALARM
+    p: Linearisation,
+    effects: Sequence[Effect],
+    level: float = FALSE_ALARM,
+    refit: Callable[[Fit, str], Fit] = add,
 ) -> tuple[Suspect, ...]:
     """Score all effects; best first, see `ranked`.
 
@@ -87,18 +123,28 @@ def rank_suspects(
         p: linearisation of the fit.
         effects: that are not in the model.
         level: of the test over all of them together.
+        refit: returns a fit with one more effect.
     """
     found = [_suspect(p, effect_columns(p.fit, e), level / len(effects)) for e in effects]
     tested = max(sum(s.score.rank > 0 for s in found), 1)
-    return ranked(
-        replace(
-            s,
-            explains=s.score.p_value * tested < level
-            and s.score.log_evidence > 0
-            and s.holdout_share >= LEAST_SHARE,
-        )
-        for s in found
-    )
+    out = []
+    for s, e in zip(found, effects, strict=True):
+        explains = s.score.p_value * tested < level and s.score.log_evidence > 0
+        s = replace(s, explains=explains and s.holdout_share >= LEAST_SHARE)
+        out.append(replace(s, kept=kept(p, e, s.score, refit)) if s.passes else s)
+    return ranked(out)
+
+
+def addition(before: Fit, after: Fit) -> Suspect:
+    """Return what was to be expected of the last effect of a model, and what the refit kept of it.
+
+    Args:
+        before: a gc-scaled fit.
+        after: the fit with one more effect.
+    """
+    p, effect = linearise(before), after.model.effects[-1]
+    (s,) = rank_suspects(p, [effect], refit=lambda fit, name: after)
+    return replace(s, kept=kept_by_refit(before, after, s.score))
 
 
 def ranked(suspects: Iterable[Suspect], rejected: Collection[str] = ()) -> tuple[Suspect, ...]:
@@ -120,6 +166,8 @@ def ranked(suspects: Iterable[Suspect], rejected: Collection[str] = ()) -> tuple
                 o.effect
                 for o in found
                 if o is not s
+                and o.plausible
+                and o.keeps
                 and o.effect not in rejected
                 and min(o.score.log_evidence, s.score.log_evidence) > SAME_EVIDENCE
                 and abs(o.score.log_evidence - s.score.log_evidence) < SAME_EVIDENCE
@@ -131,7 +179,8 @@ def ranked(suspects: Iterable[Suspect], rejected: Collection[str] = ()) -> tuple
 
 def _suspect(p: Linearisation, of: EffectColumns, level: float) -> Suspect:
     s = p.information(of.white)
-    result = p.score(of.white, s)
+    most = of.effect.most()
+    result = p.score(of.white, s, most)
     held = p.held_out(of.white, result)
     return Suspect(
         effect=of.effect.name,
@@ -140,6 +189,7 @@ def _suspect(p: Linearisation, of: EffectColumns, level: float) -> Suspect:
         holdout_share=held.share,
         explains=False,
         sure=held.sure,
+        needs=_implausible(p, of, s, result, most),
         least=least_strength(
             s,
             of.motion,
@@ -150,3 +200,22 @@ def _suspect(p: Linearisation, of: EffectColumns, level: float) -> Suspect:
             level,
         ),
     )
+
+
+def _implausible(
+    p: Linearisation, of: EffectColumns, s: Floats, at_most: FamilyScore, most: float
+) -> tuple[tuple[str, float, float], ...]:
+    """Size that an effect needs where plausible ones explain less, and plausible sizes, by unit."""
+    free = p.score(of.white, s)
+    if free.log_evidence - at_most.log_evidence <= SAME_EVIDENCE:
+        return ()
+    units = np.array([q.unit for q in of.effect.parameters])
+    needed = of.scale * free.step
+    return tuple(
+        (unit, _rms(needed[units == unit]), most * _rms(of.scale[units == unit]))
+        for unit in dict.fromkeys(units.tolist())
+    )
+
+
+def _rms(x: Floats) -> float:
+    return float(np.sqrt(np.mean(x**2)))

@@ -56,7 +56,7 @@ class Evidence:
     @cached_property
     def suspects(self) -> tuple[Suspect, ...]:
         """All of them scored."""
-        return rank_suspects(self.linearisation, self.effects)
+        return rank_suspects(self.linearisation, self.effects, refit=self._refit)
 
     @cached_property
     def misfit_breakdown(self) -> tuple[MisfitShare, ...]:

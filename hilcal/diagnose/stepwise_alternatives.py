@@ -60,7 +60,7 @@ class StepwiseAlternatives:
         """Compute the columns of the model and of all effects that are not in it."""
         self._fit = fit
         self._model = model_columns(fit)
-        self._x, self._columns = catalogue_columns(fit)
+        self._x, self._columns, self._most = catalogue_columns(fit)
         self._gram = self._x.T @ self._x
 
     def of(self, effect: str, excluded: Collection[str] = ()) -> Alternative:
@@ -73,7 +73,13 @@ class StepwiseAlternatives:
         reduced = eliminate_effect(self._fit, self._model, effect)
         own = reduced.score().log_evidence
         families = families_beside(
-            reduced.projection, reduced.residual, reduced.dof, self._x, self._columns, self._gram
+            reduced.projection,
+            reduced.residual,
+            reduced.dof,
+            self._x,
+            self._columns,
+            self._most,
+            self._gram,
         )
         same: tuple[str, ...] = ()
         others: list[str] = []

@@ -16,6 +16,8 @@ class BaseCompliance(Effect):
 
     name = "base_compliance"
     summary = "rotation B t_0 about the base origin: the ground gives way"
+    plausible = 30.0
+    """90 µrad/(N·m): an arm on a trolley. A choice."""
     elastic = True
     local_response = True
 

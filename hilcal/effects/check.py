@@ -124,6 +124,11 @@ def _class(kind: type[Effect]) -> None:
             lambda v: isinstance(v, dict) and all(map(_is_text, (*v, *v.values()))),
         ),
         ("role", ", ".join(get_args(Role)), lambda v: v in get_args(Role)),
+        (
+            "plausible",
+            "a number of ordinary magnitudes, more than 0",
+            lambda v: isinstance(v, int | float) and not isinstance(v, bool) and v > 0,
+        ),
     )
     for key, valid, good in rules:
         found = getattr(kind, key, None)

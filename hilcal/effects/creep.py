@@ -27,6 +27,8 @@ class Creep(PerJoint):
 
     name = "creep"
     summary = "dq_j = k c_j τ_j log10(1 + t/1 s): joints go on giving way under the load"
+    plausible = 10.0
+    """20 % per decade of time: polymers; metals creep by less than 2 %. A choice."""
     elastic = True
     local_response = True
     needs = ("load_time",)

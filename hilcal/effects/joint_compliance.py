@@ -11,6 +11,8 @@ class JointCompliance(PerJoint):
 
     name = "joint_compliance"
     summary = "dq_j = c_j τ_j: each joint gives way in proportion to its torque"
+    plausible = 10.0
+    """30 mrad at the rated torque; gears state 1 to 5. A choice."""
     elastic = True
     local_response = True
     role = "baseline"

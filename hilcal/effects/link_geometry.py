@@ -16,6 +16,8 @@ class LinkGeometry(Effect):
 
     name = "link_geometry"
     summary = "constant displacement and rotation of each link's end (over-complete)"
+    plausible = 3.0
+    """3 mm, 3 mrad; links differ from their drawings by 0.1 to 2 mm and mrad. A choice."""
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

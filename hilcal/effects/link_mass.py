@@ -1,5 +1,7 @@
 """`link_mass`: the links are not as heavy, or not balanced, as configured."""
 
+import numpy as np
+
 from hilcal.effects.protocol import Columns, Effect, LoadChange, Parameter, Situation
 from hilcal.robot.statics import first_moment_change
 from hilcal.types import Floats
@@ -14,6 +16,8 @@ class LinkMass(Effect):
 
     name = "link_mass"
     summary = "moment (R_k δ_k) × g at joint k: links are heavier or balanced otherwise"
+    plausible = 20.0
+    """1 kg·m: a fifth of the first moment of an upper arm of 20 kg. A choice."""
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -35,3 +39,7 @@ class LinkMass(Effect):
     def wrench_columns(self, theta: Floats, s: Situation) -> Floats:
         """Moments of unit first moments, carried by all joints up to the link's."""
         return first_moment_change(self.cell.arm, s.chain, s.load.gravity)
+
+    def most(self) -> float:
+        """As usual; without limit where the arm was described without masses."""
+        return super().most() if np.any(self.cell.arm.masses) else np.inf

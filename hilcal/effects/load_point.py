@@ -17,6 +17,8 @@ class LoadPoint(Effect):
 
     name = "load_point"
     summary = "the load acts elsewhere than configured (flange axes)"
+    plausible = 10.0
+    """10 cm: a hook or an eye instead of the flange. A choice."""
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

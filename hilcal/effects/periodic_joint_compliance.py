@@ -23,6 +23,8 @@ class PeriodicJointCompliance(PerJoint):
 
     name = "periodic_joint_compliance"
     summary = "dq_j = τ_j (a_j cos 2q_j + b_j sin 2q_j): compliance changes with the joint angle"
+    plausible = 10.0
+    """Twice an ordinary compliance; more would make it negative. A choice."""
     elastic = True
     local_response = True
     option_help: ClassVar = {

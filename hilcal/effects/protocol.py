@@ -152,6 +152,9 @@ class Effect(ABC):
             "effect": none; it is added by name, or where a diagnosis finds it missing.
             An effect that is not of the last role is never removed by a diagnosis. Those of the
             first two take the options `prior_m` and `prior_rad`.
+        plausible: standard deviation of the parameters over arms and cells as they are, in their
+            ordinary magnitudes: the range that a suspect of this name must stay in. An effect
+            that states none is plausible at any size. See `most`.
     """
 
     name: ClassVar[str]
@@ -161,6 +164,7 @@ class Effect(ABC):
     needs: ClassVar[tuple[str, ...]] = ()
     option_help: ClassVar[Mapping[str, str]] = {}
     role: ClassVar[Role] = "effect"
+    plausible: ClassVar[float] = np.inf
 
     def __init__(self, cell: Cell, states: States, options: Options | None = None) -> None:
         """Build the effect for a cell and the states at hand.
@@ -265,6 +269,14 @@ class Effect(ABC):
     def prior_std(self) -> Floats | None:
         """(P,) standard deviations of a fixed zero-mean prior, or None for a flat one."""
         return None
+
+    def most(self) -> float:
+        """Largest plausible standard deviation of the parameters, in ordinary magnitudes.
+
+        `plausible`, times the factor that `[plausible]` of the cell has for the effect.
+        """
+        config = self.cell.config
+        return self.plausible * (1.0 if config is None else config.plausible.get(self.name, 1.0))
 
     @classmethod
     def usual_options(cls, m: int) -> Options:

@@ -13,6 +13,8 @@ class SensorMisalignment(ForceSensorEffect):
 
     name = "sensor_misalignment"
     summary = "acting = R exp(δ) Rᵀ wrench: the force sensor's axes are turned by δ"
+    plausible = 20.0
+    """0.2 rad: bolted on by eye. A choice."""
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

@@ -44,6 +44,9 @@ class Template(Effect):
     # air_temperature, joint_temperature, approach, q_actual; e.g. ("time", "joint_temperature").
     # Where readings lack one of them, the effect is not among the suspects.
     needs = ()
+    # How large the parameters are in practice: their standard deviation over arms and cells, in
+    # ordinary magnitudes. A suspect that needs more is not named; leave it out if you do not know.
+    plausible = 10.0
     # Options with their meaning; what is given for them is in self.options, e.g.
     # {"period": "angle of one turn of the bearing, rad; unless given, 2π."}.
     option_help: ClassVar[dict[str, str]] = {}

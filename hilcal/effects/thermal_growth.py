@@ -26,6 +26,8 @@ class ThermalGrowth(Effect):
 
     name = "thermal_growth"
     summary = "every link grows by α ΔT of its length, ΔT from 20 °C"
+    plausible = 5.0
+    """60e-6 per kelvin: polymers; aluminium has 23e-6. A choice."""
     needs = ("air_temperature or joint_temperature",)
     option_help: ClassVar = {
         "reference_degC": "T_ref, at which the links are as long as configured; unless given, 20.",

@@ -20,6 +20,8 @@ class ToolCompliance(Effect):
 
     name = "tool_compliance"
     summary = "rotation a t_z + c t_⊥ at the flange: tool or force sensor tilts under the moment"
+    plausible = 30.0
+    """30 mrad at the rated torque of the last joint: a long, slender tool. A choice."""
     elastic = True
     local_response = True
 

@@ -16,6 +16,8 @@ class TrackerDrift(Effect):
 
     name = "tracker_drift"
     summary = "the tracker's station moves linearly in time"
+    plausible = 20.0
+    """4 mm, 4 mrad over the campaign: a tripod on a soft floor. A choice."""
     needs = ("time",)
     option_help: ClassVar = {
         "reference_s": "the time at which the station stands as registered; unless given, the "

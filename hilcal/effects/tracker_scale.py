@@ -13,6 +13,8 @@ class TrackerScale(Effect):
 
     name = "tracker_scale"
     summary = "position read = (1 + s) position: the tracker's ranges have a scale error"
+    plausible = 100.0
+    """1 mm/m: photogrammetry without a scale bar; refraction alone makes 0.05. A choice."""
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

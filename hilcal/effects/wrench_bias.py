@@ -12,6 +12,8 @@ class WrenchBias(ForceSensorEffect):
 
     name = "wrench_bias"
     summary = "wrench read = true + b: the force sensor has a constant offset, in its own axes"
+    plausible = 30.0
+    """30 N, 3 N·m: a sensor that was not zeroed with its tool. A choice."""
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

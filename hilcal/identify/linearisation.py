@@ -98,15 +98,16 @@ class Linearisation:
         """Return S = Xᵀ M X (P, P) of whitened columns X (R, P)."""
         return self.projection.information(x)
 
-    def score(self, x: Floats, s: Floats | None = None) -> FamilyScore:
+    def score(self, x: Floats, s: Floats | None = None, most: float = np.inf) -> FamilyScore:
         """Score whitened columns X (R, P) beside the model.
 
         Args:
             x: X.
             s: (P, P) S where it is known.
+            most: largest plausible strength.
         """
         s = self.information(x) if s is None else s
-        return score_family(s, x.T @ self.residual, self.rss, self.fit.dof)
+        return score_family(s, x.T @ self.residual, self.rss, self.fit.dof, most=most)
 
     def misfit(self) -> float:
         """‖r‖² − dof, the misfit beyond the noise, at least `LEAST_MISFIT` of its σ."""

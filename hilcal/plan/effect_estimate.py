@@ -55,7 +55,7 @@ def estimate(linear: Linearisation, effect: Effect) -> EffectEstimate | None:
     if not computable(linear.fit, effect):
         return None
     columns = effect_columns(linear.fit, effect)
-    found = linear.score(columns.white)
+    found = linear.score(columns.white, most=effect.most())
     if not found.rank:
         return None
     scale = columns.scale

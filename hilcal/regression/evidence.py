@@ -110,7 +110,19 @@ def log_evidence(
     return np.asarray(-0.5 * np.log1p(t2 * lam).sum(axis=-1) - 0.5 * dof * np.log(left / rss))
 
 
-def score_family(s: Floats, g: Floats, rss: float, dof: float, spent: float = 0.0) -> FamilyScore:
+def _posterior_strengths(lam: Floats, explained: Floats, rss: float, dof: float) -> Floats:
+    """Prior standard deviations t σ (T,) of the parameters, σ² = ‖r‖²_t / ν, at each strength.
+
+    τ is t σ for the σ of the residual without the family, which holds what the family explains.
+    """
+    shrunk = 1 - 1 / (1 + np.outer(STRENGTHS**2 * dof / rss, lam))
+    left = np.maximum(rss - shrunk @ explained, ROUNDING * rss)
+    return np.asarray(STRENGTHS * np.sqrt(left / rss))
+
+
+def score_family(
+    s: Floats, g: Floats, rss: float, dof: float, spent: float = 0.0, most: float = np.inf
+) -> FamilyScore:
     """Score a family.
 
     Args:
@@ -121,6 +133,8 @@ def score_family(s: Floats, g: Floats, rss: float, dof: float, spent: float = 0.
         spent: effective number of parameters of families with a prior that are in the model
             beside those that `dof` counts. They lower the degrees of freedom of the test; in the
             evidence their determinant has counted already, where they were added.
+        most: largest plausible standard deviation of the parameters; the test does not depend on
+            it.
     """
     values, vectors = np.linalg.eigh((s + s.T) / 2)
     seen = visible(values)
@@ -138,6 +152,11 @@ def score_family(s: Floats, g: Floats, rss: float, dof: float, spent: float = 0.
     else:
         p_value = ratio_tail(lam, free, float(c @ c) / rss)
     evidence = log_evidence(lam, explained, rss, dof)
+    if np.isfinite(most):
+        evidence = np.where(
+            _posterior_strengths(lam, explained, rss, dof) <= most, evidence, -np.inf
+        )
+        evidence[0] = max(evidence[0], -1e300)
     best = int(np.argmax(evidence))
     ridge = rss / (dof * float(STRENGTHS[best]) ** 2)
     shrunk = lam / (lam + ridge)

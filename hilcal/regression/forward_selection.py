@@ -8,8 +8,10 @@ compare.
 """
 
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+
+import numpy as np
 
 from hilcal.regression.evidence import FamilyScore, score_family
 from hilcal.regression.projection import Projection
@@ -28,6 +30,7 @@ class Families:
         dof: degrees of freedom ν of the residual without any of the families.
         columns: the columns of each family that is not in the model.
         spent: effective number of parameters of the families that are in the model by now.
+        most: largest plausible strength of each family that has one.
     """
 
     information: Floats
@@ -36,12 +39,18 @@ class Families:
     dof: float
     columns: Mapping[str, slice]
     spent: float = 0.0
+    most: Mapping[str, float] = field(default_factory=dict)
 
     def scores(self) -> dict[str, FamilyScore]:
         """Score each family by itself."""
         return {
             name: score_family(
-                self.information[k, k], self.gradient[k], self.rss, self.dof, self.spent
+                self.information[k, k],
+                self.gradient[k],
+                self.rss,
+                self.dof,
+                self.spent,
+                self.most.get(name, np.inf),
             )
             for name, k in self.columns.items()
         }
@@ -56,7 +65,8 @@ class Families:
             self.information, self.gradient, self.rss, self.columns[name], found.ridge
         )
         others = {n: k for n, k in self.columns.items() if n != name}
-        return Families(s, g, rss, self.dof, others, self.spent + found.effective)
+        spent = self.spent + found.effective
+        return Families(s, g, rss, self.dof, others, spent, self.most)
 
 
 def families_beside(
@@ -65,6 +75,7 @@ def families_beside(
     dof: float,
     x: Floats,
     columns: Mapping[str, slice],
+    most: Mapping[str, float],
     gram: Floats | None = None,
 ) -> Families:
     """Return families beside a model.
@@ -75,10 +86,12 @@ def families_beside(
         dof: degrees of freedom of r.
         x: (R, P) whitened columns of all families, in ordinary magnitudes.
         columns: of each family.
+        most: largest plausible strength of each family that has one.
         gram: (P, P) XᵀX where it is known.
     """
     rss = float(residual @ residual)
-    return Families(p.information(x, gram), x.T @ residual, rss, dof, columns)
+    s = p.information(x, gram)
+    return Families(s, x.T @ residual, rss, dof, columns, most=most)
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 from hilcal.diagnose.diagnosis import Diagnosis
+from hilcal.diagnose.effect_ranking import Suspect
 from hilcal.diagnose.minimum_detectable_effect import Strength
 from hilcal.diagnose.noise import PureError
 from hilcal.diagnose.residual_regression import Dependence
@@ -23,20 +24,7 @@ def to_json(d: Diagnosis) -> dict[str, object]:
             {"variable": v.variable, "share": v.share, "p_value": v.p_value}
             for v in d.misfit_breakdown
         ],
-        "suspects": [
-            {
-                "effect": s.effect,
-                "p_value": s.score.p_value,
-                "share": s.share,
-                "holdout_share": s.holdout_share,
-                "delta_bic": s.score.delta_bic,
-                "log_evidence": s.score.log_evidence,
-                "significant": s.passes,
-                "same_as": list(s.same_as),
-                "least": least(s.least),
-            }
-            for s in d.suspects
-        ],
+        "suspects": [suspect_json(s) for s in d.suspects],
         "apart": [
             {"effect": a.effect, "unlike": a.unlike, "times": a.times if a.possible else None}
             for a in d.separability
@@ -58,6 +46,24 @@ def to_json(d: Diagnosis) -> dict[str, object]:
         "needless": list(d.redundant),
         "carriers": carriers(d.dependences),
         "pure_error": None if d.pure_error is None else repeats(d.pure_error),
+    }
+
+
+def suspect_json(s: Suspect) -> dict[str, object]:
+    """Return what is said of one suspect."""
+    return {
+        "effect": s.effect,
+        "p_value": s.score.p_value,
+        "share": s.share,
+        "holdout_share": s.holdout_share,
+        "delta_bic": s.score.delta_bic,
+        "log_evidence": s.score.log_evidence,
+        "significant": s.passes,
+        "same_as": list(s.same_as),
+        "least": least(s.least),
+        "plausible": s.plausible,
+        "needs": [{"unit": unit, "rms": rms, "plausible_rms": most} for unit, rms, most in s.needs],
+        "kept_share": s.kept,
     }
 
 

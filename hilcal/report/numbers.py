@@ -1,7 +1,7 @@
 """Numbers for people: sensible digits, and units in which they are easy to read."""
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 # SI unit: units for people with their factor, small values first, and the value from which
 # the next one is better.
@@ -26,6 +26,15 @@ def unit_for(unit: str, values: Sequence[float]) -> tuple[str, float]:
         if largest < limit:
             return name, factor
     return unit, 1.0
+
+
+def sizes(of: Iterable[tuple[str, float]]) -> str:
+    """Write (unit, value) pairs, SI, in units for people."""
+    parts = []
+    for unit, value in of:
+        name, factor = unit_for(unit, [value])
+        parts.append(f"{digits(factor * value, 2)} {name}")
+    return ", ".join(parts)
 
 
 def length(metres: float) -> str:

@@ -6,12 +6,13 @@ from rich.console import RenderableType
 from rich.text import Text
 
 from hilcal.diagnose.diagnosis import Diagnosis
+from hilcal.diagnose.effect_ranking import Suspect
 from hilcal.identify.fit import Fit
 from hilcal.identify.full_prediction import full_prediction
 from hilcal.report import numbers, text
-from hilcal.report.text_seen import could_have_been_seen, redundant_line
+from hilcal.report.text_seen import could_have_been_seen, doubtful, redundant_line
 from hilcal.report.text_unknown import curves, repeats
-from hilcal.report.verdict_words import message
+from hilcal.report.verdict_words import implausible, message
 
 VERDICTS: Mapping[str, str] = {
     "adequate": "adequate: the residual is noise",
@@ -52,6 +53,18 @@ def suspects_table(d: Diagnosis, most: int = SUSPECTS) -> RenderableType:
     return out
 
 
+def addition_lines(s: Suspect) -> Iterator[str]:
+    """Yield what is wrong with an effect that was added: its size, or a promise that broke."""
+    if not s.plausible:
+        yield f"{s.effect} is implausible: it {implausible(s)}."
+    if not s.keeps:
+        kept = numbers.percent(max(s.kept, 0.0))
+        yield (
+            f"The linearisation promised that {s.effect} explains {numbers.percent(s.share)} of "
+            f"the misfit; the refit kept {kept} of that: remove it, hilcal remove RUN {s.effect}."
+        )
+
+
 def diagnosis_report(d: Diagnosis) -> Iterator[RenderableType]:
     """Yield the verdict, where the model fails and the suspects."""
     yield text.heading(f"Model: {text.model_name(d.fit.model.names)}")
@@ -69,6 +82,7 @@ def diagnosis_report(d: Diagnosis) -> Iterator[RenderableType]:
             style="dim",
         )
     if d.verdict != "adequate":
+        yield from doubtful(d)
         yield from (text.where_table(d.misfit_breakdown), "")
     if d.verdict in ("unknown_effect", "noise_misjudged"):
         yield (

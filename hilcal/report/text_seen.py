@@ -8,6 +8,7 @@ from rich.text import Text
 from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.diagnose.minimum_detectable_effect import Strength
 from hilcal.report import numbers, text
+from hilcal.report.verdict_words import broken, implausible
 
 
 def could_have_been_seen(d: Diagnosis) -> Iterator[RenderableType]:
@@ -32,11 +33,16 @@ def could_have_been_seen(d: Diagnosis) -> Iterator[RenderableType]:
 
 def own_units(least: Strength) -> str:
     """Write a strength in the units of the effect's parameters."""
-    parts = []
-    for unit, rms in least.parameters:
-        name, factor = numbers.unit_for(unit, [rms])
-        parts.append(f"{numbers.digits(factor * rms, 2)} {name}")
-    return ", ".join(parts)
+    return numbers.sizes(least.parameters)
+
+
+def doubtful(d: Diagnosis) -> Iterator[str]:
+    """Yield suspects that would need an implausible size, or do not keep what they promise."""
+    for s in d.suspects:
+        if not s.plausible and s.score.p_value < text.CERTAIN:
+            yield f"{s.effect} is implausible: it {implausible(s)}."
+        elif not s.keeps:
+            yield f"{s.effect} is not named: {broken(s)}."
 
 
 def redundant_line(d: Diagnosis) -> Iterator[str]:

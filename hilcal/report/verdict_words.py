@@ -6,6 +6,7 @@ from hilcal.diagnose.noise import PureError
 from hilcal.diagnose.noise_verdict import NoiseVerdict
 from hilcal.diagnose.separability import Separability
 from hilcal.diagnose.stepwise_alternatives import Alternative
+from hilcal.report.numbers import sizes
 
 
 def message(d: Diagnosis) -> str:
@@ -34,6 +35,20 @@ def _explains(s: Suspect) -> str:
     return (
         f"explains {100 * s.share:.0f} % of the misfit, {100 * max(s.holdout_share, 0):.0f} % on "
         f"poses left out (p = {s.score.p_value:.1g})"
+    )
+
+
+def implausible(s: Suspect) -> str:
+    """Say which size a suspect needs, and which is plausible."""
+    needed = sizes([(unit, rms) for unit, rms, _ in s.needs])
+    most = sizes([(unit, most) for unit, _, most in s.needs])
+    return f"would need parameters of {needed} rms, where up to {most} is plausible"
+
+
+def broken(s: Suspect) -> str:
+    """Say how much the exact model keeps of what the linearisation promised."""
+    return (
+        f"the exact model keeps {100 * max(s.kept, 0.0):.0f} % of what its linearisation promises"
     )
 
 
@@ -83,9 +98,14 @@ def _no_suspect(d: Diagnosis) -> str:
     if d.suspects and d.suspects[0].explains:
         best = d.suspects[0]
         tried = best.effect in d.history.rejected
+        but = f"does not {'' if tried else 'surely '}lower the error on poses left out"
+        if not best.plausible:
+            but = implausible(best)
+        elif not best.keeps:
+            but = broken(best)
         none = (
             f"the best effect of the catalogue, {best.effect}, explains {100 * best.share:.0f} % "
-            f"of it, but does not {'' if tried else 'surely '}lower the error on poses left out"
+            f"of it, but {but}"
         )
     follows = f"; it follows {' and '.join(d.follows)}" if d.follows else ""
     return (

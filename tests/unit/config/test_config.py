@@ -168,7 +168,7 @@ WRONG = {
         ROBOT + "[trackers]\nframe = 'base'\n",
         r'has no section or key "trackers" \(did you mean "tracker"\?\); valid here: robot, tool, '
         r"tracker, repeatability, loads, force_sensor, operator, motion, acquire, limits, "
-        r"planning, obstacles, sight, simulation$",
+        r"planning, obstacles, sight, simulation, plausible$",
     ),
     "unknown key in the second load": (
         ROBOT + LOAD + "[[loads]]\nname = 'b'\nmass = 1\n",

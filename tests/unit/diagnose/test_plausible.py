@@ -1,0 +1,96 @@
+"""Suspects must be of plausible size, and keep what their linearisation promises."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hilcal.config import load_config
+from hilcal.diagnose.effect_ranking import candidates, rank_suspects
+from hilcal.diagnose.promise import LEAST_KEPT, kept_by_refit, kept_by_step
+from hilcal.diagnose.stepwise import add
+from hilcal.diagnose.verdict import diagnose
+from hilcal.effects.catalogue import BUILT_IN
+from hilcal.errors import InputError
+from hilcal.identify.baseline import baseline
+from hilcal.identify.fit import Fit, fit
+from hilcal.identify.linearisation import linearise
+from hilcal.report.verdict_words import message
+from studies.study_cases import study_case
+from tests.support.campaigns import campaign
+from tests.support.paths import ROOT
+
+SECOND_ORDER = {"link_geometry", "encoder_offset", "link_mass"}
+
+
+def unmodelled(law: str, robot: str) -> Fit:
+    case = study_case(
+        load_config(ROOT / "configs/cells/demo_ur10e.toml"),
+        robot,
+        "deflection",
+        (law,),
+        3.0,
+        seed=0,
+    )
+    return fit(baseline(case.cell, case.readings, "deflection"), case.readings, "deflection")
+
+
+@pytest.mark.parametrize(
+    ("law", "robot"), [("crosswise compliance", "ur5e"), ("compliance by another joint", "ur10e")]
+)
+def test_no_error_of_second_order_is_named_for_deflections(law: str, robot: str) -> None:
+    d = diagnose(unmodelled(law, robot))
+    assert d.verdict == "unknown_effect"
+    assert not SECOND_ORDER & set(d.significant)
+    geometry = next(s for s in d.suspects if s.effect == "link_geometry")
+    needed = {unit: rms for unit, rms, _ in geometry.needs}
+    assert needed["m"] > 0.01 or needed["rad"] > 0.01
+    assert "plausible" in message(d) or d.suspects[0].effect != "link_geometry"
+
+
+def test_every_effect_that_ships_states_what_is_plausible() -> None:
+    assert all(1.0 <= kind.plausible < np.inf for kind in BUILT_IN)
+
+
+def test_the_cell_may_allow_more() -> None:
+    found = unmodelled("crosswise compliance", "ur10e")
+
+    def geometry(factor: dict[str, float]) -> tuple[float, bool]:
+        config = found.model.cell.configured().model_copy(update={"plausible": factor})
+        cell = replace(found.model.cell, config=config)
+        same = replace(found, model=replace(found.model, cell=cell))
+        some = [e for e in candidates(same) if e.name == "link_geometry"]
+        (s,) = rank_suspects(linearise(same), some)
+        return s.score.strength, s.plausible
+
+    usual, more = geometry({}), geometry({"link_geometry": 1e3})
+    assert usual[0] < more[0]
+    assert (usual[1], more[1]) == (False, True)
+    with pytest.raises(InputError, match=r"\[plausible\] gremlins: no such effect"):
+        geometry({"gremlins": 2.0})
+
+
+@pytest.mark.parametrize("effect", ["link_geometry", "joint_tilt_compliance"])
+def test_true_effects_keep_their_promise(effect: str) -> None:
+    mode = "absolute" if effect == "link_geometry" else "deflection"
+    c = campaign(effect, mode, 1)
+    found = fit(baseline(c.cell, c.readings, c.mode), c.readings, c.mode)
+    p = linearise(found)
+    (s,) = rank_suspects(p, [e for e in candidates(found) if e.name == effect])
+    (e,) = (e for e in candidates(found) if e.name == effect)
+    assert s.passes
+    assert s.plausible
+    assert kept_by_step(p, e, s.score) == pytest.approx(1.0, abs=0.1)
+    assert kept_by_refit(found, add(found, effect), s.score) == pytest.approx(1.0, abs=0.15)
+
+
+def test_a_refit_that_changes_nothing_keeps_nothing() -> None:
+    c = campaign("joint_tilt_compliance", "deflection", 1)
+    found = fit(baseline(c.cell, c.readings, c.mode), c.readings, c.mode)
+    p = linearise(found)
+    (e,) = (e for e in candidates(found) if e.name == "joint_tilt_compliance")
+    (s,) = rank_suspects(p, [e], refit=lambda before, effect: before)
+    assert s.keeps
+    assert kept_by_refit(found, found, s.score) == 0.0
+    far = replace(s.score, step=100 * s.score.step)
+    assert kept_by_step(p, e, far) < LEAST_KEPT
