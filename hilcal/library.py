@@ -9,9 +9,8 @@ import numpy as np
 
 from hilcal.campaign import Campaign
 from hilcal.cell import Cell
-from hilcal.data.covariance import tracker_noise
+from hilcal.data.importing import import_readings
 from hilcal.data.readings import Readings
-from hilcal.data.table import read_table as read_exchange_table
 from hilcal.data.whitening import MODES, SCALINGS, Mode, usual_mode
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError
@@ -28,8 +27,8 @@ from hilcal.report.build_story import build_story
 from hilcal.types import Floats
 
 
-def read_table(path: str | Path, cell: Cell) -> Readings:
-    """Read an exchange table, one row per reading, SI units.
+def read_table(path: str | Path, cell: Cell, mapping: str | Path | None = None) -> Readings:
+    """Read a table of readings: the exchange table, or any other by a mapping.
 
     >>> cell = hc.Cell.load(CELL)
     >>> readings = hc.read_table(TABLE, cell)
@@ -37,16 +36,17 @@ def read_table(path: str | Path, cell: Cell) -> Readings:
     ('none', '5kg', '10kg', 'pull x', 'pull y')
 
     Args:
-        path: CSV file; its columns are listed in docs/reference/exchange-table.md.
+        path: the table; without a mapping the exchange table, docs/reference/exchange-table.md.
         cell: the cell that it was measured in; its tracker gives the covariances where the table
             has none.
+        mapping: what `hilcal import --format` takes: the path of a mapping file
+            or the name of a format.
 
     Raises:
         InputError: anything that cannot be right, with row and column.
     """
-    tracker = cell.configured().tracker
-    noise, station = tracker_noise(tracker), tracker.station_m
-    return read_exchange_table(path, cell.arm, noise, station, cell.target_names)
+    form = "table" if mapping is None else mapping
+    return import_readings(Path(path), form, cell.configured(), cell.arm).readings
 
 
 def baseline(

@@ -12,22 +12,17 @@ from rich.padding import Padding
 from hilcal.campaign import Campaign
 from hilcal.cell import cell_from_config
 from hilcal.cli.terminal import Json, Run, terminal
-from hilcal.config import CellConfig, load_config
+from hilcal.config import load_config
 from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.covariance import tracker_noise
-from hilcal.data.ipa_ur10 import read_ipa_ur10
-from hilcal.data.readings import Readings
-from hilcal.data.table import FROM_TRACKER, import_table, write_table
+from hilcal.data.importing import import_readings
+from hilcal.data.table import write_table
 from hilcal.errors import InputError
 from hilcal.report import text
 from hilcal.report.progress import working
-from hilcal.robot.arm import Arm
-
-FORMATS = ("table", "ipa-ur10")
 
 
 def import_(
-    table: Annotated[Path, typer.Argument(metavar="TABLE.csv", help="What was measured.")],
+    table: Annotated[Path, typer.Argument(metavar="TABLE", help="What was measured.")],
     config: Annotated[
         Path, typer.Option("--config", metavar="CELL.toml", help="The cell it was measured in.")
     ],
@@ -36,23 +31,31 @@ def import_(
         typer.Option("-o", "--output", metavar="RUN.hilcal", help="The campaign file to make."),
     ],
     kind: Annotated[
-        str, typer.Option("--format", metavar="FORMAT", help="table or ipa-ur10.")
+        str,
+        typer.Option(
+            "--format",
+            metavar="FORMAT",
+            help="table, ipa-ur10, a mapping that comes with the program, or a mapping file.",
+        ),
     ] = "table",
+    second: Annotated[
+        Path | None,
+        typer.Option("--second", metavar="TABLE", help="The second file, e.g. of the joints."),
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing campaign.")] = False,
     as_json: Json = False,
 ) -> None:
     """Make a campaign file from a table of readings."""
     t = terminal(as_json)
-    if kind not in FORMATS:
-        raise InputError(f"--format {kind!r} is unknown; valid: {', '.join(FORMATS)}")
     settings = load_config(config)
     base_dir = config.absolute().parent
     cell = cell_from_config(settings, base_dir)
     with working(t.progress) as say:
         say(f"reading {table}")
-        readings, notes = _read(table, kind, settings, cell.arm)
+        found = import_readings(table, kind, settings, cell.arm, second)
+        readings, notes = found.readings, found.notes
         say(f"writing {output}")
-        source = f"{table.name} ({kind})"
+        source = f"{table.name} ({Path(kind).name})"
         with CampaignFile.create(
             output, settings.to_json(), str(base_dir), source, overwrite=force
         ) as campaign:
@@ -77,19 +80,6 @@ def import_(
             "notes": list(notes),
         }
     )
-
-
-def _read(
-    table: Path, kind: str, settings: CellConfig, arm: Arm
-) -> tuple[Readings, tuple[str, ...]]:
-    if kind == "ipa-ur10":
-        found = read_ipa_ur10(table, arm)
-        return found.readings, found.notes
-    s = settings.tracker
-    targets = [t.name for t in settings.tool.targets]
-    result = import_table(table, arm, tracker_noise(s), s.station_m, targets)
-    where = "" if s.frame == "tracker" or s.station_m else ", as if it stood at the arm's base"
-    return result.readings, tuple(n + where * (n == FROM_TRACKER) for n in result.notes)
 
 
 def export(

@@ -9,7 +9,8 @@ from hilcal.robot.arm import Arm
 from hilcal.types import Floats, Ints
 
 MAX_DISTANCE = 100.0  # m; no instrument measures an arm from further away
-MAX_STD = 0.01  # m; a reading worse than that is useless for an arm; a guess
+MAX_STD = 3e-3  # m; cameras do better; micrometres given 1000 times too large are above it
+MAX_ANGLE_STD = 0.05  # rad, 3°; the same for an orientation, a choice
 SAME_POSE = 1e-6  # rad; commanded joints of one pose agree to this
 _LIMIT_MARGIN = 1e-4  # rad; rounding of a limit written with few digits
 _TRACKING = 0.1  # rad; actual and commanded joints of an arm at rest are closer
@@ -109,7 +110,7 @@ def check_covariances(table: CsvTable, covariance: Floats) -> None:
 
     Raises:
         InputError: zero, a negative variance, not positive semi-definite, or a standard
-            deviation above 10 mm; names the row.
+            deviation above 3 mm or 0.05 rad; names the row.
     """
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     for i in np.flatnonzero(np.any(variance < 0, axis=1))[:1]:
@@ -137,6 +138,12 @@ def check_covariances(table: CsvTable, covariance: Floats) -> None:
         raise InputError(
             f"{table.at(int(i))}: a standard deviation of {std[i]:.3g} m cannot calibrate an arm; "
             f"covariances must be in m², m·rad and rad² (1 mm² = 1e-6 m²)"
+        )
+    turn = np.sqrt(variance[:, 3:].max(axis=1, initial=0.0))
+    for i in np.flatnonzero(turn > MAX_ANGLE_STD)[:1]:
+        raise InputError(
+            f"{table.at(int(i))}: a standard deviation of {turn[i]:.3g} rad cannot calibrate an "
+            f"arm; covariances must be in m², m·rad and rad² (1 deg² = 3.05e-4 rad²)"
         )
 
 

@@ -13,6 +13,7 @@ from hilcal.data.covariance import TrackerNoise, tracker_covariance
 from hilcal.data.csvfile import CsvTable, read_columns
 from hilcal.data.imported import ImportResult
 from hilcal.data.readings import Readings, States
+from hilcal.data.stated_noise import LEAST, floored, rounding_variance, with_rounding
 from hilcal.errors import InputError
 from hilcal.robot.arm import Arm
 from hilcal.toml import suggest
@@ -70,6 +71,7 @@ def readings_of(
     station: Floats | Sequence[float] | None = None,
     covariance: Floats | None = None,
     targets: Sequence[str] = (),
+    rounding: Floats | None = None,
 ) -> ImportResult:
     """Check a table with the exchange table's columns, in SI units, and make readings of it.
 
@@ -80,6 +82,8 @@ def readings_of(
         station: (3,) where the tracker's beam starts, m; the origin where None.
         covariance: (N, m, m) in place of the table's columns, checked like them.
         targets: names of the cell's targets, see `Cell.target_names`.
+        rounding: (3,) variance of the positions' rounding, m²; found from the positions where
+            None. It is added where it counts beside the covariance.
 
     Raises:
         InputError: anything that cannot be right.
@@ -98,11 +102,18 @@ def readings_of(
         checks.check_rotations(table, rotation)
         value = np.hstack([value, rotation])
     stated = _stated(table, value.shape[1]) if covariance is None else covariance
+    notes: tuple[str, ...]
     if stated is None:
         cov, notes = _instrument(table, value, noise, station), (FROM_TRACKER,)
     else:
         checks.check_covariances(table, stated)
-        cov, notes = stated, (FROM_TABLE,)
+        tiny = np.any(np.diagonal(stated, axis1=1, axis2=2) < min(LEAST) ** 2)
+        spec = _instrument(table, value, noise, station) if tiny and noise is not None else None
+        cov, notes = floored(table, stated, spec)
+        notes = (FROM_TABLE, *notes)
+    if rounding is None:
+        rounding = rounding_variance(value[:, :3], 1.0)
+    cov, rounded = with_rounding(cov, rounding)
     readings = Readings(
         states=states,
         pose=pose,
@@ -114,7 +125,7 @@ def readings_of(
         pose_names=tuple(pose_names),
         target_names=() if target is None else tuple(targets),
     )
-    return ImportResult(readings, notes)
+    return ImportResult(readings, (*notes, *rounded))
 
 
 def _choose(path: str, header: list[str], arm: Arm) -> tuple[Sequence[str], Sequence[str]]:

@@ -1,0 +1,67 @@
+"""Import of a table in any of the formats, into the cell that it was measured in."""
+
+from pathlib import Path
+
+from hilcal.config import CellConfig
+from hilcal.data.covariance import tracker_noise
+from hilcal.data.imported import ImportResult
+from hilcal.data.ipa_ur10 import read_ipa_ur10
+from hilcal.data.mapped import import_mapped
+from hilcal.data.mapping import Mapping, find_mapping, mapping_names
+from hilcal.data.table import FROM_TRACKER, import_table
+from hilcal.errors import InputError
+from hilcal.robot.arm import Arm
+from hilcal.toml import suggest
+
+FORMATS = ("table", "ipa-ur10")
+"""Formats that are read without a mapping."""
+
+
+def import_readings(
+    path: Path,
+    form: str | Path | Mapping,
+    config: CellConfig,
+    arm: Arm,
+    second: Path | None = None,
+) -> ImportResult:
+    """Read a table into a cell.
+
+    Args:
+        path: the table.
+        form: "table" (the exchange table), "ipa-ur10", the name of a mapping that comes with the
+            program, the path of a mapping file, or a mapping.
+        config: the cell: its tracker's noise and place, its gravity.
+        arm: its arm.
+        second: the second file of a mapping that is for two.
+
+    Raises:
+        InputError: an unknown format, or anything in the table that cannot be right.
+    """
+    mapping = form if isinstance(form, Mapping) else _mapping(form)
+    tracker = config.tracker
+    noise, station = tracker_noise(tracker), tracker.station_m
+    targets = [target.name for target in config.tool.targets]
+    if mapping is None and second is not None:
+        raise InputError(f"--second {second}: only for a --format with a section [second_file]")
+    if form == "ipa-ur10":
+        return read_ipa_ur10(path, arm)
+    if mapping is None:
+        result = import_table(path, arm, noise, station, targets)
+    else:
+        gravity = config.robot.gravity_m_s2
+        result = import_mapped(path, mapping, arm, noise, station, gravity, second, targets)
+    where = "" if tracker.frame == "tracker" or station else ", as if it stood at the arm's base"
+    notes = tuple(note + where * (note == FROM_TRACKER) for note in result.notes)
+    return ImportResult(result.readings, notes)
+
+
+def _mapping(form: str | Path) -> Mapping | None:
+    if str(form) in FORMATS:
+        return None
+    names = (*FORMATS, *mapping_names())
+    if str(form) not in names and Path(form).suffix.lower() != ".toml":
+        raise InputError(
+            f"--format {form} is unknown{suggest(str(form), names)}; valid: {', '.join(names)}, "
+            f"or the path of a mapping file (.toml)"
+        )
+    return find_mapping(form)

@@ -1,0 +1,239 @@
+"""Opening a file of any kind that holds a table: text, XLSX, MAT, Parquet.
+
+The kind is seen from the file's first bytes. Nothing in a file is ever executed: formulas count by
+the value that is stored with them, macros, links and pickles are not read.
+"""
+
+import io
+import zipfile
+from collections.abc import Iterator
+from datetime import date, datetime, time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hilcal.data.grid import Cell, Grid, content_of, joined, read_text, table, unique
+from hilcal.data.mapping import FileFormat, Mapping
+from hilcal.errors import InputError
+from hilcal.toml import suggest
+
+LARGEST = 2**30
+"""Bytes that a packed file may unpack to; a choice: far beyond any table of readings."""
+
+_REFUSED = {
+    b"SQLite format 3\x00": "an SQLite file (a campaign is opened, not imported)",
+    b"\x89HDF": "an HDF5 file (MATLAB's -v7.3); save it with -v7, or as CSV",
+    b"\xd0\xcf\x11\xe0": "an old Excel file (XLS); save it as XLSX or CSV",
+    b"\x1f\x8b": "a gzip file; unpack it first",
+    b"\x93NUMPY": "a NumPy file; save it as CSV",
+    b"\x80\x02": "a Python pickle, which is never loaded; save it as CSV",
+    b"\x80\x03": "a Python pickle, which is never loaded; save it as CSV",
+    b"\x80\x04": "a Python pickle, which is never loaded; save it as CSV",
+    b"\x80\x05": "a Python pickle, which is never loaded; save it as CSV",
+    b"%PDF": "a PDF; save the table as CSV",
+}
+
+
+def open_tables(path: str | Path, mapping: Mapping, second: Path | None = None) -> tuple[Grid, int]:
+    """Open the file or the two files that a mapping is for, as one table.
+
+    Args:
+        path: the first file.
+        mapping: its sections [file] and [second_file].
+        second: the second file, where the mapping does not name it.
+
+    Returns:
+        The table, and how many rows of the first file found no partner in the second.
+
+    Raises:
+        InputError: a file that cannot be read, or files that do not belong together.
+    """
+    first = open_grid(path, mapping.file)
+    if mapping.second_file is None:
+        if second is not None:
+            raise InputError(f"{second}: the mapping has no section [second_file]")
+        return first, 0
+    other = second or mapping.second_file.path
+    if other is None:
+        raise InputError(
+            f"{path}: the mapping has a section [second_file] without path; give it there or by "
+            f"--second"
+        )
+    return joined(first, open_grid(other, mapping.second_file), mapping.second_file.match)
+
+
+def open_grid(path: str | Path, how: FileFormat) -> Grid:
+    """Open one file as a table of cells.
+
+    Raises:
+        InputError: no such file, a kind that is not read, no table in it, or the package that
+            reads it is not installed.
+    """
+    name, content = str(path), content_of(path)
+    if not content.strip(b"\xef\xbb\xbf \t\r\n"):
+        raise InputError(f"{name}: the file is empty; expected a table of readings")
+    for magic, what in _REFUSED.items():
+        if content.startswith(magic):
+            raise InputError(f"{name}: {what}; expected text, XLSX, MAT or Parquet")
+    try:
+        if content.startswith(b"PK\x03\x04"):
+            return _xlsx(name, content, how)
+        if content.startswith(b"PAR1"):
+            return _parquet(name, content, how)
+        if content.startswith(b"MATLAB"):
+            return _mat(name, how)
+    except (ValueError, KeyError, TypeError, OSError, zipfile.BadZipFile) as e:
+        raise InputError(f"{name}: damaged, or not what its first bytes say ({_short(e)})") from e
+    if how.sheet or how.variable:
+        key = "sheet" if how.sheet else "variable"
+        raise InputError(f"{name}: text has no {key}; remove [file] {key}")
+    return read_text(name, content, how)
+
+
+def _short(error: Exception) -> str:
+    words = " ".join(str(error).split()) or type(error).__name__
+    return words if len(words) <= 80 else words[:77] + "..."
+
+
+def _package(path: str, name: str, what: str) -> Any:
+    from importlib import import_module
+
+    try:
+        return import_module(name)
+    except ImportError as e:
+        raise InputError(
+            f"{path}: {what} needs the package {name.split('.')[0]}: pip install hilcal[tables]"
+        ) from e
+
+
+def _xlsx(path: str, content: bytes, how: FileFormat) -> Grid:
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        members = archive.infolist()
+        if "xl/workbook.xml" not in [m.filename for m in members]:
+            raise InputError(f"{path}: a zip archive that is no XLSX; unpack it, or save as XLSX")
+        if sum(m.file_size for m in members) > LARGEST:
+            raise InputError(f"{path}: unpacks to over 1 GB; save the table as CSV")
+    openpyxl = _package(path, "openpyxl", "XLSX")
+    book = openpyxl.load_workbook(
+        io.BytesIO(content), read_only=True, data_only=True, keep_links=False
+    )
+    sheets = book.sheetnames
+    if how.sheet is not None and how.sheet not in sheets:
+        raise InputError(
+            f"{path}: no sheet '{how.sheet}'{suggest(how.sheet, sheets)}; it has "
+            f"{', '.join(sheets)}"
+        )
+    sheet = book[how.sheet] if how.sheet else book[sheets[0]]
+    found = []
+    for row, cells in enumerate(sheet.iter_rows(values_only=True), start=1):
+        plain = [_cell(c) for c in cells]
+        comment = how.comment is not None and str(plain[0] if plain else "").startswith(how.comment)
+        if any(c is not None for c in plain) and not comment:
+            found.append((row, plain))
+    if not found:
+        raise InputError(f"{path}: sheet '{sheet.title}' is empty; it has {', '.join(sheets)}")
+    return table(path, found, how)
+
+
+def _cell(value: object) -> Cell:
+    """Return a spreadsheet's cell as a number, a date, text or nothing."""
+    if value is None or isinstance(value, datetime):
+        return value
+    if isinstance(value, bool):
+        return str(value)
+    if isinstance(value, int | float):
+        return float(value)
+    if isinstance(value, date):
+        return datetime.combine(value, time())
+    if isinstance(value, time):
+        return datetime.combine(date(1900, 1, 1), value)
+    text = str(value).strip()
+    return text or None
+
+
+def _columns(path: str, named: list[tuple[str, list[Cell]]], how: FileFormat) -> Grid:
+    if not named or not named[0][1]:
+        raise InputError(f"{path}: no readings; expected columns of equal length")
+    names = unique([name for name, _ in named])
+    rows = np.arange(1, len(named[0][1]) + 1)
+    grid = Grid(path, names, rows, tuple(cells for _, cells in named), (how,) * len(names))
+    return grid.rows_with(~np.isin(rows, how.skip_rows))
+
+
+def _parquet(path: str, content: bytes, how: FileFormat) -> Grid:
+    parquet = _package(path, "pyarrow.parquet", "Parquet")
+    arrow = _package(path, "pyarrow", "Parquet")
+    try:
+        found = parquet.read_table(io.BytesIO(content))
+    except arrow.ArrowException as e:
+        raise ValueError(str(e)) from e
+    named = []
+    for name in found.column_names:
+        values = found[name].to_pylist()
+        if not any(isinstance(v, list | dict | bytes) for v in values):
+            named.append((name, [_cell(v) for v in values]))
+    return _columns(path, named, how)
+
+
+def _mat(path: str, how: FileFormat) -> Grid:
+    """Columns of a MAT file: those of its matrices that have the same number of rows.
+
+    A matrix A of k > 1 columns gives "A(1)" ... "A(k)", poses T of shape (4, 4, N) give
+    "T(1,1)" ..., fields of a structure "s.field".
+    """
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatReadError
+
+    try:
+        found = loadmat(path, appendmat=False, squeeze_me=False, struct_as_record=True)
+    except (MatReadError, NotImplementedError, MemoryError) as e:
+        raise InputError(
+            f"{path}: cannot be read as a MAT file ({_short(e)}); save it with -v7, or as CSV"
+        ) from e
+    variables = [name for name in found if not name.startswith("__")]
+    if how.variable is not None and how.variable not in variables:
+        raise InputError(
+            f"{path}: no variable '{how.variable}'{suggest(how.variable, variables)}; it has "
+            f"{', '.join(variables)}"
+        )
+    chosen = [how.variable] if how.variable else variables
+    blocks = [b for name in chosen for b in _blocks(name, np.asarray(found[name]))]
+    lengths = [len(values) for _, values in blocks]
+    if not blocks:
+        raise InputError(
+            f"{path}: no matrix of numbers in {', '.join(chosen) or 'it'}; tables of MATLAB are "
+            f"written by writetable as CSV"
+        )
+    rows = max(lengths, key=lambda k: (lengths.count(k), k))
+    named = [
+        part for name, values in blocks if len(values) == rows for part in _split(name, values)
+    ]
+    return _columns(path, named, how)
+
+
+def _blocks(name: str, value: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
+    """Matrices (N, k) of a variable, N > 1, by name."""
+    if value.dtype.names and value.size == 1:
+        for field in value.dtype.names:
+            yield from _blocks(f"{name}.{field}", np.asarray(value[field].flat[0]))
+    elif value.dtype.kind in "fiu" and value.ndim == 3:
+        last = value.shape[2]
+        flat = np.moveaxis(value, 2, 0).reshape(last, -1)
+        for k, at in enumerate(np.ndindex(value.shape[:2])):
+            yield f"{name}({at[0] + 1},{at[1] + 1})", flat[:, k : k + 1]
+    elif value.dtype.kind in "fiu" and value.ndim == 2 and value.size > 1:
+        yield name, value.T if value.shape[0] == 1 else value
+    elif value.dtype.kind == "O" and value.ndim == 2 and min(value.shape) == 1:
+        cells = [v.item() if isinstance(v, np.ndarray) and v.size == 1 else v for v in value.flat]
+        if len(cells) > 1 and all(isinstance(c, str) for c in cells):
+            yield name, np.array(cells, dtype=object)[:, None]
+
+
+def _split(name: str, values: np.ndarray) -> Iterator[tuple[str, list[Cell]]]:
+    count = values.shape[1]
+    for k in range(count):
+        yield (
+            (name if count == 1 else f"{name}({k + 1})"),
+            [_cell(v) for v in values[:, k].tolist()],
+        )
