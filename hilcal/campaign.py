@@ -9,6 +9,7 @@ from typing import Self
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
 from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.covariance import COVERS, INSTRUMENT, WHOLE
 from hilcal.data.readings import Readings
 from hilcal.data.records import content_hash
 from hilcal.data.revision import RevisionRecord
@@ -19,7 +20,11 @@ from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
-from hilcal.identify.full_covariance import campaign_readings
+from hilcal.identify.full_covariance import (
+    CovarianceParts,
+    campaign_readings,
+    covariance_parts,
+)
 from hilcal.model import Model
 from hilcal.refine import Refinement
 from hilcal.report.build_story import Chapter
@@ -85,6 +90,16 @@ class Campaign:
     def path(self) -> Path:
         """The file."""
         return self.file.path
+
+    @property
+    def covariance_parts(self) -> CovarianceParts:
+        """What the covariance of its readings consists of."""
+        return covariance_parts(self.file.about(COVERS), self.config)
+
+    @property
+    def covers(self) -> str:
+        """What the covariance of `readings` covers, as an exchange table states it."""
+        return INSTRUMENT if self.covariance_parts in ("instrument", "as imported") else WHOLE
 
     def close(self) -> None:
         """Close the file."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from hilcal.campaign import Campaign
 from hilcal.cell import Cell
+from hilcal.data.covariance import WHOLE
 from hilcal.data.importing import import_readings
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import MODES, SCALINGS, Mode, usual_mode
@@ -17,6 +18,7 @@ from hilcal.errors import InputError
 from hilcal.identify import baseline as starting_models
 from hilcal.identify import fit as fits
 from hilcal.identify.fit import Fit
+from hilcal.identify.full_covariance import with_joint_scatter
 from hilcal.model import Model
 from hilcal.plan.checked_plan import CheckedPlan, checked
 from hilcal.plan.planner import Request, make
@@ -38,15 +40,19 @@ def read_table(path: str | Path, cell: Cell, mapping: str | Path | None = None) 
     Args:
         path: the table; without a mapping the exchange table, docs/reference/exchange-table.md.
         cell: the cell that it was measured in; its tracker gives the covariances where the table
-            has none.
+            has none, and its [repeatability] is added where the table's do not include it.
         mapping: what `hilcal import --format` takes: the path of a mapping file
             or the name of a format.
 
     Raises:
         InputError: anything that cannot be right, with row and column.
     """
-    form = "table" if mapping is None else mapping
-    return import_readings(Path(path), form, cell.configured(), cell.arm).readings
+    form, config = "table" if mapping is None else mapping, cell.configured()
+    found = import_readings(Path(path), form, config, cell.arm)
+    if found.covers == WHOLE:
+        return found.readings
+    joint_std = config.repeatability.per_joint(cell.arm.n)
+    return with_joint_scatter(cell, found.readings, joint_std)
 
 
 def baseline(

@@ -29,6 +29,7 @@ from hilcal.identify.full_prediction import full_prediction
 from hilcal.identify.linearisation import linearise
 from hilcal.identify.validation import validate as predict_other
 from hilcal.report import numbers, text
+from hilcal.report.covariance_words import covariance_words
 from hilcal.report.progress import working
 from hilcal.report.text_scalings import scalings_table
 from hilcal.revisions import mode_of
@@ -75,8 +76,10 @@ def identify(
         kept = fits[wanted[-1]]
         number = o.store(kept, None, None)
     t.show(text.fit_report(kept))
+    t.show(numbers.sentence(covariance_words(o.covariance_parts)))
     t.show(options_line(kept))
     document = {"revision": number, **to_json(kept), "options": options_json(kept)}
+    document["covariance"] = o.covariance_parts
     if len(fits) > 1:
         t.show(["", *scalings_table(fits)])
         document["scalings"] = {s: to_json(found) for s, found in fits.items()}

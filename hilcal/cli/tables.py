@@ -14,10 +14,13 @@ from hilcal.cell import cell_from_config
 from hilcal.cli.terminal import Json, Run, terminal
 from hilcal.config import load_config
 from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.covariance import COVERS
 from hilcal.data.importing import import_readings
 from hilcal.data.table import write_table
 from hilcal.errors import InputError
+from hilcal.identify.full_covariance import covariance_parts
 from hilcal.report import text
+from hilcal.report.covariance_words import covariance_words
 from hilcal.report.progress import working
 
 
@@ -53,11 +56,17 @@ def import_(
     with working(t.progress) as say:
         say(f"reading {table}")
         found = import_readings(table, kind, settings, cell.arm, second)
-        readings, notes = found.readings, found.notes
+        readings, parts = found.readings, covariance_parts(found.covers, settings)
+        notes = (*found.notes, covariance_words(parts))
         say(f"writing {output}")
         source = f"{table.name} ({Path(kind).name})"
         with CampaignFile.create(
-            output, settings.to_json(), str(base_dir), source, overwrite=force
+            output,
+            settings.to_json(),
+            str(base_dir),
+            source,
+            overwrite=force,
+            more={COVERS: found.covers},
         ) as campaign:
             campaign.append_readings(readings)
     loads = [readings.load_names[k] for k in np.unique(readings.load)]
@@ -77,6 +86,7 @@ def import_(
             "n_poses": poses,
             "elements": readings.m,
             "loads": loads,
+            "covariance": parts,
             "notes": list(notes),
         }
     )
@@ -107,7 +117,7 @@ def export(
         if parameters is not None and record is None:
             raise InputError(f"{run}: no revision yet, so no parameters; run hilcal identify first")
         if table is not None:
-            write_table(opened_run.readings, table)
+            write_table(opened_run.readings, table, opened_run.covers)
             t.show(f"{table}: {len(opened_run.readings)} readings")
         if parameters is not None and record is not None:
             rows = record.result_json["identify"]["parameters"]

@@ -202,6 +202,10 @@ class Repeatability(Section):
     joint_std_rad: NonNegative | Annotated[tuple[NonNegative, ...], Field(min_length=1)] = Field(
         0.0, description="one standard deviation in rad, 0 or more, or one per joint"
     )
+    in_tables: bool = Field(
+        False,
+        description="true where the covariances of imported tables include the arm's scatter",
+    )
 
     def per_joint(self, n: int) -> Floats:
         """Return (n,) standard deviations, rad.

@@ -11,6 +11,7 @@ ROTATION = ("rx_rad", "ry_rad", "rz_rad")
 WRENCH = ("fx_N", "fy_N", "fz_N", "mx_Nm", "my_Nm", "mz_Nm")
 TEXT = ("pose", "load")
 TARGET = "target"
+COVERS = "covers"
 OWN_PREFIX = "x_"
 _AXES = ("x", "y", "z", "rx", "ry", "rz")
 
@@ -55,6 +56,7 @@ def known_columns(n: int) -> tuple[str, ...]:
     return (
         *required_columns(n),
         TARGET,
+        COVERS,
         *covariance_columns(6),
         *WRENCH,
         *("cycle", "time_s", "load_time_s", "air_degC"),

@@ -7,10 +7,17 @@ and R the random covariance of the K samples of a reading (`covariance_of_mean`)
 the scatter of the joints from one arrival to the next, J the Jacobian of the target
 (`joint_scatter`).
 
-A measured campaign stores the first two terms, which its file states (`COVERS` = `INSTRUMENT`):
-the third needs the registration, and is added when the readings are opened
-(`hilcal.identify.full_covariance`). An imported campaign stores what its table states, or
-`tracker_covariance` where the table states none; `[repeatability]` is not added to it.
+The third term needs the registration; it is added when the readings are opened
+(`hilcal.identify.full_covariance`), with σ_q from [repeatability]. What the stored covariances
+cover, the file states (`COVERS`):
+
+- a measured campaign stores the first two terms: `INSTRUMENT`, the third is added;
+- an imported campaign stores what its table states, or `tracker_covariance` where the table states
+  none. Both are taken as the instrument's: `INSTRUMENT`, the third is added. Where the table's
+  covariances include the arm's scatter, its column `covers` says so ("instrument+arm", which
+  `hilcal export` writes), or the cell does ([repeatability] in_tables = true): `WHOLE`, and nothing
+  is added;
+- a campaign imported before the file stated it is read as it was: nothing is added.
 """
 
 from collections.abc import Sequence
@@ -26,6 +33,8 @@ COVERS = "covariance"
 """Key among the texts about a campaign: what the stored covariances cover."""
 INSTRUMENT = "instrument"
 """They cover the instrument alone, not the arm's repeatability."""
+WHOLE = "instrument+arm"
+"""They include the arm's repeatability."""
 PRIOR_REPEATS = 20.0
 """ν0: how many repeats the stated covariance is worth as a prior; a guess, no study set it."""
 

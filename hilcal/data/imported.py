@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from hilcal.data.covariance import INSTRUMENT
 from hilcal.data.readings import Readings
 
 
@@ -12,7 +13,9 @@ class ImportResult:
     Attributes:
         readings: the readings that can be used.
         notes: one sentence per decision; left out rows are named as a spreadsheet counts them.
+        covers: what the covariances cover, see `data.covariance`.
     """
 
     readings: Readings
     notes: tuple[str, ...]
+    covers: str = INSTRUMENT

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from hilcal.config import CellConfig
-from hilcal.data.covariance import tracker_noise
+from hilcal.data.covariance import WHOLE, tracker_noise
 from hilcal.data.imported import ImportResult
 from hilcal.data.ipa_ur10 import read_ipa_ur10
 from hilcal.data.mapped import import_mapped
@@ -30,7 +30,8 @@ def import_readings(
         path: the table.
         form: "table" (the exchange table), "ipa-ur10", the name of a mapping that comes with the
             program, the path of a mapping file, or a mapping.
-        config: the cell: its tracker's noise and place, its gravity.
+        config: the cell: its tracker's noise and place, its gravity, and whether tables include
+            the arm's scatter.
         arm: its arm.
         second: the second file of a mapping that is for two.
 
@@ -44,15 +45,17 @@ def import_readings(
     if mapping is None and second is not None:
         raise InputError(f"--second {second}: only for a --format with a section [second_file]")
     if form == "ipa-ur10":
-        return read_ipa_ur10(path, arm)
-    if mapping is None:
+        result = read_ipa_ur10(path, arm)
+    elif mapping is None:
         result = import_table(path, arm, noise, station, targets)
     else:
         gravity = config.robot.gravity_m_s2
         result = import_mapped(path, mapping, arm, noise, station, gravity, second, targets)
     where = "" if tracker.frame == "tracker" or station else ", as if it stood at the arm's base"
     notes = tuple(note + where * (note == FROM_TRACKER) for note in result.notes)
-    return ImportResult(result.readings, notes)
+    stated = FROM_TRACKER not in result.notes
+    covers = WHOLE if stated and config.repeatability.in_tables else result.covers
+    return ImportResult(result.readings, notes, covers)
 
 
 def _mapping(form: str | Path) -> Mapping | None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from hilcal.data import checks, columns
-from hilcal.data.covariance import TrackerNoise, tracker_covariance
+from hilcal.data.covariance import INSTRUMENT, WHOLE, TrackerNoise, tracker_covariance
 from hilcal.data.csvfile import CsvTable, read_columns
 from hilcal.data.imported import ImportResult
 from hilcal.data.readings import Readings, States
@@ -125,7 +125,8 @@ def readings_of(
         pose_names=tuple(pose_names),
         target_names=() if target is None else tuple(targets),
     )
-    return ImportResult(readings, (*notes, *rounded))
+    covers = INSTRUMENT if stated is None else _covers(table)
+    return ImportResult(readings, (*notes, *rounded), covers)
 
 
 def _choose(path: str, header: list[str], arm: Arm) -> tuple[Sequence[str], Sequence[str]]:
@@ -142,7 +143,8 @@ def _choose(path: str, header: list[str], arm: Arm) -> tuple[Sequence[str], Sequ
         )
     columns.check_header(path, header, arm.n, arm.name)
     columns.covariance_size(path, header)
-    text = (*columns.TEXT, *(name for name in header if name == columns.TARGET))
+    optional = (columns.TARGET, columns.COVERS)
+    text = (*columns.TEXT, *(name for name in header if name in optional))
     return text, [name for name in header if name in known and name not in text]
 
 
@@ -186,6 +188,27 @@ def _targets(table: CsvTable, names: Sequence[str]) -> Ints | None:
     if len(names) < 2:
         return None
     return np.array([names.index(name) for name in given], dtype=np.int64)
+
+
+def _covers(table: CsvTable) -> str:
+    """What the table's covariances cover, by its column `covers`; the instrument where absent.
+
+    Raises:
+        InputError: another word, or not the same one in all rows.
+    """
+    given = table.text.get(columns.COVERS, [INSTRUMENT])
+    for k, word in enumerate(given):
+        if word not in (INSTRUMENT, WHOLE):
+            raise InputError(
+                f"{table.at(k, columns.COVERS)}: {word!r} is unknown; valid: {INSTRUMENT} (the "
+                f"covariance of the tracker), {WHOLE} (the arm's repeatability is in it)"
+            )
+        if word != given[0]:
+            raise InputError(
+                f"{table.at(k, columns.COVERS)}: {word}, but {given[0]} in the first row; all "
+                "rows must say the same"
+            )
+    return given[0]
 
 
 def _states(table: CsvTable, arm: Arm) -> States:
@@ -276,8 +299,13 @@ def _instrument(
     return tracker_covariance(value[:, :3], noise, origin, m)
 
 
-def write_table(readings: Readings, path: str | Path) -> None:
+def write_table(readings: Readings, path: str | Path, covers: str = INSTRUMENT) -> None:
     """Write an exchange table that `read_table` reads back exactly (shortest exact decimals).
+
+    Args:
+        readings: the readings.
+        path: the file.
+        covers: what their covariances cover, see `data.covariance`.
 
     Raises:
         InputError: a name that a table cannot hold, or the file cannot be written.
@@ -288,6 +316,9 @@ def write_table(readings: Readings, path: str | Path) -> None:
     if readings.states.target is not None:
         text.append(_names(readings.target_names, readings.target, columns.TARGET))
         text_names = (*text_names, columns.TARGET)
+    if covers != INSTRUMENT:
+        text.append([covers] * len(readings))
+        text_names = (*text_names, columns.COVERS)
     header, numbers = _number_columns(readings)
     cells = [list(map(repr, column.tolist())) for column in numbers]
     _write(

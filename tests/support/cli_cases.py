@@ -13,6 +13,7 @@ import pytest
 from drivers.simulated.rehearsal import Rehearsal
 from hilcal.cli import main
 from hilcal.config import load_config
+from hilcal.data.covariance import WHOLE
 from hilcal.data.table import write_table
 from hilcal.robot.catalogue import configs_dir
 from studies.__main__ import main as studies
@@ -85,5 +86,5 @@ def rehearsal(hidden: str, seed: int = 1, poses: int = POSES) -> Rehearsal:
 
 def table(path: Path, hidden: str, seed: int = 1, poses: int = POSES) -> Path:
     """Write the exchange table of a simulated campaign."""
-    write_table(rehearsal(hidden, seed, poses).readings, path)
+    write_table(rehearsal(hidden, seed, poses).readings, path, WHOLE)
     return path

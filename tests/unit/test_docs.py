@@ -10,6 +10,7 @@ import pytest
 import hilcal as hc
 from hilcal.config import load_config
 from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.covariance import WHOLE
 from hilcal.data.table import write_table
 from hilcal.robot.catalogue import configs_dir
 from studies.random_campaigns import rehearse
@@ -50,7 +51,7 @@ def test_the_guide_to_the_library_runs_as_it_stands(
     readings = rehearse(config, "creep", 3, 10).readings
     monkeypatch.chdir(tmp_path)
     Path("CELL.toml").write_bytes(cell.read_bytes())
-    write_table(readings, Path("readings.csv"))
+    write_table(readings, Path("readings.csv"), WHOLE)
     with CampaignFile.create("run.hilcal", config.to_json(), str(cell.parent), "test") as file:
         file.append_readings(readings)
     pyplot = ModuleType("matplotlib.pyplot")

@@ -15,6 +15,7 @@ import pytest
 import hilcal as hc
 from hilcal.config import load_config
 from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.covariance import WHOLE
 from hilcal.data.table import write_table
 from hilcal.robot.catalogue import configs_dir
 from studies.random_campaigns import rehearse
@@ -35,7 +36,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     config = load_config(CELL)
     readings = rehearse(config, "joint_tilt_compliance", 3, 10).readings
     table, run = folder / "t.csv", folder / "run.hilcal"
-    write_table(readings, table)
+    write_table(readings, table, WHOLE)
     with CampaignFile.create(run, config.to_json(), str(CELL.parent), "test") as file:
         file.append_readings(readings)
     return SimpleNamespace(table=table, run=run, cell=CELL, folder=folder)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.covariance import WHOLE
 from hilcal.data.readings import Readings
 from hilcal.data.table import write_table
 from hilcal.effects.catalogue import installed
@@ -52,7 +53,7 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
     folder = tmp_path_factory.mktemp("tables")
     truth = 2e-6 * np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
     for k, name in enumerate(("fitted", "unseen")):
-        write_table(with_the_law(truth, k, 0), folder / f"{name}.csv")
+        write_table(with_the_law(truth, k, 0), folder / f"{name}.csv", WHOLE)
     return Case(folder / "fitted.csv", folder / "unseen.csv", truth)
 
 

@@ -12,6 +12,7 @@ from hilcal.acquire.dry_run import dry_run
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig, load_config
 from hilcal.config.write import to_toml
+from hilcal.data.covariance import WHOLE
 from hilcal.data.plan import REFERENCE, UNLOADED, load_plan, read_plan
 from hilcal.data.table import write_table
 from hilcal.plan.choice import CRITERIA, objective_of, worthwhile
@@ -180,7 +181,7 @@ def test_an_edited_plan_is_checked(tmp_path: Path, capsys: Capsys) -> None:
 def test_planning_on_from_what_is_known(tmp_path: Path, capsys: Capsys) -> None:
     r = rehearsal("nothing")
     table, run = tmp_path / "readings.csv", tmp_path / "run.hilcal"
-    write_table(r.readings, table)
+    write_table(r.readings, table, WHOLE)
     cell = cell_file(tmp_path, small())
     ok(capsys, "import", table, "--config", cell, "-o", run)
     ok(capsys, "identify", run)
