@@ -10,18 +10,22 @@ import typer
 from rich.padding import Padding
 
 from hilcal.campaign import Campaign
-from hilcal.cell import cell_from_config
+from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.terminal import Json, Run, terminal
 from hilcal.config import load_config
 from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.covariance import COVERS
 from hilcal.data.importing import import_readings
+from hilcal.data.readings import Readings
 from hilcal.data.table import write_table
-from hilcal.errors import InputError
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.identify import frames_document
 from hilcal.identify.full_covariance import covariance_parts
+from hilcal.identify.registration import Registration, register
 from hilcal.report import text
 from hilcal.report.covariance_words import covariance_words
 from hilcal.report.progress import working
+from hilcal.report.text_registration import registration_lines
 
 
 def import_(
@@ -78,6 +82,9 @@ def import_(
         f"  loads: {', '.join(loads)}"
     )
     t.show(Padding(note, (0, 0, 0, 2)) for note in notes)
+    registered = _registered(cell, readings)
+    if registered is not None:
+        t.show(Padding(line, (0, 0, 0, 2)) for line in registration_lines(registered))
     t.document(
         {
             "campaign": str(output),
@@ -88,8 +95,17 @@ def import_(
             "loads": loads,
             "covariance": parts,
             "notes": list(notes),
+            "frames": None if registered is None else frames_document.document(registered),
         }
     )
+
+
+def _registered(cell: Cell, readings: Readings) -> Registration | None:
+    """Return the registration; None where the readings do not determine it."""
+    try:
+        return register(cell, readings)
+    except CannotAnswerError:
+        return None
 
 
 def export(

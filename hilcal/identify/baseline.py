@@ -11,6 +11,7 @@ from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.effects.options import Options
 from hilcal.effects.spec import EffectSpec
 from hilcal.identify.registration import register
+from hilcal.identify.rigid_frames import TARGET_M, TELL
 from hilcal.model import Model
 
 ARM = 0.5
@@ -50,8 +51,9 @@ def with_effects(
 ) -> Model:
     """Return frames where unknown, and the named effects.
 
-    In deflections the frames act only by turning them, so their closed-form estimate from the
-    positions enters as a prior, with the rms error of that estimate as standard deviation.
+    In deflections the frames act only by turning them, so the registration to the positions
+    enters as a prior, with its rms error as standard deviation. In absolute readings the target
+    gets a prior of an ordinary size where the poses do not tell all of its offset.
 
     Args:
         cell: the cell.
@@ -67,18 +69,15 @@ def with_effects(
         CannotAnswerError: the readings do not determine an unknown frame.
     """
     known, given = catalogue or installed(), options or {}
-    model = Model(register(cell, readings), (), known, readings)
+    registered = register(cell, readings)
+    model = Model(registered.cell, (), known, readings)
     frames = known.unknown_frames(cell)
-    prior = _frame_prior(model, readings) if mode == "deflection" else {}
     for name in dict.fromkeys((*frames, *names)):
-        begun = prior if name in frames else {}
+        begun: Options = {}
+        if name in frames and mode == "deflection":
+            length = max(registered.rms, 1e-6)
+            begun = {"prior_m": length, "prior_rad": length / ARM}
+        elif name in frames and known[name].role == "target" and registered.undetermined:
+            begun = {"prior_m": TARGET_M, "prior_rad": TELL}
         model = model + EffectSpec(name, {**begun, **given.get(name, {})})
     return model
-
-
-def _frame_prior(bare: Model, readings: Readings) -> Options:
-    """Return standard deviations of the frames: the rms error of the closed-form start."""
-    position = bare.predict(readings.states, np.zeros(0)).observation.position
-    off = readings.value[:, :3] - position
-    length = max(float(np.sqrt(np.mean(np.sum(off**2, axis=1)))), 1e-6)
-    return {"prior_m": length, "prior_rad": length / ARM}

@@ -5,10 +5,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from hilcal.identify.fit import Fit
+from hilcal.identify.frames_document import fit_to_json, frames_of_fit
 from hilcal.identify.full_prediction import full_prediction
 from hilcal.identify.gross_errors import gross_errors
-from hilcal.robot import se3
-from hilcal.types import Floats
 
 
 def to_json(fit: Fit) -> dict[str, object]:
@@ -40,7 +39,8 @@ def to_json(fit: Fit) -> dict[str, object]:
         "error": {"fit": fit.error.to_json(), "holdout": fit.holdout.to_json()},
         "noise_floor_m": full_prediction(fit).noise_floor,
         "outliers": outliers(fit),
-        "registration": registration(fit).tolist(),
+        "registration": frames_of_fit(fit)[0].tolist(),
+        "frames": fit_to_json(fit),
         "notes": list(notes(fit)),
     }
 
@@ -51,15 +51,6 @@ def outliers(fit: Fit) -> list[dict[str, object]]:
         {"pose": g.pose, "load": g.load, "sigma": g.sigma, "reason": g.reason}
         for g in gross_errors(fit)
     ]
-
-
-def registration(fit: Fit) -> Floats:
-    """T_sensor_base (4, 4) as fitted: the cell's, moved by the fitted twist of the base."""
-    start = fit.model.cell.registration
-    for effect, rows in zip(fit.model.effects, fit.model.slices(), strict=True):
-        if effect.role == "registration":
-            return np.asarray(start @ se3.matrix(*se3.exp(fit.theta[rows])))
-    return start
 
 
 def notes(fit: Fit) -> tuple[str, ...]:

@@ -72,7 +72,7 @@ def with_joint_scatter(cell: Cell, readings: Readings, joint_std: Floats) -> Rea
     if not np.any(joint_std):
         return readings
     try:
-        registered = register(cell, readings)
+        registered = register(cell, readings).cell
     except CannotAnswerError:
         return readings
     chain = evaluate(cell.arm, readings.states.q)

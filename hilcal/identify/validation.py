@@ -105,7 +105,7 @@ def _register(
             targets = e.displaced(offset)
     held = model.cell.with_targets(targets, known=(True,) * len(targets))
     unknown = replace(held, registration_known=False)
-    cell = replace(model.cell, registration=register(unknown, other).registration)
+    cell = replace(model.cell, registration=register(unknown, other).cell.registration)
     kept = [(e, t) for e, t in parts if e.role != "registration"]
     effects: list[Effect] = [type(e)(cell, fitted.states, e.options) for e, _ in kept]
     frame = model.catalogue.with_role("registration")[0](cell, fitted.states)

@@ -12,11 +12,11 @@ from rich.text import Text
 from hilcal.diagnose.misfit_breakdown import MisfitShare
 from hilcal.effects.protocol import Effect
 from hilcal.identify.fit import Fit
-from hilcal.identify.fit_document import notes, registration
+from hilcal.identify.fit_document import notes
 from hilcal.identify.full_prediction import FullPrediction, full_prediction
 from hilcal.identify.gross_errors import gross_errors
 from hilcal.report import numbers
-from hilcal.robot import se3
+from hilcal.report.text_registration import fitted_lines
 from hilcal.types import Ints
 
 ALL_ROWS = 60
@@ -157,8 +157,7 @@ def remarks(fit: Fit) -> Iterator[RenderableType]:
         yield from (f"  {d}" for d in null[:DIRECTIONS])
         if len(null) > DIRECTIONS:
             yield f"  ... and {len(null) - DIRECTIONS} more; --json lists all"
-    if any(e.role == "registration" for e in fit.model.effects):
-        yield placed(fit)
+    yield from fitted_lines(fit)
     for note in notes(fit):
         yield note[0].upper() + note[1:] + "."
     gross = gross_errors(fit)
@@ -167,18 +166,6 @@ def remarks(fit: Fit) -> Iterator[RenderableType]:
         yield from (f"  {g.pose}/{g.load}: {g.reason}" for g in gross[:GROSS])
         if len(gross) > GROSS:
             yield f"  ... and {len(gross) - GROSS} more; --json lists all"
-
-
-def placed(fit: Fit) -> str:
-    """Say where the base is, since `base_frame` is relative to where the fit started."""
-    t = registration(fit)
-    place = ", ".join(f"{x:.5f}" for x in t[:3, 3])
-    turn = ", ".join(f"{x:.4f}" for x in np.degrees(se3.rotation_vector(t[:3, :3])))
-    return (
-        f"As fitted, the base is at ({place}) m in the tracker frame, turned by the rotation "
-        f"vector ({turn})°; base_frame is what was added to the registration that the fit "
-        "started from."
-    )
 
 
 def scaling_remark(fit: Fit) -> str:

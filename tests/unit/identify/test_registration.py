@@ -82,7 +82,7 @@ def test_what_is_unknown_is_found_exactly(
     cell = told(registration, target, registration_known, target_known)
     if m == 3 and not target_known:  # the target's axes cannot be seen in positions
         target = pose_of(np.eye(3), offset)
-    found = register(cell, seen(registration, target, m))
+    found = register(cell, seen(registration, target, m)).cell
     # Rounding of readings up to 14 m away, through a few well-conditioned systems; the
     # alternation for positions stops when it moves by less than 1e-12 m.
     np.testing.assert_allclose(found.registration, registration, rtol=0, atol=2e-9)
@@ -96,7 +96,7 @@ def test_rotations_are_rotations_and_what_is_known_stays(m):
     readings = seen(registration, target, m, noise=1e-3)
     for registration_known, target_known in KNOWN:
         cell = told(registration, target, registration_known, target_known)
-        found = register(cell, readings)
+        found = register(cell, readings).cell
         for pose in (found.registration, found.target):
             np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
             assert np.linalg.det(pose[:3, :3]) > 0
@@ -117,7 +117,7 @@ def test_noise_enters_in_proportion(m):
     for noise in (1e-3, 1e-5):
         off = []
         for seed in range(20):
-            found = register(cell, seen(registration, target, m, noise=noise, seed=seed))
+            found = register(cell, seen(registration, target, m, noise=noise, seed=seed)).cell
             x = np.linalg.inv(registration) @ found.registration
             off.append([np.linalg.norm(x[:3, 3]), np.linalg.norm(x[:3, :3] - np.eye(3))])
         sizes.append(np.sqrt(np.mean(np.square(off), axis=0)))
@@ -167,6 +167,6 @@ def test_turns_about_one_axis_give_a_start_that_explains_the_readings():
     q[:, 0] += np.linspace(0, 1, 6)
     registration, target = pose_of(np.eye(3), [1.0, 0.0, 0.0]), pose_of(np.eye(3), [0.1, 0.0, 0.2])
     readings = seen(registration, target, 3, q)
-    found = register(told(registration, target, False, False), readings)
+    found = register(told(registration, target, False, False), readings).cell
     again = (found.registration @ flanges_at(q) @ found.target)[:, :3, 3]
     np.testing.assert_allclose(again, readings.value, rtol=0, atol=1e-6)

@@ -15,7 +15,7 @@ KNOWN = [(True, True, True), (False, True, False), (False, False, False)]
 @pytest.mark.parametrize("known", KNOWN)
 def test_base_and_targets_are_registered_together(known: tuple[bool, ...], m: int) -> None:
     c = reflectors(known=known, joint_std=0.0, m=m)
-    cell = register(c.cell, c.readings)
+    cell = register(c.cell, c.readings).cell
     assert c.world.offsets is not None
     true = OFFSETS + c.world.offsets
     off = cell.all_targets[:, :3, 3] - true

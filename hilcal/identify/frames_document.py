@@ -1,0 +1,67 @@
+"""The JSON of where base and target are, and of what the poses could not tell of them."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hilcal.effects.target_offset import TargetOffset
+from hilcal.identify.fit import Fit
+from hilcal.identify.registration import Registration, Undetermined, register
+from hilcal.robot import se3
+from hilcal.types import Floats
+
+
+def frames_of_fit(fit: Fit) -> tuple[Floats, Floats]:
+    """T_sensor_base (4, 4) and T_flange_target (T, 4, 4) as fitted: start and effects."""
+    base, targets = fit.model.cell.registration, fit.model.cell.all_targets
+    for effect, rows in zip(fit.model.effects, fit.model.slices(), strict=True):
+        theta = fit.theta[rows]
+        if effect.role == "registration":
+            base = np.asarray(base @ se3.matrix(*se3.exp(theta)))
+        elif isinstance(effect, TargetOffset):
+            targets = effect.displaced(theta)
+            if effect.size == 6:
+                turns = se3.rotation(theta.reshape(-1, 6)[:, 3:])
+                targets[effect.moved, :3, :3] = turns @ targets[effect.moved, :3, :3]
+    return base, targets
+
+
+def fit_to_json(fit: Fit) -> dict[str, object]:
+    """Frames as fitted; residual and undetermined directions of the nominal arm's registration."""
+    base, targets = frames_of_fit(fit)
+    return document(register(fit.model.cell, fit.readings), base, targets)
+
+
+def document(
+    registered: Registration, base: Floats | None = None, targets: Floats | None = None
+) -> dict[str, object]:
+    """Return the JSON of a registration, or of the frames that a fit made of it."""
+    cell = registered.cell
+    own = cell.all_targets if targets is None else targets
+    several = cell.target_names if cell.targets is not None else ()
+    each = {name: _pose(t) for name, t in zip(several, own, strict=False)}
+    return {
+        "base": _pose(cell.registration if base is None else base),
+        "target": _pose(own[0]),
+        **({"targets": each} if each else {}),
+        "estimated": registered.estimated,
+        "rms_m": registered.rms,
+        "rms_rad": registered.turn_rms,
+        "undetermined": [_direction(u) for u in registered.undetermined],
+        "joints_never_turned": (np.flatnonzero(registered.still) + 1).tolist(),
+    }
+
+
+def _pose(t: Floats) -> dict[str, Sequence[float]]:
+    turn = se3.rotation_vector(t[:3, :3])
+    return {"xyz_m": t[:3, 3].tolist(), "rotvec_rad": turn.tolist()}
+
+
+def _direction(u: Undetermined) -> dict[str, object]:
+    return {
+        "target": u.target,
+        "target_shift_m": u.target_shift.tolist(),
+        "target_turn_rad": u.target_turn.tolist(),
+        "base_shift_m": u.base_shift.tolist(),
+        "base_turn_rad": u.base_turn.tolist(),
+    }

@@ -1,0 +1,125 @@
+"""Where base and target are, and what the poses could not tell, in words."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from hilcal.cell import Cell
+from hilcal.identify.fit import Fit
+from hilcal.identify.frames_document import frames_of_fit
+from hilcal.identify.registration import Registration, Undetermined, register
+from hilcal.report import numbers
+from hilcal.robot import se3
+from hilcal.types import Bools, Floats
+
+ALONG = 0.98
+"""Share of its length that one element must have for a direction to be named after that axis."""
+
+
+def registration_lines(found: Registration) -> Iterator[str]:
+    """Yield where the nominal arm's base and target are, and how well the readings fit."""
+    if found.estimated:
+        turn = "" if found.turn_rms is None else f" and {np.degrees(found.turn_rms):.3g}°"
+        yield (
+            f"Registered: {_base(found.cell.registration)}; {_targets(found.cell)}. "
+            f"The nominal arm leaves {numbers.length(found.rms)}{turn} rms."
+        )
+    yield from undetermined_lines(found)
+
+
+def fitted_lines(fit: Fit) -> Iterator[str]:
+    """Yield where base and target are as fitted, where they were unknown."""
+    names = {e.role: e.name for e in fit.model.effects if e.role in ("registration", "target")}
+    if not names:
+        return
+    base, targets = frames_of_fit(fit)
+    parts = []
+    if "registration" in names:
+        parts.append(_base(base))
+    if "target" in names:
+        parts.append(_targets(fit.model.cell.with_targets(targets)))
+    those = " and ".join(names.values())
+    yield (
+        f"As fitted, {'; '.join(parts)}; {those} "
+        f"{'are' if len(names) > 1 else 'is'} what was added to the registration that the fit "
+        "started from."
+    )
+    yield from undetermined_lines(register(fit.model.cell, fit.readings))
+
+
+def undetermined_lines(found: Registration) -> Iterator[str]:
+    """Yield a sentence for each direction of the frames that the poses do not tell."""
+    names = found.cell.target_names if found.cell.targets is not None else ()
+    for u in found.undetermined:
+        why = _why(found.still)
+        yield f"The poses do not tell {_told(u, names)}{why}; it stays near the start."
+
+
+def _told(u: Undetermined, names: tuple[str, ...]) -> str:
+    own = "" if u.target is None or not names else f" {names[u.target]}"
+    moved = _moves(u.target_shift, u.target_turn, f"the target{own}'s", "the flange's")
+    base = _moves(u.base_shift, u.base_turn, "the base's", "its")
+    if not moved:
+        return base or "a combination of base and target"
+    return f"{moved} from {base}" if base else moved
+
+
+def _moves(shift: Floats, turn: Floats, whose: str, axes: str) -> str:
+    parts = []
+    if np.any(shift):
+        height = whose.startswith("the base") and _axis(shift) == "z"
+        parts.append(
+            "the height of the base" if height else f"{whose} offset {_along(shift, axes)}"
+        )
+    if np.any(turn):
+        parts.append(f"{whose} turn about {_axis_words(turn, axes)}")
+    return " with ".join(parts)
+
+
+def _along(v: Floats, axes: str) -> str:
+    return f"along {_axis_words(v, axes)}"
+
+
+def _axis_words(v: Floats, axes: str) -> str:
+    name = _axis(v)
+    if name:
+        return f"{axes} {name}"
+    unit = v / np.linalg.norm(v)
+    return f"{axes} direction ({', '.join(f'{x:.2f}' for x in unit)})"
+
+
+def _axis(v: Floats) -> str | None:
+    k = int(np.argmax(np.abs(v)))
+    return "xyz"[k] if abs(v[k]) > ALONG * np.linalg.norm(v) else None
+
+
+def _why(still: Bools) -> str:
+    """Joints that never turned, 1-based."""
+    which = [int(k) + 1 for k in np.flatnonzero(still)]
+    if not which:
+        return ": the tool hardly changed its orientation, or turned about one axis only"
+    if len(which) == 1:
+        return f": joint {which[0]} never turned"
+    if which == list(range(which[0], which[-1] + 1)):
+        return f": joints {which[0]} to {which[-1]} never turned"
+    return f": joints {', '.join(map(str, which[:-1]))} and {which[-1]} never turned"
+
+
+def _base(t: Floats) -> str:
+    return f"the base is at {_place(t)} in the tracker frame"
+
+
+def _targets(cell: Cell) -> str:
+    if cell.targets is None:
+        return f"the target is at {_place(cell.target)} on the flange"
+    named = zip(cell.target_names, cell.targets, strict=True)
+    return "; ".join(f"target {name} is at {_place(t)} on the flange" for name, t in named)
+
+
+def _place(t: Floats) -> str:
+    place = ", ".join(f"{x:.5f}" for x in t[:3, 3])
+    turn = np.degrees(se3.rotation_vector(t[:3, :3]))
+    if not np.any(np.abs(turn) > 1e-9):
+        return f"({place}) m"
+    words = ", ".join(f"{x:.4f}" for x in turn)
+    return f"({place}) m, turned by the rotation vector ({words})°"
