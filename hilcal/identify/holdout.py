@@ -2,7 +2,8 @@
 
 Whole poses are left out, never single readings: readings of one pose share its errors. Each
 fold is refitted by one Gauss-Newton step from the full fit, in which the fold's rows are
-taken out of the normal equations exactly.
+taken out of the normal equations exactly. The strengths of shrunk families are chosen anew in each
+fold (`regression.fold_evidence`).
 
 Without a fold the flat parameters have a prior about zero (see `regression.leave_out`), whose
 standard deviation is their ordinary magnitude, or the rms of the effect's parameters in the full
@@ -13,10 +14,15 @@ import numpy as np
 
 from hilcal.data.whitening import Whitening
 from hilcal.identify.gauss_newton import Solution
-from hilcal.identify.priors import scales_of
+from hilcal.identify.priors import FIRST_GUESS, prior_of, scales_of
 from hilcal.model import Model
+from hilcal.regression.fold_evidence import FamilyProblem, solutions
 from hilcal.regression.leave_out import Fold, folds
 from hilcal.types import Floats, Ints
+
+MOST_ELEMENTS = 5e7
+"""Elements of the columns of dropped groups up to which they may enter again in a fold. A choice,
+for memory; with more readings than that a fold of a tenth hardly decides what is dropped."""
 
 
 def folds_of(model: Model, solution: Solution, fold: Ints) -> tuple[Fold, ...]:
@@ -73,6 +79,51 @@ def leave_out(
         w: the scaling of the fit.
     """
     predicted = solution.raw.copy()
+    groups = prior_of(model)[1]
+    if w.scaling != "none" and bool((groups >= 0).any()):
+        return _with_families(model, solution, jacobian, fold, w, groups)
     for f, change in enumerate(changes(model, solution, fold, w)):
         predicted[fold == f] -= jacobian[fold == f] @ change[solution.live]
+    return predicted
+
+
+def _with_families(
+    model: Model, solution: Solution, jacobian: Floats, fold: Ints, w: Whitening, groups: Ints
+) -> Floats:
+    """`leave_out` for a model with shrunk families, whose strengths each fold chooses."""
+    basis, predicted = solution.equations.basis, solution.raw.copy()
+    flat, count = len(basis.singular), len(basis.prior_precision)
+    dropped = np.flatnonzero((groups >= 0) & (solution.prior == 0))
+    if len(dropped) * predicted.size > MOST_ELEMENTS:
+        dropped = dropped[:0]
+    guess = FIRST_GUESS * scales_of(model)[dropped]
+    more = w.raw(model.jacobian(solution.prediction, solution.theta, w.m, dropped)) * guess
+    shrunk = groups[basis.held] >= 0
+    others = np.concatenate([np.arange(flat), flat + np.flatnonzero(~shrunk)])
+    kept = flat + np.flatnonzero(shrunk)
+    family = np.concatenate([groups[basis.held[shrunk]], groups[dropped]])
+    coordinates, rows = solution.coordinates(), solution.rows
+    # Flat parameters have the prior about zero of `folds_of`, unshrunk ones their own.
+    per = basis.transform[:, :flat] / ordinary(model, solution.theta)[:, None]
+    own = np.where(basis.flat, solution.theta / ordinary(model, solution.theta), 0.0)
+    ridge = np.zeros((len(others), len(others)))
+    ridge[:flat, :flat] = solution.beta * per.T @ per
+    ridge[np.arange(flat, len(others)), np.arange(flat, len(others))] = solution.beta
+    found = solutions(
+        FamilyProblem(
+            rows=np.hstack([rows[:, others], rows[:, kept], w.whiten(more).reshape(len(rows), -1)]),
+            target=solution.white + rows @ coordinates,
+            ridge=ridge,
+            pull=np.concatenate([-solution.beta * per.T @ own, np.zeros(len(others) - flat)]),
+            groups=np.unique(family, return_inverse=True)[1],
+            std=np.concatenate([np.ones(len(kept)), np.zeros(len(dropped))]),
+            beta=solution.beta,
+        ),
+        w.rows_of(fold),
+    )
+    for f, u in enumerate(found):
+        mine, z = fold == f, np.zeros(count)
+        z[others], z[kept] = u[: len(others)], u[len(others) : count]
+        change = basis.transform[solution.live] @ (z - coordinates)
+        predicted[mine] -= jacobian[mine] @ change + more[mine] @ u[count:]
     return predicted

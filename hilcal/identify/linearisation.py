@@ -81,8 +81,13 @@ class Linearisation:
 
     @cached_property
     def left_out(self) -> Floats:
-        """(poses,) squared whitened residual of each pose, predicted without it."""
-        return left_out_by_pose(self.fit)
+        """(poses,) squared whitened residual of each pose, predicted without it.
+
+        With the strengths of the fit, as `held_out` predicts with one family more; those of
+        `Fit.left_out` are chosen without the pose.
+        """
+        white = left_out_residual(self.folds, self.projection, self.fit.white)
+        return by_pose(self.fit, white)
 
     @cached_property
     def folds(self) -> tuple[Fold, ...]:

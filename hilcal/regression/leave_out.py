@@ -91,7 +91,11 @@ def folds(
 
 
 def left_out_residual(
-    folds: tuple[Fold, ...], p: Projection, white: Floats, x: Floats, ridge: float
+    folds: tuple[Fold, ...],
+    p: Projection,
+    white: Floats,
+    x: Floats | None = None,
+    ridge: float = 0.0,
 ) -> Floats:
     """Return the residual (R,) of each row, predicted without its fold by model and family.
 
@@ -99,9 +103,14 @@ def left_out_residual(
         folds: of the model.
         p: the model's columns.
         white: (R,) residual of the model fitted to all rows.
-        x: (R, F) whitened columns of the family.
+        x: (R, F) whitened columns of the family; None for the model alone.
         ridge: of the family's parameters.
     """
+    if x is None:
+        left = np.zeros(len(white))
+        for fold in folds:
+            left[fold.out] = white[fold.out] - p.rows[fold.out] @ fold.step()
+        return left
     cross, gram, rhs = p.rows.T @ x, x.T @ x, x.T @ white
     gram[np.diag_indices_from(gram)] += max(ridge, FAMILY_ROUNDING * float(gram.max(initial=0.0)))
     left = np.zeros(len(white))

@@ -5,8 +5,9 @@ import pytest
 
 from hilcal.identify.baseline import baseline, with_effects
 from hilcal.identify.fit import Fit, fit
+from hilcal.identify.validation import validate
 from hilcal.regression.empirical_bayes import EmpiricalPrior, maximise_evidence
-from tests.support.campaigns import campaign, noiseless, plan
+from tests.support.campaigns import campaign, measured, noiseless, plan
 from tests.support.effect_cases import make
 
 
@@ -100,15 +101,18 @@ def test_harmonics_that_are_there_are_kept_and_absent_ones_are_not(seed):
     assert high > 0.9
 
 
-def test_nothing_there_leaves_almost_nothing_and_costs_less_than_a_percent():
+def test_nothing_there_leaves_almost_nothing_and_costs_less_than_two_percent():
+    """On poses that were never there."""
     worse, effective = [], []
     for seed in range(5):
         found, _ = with_harmonics("none", seed, 6)
         c = campaign("none", "absolute", seed, plan_seed=0, poses=40)
         plain = fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute")
-        worse.append(found.holdout.rms_sigma / plain.holdout.rms_sigma)
+        new = measured(c.world, plan(40, 77), np.random.default_rng(seed + 100))
+        off = [validate(f.model, f.theta, f.readings, new, f.mode) for f in (found, plain)]
+        worse.append(off[0].error.rms_sigma / off[1].error.rms_sigma)
         effective.append(found.solution.effective - plain.solution.effective)
-    assert np.mean(worse) < 1.01
+    assert np.mean(worse) < 1.02
     assert np.mean(effective) < 0.1 * 72
 
 
