@@ -161,7 +161,15 @@ def expected_share_of_mean(samples: int, systematic_share: float) -> float:
 
 
 def joint_scatter(jacobian: Floats, joint_std: Floats, rotation: Floats, m: int) -> Floats:
-    """Covariance (..., m, m) of a reading from the scatter of the joints: R J Σ_q Jᵀ Rᵀ.
+    """Covariance (..., m, m) of a reading from the scatter of the joints: R J Σ_q Jᵀ Rᵀ."""
+    turned = scatter_factor(jacobian, joint_std, rotation, m)
+    return np.asarray(turned @ np.swapaxes(turned, -1, -2))
+
+
+def scatter_factor(jacobian: Floats, joint_std: Floats, rotation: Floats, m: int) -> Floats:
+    """Factor F = R J Σ_q^½ (..., m, n) of the scatter of the joints.
+
+    F_i F_jᵀ is the covariance of two readings i, j of one arrival of the arm.
 
     Args:
         jacobian: (..., 6, n) of the target, translation then rotation, base axes.
@@ -171,5 +179,4 @@ def joint_scatter(jacobian: Floats, joint_std: Floats, rotation: Floats, m: int)
     """
     moved = jacobian * joint_std
     turned = np.concatenate([rotation @ moved[..., :3, :], rotation @ moved[..., 3:, :]], axis=-2)
-    turned = turned[..., :m, :]
-    return np.asarray(turned @ np.swapaxes(turned, -1, -2))
+    return np.asarray(turned[..., :m, :])

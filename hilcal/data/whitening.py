@@ -2,14 +2,17 @@
 
 A scaling matrix G multiplies both sides of A c = ΔX so that the errors G ε become
 independent, of unit spread, and pure numbers. G is block diagonal: one block per reading
-(absolute) or per pose group (deflections of one pose share their unloaded reading). The
-blocks are kept stacked by size; nothing of size (readings)² exists.
+(absolute) or per pose group (deflections of one pose share their unloaded reading). Where several
+targets were read in one arrival of the arm, they share its scatter F_i F_jᵀ (`Readings.common`):
+absolute readings have one block per arrival, deflections one per pose and cycle, all targets
+together. The blocks are kept stacked by size; nothing of size (readings)² exists.
 
     none   G = I
     gu     G = diag(1/M_ik), M_ik the standard deviation of element k of measurement i
     gc     G = blockdiag(S_i⁻¹), V_i = S_i S_iᵀ
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -18,7 +21,7 @@ import numpy as np
 from hilcal.data.readings import Readings
 from hilcal.errors import InputError
 from hilcal.robot import se3
-from hilcal.types import Floats, Ints
+from hilcal.types import Bools, Floats, Ints
 
 Scaling = Literal["none", "gu", "gc"]
 Mode = Literal["deflection", "absolute"]
@@ -57,17 +60,36 @@ def inverse_root(covariance: Floats, scaling: Scaling = "gc") -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bucket:
-    """G groups of one shape: L loaded readings each, and the U unloaded ones they share.
+    """G groups of one shape: L measurements each, and the U unloaded readings they share.
 
     Attributes:
         loaded: (G, L) rows of the readings.
         reference: (G, U) rows of the unloaded readings; U = 0 for absolute readings.
         factor: (G, L·m, L·m) scaling matrices.
+        weights: (L, U) of the unloaded readings in the mean that each deflection is taken from:
+            those of its target.
     """
 
     loaded: Ints
     reference: Ints
     factor: Floats
+    weights: Floats
+
+    @property
+    def shared(self) -> bool:
+        """Whether all deflections are taken from the same unloaded readings."""
+        return bool(np.all(self.weights == self.weights[:1]))
+
+    def reference_mean(self, x: Floats) -> Floats:
+        """(G, L or 1, ...) means of the unloaded of x (N, ...)."""
+        if self.shared:
+            return np.asarray(x[self.reference].mean(axis=1)[:, None])
+        return np.asarray(np.einsum("lu,gu...->gl...", self.weights, x[self.reference]))
+
+    def reference_covariance(self, v: Floats) -> Floats:
+        """(G, L or 1, m, m) covariance of those means, from covariances (N, m, m)."""
+        square = (self.weights[:1] if self.shared else self.weights) ** 2
+        return np.asarray(np.einsum("lu,guij->glij", square, v[self.reference]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,7 +123,7 @@ class Whitening:
     def raw(self, x: Floats) -> Floats:
         """Measurements (D, m, ...) from values at the readings (N, m, ...)."""
         if self.mode == "absolute":
-            return x
+            return x if _each_alone(self.buckets) else x[self.reading]
         parts = [_difference(b, x).reshape(b.loaded.size, *x.shape[1:]) for b in self.buckets]
         return np.concatenate(parts)
 
@@ -137,17 +159,14 @@ def whitening(readings: Readings, mode: Mode, scaling: Scaling = "gc") -> Whiten
     v, m = readings.covariance, readings.m
     buckets = []
     rank = 0
-    for loaded, reference in _groups(readings, mode):
-        covariance = _group_covariance(v, loaded, reference)
+    for loaded, reference, weights in _groups(readings, mode):
+        covariance = _group_covariance(readings, loaded, reference, weights)
         factor = inverse_root(covariance, scaling)
         rank += int(np.count_nonzero(np.any(factor != 0, axis=-1)))
-        buckets.append(Bucket(loaded, reference, np.ascontiguousarray(factor)))
+        buckets.append(Bucket(loaded, reference, np.ascontiguousarray(factor), weights))
     reading = np.concatenate([b.loaded.ravel() for b in buckets])
     own = np.concatenate(
-        [
-            (v[b.loaded] + _reference_covariance(v, b.reference)[:, None]).reshape(-1, m, m)
-            for b in buckets
-        ]
+        [(v[b.loaded] + b.reference_covariance(v)).reshape(-1, m, m) for b in buckets]
     )
     return Whitening(mode, scaling, m, tuple(buckets), reading, own, readings.pose[reading], rank)
 
@@ -164,45 +183,114 @@ def relative_rotation(r: Floats, w: Whitening) -> Floats:
     """Rotation vectors (D, 3) of the loaded against the mean unloaded attitudes."""
     out = []
     for b in w.buckets:
-        first = r[b.reference[:, :1]]
-        apart = se3.rotation_vector(r[b.reference] @ np.swapaxes(first, -1, -2))
-        mean = se3.rotation(apart.mean(axis=1, keepdims=True)) @ first
-        out.append(se3.rotation_vector(r[b.loaded] @ np.swapaxes(mean, -1, -2)).reshape(-1, 3))
+        turn = np.empty((*b.loaded.shape, 3))
+        for weights in np.unique(b.weights, axis=0):
+            mine = np.all(b.weights == weights, axis=1)
+            reference = b.reference[:, weights > 0]
+            first = r[reference[:, :1]]
+            apart = se3.rotation_vector(r[reference] @ np.swapaxes(first, -1, -2))
+            mean = se3.rotation(apart.mean(axis=1, keepdims=True)) @ first
+            turn[:, mine] = se3.rotation_vector(r[b.loaded[:, mine]] @ np.swapaxes(mean, -1, -2))
+        out.append(turn.reshape(-1, 3))
     return np.concatenate(out)
 
 
-def _groups(readings: Readings, mode: Mode) -> list[tuple[Ints, Ints]]:
-    """Rows of loaded and unloaded readings, groups of equal shape stacked."""
+_Group = tuple[Ints, Ints, Floats]
+"""Rows (G, L) of the measured and (G, U) of the unloaded readings, and weights (L, U)."""
+
+
+def _groups(readings: Readings, mode: Mode) -> list[_Group]:
+    """Return the groups of readings that share an error, those of equal shape stacked."""
+    if mode == "deflection":
+        return _deflections(readings)
     count = len(readings)
-    if mode == "absolute":
-        return [(np.arange(count)[:, None], np.empty((count, 0), dtype=np.int64))]
-    if count and readings.unloaded.all():
+    arrival = np.arange(count) if readings.common is None else readings.arrivals
+    order = np.argsort(arrival, kind="stable")
+    starts = np.flatnonzero(np.diff(arrival[order], prepend=-1))
+    sizes = np.diff(np.append(starts, count))
+    if len(starts) == count:
+        order = np.arange(count)
+    found = []
+    for size in np.unique(sizes):
+        rows = order[starts[sizes == size][:, None] + np.arange(size)]
+        none = np.empty((len(rows), 0), dtype=np.int64)
+        found.append((rows, none, np.zeros((size, 0))))
+    return found
+
+
+def _each_alone(buckets: tuple[Bucket, ...]) -> bool:
+    """Whether no absolute readings share an error, so that they are in their own order."""
+    return len(buckets) == 1 and buckets[0].loaded.shape[1] == 1
+
+
+def _deflections(readings: Readings) -> list[_Group]:
+    """Group loaded readings with the unloaded ones of their pose, cycle and target.
+
+    Targets that share the scatter of an arrival are in one group. A loaded reading whose target,
+    of several, was not read unloaded in its pose and cycle makes no deflection.
+    """
+    if len(readings) and readings.unloaded.all():
         raise InputError("readings = deflection: there is no loaded reading; use absolute")
-    keys = np.stack([readings.pose, readings.cycle], axis=1)
-    _, group = np.unique(keys, axis=0, return_inverse=True)
-    group = group.reshape(-1)
-    order = np.lexsort((~readings.unloaded, group))
+    _refuse_without_unloaded(readings)
+    keys = [readings.pose, readings.cycle]
+    rows = np.flatnonzero(_has_unloaded(readings, [*keys, readings.target]))
+    unloaded, target = readings.unloaded[rows], readings.target[rows]
+    if readings.common is None:
+        keys.append(readings.target)
+    group = _numbered([k[rows] for k in keys])
+    order = np.lexsort((target, ~unloaded, group))
     starts = np.flatnonzero(np.diff(group[order], prepend=-1))
-    ends = np.append(starts[1:], count)
-    unloaded = np.add.reduceat(readings.unloaded[order].astype(np.int64), starts)
-    sizes = ends - starts
-    lacking = (unloaded == 0) & (sizes > 0)
-    if lacking.any():
-        row = order[starts[np.flatnonzero(lacking)[0]]]
+    sizes = np.diff(np.append(starts, len(rows)))
+    count = np.add.reduceat(unloaded[order].astype(np.int64), starts)
+    alike = np.zeros_like(starts)
+    if readings.common is not None:
+        kinds: dict[bytes, int] = {}
+        for k, mine in enumerate(np.split(target[order], starts[1:])):
+            alike[k] = kinds.setdefault(mine.tobytes(), len(kinds))
+    shapes = np.stack([sizes, count, alike], axis=1)
+    found = []
+    for shape in np.unique(shapes, axis=0):
+        size, u = int(shape[0]), int(shape[1])
+        if size == u:
+            continue
+        at = order[starts[np.all(shapes == shape, axis=1)][:, None] + np.arange(size)]
+        same = target[at[0, u:], None] == target[at[0, :u]]
+        found.append((rows[at[:, u:]], rows[at[:, :u]], same / same.sum(axis=1, keepdims=True)))
+    if not found:
+        raise InputError(
+            "readings = deflection: no target was read both loaded and unloaded in one pose and "
+            "cycle; use absolute"
+        )
+    return found
+
+
+def _numbered(keys: Sequence[Ints]) -> Ints:
+    """(N,) number of the combination of keys (N,)."""
+    return np.unique(np.stack(keys, axis=1), axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def _has_unloaded(readings: Readings, keys: Sequence[Ints]) -> Bools:
+    """(N,) whether an unloaded reading has the same keys."""
+    group = _numbered(keys)
+    has = np.zeros(int(group.max()) + 1, dtype=bool)
+    has[group[readings.unloaded]] = True
+    return np.asarray(has[group])
+
+
+def _refuse_without_unloaded(readings: Readings) -> None:
+    """Refuse a pose and cycle without any unloaded reading.
+
+    Raises:
+        InputError: names it.
+    """
+    has = _has_unloaded(readings, [readings.pose, readings.cycle])
+    if not has.all():
+        row = int(np.argmin(has))
         name = readings.pose_names[readings.pose[row]]
         raise InputError(
             f"pose {name}, cycle {readings.cycle[row]}: no unloaded reading (load = none), which "
             "a deflection needs; measure it, or use --readings absolute"
         )
-    shapes = np.stack([sizes, unloaded], axis=1)
-    found = []
-    for size, u in np.unique(shapes, axis=0):
-        if size == u:
-            continue
-        mine = starts[(shapes[:, 0] == size) & (shapes[:, 1] == u)]
-        rows = order[mine[:, None] + np.arange(size)]
-        found.append((rows[:, u:], rows[:, :u]))
-    return found
 
 
 def _difference(b: Bucket, x: Floats) -> Floats:
@@ -210,39 +298,34 @@ def _difference(b: Bucket, x: Floats) -> Floats:
     loaded = x[b.loaded]
     if b.reference.shape[1] == 0:
         return loaded
-    return np.asarray(loaded - x[b.reference].mean(axis=1)[:, None])
+    return np.asarray(loaded - b.reference_mean(x))
 
 
-def _reference_covariance(v: Floats, reference: Ints) -> Floats:
-    """(G, m, m) covariance of the mean of the unloaded readings."""
-    count = reference.shape[1]
-    if count == 0:
-        return np.zeros((len(reference), *v.shape[1:]))
-    return np.asarray(v[reference].sum(axis=1) / count**2)
+def _group_covariance(readings: Readings, loaded: Ints, reference: Ints, weights: Floats) -> Floats:
+    """(G, L·m, L·m) covariance D C Dᵀ of the measurements of each group, D = [I, −weights].
 
-
-def _group_covariance(v: Floats, loaded: Ints, reference: Ints) -> Floats:
-    """(G, L·m, L·m) covariance of the deflections of each group.
-
-    Block (i, j) is δ_ij V_i + V_u: the unloaded reading's error is in all of them.
+    C, of all its readings, has the blocks V_i, and F_i F_jᵀ for two readings of one arrival.
     """
-    groups, count = loaded.shape
-    m = v.shape[-1]
-    shared = _reference_covariance(v, reference)
-    out = np.broadcast_to(shared[:, None, :, None, :], (groups, count, m, count, m)).copy()
+    rows = np.concatenate([loaded, reference], axis=1)
+    groups, count = rows.shape
+    m = readings.m
+    c = np.zeros((groups, count, m, count, m))
+    if readings.common is not None and count > 1:
+        f, arrival = readings.common[rows], readings.arrivals[rows]
+        together = (arrival[:, :, None] == arrival[:, None, :]).astype(float)
+        np.einsum("gain,gbjn,gab->gaibj", f, f, together, out=c, optimize=True)
     each = np.arange(count)
-    out[:, each, :, each, :] += np.moveaxis(v[loaded], 1, 0)
-    return out.reshape(groups, count * m, count * m)
+    c[:, each, :, each, :] = np.moveaxis(readings.covariance[rows], 1, 0)
+    if reference.shape[1]:
+        d = np.concatenate([np.eye(len(weights)), -weights], axis=1)
+        c = np.einsum("pa,gaibj,qb->gpiqj", d, c, d, optimize=True)
+    size = len(weights) * m
+    return c.reshape(groups, size, size)
 
 
 def usual_mode(readings: Readings) -> Mode:
     """Deflections where every loaded reading has an unloaded one in its pose and cycle."""
-    unloaded = readings.unloaded
-    if unloaded.all():
+    if readings.unloaded.all():
         return "absolute"
-    key = np.stack([readings.pose, readings.cycle], axis=1)
-    _, group = np.unique(key, axis=0, return_inverse=True)
-    group = group.reshape(-1)
-    has = np.zeros(int(group.max()) + 1, dtype=bool)
-    has[group[unloaded]] = True
-    return "deflection" if has[group[~unloaded]].all() else "absolute"
+    has = _has_unloaded(readings, [readings.pose, readings.cycle])
+    return "deflection" if has.all() else "absolute"

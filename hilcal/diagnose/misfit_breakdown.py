@@ -2,8 +2,9 @@
 
 For a variable x, a generic family asks whether *any* joint's angle, or the target's position,
 errs as a smooth function of x: columns φ_k(x) times the motion of each joint and times each
-base axis. The family is scored like a suspect, so its p-value is exact; its share is the part of
-the misfit that it predicts on poses left out. It names no cause.
+base axis. Of several targets, "target" asks whether one of them is displaced on the flange. The
+family is scored like a suspect, so its p-value is exact; its share is the part of the misfit that
+it predicts on poses left out. It names no cause.
 """
 
 from dataclasses import dataclass
@@ -53,12 +54,18 @@ def misfit_breakdown(p: Linearisation) -> tuple[MisfitShare, ...]:
     # Motions of ordinary size: 1 mrad of a joint, 1 mm of the target.
     generic = 1e-3 * np.concatenate([moves.dq, axes], axis=2)
     at_measurement = generic[w.reading]
-    out = []
+    raws = []
     for name, basis, follows_load in _variables(p):
         if follows_load:
-            raw = w.raw(_times(generic, basis))
+            raws.append((name, w.raw(_times(generic, basis))))
         else:
-            raw = _times(at_measurement, basis[w.reading])
+            raws.append((name, _times(at_measurement, basis[w.reading])))
+    target = fit.readings.target[~fit.outlier][w.reading]
+    if np.ptp(target) > 0:
+        member = (target[:, None] == np.unique(target)).astype(float)
+        raws.append(("target", 1e-3 * _times(moves.by_target()[w.reading, :, :3], member)))
+    out = []
+    for name, raw in raws:
         x = w.whiten(raw).reshape(-1, raw.shape[2])
         result = p.score(x)
         share = max(p.held_out(x, result).share, 0.0)

@@ -92,7 +92,7 @@ class Contrasts:
 
 
 def classes(readings: Readings) -> Ints:
-    """(N,) class of each reading: same joints, same name of the load, same wrench."""
+    """(N,) class of each reading: same joints, same load by name and wrench, same target."""
     s = readings.states
     size = np.repeat(
         [
@@ -102,7 +102,8 @@ def classes(readings: Readings) -> Ints:
         3,
     )
     wrench = s.wrench / np.where(size > 0, SAME_LOAD * size, 1.0)
-    points = np.concatenate([s.q / SAME_ANGLE, wrench, 10.0 * readings.load[:, None]], axis=1)
+    named = 10.0 * np.stack([readings.load, readings.target], axis=1)
+    points = np.concatenate([s.q / SAME_ANGLE, wrench, named], axis=1)
     pairs = cKDTree(points).query_pairs(1.0, p=np.inf, output_type="ndarray")
     shape = (len(points),) * 2
     links = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=shape)
@@ -166,8 +167,10 @@ def _blocks(w: Whitening, kind: Ints) -> tuple[Block, ...]:
     for b in w.buckets:
         of = kind[b.loaded]
         if b.reference.shape[1]:
-            ends = np.stack([kind[b.reference].min(axis=1), kind[b.reference].max(axis=1)], axis=1)
-            ends = np.broadcast_to(ends[:, None, :], (*of.shape, 2))
+            of_reference, apart = kind[b.reference][:, None, :], b.weights == 0
+            low = np.where(apart, len(kind), of_reference).min(axis=2)
+            high = np.where(apart, -1, of_reference).max(axis=2)
+            ends = np.stack([low, high], axis=2)
         else:
             ends = np.zeros((*of.shape, 2), dtype=of.dtype)
         label.append(np.concatenate([of[:, :, None], ends], axis=2).reshape(-1, 3))
@@ -212,7 +215,7 @@ def _block(groups: list[Group], number: Ints, m: int) -> Block | None:
         pick[span, first : first + count * m] = np.eye(count * m)
         for k in range(refs):
             start = first + (count + k) * m
-            pick[span, start : start + m] = -np.tile(np.eye(m), (count, 1)) / refs
+            pick[span, start : start + m] = -np.kron(b.weights[:, [k]], np.eye(m))
         at += count * m
         first += (count + refs) * m
     member = np.kron(np.eye(int(column.max()) + 1)[column], np.eye(m))

@@ -185,19 +185,21 @@ def _candidates(w: Whitening) -> _Shifts:
         refs = b.reference.shape[1]
         rows = first + np.arange(groups * size * m).reshape(groups, -1)
         shifts, cells = [b.factor], [b.loaded]
-        # With one loaded reading only, a shift of either is the same.
-        shared = refs if size > 1 or refs > 1 else 0
-        total = b.factor.reshape(groups, size * m, size, m).sum(axis=2)
-        shifts += [-total / max(refs, 1)] * shared
-        cells += [b.reference[:, [u]] for u in range(shared)]
+        each = b.factor.reshape(groups, size * m, size, m)
+        # Where one deflection is taken from one unloaded reading, a shift of either is the same.
+        users = [np.flatnonzero(b.weights[:, u]) for u in range(refs)]
+        alone = [bool(np.all(b.weights[mine, u] == 1.0)) for u, mine in enumerate(users)]
+        tested = [u for u in range(refs) if len(users[u]) > 1 or not alone[u]]
+        shifts += [-np.einsum("grli,l->gri", each, b.weights[:, u]) for u in tested]
+        cells += [b.reference[:, [u]] for u in tested]
         blocks.append((rows, np.concatenate(shifts, axis=2)))
         of = np.concatenate(cells, axis=1)
         row.append(of.reshape(-1))
         loaded.append(np.tile(np.arange(of.shape[1]) < size, groups))
         for g in range(groups):
             drops += [np.array([r]) for r in b.loaded[g]]
-            for u in range(shared):
-                alone = b.reference[g, [u]]
-                drops.append(alone if refs > 1 else np.concatenate([alone, b.loaded[g]]))
+            for u in tested:
+                own = b.reference[g, [u]]
+                drops.append(np.concatenate([own, b.loaded[g, users[u]]]) if alone[u] else own)
         first += groups * size * m
     return _Shifts(np.concatenate(row), np.concatenate(loaded), drops, blocks, m)

@@ -8,7 +8,8 @@ import numpy as np
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.covariance import COVERS, INSTRUMENT, WHOLE, joint_scatter
+from hilcal.data.covariance import COVERS, INSTRUMENT, WHOLE, scatter_factor
+from hilcal.data.whitening import inverse_root
 from hilcal.data.readings import Readings
 from hilcal.errors import CannotAnswerError
 from hilcal.identify.registration import register
@@ -36,9 +37,13 @@ def campaign_readings(campaign: CampaignFile, cell: Cell, config: CellConfig) ->
         InputError: there are no readings yet, or they are damaged.
     """
     readings = campaign.readings()
-    if covariance_parts(campaign.about(COVERS), config) != "instrument and repeatability":
-        return readings
-    return with_joint_scatter(cell, readings, config.repeatability.per_joint(cell.arm.n))
+    parts = covariance_parts(campaign.about(COVERS), config)
+    joint_std = config.repeatability.per_joint(cell.arm.n)
+    if parts == "instrument and repeatability":
+        return with_joint_scatter(cell, readings, joint_std)
+    if parts == "instrument and arm as stated":
+        return with_common_scatter(cell, readings, joint_std)
+    return readings
 
 
 def covariance_parts(covers: str | None, config: CellConfig) -> CovarianceParts:
@@ -62,20 +67,52 @@ def with_joint_scatter(cell: Cell, readings: Readings, joint_std: Floats) -> Rea
     V = V_instrument + R J Σ_q Jᵀ Rᵀ with the Jacobian of the nominal arm and R the orientation of
     the base in the sensor's frame, estimated from the readings where it is unknown. With too few
     poses to estimate it, the readings are returned as they are; nothing can be fitted to them
-    either.
+    either. Targets that were read in one arrival have the scatter in common (`Readings.common`).
 
     Args:
         cell: the cell.
         readings: N readings whose covariances are the instrument's alone.
         joint_std: (n,) standard deviations from one arrival to the next, rad.
     """
-    if not np.any(joint_std):
+    factor = _scatter(cell, readings, joint_std)
+    if factor is None:
         return readings
+    return replace(
+        readings,
+        covariance=readings.covariance + factor @ np.swapaxes(factor, 1, 2),
+        common=None if readings.states.target is None else factor,
+    )
+
+
+def with_common_scatter(cell: Cell, readings: Readings, joint_std: Floats) -> Readings:
+    """Return readings whose covariances include the joints' scatter with what arrivals share of it.
+
+    Only several targets share any. The factor F of a reading is shortened where F Fᵀ is more than
+    its covariance.
+
+    Args:
+        cell: the cell.
+        readings: N readings with their full covariances.
+        joint_std: (n,) standard deviations from one arrival to the next, rad.
+    """
+    factor = None
+    if readings.states.target is not None:
+        factor = _scatter(cell, readings, joint_std)
+    if factor is None:
+        return readings
+    largest = np.linalg.norm(inverse_root(readings.covariance) @ factor, ord=2, axis=(1, 2))
+    return replace(readings, common=factor / np.maximum(largest, 1.0)[:, None, None])
+
+
+def _scatter(cell: Cell, readings: Readings, joint_std: Floats) -> Floats | None:
+    """Factors (N, m, n) of the joints' scatter; None for none, or an unknown registration."""
+    if not np.any(joint_std):
+        return None
     try:
         registered = register(cell, readings).cell
     except CannotAnswerError:
-        return readings
+        return None
     chain = evaluate(cell.arm, readings.states.q)
-    jac = joint_jacobian(chain, chain.point(registered.target[:3, 3]))
-    added = joint_scatter(jac, joint_std, registered.registration[:3, :3], readings.m)
-    return replace(readings, covariance=readings.covariance + added)
+    at = registered.target_of(readings.states.target)
+    jac = joint_jacobian(chain, chain.point(at[..., :3, 3]))
+    return scatter_factor(jac, joint_std, registered.registration[:3, :3], readings.m)

@@ -7,7 +7,7 @@ from hilcal.data.whitening import Whitening, whitening
 from hilcal.identify.errors import noise_floor
 from hilcal.identify.fit import Fit, mahalanobis2
 from hilcal.identify.residual import residual
-from hilcal.model import Prediction
+from hilcal.model import Model, Prediction
 from hilcal.types import Floats
 
 
@@ -20,12 +20,16 @@ class FullPrediction:
         whitening: their gc-scaling; `whitening.reading` (D,) are rows of `readings`.
         prediction: of all readings.
         raw: (D, m) residual, sensor axes.
+        model: the model of the fit.
+        theta: (P,) its parameters.
     """
 
     readings: Readings
     whitening: Whitening
     prediction: Prediction
     raw: Floats
+    model: Model
+    theta: Floats
 
     @property
     def mahalanobis2(self) -> Floats:
@@ -50,7 +54,10 @@ def names(readings: Readings, row: int) -> tuple[str, str]:
 def full_prediction(fit: Fit) -> FullPrediction:
     """Predict all readings of a fit."""
     if not fit.outlier.any():
-        return FullPrediction(fit.readings, fit.whitening, fit.solution.prediction, fit.raw)
+        return FullPrediction(
+            fit.readings, fit.whitening, fit.solution.prediction, fit.raw, fit.model, fit.theta
+        )
     w = whitening(fit.readings, fit.mode, "gc")
     prediction = fit.model.predict(fit.readings.states, fit.theta)
-    return FullPrediction(fit.readings, w, prediction, residual(fit.readings, prediction, w))
+    raw = residual(fit.readings, prediction, w)
+    return FullPrediction(fit.readings, w, prediction, raw, fit.model, fit.theta)

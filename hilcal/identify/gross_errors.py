@@ -1,6 +1,6 @@
 """Readings that were set aside as gross errors, with the likely reason."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2
@@ -16,6 +16,9 @@ SAME = 1e-3
 """A reading that repeats another to this share of σ was not taken anew; a choice."""
 MOSTLY = 0.8
 """Share of the whitened error that an axis must have to be named; a choice."""
+SWAPPED = 0.1
+"""Share of a reading's error that another target's place must leave at most; a choice: targets are
+centimetres apart."""
 AXES = ("x", "y", "z", "rotation about x", "rotation about y", "rotation about z")
 
 
@@ -52,12 +55,13 @@ def gross_errors(fit: Fit) -> tuple[GrossError, ...]:
         size = b.loaded.shape[1]
         for g in range(len(b.loaded)):
             at = first + g * size + np.arange(size)
-            shared = [int(r) for r in b.reference[g] if fit.outlier[r]]
-            for row in shared:
-                found[row] = _shared(e, row, at, len(b.reference[g]) == 1)
-            if len(shared) == len(b.reference[g]) and shared:
-                continue
-            for k, r in zip(at, b.loaded[g], strict=True):
+            out = fit.outlier[b.reference[g]]
+            for u in np.flatnonzero(out):
+                row, mine = int(b.reference[g, u]), b.weights[:, u] > 0
+                found[row] = _shared(e, row, at[mine], bool(np.all(b.weights[mine, u] == 1.0)))
+            # Deflections of which no unloaded reading is left are not listed one by one.
+            lost = (b.weights @ out > 1.0 - 1e-9) if len(out) else np.zeros(size, dtype=bool)
+            for k, r in zip(at[~lost], b.loaded[g, ~lost], strict=True):
                 if fit.outlier[r]:
                     found[int(r)] = _one(e, int(r), e.raw[k], e.whitening.covariance[k])
         first += b.loaded.size
@@ -82,8 +86,31 @@ def _shared(e: FullPrediction, row: int, measurements: Floats, alone: bool) -> G
 
 def _one(e: FullPrediction, row: int, off: Floats, covariance: Floats) -> GrossError:
     sigma = _distance(off, covariance)
-    reason = _stale(e.readings, row) or _like_another(e.readings, row) or _off(off, covariance)
-    return GrossError(row, *names(e.readings, row), sigma, reason)
+    reason = (
+        _stale(e.readings, row)
+        or _another_target(e, row, off)
+        or _like_another(e.readings, row)
+        or _off(off, covariance)
+    )
+    pose, load = names(e.readings, row)
+    if e.readings.states.target is not None:
+        reason = f"target {e.readings.target_names[e.readings.target[row]]}: {reason}"
+    return GrossError(row, pose, load, sigma, reason)
+
+
+def _another_target(e: FullPrediction, row: int, off: Floats) -> str:
+    """Phrase for a reading that lies where the prediction has another target, or ''."""
+    r = e.readings
+    if r.states.target is None:
+        return ""
+    states, own = r.states[row : row + 1], e.prediction.observation.position[row]
+    best, found = SWAPPED * float(np.linalg.norm(off[:3])), -1
+    for other in range(len(r.target_names)):
+        there = e.model.predict(replace(states, target=np.array([other])), e.theta)
+        away = float(np.linalg.norm(off[:3] - (there.observation.position[0] - own)))
+        if other != r.target[row] and away < best:
+            best, found = away, other
+    return "" if found < 0 else f"lies where {r.target_names[found]} is: were they swapped?"
 
 
 def _stale(r: Readings, row: int) -> str:
@@ -98,7 +125,8 @@ def _stale(r: Readings, row: int) -> str:
 def _like_another(r: Readings, row: int) -> str:
     """Phrase for a reading that agrees with one under another load at the same pose, or ''."""
     best, found = float(chi2.isf(ALIKE, r.m)), -1
-    for other in np.flatnonzero((r.pose == r.pose[row]) & (r.load != r.load[row])):
+    beside = (r.pose == r.pose[row]) & (r.load != r.load[row]) & (r.target == r.target[row])
+    for other in np.flatnonzero(beside):
         away = _distance(r.value[row] - r.value[other], r.covariance[row] + r.covariance[other])
         if away**2 < best:
             best, found = away**2, int(other)

@@ -1,9 +1,16 @@
 """Several targets per pose: prediction, derivative, registration."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from hilcal.identify.baseline import with_effects
+from hilcal.data.whitening import MODES, Mode
+from hilcal.diagnose.misfit_breakdown import misfit_breakdown
+from hilcal.identify.baseline import baseline, with_effects
+from hilcal.identify.fit import fit
+from hilcal.identify.gross_errors import gross_errors
+from hilcal.identify.linearisation import linearise
 from hilcal.identify.registration import register
 from hilcal.robot.se3 import rotation_vector
 from tests.support.reflector_cases import OFFSETS, reflectors
@@ -54,3 +61,41 @@ def test_one_offset_moves_one_target() -> None:
     moved = model.predict(c.readings.states, theta).observation.position - before
     distance = np.linalg.norm(moved, axis=1)
     np.testing.assert_allclose(distance, np.where(c.readings.target == 2, np.sqrt(3) * 1e-3, 0.0))
+
+
+@pytest.mark.parametrize(("mode", "known"), zip(MODES, (KNOWN[0], KNOWN[-1]), strict=True))
+def test_swapped_names_and_a_displaced_reading_are_named(
+    mode: Mode, known: tuple[bool, ...]
+) -> None:
+    c = reflectors("base_compliance", known=known, seed=1, joint_std=1e-5, poses=14, strength=4.0)
+    r = c.readings
+    first, second, third = np.flatnonzero((r.pose == 4) & (r.load == 2))
+    lone = np.flatnonzero((r.pose == 7) & (r.load == 1))[2]
+    number, value = r.target.copy(), r.value.copy()
+    number[[first, second]] = number[[second, first]]
+    value[lone] += [1e-3, 0.0, 0.0]
+    wrong = replace(r, states=replace(r.states, target=number), value=value)
+    named = {g.row: g.reason for g in gross_errors(fit(baseline(c.cell, wrong, mode), wrong, mode))}
+    assert set(named) == {first, second, lone}
+    assert named[first] == "target R2: lies where R1 is: were they swapped?"
+    assert named[second] == "target R1: lies where R2 is: were they swapped?"
+    assert named[lone].startswith("target R3: ")
+    assert third not in named
+
+
+def test_the_misfit_of_a_displaced_reflector_follows_the_target() -> None:
+    c = reflectors(seed=2, joint_std=1e-5)
+    moved = c.cell.all_targets.copy()
+    moved[1, :3, 3] += [2e-4, -1e-4, 1e-4]
+    cell = c.cell.with_targets(moved)
+    found = fit(baseline(cell, c.readings, "absolute"), c.readings, "absolute")
+    shares = misfit_breakdown(linearise(found))
+    assert shares[0].variable == "target"
+    assert shares[0].share > 0.9
+    model = with_effects(cell, c.readings, "absolute", ["joint_compliance", "target_offset"])
+    offset = model.slices()[model.names.index("target_offset")]
+    theta = fit(model, c.readings, "absolute").theta[offset].reshape(3, 3)
+    # A common displacement of all targets is hardly told from one of the base; a single one is.
+    np.testing.assert_allclose(
+        theta[1] - theta[[0, 2]].mean(axis=0), [-2e-4, 1e-4, -1e-4], atol=1.5e-5
+    )
