@@ -9,8 +9,8 @@ from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.covariance import COVERS, INSTRUMENT, WHOLE, scatter_factor
-from hilcal.data.whitening import inverse_root
 from hilcal.data.readings import Readings
+from hilcal.data.whitening import inverse_root
 from hilcal.errors import CannotAnswerError
 from hilcal.identify.registration import register
 from hilcal.robot.chain import evaluate, joint_jacobian
