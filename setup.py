@@ -7,8 +7,9 @@ The directory configs/ becomes hilcal/configs in a wheel; `configs_dir()` in
 from setuptools import find_packages, setup
 
 CODE = ("hilcal", "hilcal.*", "drivers", "drivers.*")
+CONFIGS = ("hilcal.configs.cells", "hilcal.configs.mappings", "hilcal.configs.robots")
 
 setup(
-    packages=[*find_packages(include=CODE), "hilcal.configs.cells", "hilcal.configs.robots"],
+    packages=[*find_packages(include=CODE), *CONFIGS],
     package_dir={"hilcal.configs": "configs"},
 )

@@ -11,6 +11,7 @@ from rich.padding import Padding
 
 from hilcal.campaign import Campaign
 from hilcal.cell import Cell, cell_from_config
+from hilcal.cli.previewing import show_preview
 from hilcal.cli.terminal import Json, Run, terminal
 from hilcal.config import load_config
 from hilcal.data.campaign_file import CampaignFile
@@ -31,12 +32,18 @@ from hilcal.report.text_registration import registration_lines
 def import_(
     table: Annotated[Path, typer.Argument(metavar="TABLE", help="What was measured.")],
     config: Annotated[
-        Path, typer.Option("--config", metavar="CELL.toml", help="The cell it was measured in.")
-    ],
+        Path | None,
+        typer.Option("--config", metavar="CELL.toml", help="The cell it was measured in."),
+    ] = None,
     output: Annotated[
-        Path,
-        typer.Option("-o", "--output", metavar="RUN.hilcal", help="The campaign file to make."),
-    ],
+        Path | None,
+        typer.Option(
+            "-o",
+            "--output",
+            metavar="RUN.hilcal",
+            help="The campaign file to make; with --preview, the mapping file.",
+        ),
+    ] = None,
     kind: Annotated[
         str,
         typer.Option(
@@ -49,11 +56,23 @@ def import_(
         Path | None,
         typer.Option("--second", metavar="TABLE", help="The second file, e.g. of the joints."),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace an existing campaign.")] = False,
+    preview: Annotated[
+        bool,
+        typer.Option("--preview", help="Show how the table could be read; make no campaign."),
+    ] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
     as_json: Json = False,
 ) -> None:
     """Make a campaign file from a table of readings."""
     t = terminal(as_json)
+    if preview:
+        if kind != "table":
+            raise InputError(f"--preview proposes a mapping; leave out --format {kind}")
+        show_preview(t, table, second, config, output, force)
+        return
+    if config is None or output is None:
+        what = "--config CELL.toml" if config is None else "-o RUN.hilcal"
+        raise InputError(f"{what} is missing; without it only --preview is possible")
     settings = load_config(config)
     base_dir = config.absolute().parent
     cell = cell_from_config(settings, base_dir)

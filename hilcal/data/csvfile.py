@@ -15,10 +15,11 @@ _BLOCK = 4096
 _BLANK = ("", "nan", "na", "n/a", "null", "-")
 _NOT_TEXT = {
     b"SQLite format 3\x00": "an SQLite file (a campaign is opened, not imported)",
-    b"PK\x03\x04": "a zip archive or spreadsheet; save it as CSV",
-    b"\xff\xfe": "UTF-16 text; save it as CSV UTF-8",
-    b"\xfe\xff": "UTF-16 text; save it as CSV UTF-8",
-    b"PAR1": "a Parquet file",
+    b"PK\x03\x04": "a zip archive or spreadsheet; --preview proposes a mapping for it",
+    b"\xff\xfe": "UTF-16 text; --preview proposes a mapping for it",
+    b"\xfe\xff": "UTF-16 text; --preview proposes a mapping for it",
+    b"PAR1": "a Parquet file; --preview proposes a mapping for it",
+    b"MATLAB": "a MAT file; --preview proposes a mapping for it",
     b"\x1f\x8b": "a gzip file; unpack it first",
 }
 
@@ -106,7 +107,9 @@ def read_columns(
             text, number = choose(header)
             return _parse(name, reader, header, text, number, dialect)
     except UnicodeDecodeError as e:
-        raise InputError(f"{name}: not UTF-8 text; expected a CSV file") from e
+        raise InputError(
+            f"{name}: not UTF-8 text; expected a CSV file; --preview proposes a mapping for others"
+        ) from e
     except csv.Error as e:
         raise InputError(f"{name}: not a CSV file ({e})") from e
     except OSError as e:

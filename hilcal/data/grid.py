@@ -144,7 +144,10 @@ def number(cell: Cell, how: FileFormat) -> float:
     plain = cell.strip()
     if plain.lower() in BLANK or plain in how.missing:
         return float("nan")
-    if how.thousands:
+    if how.thousands and how.thousands in plain:
+        whole = plain.split(how.decimal)[0].lstrip("+-").split(how.thousands)
+        if not 0 < len(whole[0]) <= 3 or any(len(part) != 3 for part in whole[1:]):
+            return float("inf")
         plain = plain.replace(how.thousands, "")
     if how.decimal == ",":
         if "." in plain:
@@ -220,6 +223,8 @@ def records(path: str, text: str, how: FileFormat) -> Iterator[tuple[int, list[s
     separator = SEPARATORS.get(how.separator or ",", how.separator or ",")
     if how.separator == "blanks":
         text = text.replace("\t", " ")
+    if how.comment is not None and how.header_row:
+        text = _header_uncommented(text, how.header_row, how.comment)
     lines = io.StringIO(text, newline=None)
     reader = csv.reader(
         lines, delimiter=separator, skipinitialspace=how.separator == "blanks", strict=True
@@ -234,6 +239,14 @@ def records(path: str, text: str, how: FileFormat) -> Iterator[tuple[int, list[s
                 yield reader.line_num, stripped
     except csv.Error as e:
         raise InputError(f"{path}: row {reader.line_num}: not delimited text ({e})") from e
+
+
+def _header_uncommented(text: str, row: int, comment: str) -> str:
+    """Take the comment's mark off the header, as numpy.savetxt writes it."""
+    lines = text.splitlines(keepends=True)
+    if row <= len(lines) and lines[row - 1].lstrip().startswith(comment):
+        lines[row - 1] = lines[row - 1].lstrip()[len(comment) :].lstrip()
+    return "".join(lines)
 
 
 def table(path: str, found: Sequence[tuple[int, Sequence[Cell]]], how: FileFormat) -> Grid:

@@ -21,7 +21,7 @@ from hilcal.toml import suggest
 LARGEST = 2**30
 """Bytes that a packed file may unpack to; a choice: far beyond any table of readings."""
 
-_REFUSED = {
+REFUSED = {
     b"SQLite format 3\x00": "an SQLite file (a campaign is opened, not imported)",
     b"\x89HDF": "an HDF5 file (MATLAB's -v7.3); save it with -v7, or as CSV",
     b"\xd0\xcf\x11\xe0": "an old Excel file (XLS); save it as XLSX or CSV",
@@ -33,6 +33,7 @@ _REFUSED = {
     b"\x80\x05": "a Python pickle, which is never loaded; save it as CSV",
     b"%PDF": "a PDF; save the table as CSV",
 }
+"""First bytes of files that are not read, and what they are."""
 
 
 def open_tables(path: str | Path, mapping: Mapping, second: Path | None = None) -> tuple[Grid, int]:
@@ -73,7 +74,7 @@ def open_grid(path: str | Path, how: FileFormat) -> Grid:
     name, content = str(path), content_of(path)
     if not content.strip(b"\xef\xbb\xbf \t\r\n"):
         raise InputError(f"{name}: the file is empty; expected a table of readings")
-    for magic, what in _REFUSED.items():
+    for magic, what in REFUSED.items():
         if content.startswith(magic):
             raise InputError(f"{name}: {what}; expected text, XLSX, MAT or Parquet")
     try:
@@ -108,6 +109,20 @@ def _package(path: str, name: str, what: str) -> Any:
 
 
 def _xlsx(path: str, content: bytes, how: FileFormat) -> Grid:
+    sheets = sheet_names(path, content)
+    if how.sheet is not None and how.sheet not in sheets:
+        raise InputError(
+            f"{path}: no sheet '{how.sheet}'{suggest(how.sheet, sheets)}; it has "
+            f"{', '.join(sheets)}"
+        )
+    sheet = how.sheet or sheets[0]
+    found = sheet_rows(path, content, sheet, how.comment)
+    if not found:
+        raise InputError(f"{path}: sheet '{sheet}' is empty; it has {', '.join(sheets)}")
+    return table(path, found, how)
+
+
+def _book(path: str, content: bytes) -> Any:
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         members = archive.infolist()
         if "xl/workbook.xml" not in [m.filename for m in members]:
@@ -115,25 +130,34 @@ def _xlsx(path: str, content: bytes, how: FileFormat) -> Grid:
         if sum(m.file_size for m in members) > LARGEST:
             raise InputError(f"{path}: unpacks to over 1 GB; save the table as CSV")
     openpyxl = _package(path, "openpyxl", "XLSX")
-    book = openpyxl.load_workbook(
+    return openpyxl.load_workbook(
         io.BytesIO(content), read_only=True, data_only=True, keep_links=False
     )
-    sheets = book.sheetnames
-    if how.sheet is not None and how.sheet not in sheets:
-        raise InputError(
-            f"{path}: no sheet '{how.sheet}'{suggest(how.sheet, sheets)}; it has "
-            f"{', '.join(sheets)}"
-        )
-    sheet = book[how.sheet] if how.sheet else book[sheets[0]]
+
+
+def sheet_names(path: str, content: bytes) -> list[str]:
+    """Names of the sheets of an XLSX file.
+
+    Raises:
+        InputError: no XLSX file, or openpyxl is not installed.
+    """
+    try:
+        return list(_book(path, content).sheetnames)
+    except (ValueError, KeyError, TypeError, OSError, zipfile.BadZipFile) as e:
+        raise InputError(f"{path}: damaged, or not an XLSX file ({_short(e)})") from e
+
+
+def sheet_rows(
+    path: str, content: bytes, sheet: str, comment: str | None
+) -> list[tuple[int, list[Cell]]]:
+    """Rows of a sheet that are neither empty nor comments, with their numbers from 1."""
     found = []
-    for row, cells in enumerate(sheet.iter_rows(values_only=True), start=1):
+    for row, cells in enumerate(_book(path, content)[sheet].iter_rows(values_only=True), start=1):
         plain = [_cell(c) for c in cells]
-        comment = how.comment is not None and str(plain[0] if plain else "").startswith(how.comment)
-        if any(c is not None for c in plain) and not comment:
+        remark = comment is not None and str(plain[0] if plain else "").startswith(comment)
+        if any(c is not None for c in plain) and not remark:
             found.append((row, plain))
-    if not found:
-        raise InputError(f"{path}: sheet '{sheet.title}' is empty; it has {', '.join(sheets)}")
-    return table(path, found, how)
+    return found
 
 
 def _cell(value: object) -> Cell:

@@ -21,6 +21,7 @@ from hilcal.types import Floats, Ints
 
 FROM_TABLE = "covariance: from the table"
 FROM_TRACKER = "covariance: from the tracker's noise in [tracker]"
+PREVIEW = "hilcal import TABLE --preview proposes a mapping for --format"
 
 
 def read_table(
@@ -134,12 +135,15 @@ def _choose(path: str, header: list[str], arm: Arm) -> tuple[Sequence[str], Sequ
     if header and header[0].startswith("Timestamp;"):
         raise InputError(f"{path}: not an exchange table; looks like --format ipa-ur10")
     if len(header) == 1 and (";" in header[0] or "\t" in header[0]):
-        raise InputError(f"{path}: columns must be separated by ',' with '.' as decimal mark")
+        raise InputError(
+            f"{path}: columns must be separated by ',' with '.' as decimal mark; for any other "
+            f"table: {PREVIEW}"
+        )
     known = columns.known_columns(arm.n)
     if not any(name in known for name in header):
         raise InputError(
-            f"{path}: not an exchange table: row 1 has none of its columns; "
-            f"expected {', '.join(columns.required_columns(arm.n))}"
+            f"{path}: not an exchange table: row 1 has none of its columns "
+            f"({', '.join(columns.required_columns(arm.n))}); for any other table: {PREVIEW}"
         )
     columns.check_header(path, header, arm.n, arm.name)
     columns.covariance_size(path, header)

@@ -1,0 +1,150 @@
+"""`import --preview`: propose how a table is to be read."""
+
+from pathlib import Path
+
+import numpy as np
+from rich.padding import Padding
+
+from hilcal.cell import cell_from_config
+from hilcal.cli.terminal import Terminal
+from hilcal.config import CellConfig, load_config
+from hilcal.data.guess import GUESSED
+from hilcal.data.importing import import_readings
+from hilcal.data.mapping import ANGLES, LENGTHS
+from hilcal.data.proposal import Understood
+from hilcal.data.propose import Proposed, propose
+from hilcal.errors import InputError
+from hilcal.identify.conventions import Fit, choose_convention
+from hilcal.report import text
+from hilcal.report.text_import import preview
+from hilcal.robot.arm import Arm
+
+
+def show_preview(
+    t: Terminal, table: Path, second: Path | None, config: Path | None, output: Path | None,
+    force: bool,
+) -> None:  # fmt: skip
+    """Print what a table seems to hold; write the mapping file where one is asked for.
+
+    Raises:
+        InputError: a file that cannot be read, or an output that exists.
+    """
+    if output is not None and output.suffix != ".toml":
+        raise InputError(f"-o {output}: --preview writes a mapping file; name it like mapping.toml")
+    if output is not None and output.exists() and not force:
+        raise InputError(f"{output}: the file exists; choose another name or give --force")
+    settings = None if config is None else load_config(config)
+    arm = None
+    if settings is not None and config is not None:
+        arm = cell_from_config(settings, config.absolute().parent).arm
+    found = propose(table, second, None if arm is None else arm.n)
+    if arm is not None:
+        _decide_convention(found, arm)
+    proposal = found.proposal
+    outcome = None if settings is None or arm is None else _try(table, found, settings, arm)
+    t.show(preview(proposal, len(found.grid.rows), table.name))
+    if outcome:
+        t.show(text.heading("with this mapping:"))
+        t.show(Padding(words, (0, 0, 0, 2)) for words in outcome)
+    if output is not None:
+        if second is not None:
+            _relative_second(found, output)
+        try:
+            output.write_text(proposal.to_toml(table.name), encoding="utf-8")
+        except OSError as e:
+            raise InputError(f"{output}: cannot be written ({e.strerror})") from e
+        t.notice(f"{output}: the mapping; import with --format {output}")
+    else:
+        t.notice("nothing was written; -o mapping.toml keeps this as a mapping to edit")
+    t.document(
+        {
+            "mapping": proposal.sections,
+            "understood": [
+                {"section": u.what, "columns": u.columns, "meaning": u.meaning, "first": u.example}
+                for u in proposal.understood
+            ],
+            "unsure": [{"section": what, "what": words} for what, words in proposal.unsure],
+            "unused": [{"column": name, "why": why} for name, why in proposal.unused],
+            "missing": proposal.lacking,
+            "outcome": outcome,
+            "written": None if output is None else str(output),
+        }
+    )
+
+
+def _relative_second(found: Proposed, output: Path) -> None:
+    """Write the second file's path relative to the mapping file."""
+    section = found.proposal.sections["second_file"]
+    section["path"] = str(Path(section["path"]).absolute())
+    here = output.absolute().parent
+    if Path(section["path"]).is_relative_to(here):
+        section["path"] = str(Path(section["path"]).relative_to(here))
+
+
+def _decide_convention(found: Proposed, arm: Arm) -> None:
+    """Settle a guessed convention by the nominal arm, or say what the arm leaves open."""
+    proposal, grid = found.proposal, found.grid
+    sections = [proposal.sections.get(name) for name in ("joints", "position", "orientation")]
+    joints, position, section = sections
+    if joints is None or position is None or section is None or section["convention"] == "matrix":
+        return
+    blocks = [
+        np.stack([grid.numbers(name) for name in s["columns"]], axis=1)
+        for s in (joints, position, section)
+    ]
+    if blocks[0].shape[1] != arm.n:
+        return
+    whole = np.isfinite(np.hstack(blocks)).all(axis=1)
+    q, y, numbers = (block[whole] for block in blocks)
+    unit = ANGLES[section.get("unit", "rad")]
+    choice = choose_convention(
+        arm, ANGLES[joints["unit"]] * q, LENGTHS[position["unit"]] * y, numbers, unit
+    )
+    if choice is None:
+        return
+    guess = ("orientation", GUESSED)
+    proposal.unsure[:] = [doubt for doubt in proposal.unsure if doubt != guess]
+    best, second = choice.ranked[:2]
+    if choice.decided is None:
+        words = (
+            f"{arm.name} does not tell the convention: {best.convention} leaves {_left(best)}, "
+            f"{second.convention} {_left(second)}"
+        )
+        proposal.unsure.append(("orientation", words))
+        return
+    if not _same(section["convention"], choice.decided, numbers, unit):
+        section["convention"] = choice.decided
+    what = (
+        f"{section['convention']}, {section.get('unit', '')}: {arm.name} agrees to {_left(best)}, "
+        f"next {_left(second)}"
+    )
+    for k, u in enumerate(proposal.understood):
+        if u.what == "orientation":
+            proposal.understood[k] = Understood(u.what, u.columns, what, u.example)
+    proposal.open_convention = False
+
+
+def _left(fit: Fit) -> str:
+    return f"{np.rad2deg(fit.angle):.2g}° and {1e3 * fit.position:.2g} mm"
+
+
+def _same(one: str, other: str, numbers: np.ndarray, unit: float) -> bool:
+    from hilcal.data.orientation import rotations
+
+    return bool(np.allclose(rotations(one, numbers, unit), rotations(other, numbers, unit)))
+
+
+def _try(table: Path, found: Proposed, settings: CellConfig, arm: Arm) -> list[str]:
+    """Import with the proposed mapping; what comes of it, in sentences."""
+    if found.proposal.lacking:
+        return []
+    try:
+        result = import_readings(table, found.proposal.mapping(), settings, arm)
+    except InputError as error:
+        return [f"refused: {error}"]
+    readings = result.readings
+    return [
+        f"{len(readings)} readings of {len(np.unique(readings.pose))} poses, "
+        f"{'positions' if readings.m == 3 else 'positions and orientations'}",
+        *result.notes,
+    ]
