@@ -136,10 +136,12 @@ def clearance_of(cell: Cell, config: CellConfig, floor: float | None = None) -> 
 
 
 def _tool(cell: Cell) -> tuple[Capsule, ...]:
-    """The ways from flange to target and load point; nothing of a target of unknown place."""
+    """The ways from flange to targets and load point; nothing of a target of unknown place."""
     ways = [(_AT_LOAD, cell.load_point)]
-    if cell.target_known:
-        ways.append((_AT_TARGET, cell.target[:3, 3]))
+    names = [f" {name}" for name in cell.target_names] or [""]
+    for name, pose, known in zip(names, cell.all_targets, cell.known_targets, strict=True):
+        if known:
+            ways.append((_AT_TARGET + name, pose[:3, 3]))
     flange = np.zeros(3)
     return tuple(
         flange_capsule(cell.arm, name, flange, end, TOOL_RADIUS) for name, end in ways if end.any()

@@ -23,6 +23,8 @@ PATH_STEP_RAD = 0.02
 """Distance of the points at which a path is checked, rad of the leading joint."""
 MEASURING_S = 1.0
 """How long one tracker measurement is taken to last, s; only for the estimate of time."""
+AIMING_S = 2.0
+"""How long turning the tracker to another target is taken to last, s; a choice."""
 _ROUNDING = 1e-9
 
 
@@ -262,14 +264,24 @@ def _remarks(plan: Plan) -> tuple[str, ...]:
 
 def _duration(config: CellConfig, stops: tuple[Stop, ...], changes: int, readings: int) -> float:
     """Roughly how long a route takes, cell seconds."""
-    motion, acquire = config.motion, config.acquire
+    motion = config.motion
     moving = sum(
         duration(a.q, b.q, motion.speed_rad_s, motion.acceleration_rad_s2)
         for a, b in pairwise(stops)
     )
-    each = config.planning.reading_s
-    if each is None:
-        each = acquire.settle_s + acquire.samples * MEASURING_S
-        if config.force_sensor is not None:
-            each += acquire.force_window_s
+    each = seconds_at_rest(config)
     return moving + changes * config.planning.load_change_s + readings * each
+
+
+def seconds_at_rest(config: CellConfig) -> float:
+    """Return how long the arm rests at a step, cell seconds: for the readings of all targets.
+
+    `[planning] reading_s` where it is given, which is of one target; the wrench is averaged once.
+    """
+    acquire, targets = config.acquire, max(len(config.tool.targets), 1)
+    once = 0.0 if config.force_sensor is None else acquire.force_window_s
+    each = config.planning.reading_s
+    if each is not None:
+        return targets * each
+    each = acquire.settle_s + acquire.samples * MEASURING_S + (targets > 1) * AIMING_S
+    return targets * each + once

@@ -33,13 +33,19 @@ class LineOfSight:
     tracker: Floats
 
     def free(self, q: Floats, load: str) -> Bools:
-        """Return (N,) in which states nothing is closer to the beam than [sight] clearance_m.
+        """Return (N,) in which states nothing is closer to a beam than [sight] clearance_m.
 
-        The beam ends shortly before the target. Not in its way are the way from the flange to
-        the target and what else of the tool is next to it, whose shape is not known; obstacles
-        that the tracker stands in or on; and the floor of a plan, which nothing is built on.
+        There is a beam to each target; all of them have to be free. A beam ends shortly before
+        its target. Not in its way are the way from the flange to the target and what else of the
+        tool is next to it, whose shape is not known; obstacles that the tracker stands in or on;
+        and the floor of a plan, which nothing is built on.
         """
-        beam = self.beam(q)
+        targets = range(len(self.clearance.cell.all_targets))
+        return np.asarray(np.all([self.sees(q, load, k) for k in targets], axis=0))
+
+    def sees(self, q: Floats, load: str, target: int) -> Bools:
+        """Return (N,) in which states the beam to one target is free."""
+        beam = self.beam(q, target)
         out = ~self.clearance.scene.touching(q, beam, 0.0)
         for other in self.clearance.segments(q, load):
             gap = segment_distance(beam.start, beam.end, other.start, other.end)
@@ -47,7 +53,7 @@ class LineOfSight:
         return np.asarray(out)
 
     def incidence(self, q: Floats) -> Floats | None:
-        """Return (N,) angles between the reflector's normal and the beam, rad.
+        """Return (N,) angles between the reflectors' normal and the beam, the largest, rad.
 
         None where [sight] target_normal is not given.
         """
@@ -56,9 +62,12 @@ class LineOfSight:
             return None
         chain = chains.evaluate(self.clearance.cell.arm, q)
         looks = se3.apply(chain.rotation[-1], np.array(normal) / np.linalg.norm(normal))
-        way = self.tracker - chain.point(self.clearance.cell.target[:3, 3])
-        along = np.sum(looks * way, axis=1)
-        return np.asarray(np.arctan2(np.linalg.norm(se3.cross(looks, way), axis=1), along))
+        out = []
+        for target in self.clearance.cell.all_targets:
+            way = self.tracker - chain.point(target[:3, 3])
+            along = np.sum(looks * way, axis=1)
+            out.append(np.arctan2(np.linalg.norm(se3.cross(looks, way), axis=1), along))
+        return np.asarray(np.max(out, axis=0))
 
     def problems(self, q: Floats, load: str, where: str) -> dict[tuple[str, ...], str]:
         """Return why the tracker would not see the target in one state (1, n)."""
@@ -70,24 +79,32 @@ class LineOfSight:
                 f"{where}: the beam meets the reflector at {float(angle.max()):.3g} rad; [sight] "
                 f"incidence_max_rad is {most:g}"
             )
-        if not self.free(q, load).all():
+        hidden = self.hidden(q, load)
+        if len(hidden) == len(self.clearance.cell.all_targets):  # a hidden one is a reading less
             names = self.clearance.scene.blocking(q, self.beam(q))
             names += tuple(x.name for x in self.clearance.segments(q, load) if not names)
-            out["sight", where] = f"{where}: {' and '.join(names)} between tracker and target"
+            what = "target" if len(hidden) == 1 else "targets"
+            out["sight", where] = f"{where}: {' and '.join(names)} between tracker and {what}"
         return out
 
-    def beam(self, q: Floats) -> Segment:
-        """Return the beam in N states (N, n)."""
+    def hidden(self, q: Floats, load: str) -> tuple[int, ...]:
+        """Return the numbers of the targets that the tracker does not see in one state (1, n)."""
+        targets = range(len(self.clearance.cell.all_targets))
+        return tuple(k for k in targets if not self.sees(q, load, k).all())
+
+    def beam(self, q: Floats, number: int = 0) -> Segment:
+        """Return the beam to a target in N states (N, n)."""
         config, cell = self.clearance.config, self.clearance.cell
         radius = config.sight.clearance_m
-        target = chains.evaluate(cell.arm, q).point(cell.target[:3, 3])
+        offset = cell.all_targets[number, :3, 3]
+        target = chains.evaluate(cell.arm, q).point(offset)
         way = target - self.tracker
         length = np.linalg.norm(way, axis=1, keepdims=True)
         gap = np.minimum(_SHY * (TOOL_RADIUS + radius), 0.5 * length)
         end = target - gap * way / np.where(length > 0.0, length, 1.0)
         start = np.broadcast_to(self.tracker, end.shape)
         stands = [x.name for x in config.obstacles if _holds(x, self.tracker, radius)]
-        near = self.clearance.near(cell.target[:3, 3], radius)
+        near = self.clearance.near(offset, radius)
         return Segment("beam", start, end, max(radius, 1e-4), near.union(stands, {FLOOR}))
 
 

@@ -1,7 +1,7 @@
 """Candidate states: derivative and covariance of their readings."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from hilcal.config import CellConfig
 from hilcal.data.plan import UNLOADED
 from hilcal.data.readings import States
 from hilcal.effects.protocol import Effect
-from hilcal.plan.noise_model import reading_covariance
+from hilcal.plan.noise_model import arrival_covariance
 from hilcal.plan.nominal_model import NominalModel, nominal_states
 from hilcal.types import Bools, Floats, Ints
 
@@ -55,8 +55,9 @@ class ReadingDerivatives:
 
     Attributes:
         rows: which poses.
-        jacobian: (N, 1 + L, m, P) derivative by the parameters, in their scales.
-        covariance: (N, 1 + L, m, m) of the readings.
+        jacobian: (N, 1 + L, m, P) derivative by the parameters, in their scales; m are the elements
+            of all targets that are read in one arrival.
+        covariance: (N, 1 + L, m, m) of them.
     """
 
     rows: slice
@@ -99,16 +100,20 @@ def reading_derivatives(
         more: effects that are not in the model.
         scale: (P,) what one unit of each parameter is, SI.
     """
-    model, m, loads = nominal.model, nominal.m, len(of.loads)
-    states = of.states()
+    model, m, loads = nominal.model, nominal.elements, len(of.loads)
+    states, each = of.states(), len(nominal.cell.all_targets)
+    if each > 1:
+        number = np.tile(np.arange(each), len(states))
+        states = replace(states[np.repeat(np.arange(len(states)), each)], target=number)
     live = np.concatenate([nominal.live, np.arange(model.size, model.size + sizes(more))])
-    step = max(CHUNK // loads, 1)
+    step = max(CHUNK // (loads * each), 1)
     for start in range(0, len(of), step):
         rows = slice(start, min(start + step, len(of)))
         count = rows.stop - rows.start
-        p = model.predict(states[slice(rows.start * loads, rows.stop * loads)], nominal.theta)
-        jacobian = model.jacobian_of((*model.effects, *more), p, nominal.theta, m, live)
-        covariance = reading_covariance(nominal, config, p)
+        per_pose = loads * each
+        p = model.predict(states[slice(rows.start * per_pose, rows.stop * per_pose)], nominal.theta)
+        jacobian = model.jacobian_of((*model.effects, *more), p, nominal.theta, nominal.m, live)
+        covariance = arrival_covariance(nominal, config, p)
         yield ReadingDerivatives(
             rows,
             (jacobian * scale).reshape(count, loads, m, len(scale)),

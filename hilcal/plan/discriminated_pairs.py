@@ -174,7 +174,7 @@ def _directions(problem: Problem, effect: str) -> list[Floats]:
     """Directions (E,) of an effect whose RMS over all measured elements is 1 σ."""
     where = problem.of_effect(effect)
     rows = problem.units.rows[:, :, where]
-    elements = problem.nominal.m * sum(
+    elements = problem.nominal.elements * sum(
         len([name for name in loads if name != UNLOADED or problem.mode == "absolute"])
         for _, loads in problem.what
     )

@@ -131,7 +131,7 @@ def problem(
     against = potential(nominal, config, of) if len(of) else Potential((), (), ())
     terms = _terms(nominal, against)
     scale = np.array([t.scale for t in terms])
-    layout = _layout(of, mode, nominal.m, len(terms))
+    layout = _layout(of, mode, nominal.elements, len(terms))
     rows = np.zeros((len(layout.what), layout.height, len(terms)))
     for part in reading_derivatives(nominal, config, of, against.effects, scale):
         for place, block in _blocks(part, layout, mode):

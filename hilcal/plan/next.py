@@ -239,7 +239,7 @@ def _where(made: Planned, pair: Pair, then: Floats) -> tuple[dict[str, float], f
     shares: dict[str, float] = {}
     for k, value in zip(taken, worth, strict=True):
         loads = of.what[k][1]
-        m = of.nominal.m
+        m = of.nominal.elements
         rows = of.units.rows[k][: m * len(loads)] @ u
         by = np.sum(rows.reshape(len(loads), m) ** 2, axis=1)
         for load, part in zip(loads, by, strict=True):

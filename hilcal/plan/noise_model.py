@@ -6,6 +6,7 @@ from hilcal.config import CellConfig
 from hilcal.data.covariance import (
     expected_share_of_mean,
     joint_scatter,
+    scatter_factor,
     tracker_covariance,
     tracker_noise,
 )
@@ -13,6 +14,34 @@ from hilcal.model import Prediction
 from hilcal.plan.nominal_model import NominalModel
 from hilcal.robot.chain import joint_jacobian
 from hilcal.types import Floats
+
+
+def arrival_covariance(nominal: NominalModel, config: CellConfig, predicted: Prediction) -> Floats:
+    """Covariance of all that is read in one arrival of the arm: of its T targets together.
+
+    They have the arm's repeatability in common: block (i, j) is δ_ij V_instrument + F_i F_jᵀ with
+    F = R J Σ_q^½ (see `reading_covariance`).
+
+    Args:
+        nominal: the model, with the tracker in its place.
+        config: `[tracker]`, `[acquire]` and `[repeatability]`.
+        predicted: N·T states, the T targets of one arrival in succession.
+
+    Returns:
+        (N, T·m, T·m) covariances.
+    """
+    single = reading_covariance(nominal, config, predicted)
+    count, m = len(nominal.cell.all_targets), nominal.m
+    if count == 1:
+        return single
+    o = predicted.observation
+    jac = joint_jacobian(predicted.situation.chain, o.base_position)
+    joint_std = config.repeatability.per_joint(nominal.cell.arm.n)
+    factor = scatter_factor(jac, joint_std, o.axes, m).reshape(-1, count * m, jac.shape[2])
+    out = (factor @ np.swapaxes(factor, 1, 2)).reshape(-1, count, m, count, m)
+    each = np.arange(count)
+    out[:, each, :, each, :] = np.moveaxis(single.reshape(-1, count, m, m), 1, 0)
+    return out.reshape(-1, count * m, count * m)
 
 
 def reading_covariance(nominal: NominalModel, config: CellConfig, predicted: Prediction) -> Floats:

@@ -53,6 +53,11 @@ class NominalModel:
     notes: tuple[str, ...]
 
     @property
+    def elements(self) -> int:
+        """Elements that are read in one arrival: m of each target."""
+        return self.m * len(self.cell.all_targets)
+
+    @property
     def cell(self) -> Cell:
         """The cell, registered."""
         return self.model.cell

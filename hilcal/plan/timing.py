@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from hilcal.acquire.dry_run import MEASURING_S
+from hilcal.acquire.dry_run import seconds_at_rest
 from hilcal.acquire.route import duration, route
 from hilcal.config import CellConfig
 from hilcal.data.plan import Plan
@@ -20,7 +20,7 @@ class Pace:
     Attributes:
         speed: of the leading joint, rad/s.
         acceleration: of the leading joint, rad/s².
-        reading_s: seconds at rest for one reading.
+        reading_s: seconds at rest for one step: the readings of all targets.
         change_s: seconds that a person needs for another load.
     """
 
@@ -74,14 +74,8 @@ class Duration:
 
 def pace(config: CellConfig) -> Pace:
     """Return the pace of a cell, from [motion], [planning] and [acquire]."""
-    planning, acquire = config.planning, config.acquire
-    reading = planning.reading_s
-    if reading is None:
-        reading = acquire.settle_s + acquire.samples * MEASURING_S
-        if config.force_sensor is not None:
-            reading += acquire.force_window_s
-    motion, change = config.motion, planning.load_change_s
-    return Pace(motion.speed_rad_s, motion.acceleration_rad_s2, reading, change)
+    motion, change = config.motion, config.planning.load_change_s
+    return Pace(motion.speed_rad_s, motion.acceleration_rad_s2, seconds_at_rest(config), change)
 
 
 def timeline(plan: Plan, arm: Arm, margin: float, at: Pace) -> tuple[Duration, Floats]:
