@@ -10,6 +10,7 @@ from hilcal.config import STANDARD_GRAVITY_M_S2, CellConfig, load_config
 from hilcal.errors import InputError
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm
+from hilcal.robot.conventions import as_counted
 from hilcal.robot.se3 import rotation
 from hilcal.types import Floats, Ints
 
@@ -120,6 +121,10 @@ def cell_from_config(config: CellConfig, base_dir: Path | None = None) -> Cell:
     """
     robot, tool, tracker = config.robot, config.tool, config.tracker
     arm = load_arm(robot.model, base_dir, base_link=robot.base_link, tip_link=robot.tip_link)
+    try:
+        arm = as_counted(arm, robot)
+    except InputError as error:
+        raise InputError(f"[robot] {error}") from None
     config.repeatability.per_joint(arm.n)
     described = tool.targets or (tool,)
     poses = np.stack([_pose(t.target_m, t.target_rotvec_rad) for t in described])

@@ -129,7 +129,7 @@ class World:
         Raises:
             InputError: the states lack what a hidden effect depends on, or find no equilibrium.
         """
-        q = states.q + self.joint_errors(states)
+        q = self.cell.arm.chain_angles(states.q) + self.joint_errors(states)
         return equilibrium(
             self._tree,
             self._elasticity(states),

@@ -9,7 +9,7 @@ from hilcal.acquire.rough_registration import RoughRegistration
 from hilcal.cell import Cell
 from hilcal.data.plan import UNLOADED, Step
 from hilcal.robot import chain as chains
-from hilcal.robot.chain import joint_jacobian
+from hilcal.robot.chain import command_jacobian
 from hilcal.types import Floats
 
 
@@ -51,7 +51,7 @@ class SessionState:
             self.tared_wrenches.append(tared)
         self._unloaded[step.pose, step.cycle] = position
         chain = chains.evaluate(self._cell.arm, q[None])
-        jac = joint_jacobian(chain, chain.point(self._cell.target[:3, 3]))[0, :3]
+        jac = command_jacobian(self._cell.arm, chain, chain.point(self._cell.target[:3, 3]))[0, :3]
         instrument = covariance[:3, :3]
         self._visits.append(UnloadedVisit(step.pose, position, instrument, float(np.sum(jac**2))))
         return self._drift.add(step, position, instrument + scatter)

@@ -80,7 +80,7 @@ def import_(
         say(f"reading {table}")
         found = import_readings(table, kind, settings, cell.arm, second)
         readings, parts = found.readings, covariance_parts(found.covers, settings)
-        notes = (*found.notes, covariance_words(parts))
+        notes = (*found.notes, covariance_words(parts), *cell.arm.notes)
         say(f"writing {output}")
         source = f"{table.name} ({Path(kind).name})"
         with CampaignFile.create(

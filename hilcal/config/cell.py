@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, Strict, model_validator
 
+from hilcal.config.joints import Conventions
 from hilcal.config.loads import Limits, Load
 from hilcal.config.planning import Obstacle, Planning, Sight
 from hilcal.config.rig import (
@@ -38,8 +39,8 @@ def _std(what: str) -> str:
     return f"the standard deviation {what}"
 
 
-class Robot(Section):
-    """[robot]: which arm, and how it stands in gravity."""
+class Robot(Conventions):
+    """[robot]: which arm, how its controller counts the joints, and how it stands in gravity."""
 
     model: str = Field(
         min_length=1, description='a catalogue name, e.g. "ur10e", or the path of a .urdf file'

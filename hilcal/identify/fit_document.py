@@ -71,6 +71,13 @@ def notes(fit: Fit) -> tuple[str, ...]:
             f"deflections do not see where the base is, only how it is turned: {registered[0]} "
             "holds what the closed-form registration and the turning of deflections tell"
         )
+    weightless = not np.any(fit.model.cell.arm.masses)
+    if fit.mode == "absolute" and weightless and any(e.elastic for e in fit.model.effects):
+        out.append(
+            "the arm's description has no masses: compliance from absolute readings can come out "
+            "many times too soft, since the sag under the arm's own weight is taken for a load's; "
+            "fit deflections, or give the masses"
+        )
     return tuple(out)
 
 

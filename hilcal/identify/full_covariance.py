@@ -13,7 +13,7 @@ from hilcal.data.readings import Readings
 from hilcal.data.whitening import inverse_root
 from hilcal.errors import CannotAnswerError
 from hilcal.identify.registration import register
-from hilcal.robot.chain import evaluate, joint_jacobian
+from hilcal.robot.chain import command_jacobian, evaluate
 from hilcal.types import Floats
 
 CovarianceParts = Literal[
@@ -114,5 +114,5 @@ def _scatter(cell: Cell, readings: Readings, joint_std: Floats) -> Floats | None
         return None
     chain = evaluate(cell.arm, readings.states.q)
     at = registered.target_of(readings.states.target)
-    jac = joint_jacobian(chain, chain.point(at[..., :3, 3]))
+    jac = command_jacobian(cell.arm, chain, chain.point(at[..., :3, 3]))
     return scatter_factor(jac, joint_std, registered.registration[:3, :3], readings.m)

@@ -12,7 +12,7 @@ from hilcal.data.covariance import (
 )
 from hilcal.model import Prediction
 from hilcal.plan.nominal_model import NominalModel
-from hilcal.robot.chain import joint_jacobian
+from hilcal.robot.chain import command_jacobian
 from hilcal.types import Floats
 
 
@@ -66,6 +66,8 @@ def reading_covariance(nominal: NominalModel, config: CellConfig, predicted: Pre
     out = expected_share_of_mean(a.samples, a.systematic_share) * stated
     joint_std = config.repeatability.per_joint(nominal.cell.arm.n)
     if np.any(joint_std):
-        jac = joint_jacobian(predicted.situation.chain, o.base_position)
+        jac = command_jacobian(
+            predicted.situation.cell.arm, predicted.situation.chain, o.base_position
+        )
         out = out + joint_scatter(jac, joint_std, o.axes, m)
     return np.asarray(out)

@@ -15,10 +15,10 @@ class Arm:
 
         T_base_flange(q) = L_0 Rz(q_1) L_1 Rz(q_2) ... Rz(q_n) L_n
 
-    with constant rigid transforms L_k. *Slot* k (k = 0..n) is the frame right after L_k:
-    for k < n its origin is a point of the axis of joint k + 1 and its z is that axis;
-    slot n is the flange. Body i (i = 1..n) is what joint i moves; its frame is slot i - 1
-    turned by joint i.
+    with constant rigid transforms L_k; coupled joints turn by `chain_angles`. *Slot* k
+    (k = 0..n) is the frame right after L_k: for k < n its origin is a point of the axis of joint
+    k + 1 and its z is that axis; slot n is the flange. Body i (i = 1..n) is what joint i moves;
+    its frame is slot i - 1 turned by joint i.
 
     Attributes:
         name: catalogue name or file stem.
@@ -31,6 +31,9 @@ class Arm:
         payload: rated payload, kg.
         joint_names: (n,) names.
         source: where the figures come from.
+        coupling: (n, n) C with θ = C q: the angles of the chain from the controller's values, where
+            joints follow others (see `conventions`); None where each turns by itself.
+        notes: what its description lacks, and what that means, a sentence each.
     """
 
     name: str
@@ -43,6 +46,12 @@ class Arm:
     payload: float
     joint_names: tuple[str, ...]
     source: str
+    coupling: Floats | None = None
+    notes: tuple[str, ...] = ()
+
+    def chain_angles(self, q: Floats) -> Floats:
+        """Angles (..., n) that the axes of the chain turn by, from the controller's values."""
+        return q if self.coupling is None else q @ self.coupling.T
 
     @property
     def n(self) -> int:

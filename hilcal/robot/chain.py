@@ -38,9 +38,10 @@ class Chain:
 
 
 def evaluate(arm: Arm, q: Floats, deviation: Deviation | None = None) -> Chain:
-    """Evaluate the deviated chain at q (N, n); exact, batched."""
+    """Evaluate the deviated chain at the controller's values q (N, n); exact, batched."""
     deviation = deviation or Deviation()
-    angle = along_states(q if deviation.dq is None else q + deviation.dq)
+    turned = arm.chain_angles(q)
+    angle = along_states(turned if deviation.dq is None else turned + deviation.dq)
     twist = deviation.twist
     if twist is not None:
         twist = np.swapaxes(along_states(twist), 0, 1)
@@ -72,6 +73,8 @@ def evaluate(arm: Arm, q: Floats, deviation: Deviation | None = None) -> Chain:
 def joint_jacobian(chain: Chain, x: Floats) -> Floats:
     """Geometric Jacobian (N, 6, n) of a flange-fixed point now at x (N, 3), base axes.
 
+    By the angles of the chain; `command_jacobian` is that by the controller's values.
+
     Column j is (z_j × (x − p_j), z_j); rows are m/rad and rad/rad.
     """
     n = len(chain.com)
@@ -81,6 +84,12 @@ def joint_jacobian(chain: Chain, x: Floats) -> Floats:
     out[:, :3] = np.swapaxes(se3.cross(z, lever), 1, 2)
     out[:, 3:] = np.swapaxes(z, 1, 2)
     return out
+
+
+def command_jacobian(arm: Arm, chain: Chain, x: Floats) -> Floats:
+    """Geometric Jacobian (N, 6, n) by the controller's values, see `joint_jacobian`."""
+    out = joint_jacobian(chain, x)
+    return out if arm.coupling is None else np.asarray(out @ arm.coupling)
 
 
 def slot_jacobian(chain: Chain, slot: int, x: Floats) -> Floats:

@@ -1,13 +1,17 @@
-"""Arms from classic Denavit-Hartenberg tables."""
+"""Arms from Denavit-Hartenberg tables, classic or modified."""
 
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
+from hilcal.config.joints import Conventions
+from hilcal.errors import InputError
 from hilcal.robot.arm import Arm
+from hilcal.robot.conventions import as_counted
 from hilcal.toml import NonNegative, Number, Positive, Section, Vector3, load_section
 from hilcal.types import Floats
 
@@ -38,7 +42,7 @@ class JointRow(Section):
         return self
 
 
-class DhTable(Section):
+class DhTable(Conventions):
     """A file of `configs/robots`."""
 
     title: str = Field(min_length=1, description="the arm's full name")
@@ -47,27 +51,42 @@ class DhTable(Section):
         None, description="the weight of the whole arm in kg (not used in predictions)"
     )
     source: str = Field(min_length=1, description="where the figures come from")
+    convention: Literal["standard", "modified"] = Field(
+        "standard", description='"standard" (classic rows) or "modified" (Craig\'s rows)'
+    )
     joints: tuple[JointRow, ...] = Field(min_length=1, description="sections [[joints]], in order")
 
 
 def arm_from_dh(path: Path) -> Arm:
     """Read an arm from a DH table in TOML.
 
-    T_base_flange = Π_i Rz(q_i + offset_i) Tz(d_i) Tx(a_i) Rx(alpha_i), hence the constant
-    transforms L_0 = Rz(offset_1), L_i = Tz(d_i) Tx(a_i) Rx(alpha_i) Rz(offset_{i+1}).
+    Classic rows: T_base_flange = Π_i Rz(q_i + offset_i) Tz(d_i) Tx(a_i) Rx(alpha_i), hence the
+    constant transforms L_0 = Rz(offset_1), L_i = Tz(d_i) Tx(a_i) Rx(alpha_i) Rz(offset_{i+1}).
     Centres of mass come in DH frame i; in the body frame they are Tz(d) Tx(a) Rx(alpha) com.
+
+    Modified rows (Craig, *Introduction to Robotics*, section 3.4): T_base_flange = Π_i
+    Rx(alpha_i) Tx(a_i) Rz(q_i + offset_i) Tz(d_i), with alpha and a of the link before the joint;
+    L_0 = Rx(alpha_1) Tx(a_1) Rz(offset_1), L_i = Tz(d_i) Rx(alpha_{i+1}) Tx(a_{i+1})
+    Rz(offset_{i+1}), L_n = Tz(d_n); in the body frame centres of mass are Tz(d) com.
 
     Raises:
         InputError: unreadable file, unknown or missing key, bad value.
     """
     table = load_section(path, DhTable)
     rows = table.joints
-    fixed = [_fixed_part(row) for row in rows]
     offsets = [math.radians(row.offset_deg) for row in rows]
+    shifts, turns = [_shift_z(row) for row in rows], [_across(row) for row in rows]
+    if table.convention == "modified":
+        fixed, after = shifts, [*turns[1:], np.eye(4)]
+    else:
+        fixed, after = [a @ b for a, b in zip(shifts, turns, strict=True)], [np.eye(4)] * len(rows)
+    links = _links([a @ b for a, b in zip(fixed, after, strict=True)], offsets)
+    if table.convention == "modified":
+        links[0] = turns[0] @ links[0]
     coms = [f[:3, :3] @ row.com_m + f[:3, 3] for f, row in zip(fixed, rows, strict=True)]
-    return Arm(
+    arm = Arm(
         name=path.stem,
-        links=_links(fixed, offsets),
+        links=links,
         masses=np.array([row.mass_kg for row in rows]),
         coms=np.array(coms),
         q_min=np.radians([row.q_min_deg for row in rows]),
@@ -77,6 +96,10 @@ def arm_from_dh(path: Path) -> Arm:
         joint_names=tuple(row.name for row in rows),
         source=table.source,
     )
+    try:
+        return as_counted(arm, table)
+    except InputError as error:
+        raise InputError(f"{path.name}: {error}") from None
 
 
 def _links(fixed: Sequence[Floats], offsets: Sequence[float]) -> Floats:
@@ -92,11 +115,18 @@ def _rotation_z(angle: float) -> Floats:
     return turn
 
 
-def _fixed_part(row: JointRow) -> Floats:
-    """(4, 4) Tz(d) Tx(a) Rx(alpha)."""
+def _shift_z(row: JointRow) -> Floats:
+    """(4, 4) Tz(d)."""
+    part = np.eye(4)
+    part[2, 3] = row.d_m
+    return part
+
+
+def _across(row: JointRow) -> Floats:
+    """(4, 4) Tx(a) Rx(alpha), which commute."""
     alpha = math.radians(row.alpha_deg)
     c, s = math.cos(alpha), math.sin(alpha)
     part = np.eye(4)
     part[1:3, 1:3] = [[c, -s], [s, c]]
-    part[:3, 3] = [row.a_m, 0.0, row.d_m]
+    part[0, 3] = row.a_m
     return part

@@ -66,7 +66,7 @@ class Scene:
         if floor is not None:
             up = pin.coal.Halfspace(np.array([0.0, 0.0, 1.0]), floor)
             self._things.append((FLOOR, up, pin.SE3.Identity()))
-        self._model = pinocchio_model(arm)
+        self._turned, self._model = arm, pinocchio_model(arm)
         self._data = self._model.createData()
         count = len(self.parts)
         reach = [
@@ -170,7 +170,8 @@ class Scene:
         chosen = tuple(pairs)
         for a, b in chosen:
             geometry.addCollisionPair(pin.CollisionPair(a, b))
-        return _Group(self._model, self._data, geometry, (*names, "free"), chosen)
+        parts = (*names, "free")
+        return _Group(self._turned, self._model, self._data, geometry, parts, chosen)
 
     def _not_always(self, arm: Arm, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
         """Leave out what touches in many states, whatever the arm does."""
@@ -186,12 +187,14 @@ class _Group:
 
     def __init__(
         self,
+        arm: Arm,
         model: Any,
         data: Any,
         geometry: Any,
         names: tuple[str, ...],
         pairs: tuple[tuple[int, int], ...],
     ) -> None:
+        self._turned = arm
         self._model, self._data, self._geometry = model, data, geometry
         self._state = geometry.createData()
         self._names, self._pairs = names, pairs
@@ -263,7 +266,8 @@ class _Group:
 
     def _place(self, q: Floats, lies: "_Lies | None" = None, i: int = 0) -> None:
         """Put all shapes where they are in one state; a segment is that of state i."""
-        pin.updateGeometryPlacements(self._model, self._data, self._geometry, self._state, q)
+        turned = self._turned.chain_angles(q)
+        pin.updateGeometryPlacements(self._model, self._data, self._geometry, self._state, turned)
         if lies is not None:
             half, turn, middle = lies
             self._geometry.geometryObjects[self._free].geometry.halfLength = half[i]

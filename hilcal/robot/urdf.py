@@ -20,6 +20,11 @@ from hilcal.toml import suggest
 from hilcal.types import Floats
 
 _WHOLE_TURN = 2.0 * math.pi
+NO_MASSES = (
+    "the URDF has no masses: the arm's own weight makes no torque in the model. Compliance is "
+    "right where loads are hung and deflections (loaded minus unloaded) are fitted; absolute "
+    "readings can give it many times too soft, since the weight's sag is taken for a load's"
+)
 
 
 def arm_from_urdf(path: Path, base_link: str | None = None, tip_link: str | None = None) -> Arm:
@@ -29,8 +34,9 @@ def arm_from_urdf(path: Path, base_link: str | None = None, tip_link: str | None
     the joint's axis, the constant transforms are L_0 = T_base_root M_1 R_1,
     L_k = R_kᵀ M_{k+1} R_{k+1} and L_n = R_nᵀ M_tip. Masses rigidly attached to a moving link
     are merged into it; joints outside the chain (fingers of a gripper) are held at zero.
-    A continuous joint gets the range ±2π; an effort of 0 means unknown (infinite); a URDF
-    names no payload (infinite).
+    A continuous joint gets the range ±2π, also one whose limits are both 0; an effort of 0 means
+    unknown (infinite); a URDF names no payload (infinite). What is missing is said in `Arm.notes`.
+    A joint outside of the chain that mimics another is held at zero as well.
 
     Args:
         path: the file.
@@ -68,10 +74,11 @@ def _arm(model: pin.Model, base: pin.SE3, tip: pin.SE3, path: Path) -> Arm:
     placements = [*(model.jointPlacements[joint].homogeneous for joint in joints), tip.homogeneous]
     after = [*turns, np.eye(4)]
     lower, upper, effort = zip(*(_limits(model, joint) for joint in joints), strict=True)
+    masses = np.array([model.inertias[joint].mass for joint in joints])
     return Arm(
         name=path.stem,
         links=np.array([b @ m @ a for b, m, a in zip(before, placements, after, strict=True)]),
-        masses=np.array([model.inertias[joint].mass for joint in joints]),
+        masses=masses,
         coms=np.array(coms),
         q_min=np.array(lower),
         q_max=np.array(upper),
@@ -79,14 +86,31 @@ def _arm(model: pin.Model, base: pin.SE3, tip: pin.SE3, path: Path) -> Arm:
         payload=math.inf,
         joint_names=tuple(model.names[joint] for joint in joints),
         source=f"URDF {path.name}",
+        notes=tuple(_missing(model, masses)),
     )
+
+
+def _missing(model: pin.Model, masses: Floats) -> Iterator[str]:
+    """Yield what a description lacks, and what that means."""
+    if not np.any(masses):
+        yield NO_MASSES
+    open_ended = [str(model.names[j]) for j in range(1, model.njoints) if _no_limits(model, j)]
+    if open_ended:
+        yield f"no limits in the URDF for {', '.join(open_ended)}: ±360° is assumed"
+
+
+def _no_limits(model: pin.Model, joint: int) -> bool:
+    kind = model.joints[joint]
+    if kind.nq != 1:
+        return False
+    return not model.lowerPositionLimit[kind.idx_q] and not model.upperPositionLimit[kind.idx_q]
 
 
 def _limits(model: pin.Model, joint: int) -> tuple[float, float, float]:
     """Lower and upper limit in rad, and effort in N·m."""
     kind = model.joints[joint]
     effort = float(model.upperEffortLimit[kind.idx_v]) or math.inf
-    if kind.nq != 1:  # continuous: Pinocchio keeps cosine and sine
+    if kind.nq != 1 or _no_limits(model, joint):  # continuous: Pinocchio keeps cosine and sine
         return -_WHOLE_TURN, _WHOLE_TURN, effort
     lower, upper = model.lowerPositionLimit[kind.idx_q], model.upperPositionLimit[kind.idx_q]
     return float(lower), float(upper), effort
@@ -121,11 +145,47 @@ def _chain(model: pin.Model, base: str, tip: str, path: Path) -> list[int]:
         )
     for joint in chain:
         if model.joints[joint].nv != 1 or np.any(_axis(model, joint)[:3]):
+            name = model.names[joint]
             raise InputError(
-                f'{path.name}: joint "{model.names[joint]}" is not revolute; '
-                "every moving joint of the arm must be revolute or continuous"
+                f'{path.name}: joint "{name}" is not revolute; every moving joint of the arm must '
+                "be revolute or continuous. A rail or column: set base_link to the link after "
+                f'"{name}", or give it type="fixed" with an <origin> where it stands'
             )
+        _refuse_mimic(str(model.names[joint]), path)
     return chain
+
+
+def _refuse_mimic(name: str, path: Path) -> None:
+    """Refuse a joint of the chain that has no value of its own."""
+    followed = _mimics(path).get(name)
+    if followed is not None:
+        raise InputError(
+            f'{path.name}: joint "{name}" of the arm mimics joint "{followed}"; every joint needs '
+            f'a value of its own. Take the <mimic> element out, and give "{name}" a column of its '
+            "own in the readings; where the controller counts a joint together with another, say "
+            "so by [robot] joint_coupling"
+        )
+
+
+def _mimics(path: Path) -> dict[str, str]:
+    """Return the joints with a `<mimic>` element, and which joint each follows."""
+    found: dict[str, str] = {}
+    within: list[str] = []
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        if tag == "joint":
+            within.append(attributes.get("name", ""))
+        elif tag == "mimic" and within:
+            found[within[-1]] = attributes.get("joint", "")
+
+    def end(tag: str) -> None:
+        if tag == "joint" and within:
+            within.pop()
+
+    parser = expat.ParserCreate()
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.Parse(path.read_bytes(), True)
+    return found
 
 
 def _link(model: pin.Model, name: str) -> pin.Frame:

@@ -1,0 +1,87 @@
+"""How a controller counts joints: signs, zeros, and joints that follow others.
+
+The joint j of the chain turns by
+
+    θ_j = s_j q_j + o_j + Σ_i k_ji q_i
+
+with q the controller's values, s = ±1, o the zero offset and k the couplings (a parallelogram: the
+forearm keeps its direction in space while joint 2 moves, k_32 = −1; bevel gears in a wrist).
+"""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from hilcal.config.joints import Conventions
+from hilcal.errors import InputError
+from hilcal.robot.arm import Arm
+from hilcal.types import Floats
+
+_HALF_TURN = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Rx(π): Rz(−θ) = Rx(π) Rz(θ) Rx(π)."""
+
+
+def as_counted(arm: Arm, by: Conventions) -> Arm:
+    """Return the arm as the controller counts its joints.
+
+    Raises:
+        InputError: another number of values than the arm has joints, or no such joint.
+    """
+    for key in ("joint_sign", "joint_offset_deg"):
+        given = getattr(by, key)
+        if given is not None and len(given) != arm.n:
+            raise InputError(
+                f"{key} has {len(given)} values; {arm.name} has {arm.n} joints, one value each"
+            )
+    for c in by.joint_coupling:
+        if max(c.joint, c.follows) > arm.n:
+            raise InputError(
+                f"joint_coupling names joint {max(c.joint, c.follows)}; {arm.name} has joints "
+                f"1 to {arm.n}"
+            )
+    sign = np.array(by.joint_sign or (1,) * arm.n, dtype=float)
+    offset = np.radians(by.joint_offset_deg or (0.0,) * arm.n)
+    coupling = np.zeros((arm.n, arm.n))
+    for c in by.joint_coupling:
+        coupling[c.joint - 1, c.follows - 1] += c.factor
+    return with_conventions(arm, sign, offset, coupling)
+
+
+def with_conventions(arm: Arm, sign: Floats, offset: Floats, coupling: Floats) -> Arm:
+    """Return the arm whose joint values are the controller's.
+
+    Signs and zeros go into the constant links:
+
+        Rz(s q + o) = Rz(o) X Rz(q) X⁻¹,  X = Rx(π) for s = −1, else 1
+
+    Limits are those of the controller's values and stay.
+
+    Where the arm has couplings C of its own already, they act on what results.
+
+    Args:
+        arm: the arm as drawn.
+        sign: (n,) s.
+        offset: (n,) o, rad.
+        coupling: (n, n) k, zero on the diagonal.
+    """
+    links, coms = arm.links.copy(), arm.coms.copy()
+    own = np.eye(arm.n) if arm.coupling is None else arm.coupling
+    for j, zero in enumerate(own @ offset):
+        if zero:
+            links[j] = links[j] @ _about_z(zero)
+        if sign[j] < 0:
+            links[j] = links[j] @ _HALF_TURN
+            links[j + 1] = _HALF_TURN @ links[j + 1]
+            coms[j] = _HALF_TURN[:3, :3] @ coms[j]
+    # θ = C (S q + o + K q), and S θ is what turns the links.
+    follows = sign[:, None] * (own @ (np.diag(sign) + coupling))
+    one = np.array_equal(follows, np.eye(arm.n))
+    return replace(arm, links=links, coms=coms, coupling=None if one else follows)
+
+
+def _about_z(angle: float) -> Floats:
+    c, s = math.cos(angle), math.sin(angle)
+    turn = np.eye(4)
+    turn[:2, :2] = [[c, -s], [s, c]]
+    return turn
