@@ -35,7 +35,8 @@ def arrival_covariance(nominal: NominalModel, config: CellConfig, predicted: Pre
     if count == 1:
         return single
     o = predicted.observation
-    jac = joint_jacobian(predicted.situation.chain, o.base_position)
+    s = predicted.situation
+    jac = command_jacobian(s.cell.arm, s.chain, o.base_position)
     joint_std = config.repeatability.per_joint(nominal.cell.arm.n)
     factor = scatter_factor(jac, joint_std, o.axes, m).reshape(-1, count * m, jac.shape[2])
     out = (factor @ np.swapaxes(factor, 1, 2)).reshape(-1, count, m, count, m)
