@@ -42,7 +42,7 @@ def read_table(path: str | Path, cell: Cell, mapping: str | Path | None = None) 
         cell: the cell that it was measured in; its tracker gives the covariances where the table
             has none, and its [repeatability] is added where the table's do not include it.
         mapping: what `hilcal import --format` takes: the path of a mapping file
-            or the name of a format.
+            (docs/how-to/import-a-table.md), or the name of a format.
 
     Raises:
         InputError: anything that cannot be right, with row and column.

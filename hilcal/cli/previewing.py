@@ -38,10 +38,9 @@ def show_preview(
     if settings is not None and config is not None:
         arm = cell_from_config(settings, config.absolute().parent).arm
     found = propose(table, second, None if arm is None else arm.n)
-    if arm is not None:
-        _decide_convention(found, arm)
-    proposal = found.proposal
-    outcome = None if settings is None or arm is None else _try(table, found, settings, arm)
+    proposal, outcome = found.proposal, None
+    if arm is not None and settings is not None:
+        outcome = [*_decide_convention(found, arm), *_try(table, found, settings, arm)]
     t.show(preview(proposal, len(found.grid.rows), table.name))
     if outcome:
         t.show(text.heading("with this mapping:"))
@@ -81,19 +80,19 @@ def _relative_second(found: Proposed, output: Path) -> None:
         section["path"] = str(Path(section["path"]).relative_to(here))
 
 
-def _decide_convention(found: Proposed, arm: Arm) -> None:
-    """Settle a guessed convention by the nominal arm, or say what the arm leaves open."""
+def _decide_convention(found: Proposed, arm: Arm) -> list[str]:
+    """Settle a guessed convention by the nominal arm; a sentence that says so, where it does."""
     proposal, grid = found.proposal, found.grid
     sections = [proposal.sections.get(name) for name in ("joints", "position", "orientation")]
     joints, position, section = sections
     if joints is None or position is None or section is None or section["convention"] == "matrix":
-        return
+        return []
     blocks = [
         np.stack([grid.numbers(name) for name in s["columns"]], axis=1)
         for s in (joints, position, section)
     ]
     if blocks[0].shape[1] != arm.n:
-        return
+        return []
     whole = np.isfinite(np.hstack(blocks)).all(axis=1)
     q, y, numbers = (block[whole] for block in blocks)
     unit = ANGLES[section.get("unit", "rad")]
@@ -101,7 +100,7 @@ def _decide_convention(found: Proposed, arm: Arm) -> None:
         arm, ANGLES[joints["unit"]] * q, LENGTHS[position["unit"]] * y, numbers, unit
     )
     if choice is None:
-        return
+        return []
     guess = ("orientation", GUESSED)
     proposal.unsure[:] = [doubt for doubt in proposal.unsure if doubt != guess]
     best, second = choice.ranked[:2]
@@ -111,21 +110,23 @@ def _decide_convention(found: Proposed, arm: Arm) -> None:
             f"{second.convention} {_left(second)}"
         )
         proposal.unsure.append(("orientation", words))
-        return
+        return []
     if not _same(section["convention"], choice.decided, numbers, unit):
         section["convention"] = choice.decided
-    what = (
-        f"{section['convention']}, {section.get('unit', '')}: {arm.name} agrees to {_left(best)}, "
-        f"next {_left(second)}"
-    )
+    proposal.open_convention = False
     for k, u in enumerate(proposal.understood):
         if u.what == "orientation":
-            proposal.understood[k] = Understood(u.what, u.columns, what, u.example)
-    proposal.open_convention = False
+            meaning = ", ".join(str(v) for key, v in section.items() if key != "columns")
+            proposal.understood[k] = Understood(u.what, u.columns, meaning, u.example)
+    return [
+        f"orientation: {section['convention']}, as {arm.name} tells: {_left(best)} are left, with "
+        f"the next convention {_left(second)}"
+    ]
 
 
 def _left(fit: Fit) -> str:
-    return f"{np.rad2deg(fit.angle):.2g}° and {1e3 * fit.position:.2g} mm"
+    angle, distance = float(np.rad2deg(fit.angle)), 1e3 * fit.position
+    return f"{angle:.{0 if angle >= 10 else 2}f}° and {distance:.{0 if distance >= 10 else 2}f} mm"
 
 
 def _same(one: str, other: str, numbers: np.ndarray, unit: float) -> bool:

@@ -45,6 +45,7 @@ MEASURED = {
 JOINT = {
     "q", "j", "jt", "jnt", "joint", "joints", "axis", "axes", "achse", "achsen", "gelenk", "axe",
     "articulation", "eje", "articulacion", "a", "ax", "rax", "theta", "th", "giunto", "qa",
+    "achswinkel", "gelenkwinkel", "jointangle", "jointposition", "axisangle",
 }  # fmt: skip
 """Words of joint angles; with a number each."""
 NO_ANGLE = {
@@ -125,7 +126,9 @@ def parse(name: str, unit_cell: str = "") -> ColumnName:
             numbers.append(int(digits))
         if not letters:
             continue
-        if letters in ("x", "y", "z"):
+        if letters.endswith(("temperatur", "temperature")) and letters not in TEMPERATURE:
+            words += [letters[: letters.index("temp")], "temperature"]
+        elif letters in ("x", "y", "z"):
             axis = letters
         elif letters[-1] in "wxyz" and letters[:-1] in _PREFIXES:
             axis = letters[-1]

@@ -2,6 +2,7 @@
 
 import re
 import sys
+import tomllib
 from pathlib import Path
 from types import ModuleType
 
@@ -14,6 +15,7 @@ from hilcal.data.covariance import WHOLE
 from hilcal.data.table import write_table
 from hilcal.robot.catalogue import configs_dir
 from studies.random_campaigns import rehearse
+from tests.support.cli_cases import ok
 from tests.support.paths import ROOT
 
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -66,6 +68,24 @@ def test_the_guide_to_the_library_runs_as_it_stands(
     assert Path("plan.json").is_file()
     with hc.Campaign.open("run.hilcal") as run:
         assert "creep" in run.fit().model.names
+
+
+def test_the_guide_to_imports_is_what_the_commands_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    guide = ROOT / "docs" / "how-to" / "import-a-table.md"
+    monkeypatch.chdir(tmp_path)
+    Path("CELL.toml").write_bytes((configs_dir() / "cells" / "demo_ur10e.toml").read_bytes())
+    for name, text in zip(("tracker.csv", "robot.csv"), blocks(guide, "csv"), strict=True):
+        Path(name).write_text(text, encoding="utf-8")
+    commands = [text.split()[1:] for text in blocks(guide, "console")]
+    for command in commands:
+        ok(capsys, *command)
+    (proposed,) = blocks(guide, "toml")
+    assert tomllib.loads(Path("mapping.toml").read_text()) == tomllib.loads(proposed)
+    cell = hc.Cell.load("CELL.toml")
+    readings = hc.read_table("tracker.csv", cell, "mapping.toml")
+    assert (len(readings), readings.m, readings.load_names) == (8, 6, ("none", "5 kg"))
 
 
 def test_the_first_example_of_the_library_is_short() -> None:
