@@ -1,0 +1,332 @@
+"""`hilcal import` of tables as people have them: one line for whatever is wrong."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hilcal.cli import main
+from hilcal.data.campaign_file import CampaignFile
+from tests.support.cli_cases import ok, refused
+from tests.support.foreign_tables import CELL, campaign, lines, write
+
+Capsys = pytest.CaptureFixture[str]
+C = campaign(12)
+NAMES = [f"A{k}" for k in range(1, 7)]
+HEADER = ["Point", *NAMES, "X", "Y", "Z", "sX", "sY", "sZ", "T", "M"]
+GOOD = lines(
+    HEADER, [f"P{k}" for k in range(12)], np.rad2deg(C.q), 1e3 * C.position,
+    np.full((12, 3), 0.02), np.full(12, 20.5), np.where(np.arange(12) % 2, 0.0, 5.0),
+)  # fmt: skip
+MAPPING = """
+[file]
+separator = ";"
+[position]
+columns = ["X", "Y", "Z"]
+unit = "mm"
+[joints]
+columns = ["A1", "A2", "A3", "A4", "A5", "A6"]
+unit = "deg"
+[pose]
+column = "Point"
+[std]
+columns = ["sX", "sY", "sZ"]
+unit = "mm"
+[air]
+column = "T"
+[hung_mass]
+column = "M"
+"""
+
+
+def cell(row: int, column: str, value: str) -> Callable[[str], str]:
+    """The text with one cell changed; rows as an editor counts them."""
+
+    def change(text: str) -> str:
+        rows = [line.split(";") for line in text.splitlines()]
+        rows[row - 1][HEADER.index(column)] = value
+        return "\n".join(";".join(r) for r in rows) + "\n"
+
+    return change
+
+
+def scaled(column: str, factor: float) -> Callable[[str], str]:
+    def change(text: str) -> str:
+        rows = [line.split(";") for line in text.splitlines()]
+        k = HEADER.index(column)
+        for r in rows[1:]:
+            r[k] = f"{factor * float(r[k]):.9g}"
+        return "\n".join(";".join(r) for r in rows) + "\n"
+
+    return change
+
+
+def all_of(*changes: Callable[[str], str]) -> Callable[[str], str]:
+    def change(text: str) -> str:
+        for one in changes:
+            text = one(text)
+        return text
+
+    return change
+
+
+def same(text: str) -> str:
+    return text
+
+
+def swap(old: str, new: str) -> Callable[[str], str]:
+    return lambda text: text.replace(old, new)
+
+
+STD = ("sX", "sY", "sZ")
+BAD: dict[str, tuple[Callable[[str], str], Callable[[str], str], tuple[str, ...]]] = {
+    "text for a number": (
+        cell(4, "X", "abc"), same, ("row 4", "column 'X'", "'abc' is not a number", "missing"),
+    ),
+    "a comma as decimal mark": (
+        cell(4, "A2", "1,5"), same, ("row 4", "column 'A2'", "with '.' as decimal mark"),
+    ),
+    "infinite": (cell(4, "X", "inf"), same, ("row 4", "column 'X'", "not a number")),
+    "a row that is too long": (swap("P3;", "P3;;;"), same, ("row 5 has 17 cells", "skip_rows")),
+    "a row that is too short": (swap("P3;", ""), same, ("row 5 has 14 cells", "15")),
+    "no such column": (same, swap('"A6"', '"A7"'), ("no column 'A7'", "Point")),
+    "a column beyond the last": (same, swap('"A6"', "77"), ("column 77", "there are 15")),
+    "joints in radians": (
+        same, swap('"A6"]\nunit = "deg"', '"A6"]\nunit = "rad"'),
+        ("row 2", "column 'A1'", "looks like degrees"),
+    ),
+    "positions in metres": (
+        same, swap('"Z"]\nunit = "mm"', '"Z"]\nunit = "m"'),
+        ("row 2", "column 'X'", "looks like millimetres"),
+    ),
+    "unknown unit": (same, swap('unit = "deg"', 'unit = "grad"'), ("[joints] unit", '"deg"')),
+    "unknown section": (same, swap("[air]", "[aire]"), ("aire", 'did you mean "air"')),
+    "unknown key": (same, swap('column = "T"', 'colum = "T"'), ("[air]", "colum", "column")),
+    "no position": (
+        same, lambda t: t.replace('[position]\ncolumns = ["X", "Y", "Z"]\nunit = "mm"\n', ""),
+        ("lacks", "position"),
+    ),
+    "five joints": (same, swap(', "A6"]', "]"), ("5 columns of joints", "has 6 joints")),
+    "negative standard deviation": (
+        cell(3, "sY", "-0.02"), same, ("row 3", "column 'sY'", "0 or more"),
+    ),
+    "no standard deviation": (cell(3, "sY", ""), same, ("row 3", "column 'sY'", "no value")),
+    "absurd precision": (
+        all_of(*(scaled(c, 1e-12) for c in STD)), same, ("row 2", "no instrument reaches"),
+    ),
+    "millimetres as metres": (
+        same, swap('"sZ"]\nunit = "mm"', '"sZ"]\nunit = "m"'),
+        ("row 2", "standard deviation of 0.02 m"),
+    ),
+    "larger than the workspace": (
+        all_of(*(scaled(c, 1e5) for c in STD)), same, ("row 2", "standard deviation of 2 m"),
+    ),
+    "a negative mass": (cell(3, "M", "-5"), same, ("row 3", "column 'M'", "0 or more")),
+    "kelvin": (scaled("T", 14.3), same, ("row 2", "column 'T'", "°C")),
+    "two poses of one name": (
+        swap("P3;", "P2;"), same, ("row 5", "pose 'P2'", "give another pose another name"),
+    ),
+    "no header there": (same, swap('separator = ";"', 'separator = ";"\nheader_row = 99'), ("99",)),
+    "another separator": (same, swap('";"', '"tab"'), ("no column", "Point;A1")),
+    "same marks": (same, swap('";"', '","\ndecimal = ","'), ("separator and decimal",)),
+    "a sheet of text": (same, swap('";"', '";"\nsheet = "a"'), ("sheet",)),
+    "both forces": (
+        same, lambda t: t + '[wrench]\ncolumns = ["X", "Y", "Z"]\n', ("[wrench]", "[hung_mass]"),
+    ),
+    "time": (same, lambda t: t + '[time]\ncolumn = "Point"\nunit = "iso"\n', ("row 2", "'P0'")),
+    "most rows lack a value": (swap("20.500000", ""), same, ("column 'T'", "12 of 12")),
+    "quaternion": (
+        same, lambda t: t + '[orientation]\ncolumns = ["A1", "A2", "A3", "A4"]\n'
+        'convention = "abb"\n', ("row 2", "quaternion of length 1"),
+    ),
+    "unknown convention": (
+        same, lambda t: t + '[orientation]\ncolumns = ["A1", "A2", "A3"]\n'
+        'convention = "kuka-abc"\n', ('did you mean "kuka"', "intrinsic-zyx"),
+    ),
+    "a second file that is not given": (
+        same, lambda t: t + "[second_file]\n", ("[second_file] without path", "--second"),
+    ),
+    "no readings": (lambda t: t.splitlines()[0] + "\n", same, ("no readings below row 1",)),
+    "empty": (lambda t: "", same, ("the file is empty",)),
+    "quotes": (cell(3, "T", '"x'), same, ("not delimited text",)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_what_is_wrong_is_one_line(case: str, tmp_path: Path, capsys: Capsys) -> None:
+    change, remap, named = BAD[case]
+    table = write(tmp_path / "t.csv", change(GOOD))
+    mapping = write(tmp_path / "m.toml", remap(MAPPING))
+    out = tmp_path / "run.hilcal"
+    line = refused(capsys, 2, "import", table, "--config", CELL, "--format", mapping, "-o", out)
+    assert "t.csv" in line or "m.toml" in line
+    assert all(part in line for part in named), line
+    assert not out.exists()
+
+
+def imported(
+    capsys: Capsys, tmp_path: Path, text: str | bytes, mapping: str = MAPPING, name: str = "t.csv"
+) -> dict[str, Any]:
+    path = tmp_path / name
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    out = tmp_path / "run.hilcal"
+    out.unlink(missing_ok=True)
+    given = write(tmp_path / "m.toml", mapping)
+    arguments = ("import", path, "--config", CELL, "--format", given, "-o", out, "--json")
+    return ok(capsys, *arguments).document
+
+
+def values(tmp_path: Path) -> Any:
+    with CampaignFile.open(tmp_path / "run.hilcal") as file:
+        return file.readings()
+
+
+def test_a_good_table(tmp_path: Path, capsys: Capsys) -> None:
+    d = imported(capsys, tmp_path, GOOD)
+    assert (d["n_readings"], d["n_poses"], set(d["loads"])) == (12, 12, {"none", "5kg"})
+    x = values(tmp_path)
+    np.testing.assert_allclose(x.value, C.position, atol=1e-8)
+    np.testing.assert_allclose(x.states.wrench[0], [0, 0, -5 * 9.80665, 0, 0, 0])
+    np.testing.assert_allclose(x.covariance[0], (2e-5) ** 2 * np.eye(3), rtol=1e-9, atol=1e-18)
+
+
+def test_the_same_table_with_all_that_is_in_the_wild(tmp_path: Path, capsys: Capsys) -> None:
+    imported(capsys, tmp_path, GOOD)
+    plain = values(tmp_path)
+    head, *rows = GOOD.splitlines()
+    wild = f"{head};;\r\n;deg;deg;deg;deg;deg;deg;mm;mm;mm;mm;mm;mm;C;kg;;\n\n"
+    wild += "".join(f"{row};;\r\n" for row in rows) + "\r\n\r\n"
+    wild = wild.replace(";0.000000;;\r", ";-;;\r").replace(";5.000000;;\r", ";5;;\r")
+    mapping = MAPPING.replace('";"', '";"\nunits_row = 2')
+    imported(capsys, tmp_path, b"\xef\xbb\xbf" + wild.encode(), mapping)
+    np.testing.assert_array_equal(values(tmp_path).value, plain.value)
+    np.testing.assert_array_equal(values(tmp_path).states.wrench, plain.states.wrench)
+
+
+def test_rows_without_a_value_are_left_out_and_counted(tmp_path: Path, capsys: Capsys) -> None:
+    text = cell(4, "X", "-9999")(cell(6, "Z", "n/a")(GOOD))
+    mapping = MAPPING.replace('";"', '";"\nmissing = [-9999]')
+    d = imported(capsys, tmp_path, text, mapping)
+    assert d["n_readings"] == 10
+    assert d["notes"][0] == "2 of 12 rows left out (4, 6): no value in X, Z"
+
+
+def test_zero_standard_deviations_are_the_instruments(tmp_path: Path, capsys: Capsys) -> None:
+    text = GOOD
+    for c in STD:
+        text = cell(3, c, "0.000")(cell(7, c, "1e-9")(text))
+    d = imported(capsys, tmp_path, text)
+    assert any("2 of 12 rows state a standard deviation of zero" in n for n in d["notes"])
+    x = values(tmp_path)
+    assert np.sqrt(x.covariance[1].diagonal()).min() > 5e-6
+
+
+def test_rounded_values_are_not_believed_to_the_micrometre(tmp_path: Path, capsys: Capsys) -> None:
+    rounded = lines(
+        HEADER, [f"P{k}" for k in range(12)], np.rad2deg(C.q), np.round(1e3 * C.position, 1),
+        np.full((12, 3), 0.001), np.full(12, 20.5), np.zeros(12),
+    )  # fmt: skip
+    d = imported(capsys, tmp_path, rounded)
+    assert any("positions are rounded to 0.1 mm" in n and "28.9 µm" in n for n in d["notes"])
+    expected = 1e-12 + 1e-8 / 12
+    np.testing.assert_allclose(values(tmp_path).covariance[0].diagonal(), expected, rtol=1e-6)
+
+
+def test_rounded_joints_are_said(tmp_path: Path, capsys: Capsys) -> None:
+    text = lines(
+        HEADER, [f"P{k}" for k in range(12)], np.round(np.rad2deg(C.q), 1), 1e3 * C.position,
+        np.full((12, 3), 0.02), np.full(12, 20.5), np.zeros(12),
+    )  # fmt: skip
+    d = imported(capsys, tmp_path, text)
+    assert any("joint angles are rounded to 0.1 deg" in n for n in d["notes"])
+
+
+def test_variances_that_look_like_standard_deviations(tmp_path: Path, capsys: Capsys) -> None:
+    mapping = MAPPING.replace('"sZ"]', '"sZ"]\nkind = "variance"')
+    d = imported(capsys, tmp_path, GOOD, mapping)
+    assert any("read as standard deviations the figures would be 20 µm" in n for n in d["notes"])
+
+
+def test_expanded_uncertainty_of_a_point(tmp_path: Path, capsys: Capsys) -> None:
+    std = '[std]\nvalues = [0.06]\nunit = "mm"\nkind = "expanded"\nk = 3\nof = "point"\n'
+    mapping = MAPPING.replace('[std]\ncolumns = ["sX", "sY", "sZ"]\nunit = "mm"\n', std)
+    imported(capsys, tmp_path, GOOD, mapping)
+    expected = (2e-5) ** 2 / 3 * np.eye(3)
+    np.testing.assert_allclose(values(tmp_path).covariance[5], expected, rtol=1e-9, atol=1e-20)
+
+
+def test_a_table_of_another_form_says_what_to_do(tmp_path: Path, capsys: Capsys) -> None:
+    path = write(tmp_path / "t.csv", GOOD)
+    line = refused(capsys, 2, "import", path, "--config", CELL, "-o", tmp_path / "x.hilcal")
+    assert "--preview" in line
+    line = refused(capsys, 2, "import", path)
+    assert "--config CELL.toml is missing" in line
+    line = refused(capsys, 2, "import", path, "--preview", "-o", tmp_path / "run.hilcal")
+    assert "mapping.toml" in line
+    both = ("--preview", "--format", "polyworks")
+    assert "--format" in refused(capsys, 2, "import", path, *both)
+
+
+def test_the_preview_writes_nothing_unless_asked(tmp_path: Path, capsys: Capsys) -> None:
+    path = write(tmp_path / "t.csv", GOOD)
+    d = ok(capsys, "import", path, "--preview", "--json").document
+    assert list(tmp_path.iterdir()) == [path]
+    assert d["mapping"]["position"] == {"columns": ["X", "Y", "Z"], "unit": "mm"}
+    mapping = tmp_path / "m.toml"
+    words = ok(capsys, "import", path, "--preview", "--config", CELL, "-o", mapping).out
+    assert "12 readings of 12 poses" in words
+    out = tmp_path / "run.hilcal"
+    ok(capsys, "import", path, "--config", CELL, "--format", mapping, "-o", out)
+    assert "exists" in refused(capsys, 2, "import", path, "--preview", "-o", mapping)
+
+
+def test_words_fit_eighty_columns(
+    tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write(tmp_path / "t.csv", GOOD)
+    monkeypatch.setattr("hilcal.cli.terminal.WIDTH", 80)
+    words = ok(capsys, "import", path, "--preview", "--config", CELL).out
+    assert max(map(len, words.splitlines())) <= 80
+
+
+@pytest.mark.parametrize("name", ["spatial-analyzer", "spatial-analyzer-points", "polyworks",
+                                  "tracker-pilot"])  # fmt: skip
+def test_shipped_mappings(name: str, tmp_path: Path, capsys: Capsys) -> None:
+    points = [f"P{k}" for k in range(12)]
+    p = 1e3 * C.position
+    text = {
+        "spatial-analyzer": lines(None, points, p, C.angles("xyz"), separator=","),
+        "spatial-analyzer-points": "// SA\n"
+        + lines(None, ["A"] * 12, ["Main"] * 12, points, p, separator=","),
+        "polyworks": lines(None, points, p, separator=" "),
+        "tracker-pilot": lines(
+            ["Name", "X", "Y", "Z", "StdDev X", "StdDev Y", "StdDev Z", "Timestamp"],
+            points, p, np.full((12, 3), 0.004), [f"2024-05-31T12:00:{k:02}" for k in range(12)],
+        ),
+    }[name]  # fmt: skip
+    table = write(tmp_path / "t.csv", text)
+    # the controller's log: as the mapping says, in another order where rows are matched by name
+    order = np.arange(12)[::-1] if name == "spatial-analyzer-points" else np.arange(12)
+    head = ["Target", *[f"J{k}" for k in range(1, 7)]]
+    separator = {"tracker-pilot": ","}.get(name, ",")
+    log = lines(head, [points[k] for k in order], np.rad2deg(C.q)[order], separator=separator)
+    second = write(tmp_path / "j.csv", log)
+    out = tmp_path / "run.hilcal"
+    d = ok(
+        capsys, "import", table, "--second", second, "--config", CELL, "--format", name, "-o", out,
+        "--json",
+    ).document  # fmt: skip
+    assert d["n_readings"] == 12
+    x = values(tmp_path)
+    np.testing.assert_allclose(x.states.q, C.q, atol=1e-7)
+    np.testing.assert_allclose(x.value[:, :3], C.position, atol=1e-8)
+
+
+def test_the_document_is_json_only(tmp_path: Path, capsys: Capsys) -> None:
+    path = write(tmp_path / "t.csv", GOOD)
+    with pytest.raises(SystemExit):
+        main(["import", str(path), "--preview", "--json"])
+    assert json.loads(capsys.readouterr().out)["missing"] == []
