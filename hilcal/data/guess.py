@@ -1,6 +1,7 @@
 """What the columns of a table hold, guessed from their names and values."""
 
 from collections.abc import Callable, Iterable, Sequence
+from datetime import datetime
 
 import numpy as np
 
@@ -478,7 +479,8 @@ def _is_name(g: Guesser, name: str) -> bool:
 
 def _whole(g: Guesser, name: str) -> bool:
     values = g.block([name])[:, 0]
-    return bool(np.all(values == np.rint(values)))
+    known = values[np.isfinite(values)]
+    return bool(np.all(known == np.rint(known)))
 
 
 def _few(g: Guesser, name: str) -> bool:
@@ -502,7 +504,9 @@ def _one_pose_each(g: Guesser, name: str, joints: list[str]) -> bool:
 def _scalars(g: Guesser) -> None:
     """Times and the temperature of the air."""
     for c in list(g.free.values()):
-        if "time" not in g.proposal.sections and c.has(words.TIME) and not c.axis:
+        dated = all(isinstance(cell, datetime) for cell in g.grid.cells(c.name))
+        timed = dated or (c.has(words.TIME) and not c.axis)
+        if "time" not in g.proposal.sections and timed:
             found = time_unit(g.grid, c.name, c.unit, g.values[c.name])
             if found is not None:
                 section, doubt = found

@@ -1,0 +1,183 @@
+"""Spreadsheets, MAT and Parquet files hold the same readings as text; others are refused."""
+
+import io
+import pickle
+import sys
+import zipfile
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import openpyxl
+import pyarrow
+import pytest
+from pyarrow import parquet
+from scipy.io import savemat
+
+from hilcal.data.covariance import TrackerNoise
+from hilcal.data.mapped import import_mapped
+from hilcal.data.mapping import FileFormat, Mapping
+from hilcal.data.propose import propose
+from hilcal.data.readings import Readings
+from hilcal.data.sheets import open_grid
+from hilcal.errors import InputError
+from hilcal.robot.arm import Arm
+from hilcal.robot.catalogue import load_arm
+from hilcal.toml import check_section
+from tests.support.foreign_tables import campaign
+
+C = campaign(12)
+NOISE = TrackerNoise(10e-6, 0.3e-6, 15e-6, 6e-6, 1e-4)
+NAMES = [f"A{k}" for k in range(1, 7)]
+START = datetime(2024, 5, 31, 23, 59)
+
+
+@pytest.fixture(scope="module")
+def arm() -> Arm:
+    return load_arm("ur10e")
+
+
+def section(**more: Any) -> Mapping:
+    basic = {
+        "position": {"columns": ["X", "Y", "Z"], "unit": "mm"},
+        "joints": {"columns": NAMES, "unit": "deg"},
+    }
+    return check_section(basic | more, Mapping, "m.toml")
+
+
+def read(path: Path, mapping: Mapping, arm: Arm) -> Readings:
+    return import_mapped(path, mapping, arm, NOISE).readings
+
+
+def book(path: Path) -> None:
+    out = openpyxl.Workbook()
+    notes = out.active
+    assert notes is not None
+    notes.title = "Notes"
+    notes["A1"] = "nothing here"
+    sheet = out.create_sheet("Data")
+    sheet.append(["Measured on a Friday"])
+    sheet.append([])
+    sheet.append(["When", *NAMES, "X", "Y", "Z", "Load"])
+    for k in range(12):
+        sheet.append(
+            [
+                START + timedelta(seconds=30 * k),
+                *np.rad2deg(C.q[k]).tolist(),
+                *(1e3 * C.position[k]).tolist(),
+                "none" if k % 2 else 5,
+            ]
+        )
+    out.save(path)
+
+
+def test_a_spreadsheet(tmp_path: Path, arm: Arm) -> None:
+    path = tmp_path / "t.xlsx"
+    book(path)
+    found = propose(path).proposal.mapping()
+    assert (found.file.sheet, found.file.header_row) == ("Data", 3)
+    x = read(path, found, arm)
+    np.testing.assert_allclose(x.states.q, C.q, atol=1e-12)
+    np.testing.assert_allclose(x.value, C.position, atol=1e-12)
+    assert x.states.time is not None
+    np.testing.assert_allclose(x.states.time, 30 * np.arange(12))
+    assert x.load_names == ("5", "none")
+    with pytest.raises(InputError, match=r"no sheet 'Date' \(did you mean \"Data\"\?\); it has"):
+        open_grid(path, FileFormat(sheet="Date"))
+
+
+def test_a_formula_without_a_stored_value_is_no_number(tmp_path: Path, arm: Arm) -> None:
+    path = tmp_path / "t.xlsx"
+    book(path)
+    edited = openpyxl.load_workbook(path)
+    edited["Data"]["B5"] = "=1+1"
+    edited.save(path)
+    mapping = section(file={"sheet": "Data", "header_row": 3})
+    result = import_mapped(path, mapping, arm, NOISE)
+    assert result.notes[0] == "1 of 12 rows left out (5): no value in A1"
+
+
+def test_a_mat_file(tmp_path: Path, arm: Arm) -> None:
+    path = tmp_path / "t.mat"
+    t = np.zeros((4, 4, 12))
+    t[:3, :3], t[:3, 3], t[3, 3] = np.moveaxis(C.attitude.as_matrix(), 0, 2), C.position.T, 1
+    savemat(path, {"q": C.q, "run": {"p": 1e3 * C.position, "who": "me"}, "T": t, "n": 12.0})
+    grid = open_grid(path, FileFormat())
+    assert {"q(1)", "run.p(3)", "T(1,4)"} <= set(grid.names)
+    mapping = check_section(
+        {
+            "position": {"columns": ["run.p(1)", "run.p(2)", "run.p(3)"], "unit": "mm"},
+            "joints": {"columns": [f"q({k})" for k in range(1, 7)], "unit": "rad"},
+            "orientation": {
+                "columns": [f"T({i},{j})" for i in (1, 2, 3) for j in (1, 2, 3)],
+                "convention": "matrix",
+            },
+        },
+        Mapping,
+        "m.toml",
+    )
+    x = read(path, mapping, arm)
+    np.testing.assert_allclose(x.states.q, C.q)
+    np.testing.assert_allclose(x.value[:, :3], C.position)
+    np.testing.assert_allclose(x.value[:, 3:], C.attitude.as_rotvec(), atol=1e-9)
+    with pytest.raises(InputError, match="no variable 'Q'"):
+        open_grid(path, FileFormat(variable="Q"))
+
+
+def test_parquet(tmp_path: Path, arm: Arm) -> None:
+    path = tmp_path / "t.parquet"
+    columns: dict[str, Any] = {n: np.rad2deg(C.q[:, k]) for k, n in enumerate(NAMES)}
+    columns |= {n: 1e3 * C.position[:, k] for k, n in enumerate("XYZ")}
+    columns["pose"] = [f"P{k}" for k in range(12)]
+    columns["raw"] = [[1.0, 2.0]] * 12
+    parquet.write_table(pyarrow.table(columns), path)
+    found = propose(path).proposal.mapping()
+    assert found == section(pose={"column": "pose"})
+    np.testing.assert_allclose(read(path, found, arm).value, C.position)
+
+
+@pytest.mark.parametrize("name", ["openpyxl", "pyarrow.parquet"])
+def test_a_missing_package_is_named(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "t"
+    if name == "openpyxl":
+        book(path)
+    else:
+        parquet.write_table(pyarrow.table({"X": [1.0]}), path)
+    monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(InputError, match=r"needs the package \w+: pip install hilcal\[tables\]"):
+        open_grid(path, FileFormat())
+
+
+def _zip(**members: bytes) -> bytes:
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    return out.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"\x89HDF\r\n\x1a\n and so on", r"HDF5 file \(MATLAB's -v7.3\); save it with -v7"),
+        (pickle.dumps([1, 2]), "pickle, which is never loaded"),
+        (b"\xd0\xcf\x11\xe0 and so on", r"old Excel file"),
+        (_zip(a=b"1"), "a zip archive that is no XLSX"),
+        (b"PK\x03\x04 cut", "damaged"),
+        (b"PAR1 cut", "damaged"),
+        (b"MATLAB 5.0 MAT-file cut", "t.bin"),
+        (b"\x1f\x8b\x08", "gzip"),
+        (b"a\x00b", "binary data"),
+        (b"", "empty"),
+    ],
+)
+def test_what_is_no_table(content: bytes, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "t.bin"
+    path.write_bytes(content)
+    for attempt in (lambda: open_grid(path, FileFormat()), lambda: propose(path)):
+        with pytest.raises(InputError, match=message) as error:
+            attempt()
+        assert "\n" not in str(error.value)
