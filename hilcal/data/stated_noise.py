@@ -78,12 +78,13 @@ def floored(
 
 def _meant(usual: float) -> str:
     low, high = _PLAUSIBLE
+    looks = []
     if low <= np.sqrt(usual) <= high:
-        return "; looks like variances given as standard deviations"
+        looks.append("variances given as standard deviations")
     if low <= 1e3 * usual <= high:
-        return "; looks like a unit that is 1000 times too small"
-    if low <= usual**0.25 <= high:
-        return "; looks like squares of variances"
+        looks.append("a unit that is 1000 times too small")
+    if looks:
+        return f"; looks like {' or '.join(looks)}"
     return "; expected the standard deviations, or the covariance in m², of each reading"
 
 

@@ -1,0 +1,113 @@
+"""Stated uncertainties that cannot be right are refused, raised, or doubted in words."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilcal.data.covariance import TrackerNoise, tracker_covariance
+from hilcal.data.imported import ImportResult
+from hilcal.data.readings import Readings
+from hilcal.data.stated_noise import rounding_variance, step
+from hilcal.data.table import import_table, write_table
+from hilcal.errors import InputError
+from tests.support.readings_cases import make_arm, simple
+
+ARM = make_arm()
+NOISE = TrackerNoise(10e-6, 0.3e-6, 15e-6, 6e-6, 1e-4)
+
+
+def through_a_table(
+    tmp_path: Path, x: Readings, noise: TrackerNoise | None = NOISE
+) -> ImportResult:
+    write_table(x, tmp_path / "t.csv")
+    return import_table(tmp_path / "t.csv", ARM, noise)
+
+
+def with_variances(x: Readings, row: int, *variances: float) -> Readings:
+    cov = x.covariance.copy()
+    cov[row] = np.diag(variances)
+    return replace(x, covariance=cov)
+
+
+@pytest.mark.parametrize("tiny", [0.0, 1e-30, 1e-15])
+def test_one_variance_of_zero_is_the_instruments(tmp_path: Path, tiny: float) -> None:
+    x = with_variances(simple(20), 4, 1e-10, tiny, 1e-10)
+    result = through_a_table(tmp_path, x)
+    cov = result.readings.covariance
+    spec = tracker_covariance(x.value, NOISE)
+    assert cov[4, 1, 1] == spec[4, 1, 1]
+    np.testing.assert_array_equal(cov[4, [0, 2], [0, 2]], 1e-10)
+    np.testing.assert_array_equal(np.delete(cov, 4, axis=0), np.delete(x.covariance, 4, axis=0))
+    assert "1 of 20 rows state a standard deviation of zero" in result.notes[1]
+    assert "the first is row 6" in result.notes[1]
+    with pytest.raises(InputError, match=r"row 6: a stated variance is .*more than 0"):
+        through_a_table(tmp_path, x, None)
+
+
+def test_angles_have_a_floor_of_their_own(tmp_path: Path) -> None:
+    x = with_variances(simple(20, m=6), 4, 1e-10, 1e-10, 1e-10, 1e-8, 0.0, 1e-8)
+    assert through_a_table(tmp_path, x).readings.covariance[4, 4, 4] == NOISE.orientation_std**2
+
+
+@pytest.mark.parametrize(
+    ("sigma", "looks"),
+    [
+        (1e-15, "expected the standard deviations"),
+        (1e-10, "variances given as standard deviations"),
+        (2e-8, "1000 times too small"),
+    ],
+)
+def test_precision_that_nothing_has_is_refused(tmp_path: Path, sigma: float, looks: str) -> None:
+    x = simple(20)
+    cov = np.tile(sigma**2 * np.eye(3), (20, 1, 1))
+    with pytest.raises(InputError, match="no instrument reaches") as error:
+        through_a_table(tmp_path, replace(x, covariance=cov))
+    assert looks in str(error.value)
+    assert "t.csv: row 2" in str(error.value)
+
+
+@pytest.mark.parametrize(("m", "sigma", "unit"), [(3, 5e-3, "m"), (3, 40.0, "m"), (6, 0.1, "rad")])
+def test_noise_that_calibrates_nothing_is_refused(
+    tmp_path: Path, m: int, sigma: float, unit: str
+) -> None:
+    x = simple(20, m=m)
+    cov = x.covariance.copy()
+    cov[:, -1, -1] = sigma**2
+    with pytest.raises(InputError, match=rf"row 2: a standard deviation of {sigma:g} {unit}"):
+        through_a_table(tmp_path, replace(x, covariance=cov))
+
+
+def test_rounding_is_found_and_added(tmp_path: Path) -> None:
+    x = simple(20)
+    fine = through_a_table(tmp_path, x)
+    np.testing.assert_array_equal(fine.readings.covariance, x.covariance)
+    assert len(fine.notes) == 1
+    rounded = replace(x, value=np.round(x.value, 4), covariance=1e-3 * x.covariance)
+    result = through_a_table(tmp_path, rounded)
+    expected = rounded.covariance + 1e-8 / 12 * np.eye(3)
+    np.testing.assert_allclose(result.readings.covariance, expected, rtol=1e-12)
+    assert "rounded to 0.1 mm" in result.notes[1]
+    coarse = replace(rounded, covariance=np.tile(1e-6 * np.eye(3), (20, 1, 1)))
+    assert len(through_a_table(tmp_path, coarse).notes) == 1  # it does not count beside 1 mm
+
+
+def test_the_step_of_values() -> None:
+    rng = np.random.default_rng(0)
+    values = rng.uniform(-2000, 2000, 50)
+    assert step(values) == 0
+    for digits in (0, 1, 3, 6):
+        assert step(np.round(values, digits)) == pytest.approx(10.0**-digits)
+    assert step(np.round(values[:8], 1)) == 0  # too few to tell
+    np.testing.assert_allclose(rounding_variance(np.round(values[:48].reshape(16, 3), 2), 1e-3),
+                               (1e-5) ** 2 / 12)  # fmt: skip
+
+
+def test_rounding_changes_the_spread_by_its_variance() -> None:
+    """Δ²/12 against the scatter that rounding really makes."""
+    rng = np.random.default_rng(1)
+    exact = rng.uniform(-1, 1, (20000, 3))
+    error = np.round(exact, 2) - exact
+    np.testing.assert_allclose(error.var(axis=0), rounding_variance(np.round(exact, 2), 1.0),
+                               rtol=0.05)  # fmt: skip
