@@ -25,6 +25,7 @@ from hilcal.identify.full_covariance import (
     campaign_readings,
     covariance_parts,
 )
+from hilcal.identify.predictive import Predictive
 from hilcal.model import Model
 from hilcal.refine import Refinement
 from hilcal.report.build_story import Chapter
@@ -36,6 +37,7 @@ from hilcal.revisions import (
     mode_of,
     restore,
     restore_model,
+    restore_predictive,
     to_record,
 )
 from hilcal.types import Floats
@@ -152,6 +154,10 @@ class Campaign:
         """Return model and parameters (P,) of a stored revision; raises as `fit` does."""
         check_sources(record, self.path, self.catalogue)
         return restore_model(record, self.cell, self.readings, self.catalogue)
+
+    def predictive(self, record: RevisionRecord, model: Model, theta: Floats) -> Predictive:
+        """Return what a stored revision knows of readings that it has not seen."""
+        return restore_predictive(record, model, theta, self.readings)
 
     def history(self, revision: int | None = None) -> History:
         """Return how the model of a revision was reached, which `diagnose` takes.

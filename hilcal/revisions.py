@@ -18,6 +18,7 @@ from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError
 from hilcal.identify import fit_document
 from hilcal.identify.fit import Fit, fit
+from hilcal.identify.predictive import Predictive, predictive
 from hilcal.model import Model
 from hilcal.types import Floats
 
@@ -124,6 +125,24 @@ def restore_model(
             "have other parameters; run hilcal identify again"
         )
     return model, np.array(stored["theta"], dtype=float)
+
+
+def restore_predictive(
+    record: RevisionRecord, model: Model, theta: Floats, readings: Readings
+) -> Predictive:
+    """Return what a stored fit knows of readings that it has not seen.
+
+    Args:
+        record: the revision.
+        model: its model.
+        theta: (P,) its parameters.
+        readings: all readings that it was fitted to.
+    """
+    stored: Mapping[str, Any] = record.parameters_json
+    prior = np.array([np.inf if s is None else float(s) for s in stored["prior"]], dtype=float)
+    used = np.delete(np.arange(len(readings)), np.array(stored["outliers"], dtype=int))
+    sigma = float(record.result_json["identify"]["error"]["holdout"]["rms_sigma"])
+    return predictive(model, theta, prior, readings[used], mode_of(record), sigma)
 
 
 def mode_of(record: RevisionRecord) -> Mode:

@@ -80,7 +80,7 @@ def effects_shown(mode: Mode) -> tuple[str, ...]:
 
 def laws_shown(mode: Mode) -> tuple[str, ...]:
     """Return the laws outside of the catalogue that readings of a kind show."""
-    return tuple(law.name for law in LAWS if mode in law.readings)
+    return tuple(law.name for law in LAWS if mode in law.readings and not law.resembles)
 
 
 def study_case(

@@ -31,6 +31,7 @@ class UnmodelledLaw:
         variables: what it depends on, as a diagnosis would call it.
         readings: kinds of readings that show it.
         motion: the law, at any size.
+        resembles: effects of the catalogue that describe it nearly as well.
     """
 
     name: str
@@ -38,6 +39,7 @@ class UnmodelledLaw:
     variables: tuple[str, ...]
     readings: tuple[str, ...]
     motion: Law
+    resembles: tuple[str, ...] = ()
 
 
 def _of_joint(j: int, states: States, values: Floats) -> Floats:
@@ -160,7 +162,12 @@ LAWS: tuple[UnmodelledLaw, ...] = (
         "one-sided stop", "dq_2 = a max(tau_2, 0)", ("joint 2 torque",), (DEFLECTION,), _one_sided
     ),
     UnmodelledLaw(
-        "saturating gear", "dq_2 = a tanh tau_2", ("joint 2 torque",), (DEFLECTION,), _saturating
+        "saturating gear",
+        "dq_2 = a tanh tau_2",
+        ("joint 2 torque",),
+        (DEFLECTION,),
+        _saturating,
+        resembles=("joint_stiffening",),
     ),
     UnmodelledLaw(
         "compliance by another joint",

@@ -23,12 +23,13 @@ from hilcal.diagnose.misfit_breakdown import misfit_breakdown
 from hilcal.effects.written import write_effect
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline, with_effects
+from hilcal.identify.extrapolation import extrapolation
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.fit_document import to_json
 from hilcal.identify.full_prediction import full_prediction
 from hilcal.identify.linearisation import linearise
 from hilcal.identify.validation import validate as predict_other
-from hilcal.report import numbers, text
+from hilcal.report import numbers, text, text_validate
 from hilcal.report.covariance_words import covariance_words
 from hilcal.report.progress import working
 from hilcal.report.text_scalings import scalings_table
@@ -167,25 +168,18 @@ def validate(
         found = predict_other(
             model, theta, o.readings, unseen.readings, mode_of(record), registered=register
         )
+        say("comparing with what was measured")
+        beyond = extrapolation(o.predictive(record, model, theta), o.readings, found)
     name = text.model_name(titles(model, o.readings))
     t.show(text.heading(f"Revision {record.number}: {name}"))
     what = "deflections" if mode_of(record) == "deflection" else "positions"
-    out = text.table("3-D position error", "rms", "mean", "largest", "rms in σ")
     e = found.error
-    out.add_row(
-        "never fitted",
-        numbers.length(e.rms_m),
-        numbers.length(e.mean_m),
-        numbers.length(e.max_m),
-        f"{e.rms_sigma:.2f}",
-    )
-    out.add_row("noise alone", numbers.length(found.noise_floor), "", "", "1.00")
     t.show(
         f"{len(found.raw)} {what} that were never fitted are predicted to "
         f"{numbers.length(e.rms_m)} rms; noise alone would leave "
         f"{numbers.length(found.noise_floor)}.\n"
     )
-    t.show([out, ""])
+    t.show(text_validate.validation_report(found, beyond))
     if e.rms_sigma > 5 and not register:
         t.show(
             "Was the tracker set up anew for these readings? Then --register fits its place first."
@@ -201,5 +195,6 @@ def validate(
             "error": e.to_json(),
             "variance_factor": found.variance_factor,
             "noise_floor_m": found.noise_floor,
+            **text_validate.to_json(beyond),
         }
     )

@@ -5,9 +5,9 @@ its evidence is positive, it explains a share of the misfit on poses left out, t
 falls by more than it scatters from pose to pose, its parameters need not be larger than is
 plausible, and the exact model keeps what the linearisation promised (see `promise`).
 
-All is scored at plausible sizes: the standard deviation of the parameters is at most the effect's
-`most`. Where the evidence is larger by more than `SAME_EVIDENCE` beyond that, the effect is
-implausible, and the size that it would need is stated.
+All is scored at plausible sizes: the standard deviation of the parameters is at most what
+`plausible_size.most` states. Where more than a share `LOST` of its evidence needs larger ones, the
+effect is implausible, and the size that it would need is stated.
 """
 
 from collections.abc import Callable, Collection, Iterable, Sequence
@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilcal.diagnose.minimum_detectable_effect import Strength, least_strength
+from hilcal.diagnose.plausible_size import Unloaded, most, unloaded_readings
 from hilcal.diagnose.promise import LEAST_KEPT, kept, kept_by_refit
 from hilcal.diagnose.stepwise import add
 from hilcal.effects.protocol import Effect
@@ -31,6 +32,11 @@ FALSE_ALARM = 0.001
 """Chance of naming any effect where none is missing, over the whole catalogue."""
 LEAST_SHARE = 0.01
 """An effect that explains less of the misfit on poses left out is not worth adding; a guess."""
+
+
+LOST = 0.2
+"""Share of its evidence that an effect may lose at plausible sizes. A choice: a prior that is too
+narrow by half costs a few units however strong the evidence is."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,7 +106,7 @@ def candidates(fit: Fit) -> tuple[Effect, ...]:
 
 
 def catalogue_columns(fit: Fit) -> tuple[Floats, dict[str, slice], dict[str, float]]:
-    """Return the columns (R, P) of all `candidates`, which are whose, and `Effect.most`."""
+    """Return the columns (R, P) of all `candidates`, which are whose, and how large each may be."""
     families = [effect_columns(fit, e) for e in candidates(fit)]
     ends = np.cumsum([0] + [f.white.shape[1] for f in families])
     columns = np.hstack([np.zeros((len(fit.white), 0)), *(f.white for f in families)])
@@ -108,7 +114,8 @@ def catalogue_columns(fit: Fit) -> tuple[Floats, dict[str, slice], dict[str, flo
         f.effect.name: slice(int(a), int(b))
         for f, a, b in zip(families, ends[:-1], ends[1:], strict=True)
     }
-    return columns, of, {f.effect.name: f.effect.most() for f in families}
+    bare = unloaded_readings(fit)
+    return columns, of, {f.effect.name: most(f, bare) for f in families}
 
 
 def rank_suspects(
@@ -125,7 +132,8 @@ def rank_suspects(
         level: of the test over all of them together.
         refit: returns a fit with one more effect.
     """
-    found = [_suspect(p, effect_columns(p.fit, e), level / len(effects)) for e in effects]
+    bare = unloaded_readings(p.fit)
+    found = [_suspect(p, effect_columns(p.fit, e), bare, level / len(effects)) for e in effects]
     tested = max(sum(s.score.rank > 0 for s in found), 1)
     out = []
     for s, e in zip(found, effects, strict=True):
@@ -177,10 +185,10 @@ def ranked(suspects: Iterable[Suspect], rejected: Collection[str] = ()) -> tuple
     )
 
 
-def _suspect(p: Linearisation, of: EffectColumns, level: float) -> Suspect:
+def _suspect(p: Linearisation, of: EffectColumns, bare: Unloaded | None, level: float) -> Suspect:
     s = p.information(of.white)
-    most = of.effect.most()
-    result = p.score(of.white, s, most)
+    largest = most(of, bare)
+    result = p.score(of.white, s, largest)
     held = p.held_out(of.white, result)
     return Suspect(
         effect=of.effect.name,
@@ -189,7 +197,7 @@ def _suspect(p: Linearisation, of: EffectColumns, level: float) -> Suspect:
         holdout_share=held.share,
         explains=False,
         sure=held.sure,
-        needs=_implausible(p, of, s, result, most),
+        needs=_implausible(p, of, s, result, largest),
         least=least_strength(
             s,
             of.motion,
@@ -203,16 +211,17 @@ def _suspect(p: Linearisation, of: EffectColumns, level: float) -> Suspect:
 
 
 def _implausible(
-    p: Linearisation, of: EffectColumns, s: Floats, at_most: FamilyScore, most: float
+    p: Linearisation, of: EffectColumns, s: Floats, at_most: FamilyScore, largest: float
 ) -> tuple[tuple[str, float, float], ...]:
     """Size that an effect needs where plausible ones explain less, and plausible sizes, by unit."""
     free = p.score(of.white, s)
-    if free.log_evidence - at_most.log_evidence <= SAME_EVIDENCE:
+    lost = free.log_evidence - at_most.log_evidence
+    if lost <= max(SAME_EVIDENCE, LOST * free.log_evidence):
         return ()
     units = np.array([q.unit for q in of.effect.parameters])
     needed = of.scale * free.step
     return tuple(
-        (unit, _rms(needed[units == unit]), most * _rms(of.scale[units == unit]))
+        (unit, _rms(needed[units == unit]), largest * _rms(of.scale[units == unit]))
         for unit in dict.fromkeys(units.tolist())
     )
 

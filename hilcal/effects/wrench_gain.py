@@ -17,8 +17,8 @@ class WrenchGain(ForceSensorEffect):
 
     name = "wrench_gain"
     summary = "wrench read = (1 + g) true per axis: the force sensor has a gain error"
-    plausible = 20.0
-    """20 %: a wrong calibration matrix. A choice."""
+    plausible = 50.0
+    """50 %: a wrong calibration matrix, a channel that hardly reads. A choice."""
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

@@ -34,12 +34,14 @@ class EffectColumns:
         scale: (P,) ordinary magnitudes, SI.
         white: (R, P) whitened columns.
         motion: (D, 3, P) displacement of each measured position, m.
+        at_reading: (N, 3, P) displacement of the target in each fitted reading, sensor axes, m.
     """
 
     effect: Effect
     scale: Floats
     white: Floats
     motion: Floats
+    at_reading: Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,8 +157,10 @@ def effect_columns(fit: Fit, effect: Effect) -> EffectColumns:
     s, w = fit.solution, fit.whitening
     jacobian = fit.model.jacobian_of((effect,), s.prediction, s.theta, w.m)
     scale = np.array([q.scale for q in effect.parameters])
-    raw = w.raw(jacobian * scale)
-    return EffectColumns(effect, scale, w.whiten(raw).reshape(w.m * len(w), len(scale)), raw[:, :3])
+    at_reading = jacobian * scale
+    raw = w.raw(at_reading)
+    white = w.whiten(raw).reshape(w.m * len(w), len(scale))
+    return EffectColumns(effect, scale, white, raw[:, :3], at_reading[:, :3])
 
 
 def model_columns(fit: Fit) -> Floats:

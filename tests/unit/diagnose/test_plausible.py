@@ -7,6 +7,7 @@ import pytest
 
 from hilcal.config import load_config
 from hilcal.diagnose.effect_ranking import candidates, rank_suspects
+from hilcal.diagnose.plausible_size import most, unloaded_readings
 from hilcal.diagnose.promise import LEAST_KEPT, kept_by_refit, kept_by_step
 from hilcal.diagnose.stepwise import add
 from hilcal.diagnose.verdict import diagnose
@@ -14,10 +15,10 @@ from hilcal.effects.catalogue import BUILT_IN
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
-from hilcal.identify.linearisation import linearise
+from hilcal.identify.linearisation import effect_columns, linearise
 from hilcal.report.verdict_words import message
 from studies.study_cases import study_case
-from tests.support.campaigns import campaign
+from tests.support.campaigns import campaign, configuration
 from tests.support.paths import ROOT
 
 SECOND_ORDER = {"link_geometry", "encoder_offset", "link_mass"}
@@ -53,21 +54,32 @@ def test_every_effect_that_ships_states_what_is_plausible() -> None:
 
 
 def test_the_cell_may_allow_more() -> None:
-    found = unmodelled("crosswise compliance", "ur10e")
+    c = campaign("none", "absolute", 1)
+    found = fit(baseline(c.cell, c.readings, c.mode), c.readings, c.mode)
 
-    def geometry(factor: dict[str, float]) -> tuple[float, bool]:
-        config = found.model.cell.configured().model_copy(update={"plausible": factor})
+    def largest(factor: dict[str, float]) -> float:
+        config = configuration().model_copy(update={"plausible": factor})
         cell = replace(found.model.cell, config=config)
         same = replace(found, model=replace(found.model, cell=cell))
-        some = [e for e in candidates(same) if e.name == "link_geometry"]
-        (s,) = rank_suspects(linearise(same), some)
-        return s.score.strength, s.plausible
+        (e,) = (e for e in candidates(same) if e.name == "link_geometry")
+        return e.most()
 
-    usual, more = geometry({}), geometry({"link_geometry": 1e3})
-    assert usual[0] < more[0]
-    assert (usual[1], more[1]) == (False, True)
+    assert largest({}) == pytest.approx(3.0)
+    assert largest({"link_geometry": 4.0}) == pytest.approx(12.0)
     with pytest.raises(InputError, match=r"\[plausible\] gremlins: no such effect"):
-        geometry({"gremlins": 2.0})
+        largest({"gremlins": 2.0})
+
+
+def test_unloaded_readings_bound_what_geometry_may_do_to_deflections() -> None:
+    """A geometry that is off by so much is allowed as much, and not ten times as much."""
+    c = campaign("link_geometry", "absolute", 1, strength=10.0)
+    found = fit(baseline(c.cell, c.readings, "deflection"), c.readings, "deflection")
+    (e,) = (e for e in candidates(found) if e.name == "link_geometry")
+    off = c.world.physics.link_geometry
+    allowed = most(effect_columns(found, e), unloaded_readings(found))
+    true = float(np.sqrt(np.mean((1e3 * off) ** 2)))
+    assert true < allowed < 10 * true
+    assert most(effect_columns(found, e), None) == pytest.approx(e.most())
 
 
 @pytest.mark.parametrize("effect", ["link_geometry", "joint_tilt_compliance"])

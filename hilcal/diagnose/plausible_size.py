@@ -1,0 +1,76 @@
+"""Largest plausible strength of an effect: what it states, and what absolute positions allow.
+
+Deflections show errors of geometry and encoders in the second order only, so that such an effect
+would need to be large to explain them. The unloaded readings of the same campaign show it in the
+first order: with the frames of base and target estimated, its displacements there can hardly be
+larger than what the model misses,
+
+    t g ≤ `ALLOWED` s,    s² = mean |P y|²,    g² = mean Σ_p |P x_p|²
+
+y the residual of the unloaded readings, x_p their displacement by an ordinary magnitude of
+parameter p, P the projection off the frames. Elastic effects are not held to that: a controller may
+compensate for what gravity does.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilcal.identify.fit import Fit
+from hilcal.identify.linearisation import EffectColumns, effect_columns
+from hilcal.types import Bools, Floats
+
+ALLOWED = 2.0
+"""Displacement that an effect may make in unloaded readings, in units of what the model misses
+there: as much again may be hidden by other errors. A choice."""
+ROUNDING = 1e-9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Unloaded:
+    """The unloaded readings of a campaign of deflections.
+
+    Attributes:
+        rows: (N,) which of the fitted readings they are.
+        frames: (K, F) orthonormal displacements by the frames.
+        missed: s, m.
+    """
+
+    rows: Bools
+    frames: Floats
+    missed: float
+
+    def most(self, of: EffectColumns) -> float:
+        """Return the largest strength of an effect that they allow."""
+        if of.effect.elastic:
+            return np.inf
+        x = of.at_reading[self.rows].reshape(-1, len(of.scale))
+        free = x - self.frames @ (self.frames.T @ x)
+        moved = float(np.sqrt(np.sum(free**2) / len(x)))
+        return ALLOWED * self.missed / moved if moved > ROUNDING * self.missed else np.inf
+
+
+def unloaded_readings(fit: Fit) -> Unloaded | None:
+    """Return the unloaded readings; None for a fit of absolute readings, which shows all itself."""
+    if fit.mode == "absolute":
+        return None
+    readings, model = fit.readings[~fit.outlier], fit.model
+    rows = readings.unloaded
+    kinds = model.catalogue.with_role("registration", "target")
+    frames = [
+        effect_columns(fit, kind(model.cell, readings.states)).at_reading[rows] for kind in kinds
+    ]
+    columns = np.concatenate(frames, axis=2).reshape(3 * int(rows.sum()), -1)
+    u, s, _ = np.linalg.svd(columns, full_matrices=False)
+    u = u[:, s > ROUNDING * s.max(initial=0.0)]
+    off = readings.value[:, :3] - fit.solution.prediction.observation.position
+    y = off[rows].reshape(-1)
+    missed = y - u @ (u.T @ y)
+    free = max(len(y) - u.shape[1], 1)
+    return Unloaded(rows, u, float(np.sqrt(missed @ missed / free)))
+
+
+def most(of: EffectColumns, unloaded: Unloaded | None) -> float:
+    """Return the largest plausible strength of an effect, in ordinary magnitudes."""
+    own = of.effect.most()
+    return own if unloaded is None else min(own, unloaded.most(of))

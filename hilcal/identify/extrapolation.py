@@ -1,0 +1,146 @@
+"""Which readings lie outside of what a model was fitted to: in which variable, and by how much.
+
+A model may be wrong wherever nothing was measured, however well it predicts poses left out among
+those that were. A variable is left where a reading is beyond the fitted ones' smallest or largest
+value by more than `MARGIN` of their range. Joint angles inside of their ranges can be far from all
+fitted ones as well; then the leverage of a reading is large: the variance of its prediction over
+that of the noise, (J C Jᵀ) V⁻¹ σ⁻² with the largest eigenvalue, compared with h/(1 − h) of the
+fitted measurements, each predicted without itself.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilcal.data.readings import Readings, States
+from hilcal.data.whitening import Whitening, inverse_root
+from hilcal.identify.errors import ErrorBlock
+from hilcal.identify.predictive import Predictive
+from hilcal.identify.validation import Validation
+from hilcal.types import Bools, Floats
+
+MARGIN = 0.02
+"""Share of the fitted range by which a reading is beyond it; a choice: of two random halves, few
+readings are."""
+FAR = 2.0
+"""Leverage from which a reading is outside, in units of that which only one in a hundred of the
+fitted measurements exceeds; a choice."""
+
+
+@dataclass(frozen=True, slots=True)
+class Beyond:
+    """Readings beyond the fitted range of one variable.
+
+    Attributes:
+        variable: e.g. "joint 2 angle", "force", "leverage".
+        unit: SI.
+        low: smallest fitted value.
+        high: largest fitted value; of the leverage, the limit.
+        count: number of measurements beyond.
+        most: how far the farthest is beyond.
+    """
+
+    variable: str
+    unit: str
+    low: float
+    high: float
+    count: int
+    most: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Extrapolation:
+    """What a fit states of readings that it has not seen, and which of them lie outside.
+
+    Attributes:
+        outside: (D,) measurements that lie outside in any variable.
+        variables: those that are left, most measurements first.
+        stated_m: (D,) standard deviation that the fit states of the 3-D position error, m.
+        z: (D,) error over the stated standard deviation, rms of the elements.
+        inside_error: of the measurements inside; None where there are none.
+        outside_error: of those outside; None where there are none.
+    """
+
+    outside: Bools
+    variables: tuple[Beyond, ...]
+    stated_m: Floats
+    z: Floats
+    inside_error: ErrorBlock | None
+    outside_error: ErrorBlock | None
+
+
+def extrapolation(p: Predictive, fitted: Readings, found: Validation) -> Extrapolation:
+    """Compare readings with those that a model was fitted to.
+
+    Args:
+        p: what the fit knows.
+        fitted: the readings that it was fitted to.
+        found: the other readings, predicted.
+    """
+    w, other = found.whitening, found.readings
+    prediction = p.model.predict(other.states, p.theta)
+    spread, noise = p.of_prediction(prediction, w), p.factor * p.noise * w.covariance
+    total = spread + noise
+    root = inverse_root(noise)
+    leverage = np.linalg.eigvalsh(root @ spread @ np.swapaxes(root, 1, 2))[:, -1]
+    outside = np.zeros(len(w.reading), dtype=np.bool_)
+    variables = []
+    for name, unit, before, after in _variables(fitted, other):
+        low, high = float(before.min()), float(before.max())
+        beyond = np.maximum(after - high, low - after)[w.reading]
+        far = beyond > MARGIN * (high - low) + 1e-9 * max(abs(low), abs(high), 1.0)
+        if far.any():
+            variables.append(
+                Beyond(name, unit, low, high, int(far.sum()), float(beyond[far].max()))
+            )
+        outside |= far
+    limit = FAR * float(np.quantile(p.leverage / (1 - p.leverage), 0.99))
+    far = leverage > max(limit, 1e-12)
+    if far.any():
+        most = float(leverage.max() - limit)
+        variables.append(Beyond("leverage", "1", 0.0, limit, int(far.sum()), most))
+    outside |= far
+    white = np.einsum("dij,dj->di", inverse_root(total), found.raw)
+    return Extrapolation(
+        outside=outside,
+        variables=tuple(sorted(variables, key=lambda v: -v.count)),
+        stated_m=np.sqrt(np.trace(total[:, :3, :3], axis1=1, axis2=2)),
+        z=np.sqrt(np.mean(white**2, axis=1)),
+        inside_error=_error(found.raw, w, ~outside),
+        outside_error=_error(found.raw, w, outside),
+    )
+
+
+def _variables(fitted: Readings, other: Readings) -> Iterator[tuple[str, str, Floats, Floats]]:
+    """Yield name, unit, and the values (N,) at the fitted and at the other readings."""
+    a, b = fitted.states, other.states
+    for j in range(a.q.shape[1]):
+        yield f"joint {j + 1} angle", "rad", a.q[:, j], b.q[:, j]
+    for name, unit, part in (("force", "N", slice(0, 3)), ("moment", "N·m", slice(3, 6))):
+        size = [np.linalg.norm(s.wrench[:, part], axis=1) for s in (a, b)]
+        yield name, unit, size[0], size[1]
+    yield from _temperatures(a, b)
+
+
+def _temperatures(a: States, b: States) -> Iterator[tuple[str, str, Floats, Floats]]:
+    if a.air_temperature is not None and b.air_temperature is not None:
+        yield "air temperature", "K", a.air_temperature, b.air_temperature
+    if a.joint_temperature is not None and b.joint_temperature is not None:
+        for j in range(a.joint_temperature.shape[1]):
+            before, after = a.joint_temperature[:, j], b.joint_temperature[:, j]
+            yield f"joint {j + 1} temperature", "K", before, after
+
+
+def _error(raw: Floats, w: Whitening, mine: Bools) -> ErrorBlock | None:
+    """Errors of some measurements, each whitened by itself."""
+    if not mine.any():
+        return None
+    distance = np.linalg.norm(raw[mine, :3], axis=1)
+    white = np.einsum("dij,dj->di", inverse_root(w.covariance[mine]), raw[mine])
+    return ErrorBlock(
+        rms_m=float(np.sqrt(np.mean(distance**2))),
+        mean_m=float(distance.mean()),
+        max_m=float(distance.max()),
+        rms_sigma=float(np.sqrt(np.mean(white**2))),
+    )
