@@ -23,6 +23,7 @@ from hilcal.config.cell import Tracker as TrackerConfig
 from hilcal.data.covariance import TrackerNoise, tracker_covariance
 from hilcal.errors import DeviceError, InputError
 from hilcal.toml import NonNegative, Positive, Section, check_section
+from hilcal.types import Floats
 
 BAUD = 115200
 DEADLINE_S = 4.0
@@ -80,6 +81,29 @@ class GeoComTracker:
         covariance = tracker_covariance(value[None], TrackerNoise(along, 0.0, across, 0.0))[0]
         return TrackerSample(polar.host_ns, value, covariance, polar.warning)
 
+    def aim(self, position: Floats, radius: float) -> None:
+        """Turn to where a target is expected, aim at the one that is there, lock on it.
+
+        Args:
+            position: (3,) sensor axes, m.
+            radius: a target farther from there is another one, m.
+
+        Raises:
+            TargetLostError: there is none.
+            DeviceError: the instrument or its line failed.
+        """
+        x, y, z = (float(v) for v in position)
+        moving = max(_LEAST_S, self._clock.real(SEARCHING_S))
+        hz, v = np.arctan2(x, y) % (2 * np.pi), np.arctan2(np.hypot(x, y), z)
+        until = time.monotonic() + DEADLINE_S + moving
+        answer = self._link.ask(
+            geo.TURN, (float(hz), float(v), 0, 0, 0), until=until, seconds=ANSWER_S + moving
+        )
+        if answer.code != geo.OK:
+            raise geo.failure("turning to the target", answer.code)
+        distance = max(float(np.linalg.norm(position)), self._options.min_distance_m)
+        self._find(min(2 * radius / distance, self._options.search_rad), search=False)
+
     def find_target(self) -> None:
         """Aim at the target, search for it where it is not in sight, lock on it.
 
@@ -87,16 +111,18 @@ class GeoComTracker:
             TargetLostError: not found.
             DeviceError: the instrument or its line failed.
         """
+        self._find(self._options.search_rad, search=True)
+
+    def _find(self, window: float, search: bool) -> None:
         moving = max(_LEAST_S, self._clock.real(SEARCHING_S))
         until = time.monotonic() + DEADLINE_S + 4 * moving
-        window = self._options.search_rad
 
         def do(request: int, *values: float) -> int:
             answer = self._link.ask(request, values, until=until, seconds=ANSWER_S + moving)
             return answer.code
 
         code = do(geo.FINE_ADJUST, window, window, 0)
-        if code in geo.LOST:
+        if code in geo.LOST and search:
             code = do(geo.SEARCH, 0)
             if code != geo.OK:
                 raise geo.failure("searching for the target", code)

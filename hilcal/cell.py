@@ -128,7 +128,7 @@ def cell_from_config(config: CellConfig, base_dir: Path | None = None) -> Cell:
     config.repeatability.per_joint(arm.n)
     described = tool.targets or (tool,)
     poses = np.stack([_pose(t.target_m, t.target_rotvec_rad) for t in described])
-    known = tuple(t.target_m is not None for t in described)
+    known = tuple(t.target_m is not None and not getattr(t, "estimate", False) for t in described)
     return Cell(
         arm=arm,
         target=poses[0],

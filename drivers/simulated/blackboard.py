@@ -14,6 +14,8 @@ import numpy as np
 
 N = 6
 """Joints of the arm in the cell."""
+MOST_TARGETS = 8
+"""Targets that a tool can carry in the simulated cell."""
 
 SECTIONS: dict[str, np.dtype[Any]] = {
     # written once by the world
@@ -39,6 +41,7 @@ SECTIONS: dict[str, np.dtype[Any]] = {
             ("load_since", "<f8"),  # world time of its last change, s
             ("target", "<f8", 3),  # tracked target, sensor (tracker) axes, m
             ("target_rotation", "<f8", (3, 3)),
+            ("targets", "<f8", (MOST_TARGETS, 3)),  # of several all, `target` first; else NaN, m
             ("flange", "<f8", (4, 4)),  # T_base_flange
             ("sensor_wrench", "<f8", 6),  # on the force sensor by tool and load, sensor axes
             ("drive_torque", "<f8", N),  # N·m

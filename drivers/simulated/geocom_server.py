@@ -3,7 +3,8 @@
     python -m drivers.simulated.geocom_server --directory DIR --range-std A B
         --transverse-std C E --seed N [--baud 115200]
 
-Admin operations besides those of the line (`pty_port.FAULTS`): `beam {on}` blocks it, `lock_lost`,
+Admin operations besides those of the line (`pty_port.FAULTS`): `beam {on}` blocks it, `hide
+{targets}` covers reflectors by number, `lock_lost`,
 `dist_error {on}`, `warn {code}` (1283 or 1284, 0 is none), `busy {on}`, `delay {rpc, seconds,
 count}` in real time, `wrong_trid {count}`, `meas_s {seconds}` of world time, `log`, `state`.
 """
@@ -54,6 +55,9 @@ def operate(station: Station, port: PtyPort, op: str, arguments: dict[str, Any])
     match op:
         case "beam":
             station.broken = bool(arguments["on"])
+        case "hide":
+            station.hidden = {int(k) for k in arguments["targets"]}
+            station.locked = station.locked and station.number not in station.hidden
         case "lock_lost":
             station.locked = False
         case "dist_error":

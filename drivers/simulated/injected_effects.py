@@ -223,13 +223,14 @@ def _pairs(states: States, pose: Ints | None, cycle: Ints | None) -> tuple[Ints,
     if cycle is None:
         cycle = np.zeros(len(states), dtype=np.int64)
     loaded = np.any(states.wrench != 0.0, axis=1)
-    first: dict[tuple[int, int], int] = {}
+    target = np.zeros_like(pose) if states.target is None else states.target
+    first: dict[tuple[int, int, int], int] = {}
     for row in np.flatnonzero(~loaded):
-        first.setdefault((int(pose[row]), int(cycle[row])), int(row))
+        first.setdefault((int(pose[row]), int(cycle[row]), int(target[row])), int(row))
     rows = np.flatnonzero(loaded)
     if not len(rows):
         raise InputError("states: no loaded reading; valid: one with a wrench that is not zero")
-    keys = [(int(pose[row]), int(cycle[row])) for row in rows]
+    keys = [(int(pose[row]), int(cycle[row]), int(target[row])) for row in rows]
     for row, key in zip(rows, keys, strict=True):
         if key not in first:
             raise InputError(

@@ -1,5 +1,7 @@
 """The states that a plan visits, as far as they are known before it is run."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from drivers.simulated.rehearsal import CampaignStates
@@ -17,6 +19,8 @@ def planned_states(
     cell: Cell, config: CellConfig, plan: Plan, begun: float = 0.0
 ) -> CampaignStates:
     """Return the N states of a plan's steps in order, with times as they will about be.
+
+    Of several targets, each is read at every step.
 
     A joint's approach side is the direction of its last motion; the first step is reached by
     a move in the positive direction of every joint. The joints warm up as those of the cell
@@ -39,9 +43,10 @@ def planned_states(
         side[k] = np.where(side[k] == 0.0, side[k - 1], side[k])
     speed, acceleration = config.motion.speed_rad_s, config.motion.acceleration_rad_s2
     changed = np.diff(load, prepend=0) != 0
-    lasts = np.abs(moved).max(axis=1) / speed + speed / acceleration + _MEASURING
+    resting = _MEASURING * len(cell.all_targets)
+    lasts = np.abs(moved).max(axis=1) / speed + speed / acceleration + resting
     time = begun + np.cumsum(lasts + _LOADING * changed)
-    hung = np.maximum.accumulate(np.where(changed, time - _MEASURING, begun))
+    hung = np.maximum.accumulate(np.where(changed, time - resting, begun))
     states = States(
         q=q,
         wrench=wrench,
@@ -51,4 +56,13 @@ def planned_states(
         approach=side,
     )
     pose = np.array([plan.pose_names.index(step.pose) for step in plan.steps])
-    return CampaignStates(states, pose, load, np.array([step.cycle for step in plan.steps]))
+    cycle = np.array([step.cycle for step in plan.steps])
+    if cell.targets is None:
+        return CampaignStates(states, pose, load, cycle)
+    each = np.repeat(np.arange(len(pose)), len(cell.targets))
+    target = np.tile(np.arange(len(cell.targets)), len(pose))
+    states = states[each]
+    passed = _MEASURING * target
+    loaded = np.maximum(time - hung, 1.0)[each] + passed
+    states = replace(states, target=target, time=time[each] + passed, load_time=loaded)
+    return CampaignStates(states, pose[each], load[each], cycle[each])

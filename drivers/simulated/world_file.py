@@ -17,7 +17,7 @@ from hilcal.types import Floats
 
 FORMAT = "hilcal-world"
 VERSION = 2
-_CELL = ("target", "load_point", "tool_mass", "tool_com", "gravity")
+_CELL = ("all_targets", "load_point", "tool_mass", "tool_com", "gravity")
 _ARM = ("links", "masses", "coms", "q_min", "q_max", "torque_max")
 
 
@@ -50,6 +50,7 @@ def write_world(path: Path, world: World, config: CellConfig, base_dir: Path | N
         "station": _listed(world.station),
         "joint_std": _listed(world.joint_std),
         "joint_reference": world.joint_reference,
+        "offsets": None if world.offsets is None else _listed(world.offsets),
         "noise": {
             "range_std": list(noise.range_std),
             "transverse_std": list(noise.transverse_std),
@@ -96,6 +97,7 @@ def read_world(path: Path) -> tuple[World, CellConfig]:
             ),
             joint_std=_array(data["joint_std"]),
             joint_reference=float(data["joint_reference"]),
+            offsets=_array(data["offsets"]) if data.get("offsets") else None,
         )
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise InputError(f"{path}: damaged: {type(error).__name__} {error}") from None

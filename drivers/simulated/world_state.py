@@ -3,12 +3,12 @@
 import contextlib
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from drivers.simulated.blackboard import Blackboard, N
+from drivers.simulated.blackboard import MOST_TARGETS, Blackboard, N
 from drivers.simulated.sensor_mount import SensorMount
 from drivers.simulated.temperatures import AIR, warm_up
 from drivers.simulated.world import World
@@ -69,6 +69,11 @@ class WorldState:
             raise InputError(
                 f"simulated cell: the arm {world.cell.arm.name} has {world.cell.arm.n} joints; "
                 f"valid: arms of {N} joints"
+            )
+        if len(world.cell.all_targets) > MOST_TARGETS:
+            raise InputError(
+                f"simulated cell: {len(world.cell.all_targets)} [[tool.targets]]; valid: at most "
+                f"{MOST_TARGETS}"
             )
         self._world, self._board, self._seed = world, board, seed
         self._loads = config.loads
@@ -174,7 +179,9 @@ class WorldState:
         """Return what is true now, as JSON can hold it."""
         with self._lock:
             truth = self._board.read("truth")
+            seen = np.isfinite(truth["targets"]).all(axis=1)
             out = {name: truth[name].tolist() for name in truth.dtype.names}
+            out["targets"] = truth["targets"][seen].tolist()
             arrivals = int(truth["arrivals"])
             return {
                 **out,
@@ -211,7 +218,14 @@ class WorldState:
         )
         slip = self.slip(int(arm["arrivals"]))[None]
         rest = world.rest(states, slip)
-        sight = world.sight(states, slip)
+        targets = np.full((MOST_TARGETS, 3), np.nan)
+        if world.cell.targets is None:
+            sight = world.sight(states, slip)
+        else:
+            count = len(world.cell.targets)
+            each = replace(states[np.zeros(count, dtype=np.int64)], target=np.arange(count))
+            sight = world.sight(each, np.repeat(slip, count, axis=0))
+            targets[:count] = sight.position
         flange = rest.flange[0]
         self._board.write(
             "truth",
@@ -219,6 +233,7 @@ class WorldState:
             load_since=self._since,
             target=sight.position[0],
             target_rotation=sight.rotation[0],
+            targets=targets,
             flange=flange,
             sensor_wrench=self._mount.feels(world, flange[:3, :3], wrench),
             drive_torque=rest.torque[0, world.drives],

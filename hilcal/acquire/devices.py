@@ -6,7 +6,7 @@ a device that does not answer raises `DeviceError` with one clear line, within i
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from hilcal.config import Load
 from hilcal.errors import DeviceError
@@ -195,6 +195,24 @@ class TrackerDevice(Protocol):
 
     def close(self) -> None:
         """Give the port back. Never raises, may be called twice."""
+        ...
+
+
+@runtime_checkable
+class PointingTracker(TrackerDevice, Protocol):
+    """A tracker that can be told which of several targets to measure."""
+
+    def aim(self, position: Floats, radius: float) -> None:
+        """Turn to where a target is expected, find the one that is there, and lock on it.
+
+        Args:
+            position: (3,) sensor axes, m.
+            radius: a target farther from there is another one, m.
+
+        Raises:
+            TargetLostError: there is none.
+            DeviceError: the instrument or its line failed.
+        """
         ...
 
 

@@ -79,12 +79,19 @@ def dry_run(cell: Cell, config: CellConfig, plan: Plan) -> DryRun:
 
 
 def _cell_problems(config: CellConfig) -> list[str]:
+    out = [
+        f'target "{t.name}" has no target_m: the tracker could not be pointed to it; give a rough '
+        "place and estimate = true"
+        for t in config.tool.targets
+        if len(config.tool.targets) > 1 and t.target_m is None
+    ]
     speed, limit = config.motion.speed_rad_s, config.limits.joint_speed_rad_s
     if speed <= limit:
-        return []
+        return out
     return [
+        *out,
         f"[motion] speed_rad_s = {speed:g} is over [limits] joint_speed_rad_s = {limit:g}; "
-        "the arm would be stopped in every motion"
+        "the arm would be stopped in every motion",
     ]
 
 

@@ -1,5 +1,6 @@
 """Measuring one reading: wait until everything has settled, average, check."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -70,21 +71,31 @@ class Measurer:
         self._mover, self._tracker, self._meter = mover, tracker, meter
         self._config, self._clock, self._watcher = config, clock, watcher
 
-    def measure(self, name: str) -> Measured:
+    def measure(
+        self,
+        name: str,
+        find: Callable[[], None] | None = None,
+        force: WrenchSample | None = None,
+    ) -> Measured:
         """Measure at the present pose, called `name`.
 
+        Args:
+            name: of the pose.
+            find: finds a lost target again; the tracker's search where None.
+            force: the wrench where it was averaged at this stop already.
+
         Raises:
-            DeviceError: nothing settled in time, the target was not found again, the arm did
-                not stand still, or a device failed.
+            TargetLostError: the target was not found again.
+            DeviceError: nothing settled in time, the arm did not stand still, or a device failed.
         """
         remarks: list[str] = []
         searches = repeats = 0
         while True:
             try:
                 settling = self._settle(name)
-                measured, why = self._averaged(settling, tuple(remarks))
+                measured, why = self._averaged(settling, tuple(remarks), force)
             except TargetLostError as error:
-                searches = self._search(error, name, searches)
+                searches = self._search(error, name, searches, find or self._tracker.find_target)
                 remarks.append(f"target lost and found again: {error}")
                 continue
             if measured is not None:
@@ -123,7 +134,9 @@ class Measurer:
     def _window(self) -> SettleWindow:
         return SettleWindow(self._config.acquire.samples, self._clock.scale)
 
-    def _averaged(self, settling: float, remarks: tuple[str, ...]) -> tuple[Measured | None, str]:
+    def _averaged(
+        self, settling: float, remarks: tuple[str, ...], force: WrenchSample | None
+    ) -> tuple[Measured | None, str]:
         """Average over the window; None and the reason where that cannot be a reading."""
         before = self._mover.look()
         tracker: list[TrackerSample] = []
@@ -131,7 +144,8 @@ class Measurer:
         for _ in range(self._config.acquire.samples):
             tracker.append(self._tracker.measure())
             angles.append(self._mover.look().q)
-        force = None if self._meter is None else self._meter.average()
+        if force is None and self._meter is not None:
+            force = self._meter.average()
         after = self._mover.look()
         why = self._mover.check_still(before, after)
         if why is not None:
@@ -146,23 +160,25 @@ class Measurer:
         said = (*remarks, *mean.warnings)
         return Measured(mean, q, before, after, tuple(tracker), force, settling, said), ""
 
-    def _search(self, error: TargetLostError, name: str, searches: int) -> int:
+    def _search(
+        self, error: TargetLostError, name: str, searches: int, find: Callable[[], None]
+    ) -> int:
         """Search the target; returns how often that has been done.
 
         Raises:
-            DeviceError: it was lost or not found too often.
+            TargetLostError: it was lost or not found too often.
         """
         while searches < SEARCHES:
             searches += 1
             self._watcher.notify(Remark(f"{name}: {error}; searching the target"))
             try:
-                self._tracker.find_target()
+                find()
             except TargetLostError as again:
                 error = again
             else:
                 self._mover.look()
                 return searches
-        raise DeviceError(
+        raise TargetLostError(
             f"{error} (at {name}, searched {SEARCHES} times). Clear the line of sight and have "
             "the tracker see the target"
         )

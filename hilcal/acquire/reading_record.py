@@ -22,6 +22,8 @@ def reading_of(
     load_time: float,
     side: Floats,
     joint_temperature: Floats | None,
+    target: int | None = None,
+    target_names: tuple[str, ...] = (),
 ) -> Readings:
     """Return one reading; its covariance is the instrument's alone.
 
@@ -34,6 +36,8 @@ def reading_of(
         load_time: since the load's last change, cell s.
         side: (n,) from which each joint arrived, -1 or +1.
         joint_temperature: (n,) °C; None in a campaign without.
+        target: number of the target that was read; None where there is one.
+        target_names: the cell's names of them.
     """
     states = States(
         q=q[None].copy(),
@@ -43,6 +47,7 @@ def reading_of(
         joint_temperature=None if joint_temperature is None else joint_temperature[None].copy(),
         approach=side[None].copy(),
         q_actual=measured.q[None].copy(),
+        target=None if target is None else np.array([target]),
     )
     return Readings(
         states=states,
@@ -53,6 +58,7 @@ def reading_of(
         covariance=measured.mean.covariance[None].copy(),
         load_names=(step.load,),
         pose_names=(step.pose,),
+        target_names=() if target is None else target_names,
     )
 
 

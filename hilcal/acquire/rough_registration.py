@@ -28,9 +28,9 @@ class RoughRegistration:
         self._held: list[Floats] = []
         self._seen: list[Floats] = []
 
-    def add(self, q: Floats, position: Floats) -> None:
+    def add(self, q: Floats, position: Floats, target: int = 0) -> None:
         """Take note of a reading: joint angles (n,) and position (3,), sensor axes, m."""
-        self._held.append(self._position(q))
+        self._held.append(self._positions(q)[target])
         self._seen.append(np.asarray(position))
 
     def pose(self) -> tuple[Floats, Floats] | None:
@@ -53,12 +53,17 @@ class RoughRegistration:
         rotation = u @ flip @ vt
         return rotation, seen.mean(axis=0) - rotation @ held.mean(axis=0)
 
-    def implausible(self, q: Floats, position: Floats) -> str | None:
-        """Return in one line why a reading cannot be of the target on the arm, or None."""
+    def expected(self, q: Floats) -> Floats | None:
+        """Return (T, 3) where the targets are expected, sensor axes, m; None while unknown."""
         pose = self.pose()
-        if pose is None or not self._cell.target_known:
+        return None if pose is None else self._positions(q) @ pose[0].T + pose[1]
+
+    def implausible(self, q: Floats, position: Floats, target: int = 0) -> str | None:
+        """Return in one line why a reading cannot be of the target on the arm, or None."""
+        places = self.expected(q)
+        if places is None or not self._cell.known_targets[target]:
             return None
-        off = float(np.linalg.norm(position - pose[0] @ self._position(q) - pose[1]))
+        off = float(np.linalg.norm(position - places[target]))
         if off <= PLAUSIBLE_M:
             return None
         return (
@@ -79,7 +84,7 @@ class RoughRegistration:
             return np.asarray(np.trace(joint_scatter(jac, joint_std, np.eye(3), 3)) / 3 * np.eye(3))
         return joint_scatter(jac, joint_std, pose[0], 3)
 
-    def _position(self, q: Floats) -> Floats:
-        """(3,) nominal position of the target, base axes, m."""
+    def _positions(self, q: Floats) -> Floats:
+        """(T, 3) nominal positions of the targets, base axes, m."""
         chain = chains.evaluate(self._cell.arm, np.asarray(q)[None])
-        return np.asarray(chain.point(self._cell.target[:3, 3])[0])
+        return np.array([chain.point(t[:3, 3])[0] for t in self._cell.all_targets])

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from hilcal.acquire.arrival import ArrivalReader, TargetReading
 from hilcal.acquire.clock import Clock
 from hilcal.acquire.drift import Shift
 from hilcal.acquire.dry_run import route_problems
@@ -69,6 +70,9 @@ class Session:
         )
         self._joint_std = config.repeatability.per_joint(cell.arm.n)
         self._state = SessionState(cell, self._joint_std)
+        self._reader = ArrivalReader(
+            cell, rig.tracker, self._measurer, self._state.registration, clock, watcher
+        )
         self._identified = 0
         self._temperatures: bool | None = None
         self._done = 0
@@ -88,11 +92,11 @@ class Session:
         passed = (self._wall() - self._epoch) * self._clock.scale
         self._elapsed = max(last, passed)
         self._temperatures = stored.states.joint_temperature is not None
-        self._done = len(details)
-        for old, value in zip(details, stored.value, strict=True):
+        self._done = len(self._store.done())
+        for old, value, target in zip(details, stored.value, stored.target.tolist(), strict=True):
             step = Step(old["pose"], old["load"], old["cycle"])
             q, covariance = np.array(old["q_actual"]), np.array(old["tracker_covariance"])
-            self._state.add(step, q, value, covariance, stored_wrench(old))
+            self._state.add(step, q, value, covariance, stored_wrench(old), target)
         felt = details[-1].get("felt")
         if self._meter is not None and felt is not None:
             self._meter.zero = np.array(felt["zero"])
@@ -210,26 +214,50 @@ class Session:
     # one reading
 
     def _reading(self, stop: Stop, step: Step) -> tuple[Readings, float]:
-        """Measure and store; the arm has arrived."""
+        """Measure and store all targets; the arm has arrived. Returns the first one's reading."""
         self._watcher.notify(Phase(f"measuring {step}"))
-        measured = self._measurer.measure(stop.name)
-        wrong = self._state.registration.implausible(measured.q, measured.mean.value[:3])
-        if wrong is not None:
-            raise DeviceError(wrong)
-        tared = None
-        if self._meter is not None and measured.force is not None:
-            tared = self._meter.tared(measured.force, measured.q)
-        now = self._clock.now()
-        elapsed = self._elapsed + now - self._begun
+        found = self._reader.read(stop.q, stop.name)
+        rows, details = [], []
+        for one in found:
+            wrong = self._state.registration.implausible(
+                one.measured.q, one.measured.mean.value[:3], one.target or 0
+            )
+            if wrong is not None:
+                raise DeviceError(wrong)
+            reading, told = self._row(stop, step, one)
+            rows.append(reading)
+            details.append(told)
+        first = rows[0]
+        self._store.record(Readings.joined(rows), step, details[0], *details[1:])
+        self._done += 1
+        for one in found:
+            measured, mean = one.measured, one.measured.mean
+            name = f"{step}" if one.target is None else f"{step}, {self._name(one.target)}"
+            for text in measured.remarks:
+                self._watcher.notify(Remark(f"{name}: {text}"))
+            tared = None if one.target else self._tared(measured)
+            shift = self._state.add(
+                step, measured.q, mean.value, mean.covariance, tared, one.target or 0
+            )
+            if shift is not None:
+                self._tell_drift(step, shift)
+        return first, sum(one.measured.settling for one in found)
+
+    def _row(self, stop: Stop, step: Step, one: TargetReading) -> tuple[Readings, dict[str, Any]]:
+        """One reading, and what is stored with it."""
+        measured, tared = one.measured, self._tared(one.measured)
+        elapsed = self._elapsed + one.ended - self._begun
         reading = reading_of(
             step,
             stop.q,
             measured,
             self._wrench(step, tared),
             elapsed,
-            now - self._hook.since,
+            one.ended - self._hook.since,
             self._mover.side,
             self._temperature(measured),
+            one.target,
+            self._cell.target_names,
         )
         session: dict[str, Any] = {
             "epoch_wall_s": self._epoch,
@@ -238,16 +266,18 @@ class Session:
             "side": self._mover.side.tolist(),
             "losses": None if self._rig.force is None else sample_json(self._rig.force.losses()),
         }
+        if one.target is not None:
+            session["target"] = self._name(one.target)
         zero = None if self._meter is None else self._meter.zero
-        self._store.record(reading, step, detail(step, measured, tared, zero, session))
-        self._done += 1
-        for text in measured.remarks:
-            self._watcher.notify(Remark(f"{step}: {text}"))
-        mean = measured.mean
-        shift = self._state.add(step, measured.q, mean.value, mean.covariance, tared)
-        if shift is not None:
-            self._tell_drift(step, shift)
-        return reading, measured.settling
+        return reading, detail(step, measured, tared, zero, session)
+
+    def _name(self, target: int) -> str:
+        return self._cell.target_names[target]
+
+    def _tared(self, measured: Measured) -> TaredWrench | None:
+        if self._meter is None or measured.force is None:
+            return None
+        return self._meter.tared(measured.force, measured.q)
 
     def _wrench(self, step: Step, tared: TaredWrench | None) -> Floats:
         """(6,) wrench of the load at the load point, base axes: configured or measured."""
@@ -282,7 +312,8 @@ class Session:
     def _tell(
         self, step: Step, reading: Readings, total: int, left: float, settling: float
     ) -> None:
-        deflection = self._state.deflection(step, reading.value[0, :3])
+        number = int(reading.target[0])
+        deflection = self._state.deflection(step, reading.value[0, :3], number)
         live = LiveResidual()
         if self._live is not None and (readings := self._store.readings()) is not None:
             with suppress(HilcalError):  # too early for a model; nothing depends on it

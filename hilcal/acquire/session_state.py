@@ -26,12 +26,18 @@ class SessionState:
         self.registration = RoughRegistration(cell)
         self.tared_wrenches: list[TaredWrench] = []
         self._cell, self._joint_std = cell, joint_std
-        self._unloaded: dict[tuple[str, int], Floats] = {}
+        self._unloaded: dict[tuple[str, int, int], Floats] = {}
         self._visits: list[UnloadedVisit] = []
         self._drift = Drift()
 
     def add(
-        self, step: Step, q: Floats, value: Floats, covariance: Floats, tared: TaredWrench | None
+        self,
+        step: Step,
+        q: Floats,
+        value: Floats,
+        covariance: Floats,
+        tared: TaredWrench | None,
+        target: int = 0,
     ) -> Shift | None:
         """Add a reading; returns its shift where it is a return to the reference.
 
@@ -41,24 +47,27 @@ class SessionState:
             value: (m,) sensor axes.
             covariance: (m, m) of the instrument alone.
             tared: the mean wrench; None without a force sensor.
+            target: its number; drift, scatter and wrench are taken from the first one.
         """
         position = value[:3]
         scatter = self.registration.repeatability(q, self._joint_std)
-        self.registration.add(q, position)
+        self.registration.add(q, position, target)
         if step.load != UNLOADED:
+            return None
+        self._unloaded[step.pose, step.cycle, target] = position
+        if target:
             return None
         if tared is not None:
             self.tared_wrenches.append(tared)
-        self._unloaded[step.pose, step.cycle] = position
         chain = chains.evaluate(self._cell.arm, q[None])
         jac = command_jacobian(self._cell.arm, chain, chain.point(self._cell.target[:3, 3]))[0, :3]
         instrument = covariance[:3, :3]
         self._visits.append(UnloadedVisit(step.pose, position, instrument, float(np.sum(jac**2))))
         return self._drift.add(step, position, instrument + scatter)
 
-    def deflection(self, step: Step, position: Floats) -> float | None:
+    def deflection(self, step: Step, position: Floats, target: int = 0) -> float | None:
         """Return how far a loaded reading is from its unloaded one, m; None where that lacks."""
-        before = self._unloaded.get((step.pose, step.cycle))
+        before = self._unloaded.get((step.pose, step.cycle, target))
         if step.load == UNLOADED or before is None:
             return None
         return float(np.linalg.norm(position - before))

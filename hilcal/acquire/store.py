@@ -13,8 +13,13 @@ class Store(Protocol):
     InputError or DeviceError, one clear line, where it cannot be written.
     """
 
-    def record(self, reading: Readings, step: Step, detail: dict[str, Any]) -> None:
-        """Store one reading (one row) with everything raw behind it, as one transaction."""
+    def record(
+        self, reading: Readings, step: Step, detail: dict[str, Any], *more: dict[str, Any]
+    ) -> None:
+        """Store a step's reading with everything raw behind it, as one transaction.
+
+        Of several targets all that were read in the arrival: a row and a detail for each.
+        """
         ...
 
     def event(self, kind: str, content: dict[str, Any]) -> None:

@@ -77,6 +77,9 @@ class Target(Section):
         None, description=VECTOR_M + "; leave it out to have it estimated"
     )
     target_rotvec_rad: Vector3 | None = Field(None, description=ROTVEC)
+    estimate: bool = Field(
+        False, description="true or false: whether target_m is rough, and the offset estimated"
+    )
 
     @model_validator(mode="after")
     def _sound(self) -> "Target":

@@ -1,5 +1,6 @@
 """States of the arm, and readings of the tracker in them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -43,6 +44,13 @@ class States:
         """Return the chosen states."""
         given = {f.name: a for f in fields(self) if (a := getattr(self, f.name)) is not None}
         return replace(self, **{name: a[rows] for name, a in given.items()})
+
+    @staticmethod
+    def joined(parts: Sequence["States"]) -> "States":
+        """Put states with the same columns one after the other."""
+        given = [f.name for f in fields(parts[0]) if getattr(parts[0], f.name) is not None]
+        columns = {name: np.concatenate([getattr(p, name) for p in parts]) for name in given}
+        return replace(parts[0], **columns)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,6 +99,22 @@ class Readings:
             value=self.value[rows],
             covariance=self.covariance[rows],
             common=None if self.common is None else self.common[rows],
+        )
+
+    @staticmethod
+    def joined(parts: Sequence["Readings"]) -> "Readings":
+        """Put readings with the same names and columns one after the other."""
+        if len(parts) == 1:
+            return parts[0]
+        return replace(
+            parts[0],
+            states=States.joined([p.states for p in parts]),
+            pose=np.concatenate([p.pose for p in parts]),
+            load=np.concatenate([p.load for p in parts]),
+            cycle=np.concatenate([p.cycle for p in parts]),
+            value=np.concatenate([p.value for p in parts]),
+            covariance=np.concatenate([p.covariance for p in parts]),
+            common=None,
         )
 
     @property

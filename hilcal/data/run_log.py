@@ -135,26 +135,34 @@ class RunLog:
             rows.insert_meta(connection, f"{PLAN} {len(self.plans) + 1}", plan.to_json())
         self.plans = (*self.plans, plan)
 
-    def record(self, reading: Readings, step: Step, detail: dict[str, Any]) -> None:
-        """Append one reading of one step, with everything raw that belongs to it.
+    def record(
+        self, reading: Readings, step: Step, detail: dict[str, Any], *more: dict[str, Any]
+    ) -> None:
+        """Append the reading of a step, with everything raw that belongs to it.
+
+        Of several targets all readings of the arrival, one detail for each, or none of them: a
+        step that is measured again is another arrival.
 
         Raises:
             InputError: the step is there already, or other quantities than before.
             DeviceError: the disk is full or failed; the file is as before.
         """
-        if len(reading) != 1:
-            raise ValueError(f"{len(reading)} readings of one step")
-        key, text = _key(step), json.dumps(detail, allow_nan=False)
+        details = (detail, *more)
+        if len(reading) != len(details):
+            raise ValueError(f"{len(reading)} readings of one step, {len(details)} details")
         path, connection = self._campaign.path, self._campaign.connection
         with schema.sqlite_errors(path), schema.transaction(connection):
-            number = self._campaign.insert(reading)
-            try:
-                connection.execute(
-                    "INSERT INTO details VALUES (?, ?, ?, ?)",
-                    (number, key, text, rows.text_crc(f"{number}{key}", text)),
-                )
-            except sqlite3.IntegrityError:
-                raise InputError(f"{path}: {step} has been measured already") from None
+            last = self._campaign.insert(reading)
+            for k, content in enumerate(details):
+                number, text = last - len(details) + 1 + k, json.dumps(content, allow_nan=False)
+                key = _key(step, reading, k)
+                try:
+                    connection.execute(
+                        "INSERT INTO details VALUES (?, ?, ?, ?)",
+                        (number, key, text, rows.text_crc(f"{number}{key}", text)),
+                    )
+                except sqlite3.IntegrityError:
+                    raise InputError(f"{path}: {step} has been measured already") from None
 
     def event(self, kind: str, content: dict[str, Any]) -> None:
         """Append what happened, with the time (UTC).
@@ -173,7 +181,7 @@ class RunLog:
     def done(self) -> frozenset[Step]:
         """Return the steps that have been measured."""
         stored = self._select("SELECT step FROM details")
-        return frozenset(Step(*json.loads(key)) for (key,) in stored)
+        return frozenset(Step(*json.loads(key)[:3]) for (key,) in stored)
 
     def details(self) -> list[dict[str, Any]]:
         """Return the raw details of all readings, in order, each with its "step".
@@ -188,7 +196,7 @@ class RunLog:
                     f"{self._campaign.path}: the campaign is damaged at the details of "
                     f"reading {number}"
                 )
-            pose, load, cycle = json.loads(key)
+            pose, load, cycle = json.loads(key)[:3]
             out.append({**json.loads(text), "step": {"pose": pose, "load": load, "cycle": cycle}})
         return out
 
@@ -216,5 +224,8 @@ class RunLog:
             return self._campaign.connection.execute(statement).fetchall()
 
 
-def _key(step: Step) -> str:
-    return json.dumps([step.pose, step.load, step.cycle])
+def _key(step: Step, reading: Readings, row: int) -> str:
+    """Key of a stored detail: the step, and the name of the target where there are several."""
+    several = reading.states.target is not None
+    target = [reading.target_names[reading.target[row]]] if several else []
+    return json.dumps([step.pose, step.load, step.cycle, *target])

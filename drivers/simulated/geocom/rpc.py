@@ -97,6 +97,12 @@ def _acquire(station: Station, parameters: tuple[str, ...]) -> Answer:
     return (OK if station.acquire() else NO_TARGET), []
 
 
+def _fine_adjust(station: Station, parameters: tuple[str, ...]) -> Answer:
+    """AUT_FineAdjust: within a window, rad; the reference manual's are whole widths."""
+    window = 0.5 * max(float(parameters[0]), float(parameters[1]))
+    return (OK if station.acquire(window) else NO_TARGET), []
+
+
 def _turn(station: Station, parameters: tuple[str, ...]) -> Answer:
     hz, v = float(parameters[0]), float(parameters[1])
     station.turn(hz, v)
@@ -228,7 +234,7 @@ _PROCEDURES: dict[int, Procedure] = {
     9020: _switch_lock,
     9021: _lock_state,
     9027: _turn,
-    9037: _acquire,
+    9037: _fine_adjust,
     11001: _constant(),
     11004: _constant(),
     17008: _setting(17008),

@@ -45,6 +45,8 @@ class Station:
         tracking: whether the distance meter goes on by itself.
         requests: the last requests: number and parameters.
         measured: number of target measurements.
+        number: of the target that is held, or was last.
+        hidden: numbers of targets that cannot be seen.
     """
 
     board: Blackboard
@@ -74,15 +76,25 @@ class Station:
         default_factory=lambda: deque(maxlen=10_000)
     )
     measured: int = 0
+    number: int = 0
+    hidden: set[int] = field(default_factory=set)
+
+    def targets(self) -> dict[int, PolarPoint]:
+        """Return where the targets that can be seen truly are at this moment, by number."""
+        if self.broken:
+            return {}
+        truth = settled_truth(self.board)
+        several = truth["targets"]
+        points = several if np.isfinite(several[0]).all() else truth["target"][None]
+        return {
+            k: PolarPoint.of(point)
+            for k, point in enumerate(points)
+            if k not in self.hidden and np.all(np.isfinite(point)) and np.any(point)
+        }
 
     def target(self) -> PolarPoint | None:
-        """Return where the target truly is at this moment; None where none can be seen."""
-        if self.broken:
-            return None
-        point = settled_truth(self.board)["target"]
-        if not np.all(np.isfinite(point)) or not np.any(point):
-            return None  # the world has not begun
-        return PolarPoint.of(point)
+        """Return where its target truly is at this moment; None where it cannot be seen."""
+        return self.targets().get(self.number)
 
     def held(self) -> PolarPoint | None:
         """Return where the held target truly is; None without lock or sight."""
@@ -102,10 +114,19 @@ class Station:
         """Take so much world time."""
         time.sleep(max(0.0, world_seconds) / self.board.scale)
 
-    def acquire(self) -> bool:
-        """Search and hold the target: whether it is there."""
+    def acquire(self, window: float = np.inf) -> bool:
+        """Search and hold the target that is closest to where it looks: whether there is any.
+
+        Args:
+            window: of several targets, only those that are so close to where it looks, rad.
+        """
         self.wait(AIM_S)
-        self.locked = self.target() is not None
+        seen = self.targets()
+        if np.isfinite(settled_truth(self.board)["targets"]).any():
+            seen = {k: at for k, at in seen.items() if at.angle_to(self.pointing) <= window}
+        if seen:
+            self.number = min(seen, key=lambda k: seen[k].angle_to(self.pointing))
+        self.locked = bool(seen)
         self.look()
         return self.locked
 
