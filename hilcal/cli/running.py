@@ -114,7 +114,7 @@ def run(
         elif not resume:
             campaign = stack.enter_context(create_run(output, config, base_dir, made))
         measured = measure(t, config, numbers, campaign, goal)
-        planned = len(RunLog(campaign).plan.steps)
+        planned = len(RunLog(campaign).plan.steps) * len(numbers.all_targets)
     document: dict[str, object] = {"campaign": str(output), "readings": measured}
     document["planned"] = planned
     if goal is not None:
