@@ -47,6 +47,7 @@ class Station:
         measured: number of target measurements.
         number: of the target that is held, or was last.
         hidden: numbers of targets that cannot be seen.
+        several: whether the tool carries several targets.
     """
 
     board: Blackboard
@@ -78,19 +79,21 @@ class Station:
     measured: int = 0
     number: int = 0
     hidden: set[int] = field(default_factory=set)
+    several: bool = False
 
     def targets(self) -> dict[int, PolarPoint]:
         """Return where the targets that can be seen truly are at this moment, by number."""
         if self.broken:
             return {}
         truth = settled_truth(self.board)
-        several = truth["targets"]
-        points = several if np.isfinite(several[0]).all() else truth["target"][None]
-        return {
-            k: PolarPoint.of(point)
-            for k, point in enumerate(points)
-            if k not in self.hidden and np.all(np.isfinite(point)) and np.any(point)
-        }
+        points = truth["targets"]
+        given = np.isfinite(points).all(axis=1) & points.any(axis=1)
+        self.several = bool(given.any())
+        if not self.several:
+            points = truth["target"][None]
+            given = np.isfinite(points).all(axis=1) & points.any(axis=1)  # the world has begun
+        seen = (k for k in np.flatnonzero(given).tolist() if k not in self.hidden)
+        return {k: PolarPoint.of(points[k]) for k in seen}
 
     def target(self) -> PolarPoint | None:
         """Return where its target truly is at this moment; None where it cannot be seen."""
@@ -122,7 +125,7 @@ class Station:
         """
         self.wait(AIM_S)
         seen = self.targets()
-        if np.isfinite(settled_truth(self.board)["targets"]).any():
+        if self.several:
             seen = {k: at for k, at in seen.items() if at.angle_to(self.pointing) <= window}
         if seen:
             self.number = min(seen, key=lambda k: seen[k].angle_to(self.pointing))
