@@ -8,7 +8,7 @@ from rich.padding import Padding
 from hilcal.cell import cell_from_config
 from hilcal.cli.terminal import Terminal
 from hilcal.config import CellConfig, load_config
-from hilcal.data.guess import GUESSED
+from hilcal.data.guess import GUESSED, SIDE_BY_SIDE
 from hilcal.data.importing import import_readings
 from hilcal.data.mapping import ANGLES, LENGTHS
 from hilcal.data.proposal import Understood
@@ -40,6 +40,7 @@ def show_preview(
     found = propose(table, second, None if arm is None else arm.n)
     proposal, outcome = found.proposal, None
     if arm is not None and settings is not None:
+        _name_targets(found, [target.name for target in settings.tool.targets])
         outcome = [*_decide_convention(found, arm), *_try(table, found, settings, arm)]
     t.show(preview(proposal, len(found.grid.rows), table.name))
     if outcome:
@@ -78,6 +79,16 @@ def _relative_second(found: Proposed, output: Path) -> None:
     here = output.absolute().parent
     if Path(section["path"]).is_relative_to(here):
         section["path"] = str(Path(section["path"]).relative_to(here))
+
+
+def _name_targets(found: Proposed, names: list[str]) -> None:
+    """Give targets that stand side by side the cell's names, in its order."""
+    section = found.proposal.sections.get("position", {})
+    if names and len(names) == len(section.get("targets", ())):
+        section["targets"] = names
+        words = f"the targets are {', '.join(names)}, in the cell's order"
+        kept = [doubt for doubt in found.proposal.unsure if doubt != ("position", SIDE_BY_SIDE)]
+        found.proposal.unsure[:] = [*kept, ("position", words)]
 
 
 def _decide_convention(found: Proposed, arm: Arm) -> list[str]:

@@ -57,7 +57,7 @@ TEMPERATURE = {"temp", "temperature", "temperatur", "temperatura"}
 APPROACH = {"approach", "richtung", "direction", "anfahrt"}
 POSE = {
     "pose", "poses", "point", "punkt", "pt", "messpunkt", "posenr", "id", "name", "nr", "no",
-    "number", "index", "position", "punto", "target",
+    "number", "index", "position", "punto", "target", "p", "pkt", "label",
 }  # fmt: skip
 LOAD = {"load", "last", "payload", "charge", "carga", "loadcase", "lastfall", "zuladung"}
 MASS = {"mass", "masse", "weight", "gewicht", "masa", "peso"}

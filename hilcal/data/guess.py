@@ -2,10 +2,12 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from datetime import datetime
+from typing import Any
 
 import numpy as np
 
 from hilcal.data import column_names as words
+from hilcal.data.checks import SAME_POSE
 from hilcal.data.column_names import ColumnName, parse
 from hilcal.data.grid import Grid
 from hilcal.data.guess_values import (
@@ -14,7 +16,7 @@ from hilcal.data.guess_values import (
     sentinels,
     time_unit,
 )
-from hilcal.data.mapping import UNLOADED
+from hilcal.data.mapping import ANGLES, UNLOADED
 from hilcal.data.proposal import Proposal, Understood
 from hilcal.errors import InputError
 from hilcal.types import Floats
@@ -24,6 +26,9 @@ TURN = 2 * np.pi + 0.1
 FAR = 50.0
 """A position beyond this number is in millimetres: no arm is measured from 50 m."""
 GUESSED = "the convention is a guess; --config CELL.toml lets the arm tell"
+SIDE_BY_SIDE = "several targets: name them as in the cell's [[tool.targets]]"
+REPORTED = 5e-3
+"""rad; encoders at rest in one pose differ by less, commanded poses by more; a choice."""
 FEWEST_JOINTS, MOST_JOINTS = 4, 8
 SHOWN = 3
 
@@ -257,9 +262,21 @@ def _triples(g: Guesser) -> None:
     ranked = sorted(positions, key=lambda stem: _rank(stem))
     stem = ranked[0]
     names = [positions[stem][axis] for axis in "xyz"]
-    unit = length_unit(g, "position", names)
-    g.take("position", names, unit, unit=unit)
-    others = [positions[s]["x"] for s in ranked[1:] if not set(map(str, s)) & words.NOMINAL]
+    side_by_side = _several(positions, stem)
+    if side_by_side:
+        names = [positions[s][axis] for s in side_by_side for axis in "xyz"]
+        unit = length_unit(g, "position", names)
+        targets = [str(s[-1]) for s in side_by_side]
+        meaning = f"{unit}, {len(targets)} targets"
+        g.take("position", names, meaning, unit=unit, targets=targets)
+        g.unsure("position", SIDE_BY_SIDE)
+    else:
+        unit = length_unit(g, "position", names)
+        g.take("position", names, unit, unit=unit)
+    ranked = [s for s in ranked if s not in side_by_side]
+    others = [
+        positions[s]["x"] for s in ranked if s != stem and not set(map(str, s)) & words.NOMINAL
+    ]
     if others:
         listed = ", ".join(f"'{name}' ..." for name in others[:SHOWN])
         g.unsure("position", f"'{names[0]}' ... are used, not {listed}")
@@ -270,6 +287,16 @@ def _triples(g: Guesser) -> None:
     _orientation(g, whole, stem)
     _forces(g, whole)
     _std(g, whole, stem, unit)
+
+
+def _several(
+    positions: dict[tuple[object, ...], dict[str, str]], stem: tuple[object, ...]
+) -> list[tuple[object, ...]]:
+    """Positions whose names differ by a number alone, which are those of several targets."""
+    if not stem or not isinstance(stem[-1], int):
+        return []
+    alike = [s for s in positions if s[:-1] == stem[:-1] and s and isinstance(s[-1], int)]
+    return sorted(alike, key=str) if len(alike) > 1 else []
 
 
 def _rank(stem: tuple[object, ...]) -> tuple[int, int]:
@@ -438,7 +465,7 @@ def _std(g: Guesser, whole: Group, stem: tuple[object, ...], position_unit: str)
 def _names(g: Guesser) -> None:
     """Poses, loads, cycles and reflectors."""
     q = g.proposal.sections.get("joints")
-    _pick(g, "pose", words.POSE, lambda n: q is None or _one_pose_each(g, n, list(q["columns"])))
+    _pick(g, "pose", words.POSE, lambda n: q is None or _one_pose_each(g, n, q))
     for c in list(g.free.values()):
         if c.has(words.MASS | words.LOAD) and g.number(c.name) and "load" not in g.free:
             mass = c.unit in ("kg", "g", "lb") or c.has(words.MASS)
@@ -487,17 +514,22 @@ def _few(g: Guesser, name: str) -> bool:
     return 1 < len(set(g.grid.text(name))) <= 20
 
 
-def _one_pose_each(g: Guesser, name: str, joints: list[str]) -> bool:
-    """Whether all rows of a name command the same joints."""
+def _one_pose_each(g: Guesser, name: str, joints: dict[str, Any]) -> bool:
+    """Whether all rows of a name command the same joints, or reported nearly the same."""
     texts = g.grid.text(name)
-    if "" in texts or not all(j in g.values for j in joints):
+    if "" in texts:
         return False
-    q = g.block(joints)
+    q = g.block(joints["columns"]) * ANGLES[joints["unit"]]
     first: dict[str, int] = {}
-    for k, text in enumerate(texts):
-        if not np.allclose(q[k], q[first.setdefault(text, k)], rtol=0, atol=1e-6, equal_nan=True):
-            g.unsure("joints", f"'{name}' is no pose: '{text}' stands at different joints")
-            return False
+    rows = [first.setdefault(text, k) for k, text in enumerate(texts)]
+    off = np.nan_to_num(np.abs(q - q[rows]))
+    if off.max() > REPORTED:
+        k = int(np.argmax(off.max(axis=1)))
+        g.unsure("joints", f"'{name}' is no pose: '{texts[k]}' stands at different joints")
+        return False
+    if off.max() > SAME_POSE and "actual_joints" not in g.proposal.sections:
+        joints["reported"] = True
+        g.unsure("joints", f"they differ by up to {off.max():.2g} rad in a pose: reported angles")
     return True
 
 

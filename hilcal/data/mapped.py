@@ -19,6 +19,7 @@ from hilcal.data.sheets import open_tables
 from hilcal.data.stated import stated_covariance
 from hilcal.data.stated_noise import check_joint_rounding, rounding_variance
 from hilcal.data.table import readings_of
+from hilcal.data.wide import one_target_per_row
 from hilcal.errors import InputError
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
@@ -95,6 +96,7 @@ def readings_of_grid(
     Raises:
         InputError: anything that cannot be right.
     """
+    grid, mapping = one_target_per_row(grid, mapping)
     raw = _raw(grid, mapping, arm)
     keep, notes = _complete(grid, raw)
     grid = grid.rows_with(keep)
@@ -104,7 +106,9 @@ def readings_of_grid(
     _surroundings(grid, mapping, raw, found)
     wrench = _wrench(grid, mapping, np.asarray(gravity), found)
     text = {"load": _loads(grid, mapping, wrench)}
-    text["pose"] = _poses(grid, mapping, q, text["load"])
+    text["pose"] = _poses(grid, mapping, q)
+    if mapping.joints.reported:
+        _as_commanded(found, text["pose"], q)
     if mapping.target is not None:
         text["target"] = grid.text(mapping.target.column)
     table = CsvTable(grid.path, grid.names, grid.rows, text, found.number, found.alias)
@@ -262,7 +266,19 @@ def _loads(grid: Grid, mapping: Mapping, wrench: Floats) -> list[str]:
     return ["load" if loaded else "none" for loaded in np.asarray(wrench.any(axis=1))]
 
 
-def _poses(grid: Grid, mapping: Mapping, q: Floats, loads: Sequence[str]) -> list[str]:
+def _as_commanded(found: _Found, poses: Sequence[str], q: Floats) -> None:
+    """Take the angles of a pose's first row as commanded, those of each row as actual."""
+    first: dict[str, int] = {}
+    rows = [first.setdefault(name, k) for k, name in enumerate(poses)]
+    n = q.shape[1]
+    for k, (name, actual) in enumerate(
+        zip(columns.joint_columns(n), columns.actual_columns(n), strict=True)
+    ):
+        found.number[actual], found.alias[actual] = q[:, k], found.alias[name]
+        found.number[name] = q[rows, k]
+
+
+def _poses(grid: Grid, mapping: Mapping, q: Floats) -> list[str]:
     """Names of the poses: the column's, or the row where these joints were first commanded."""
     if mapping.pose is not None:
         names = grid.text(mapping.pose.column)

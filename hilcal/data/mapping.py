@@ -88,10 +88,25 @@ class SecondFile(FileFormat):
 
 
 class Position(Section):
-    """[position]: the target's position."""
+    """[position]: the target's position, or those of several targets side by side."""
 
-    columns: tuple[Column, Column, Column] = Field(description="three columns: x, y, z")
+    columns: tuple[Column, ...] = Field(
+        description="three columns x, y, z; with targets, three for each"
+    )
     unit: Length = Field(description=_LENGTH)
+    targets: tuple[str, ...] = Field(
+        (), description="names of the targets whose positions stand side by side in a row"
+    )
+
+    @model_validator(mode="after")
+    def _three_each(self) -> "Position":
+        wanted = 3 * max(1, len(self.targets))
+        if len(self.columns) != wanted:
+            raise ValueError(
+                f"columns: {len(self.columns)} given; it must be {wanted}"
+                + (f" for {len(self.targets)} targets" if self.targets else ": x, y, z")
+            )
+        return self
 
 
 class Orientation(Section):
@@ -120,12 +135,22 @@ class Orientation(Section):
 
 
 class Joints(Section):
-    """[joints] and [actual_joints]: joint angles, commanded or reported by the encoders."""
+    """[actual_joints]: joint angles that the encoders reported."""
 
     columns: Annotated[tuple[Column, ...], Field(min_length=1)] = Field(
         description="one column per joint"
     )
     unit: Angle = Field(description=_ANGLE)
+
+
+class CommandedJoints(Joints):
+    """[joints]: commanded joint angles."""
+
+    reported: bool = Field(
+        False,
+        description="true where they are what the encoders reported: those of a pose's first row "
+        "then count as commanded, else false",
+    )
 
 
 class Name(Section):
@@ -241,8 +266,8 @@ class Std(Section):
         if bool(self.columns) == bool(self.values):
             raise ValueError("columns or values: give one of them")
         given = len(self.columns) or len(self.values)
-        if given not in (1, 3, 6):
-            raise ValueError(f"{given} figures; it must be 1, 3 or 6")
+        if given not in (1, 6) and (given % 3 or not given):
+            raise ValueError(f"{given} figures; it must be 1, 3 or 6, or 3 for each target")
         if self.of == "point" and given != 1:
             raise ValueError(f'of = "point" with {given} figures; it must be one')
         if self.values and not all(self.values):
@@ -289,7 +314,7 @@ class Mapping(Section):
         description='a section [position] with columns = ["x", "y", "z"] and unit = "mm" or so'
     )
     orientation: Orientation | None = Field(None, description="a section [orientation]")
-    joints: Joints = Field(
+    joints: CommandedJoints = Field(
         description='a section [joints] with columns, one per joint, and unit = "deg" or "rad"'
     )
     actual_joints: Joints | None = Field(None, description="a section [actual_joints]")
@@ -318,11 +343,19 @@ class Mapping(Section):
             raise ValueError("[covariance] together with [std] or [correlation]; give one of them")
         if self.correlation and (self.std is None or len(self.std.columns) == 1):
             raise ValueError("[correlation] needs [std] with three or six columns")
-        six = (self.std is not None and len(self.std.columns or self.std.values) == 6) or (
+        wide = 3 * len(self.position.targets)
+        figures = 0 if self.std is None else len(self.std.columns or self.std.values)
+        six = (figures == 6 and wide != 6) or (
             self.covariance is not None and len(self.covariance.columns) > 9
         )
         if six and self.orientation is None:
             raise ValueError("uncertainties of six elements need [orientation]")
+        if self.joints.reported and (self.pose is None or self.actual_joints is not None):
+            raise ValueError("[joints] reported = true needs [pose], and no [actual_joints]")
+        if self.position.targets and self.target:
+            raise ValueError("[target] together with targets in [position]; give one of them")
+        if self.std and len(self.std.columns or self.std.values) > 6 and not self.position.targets:
+            raise ValueError("[std] has more than 6 figures; it must be 1, 3 or 6")
         if self.load_time and self.load_time.unit not in SECONDS:
             raise ValueError('[load_time] unit must be "s", "ms", "min" or "h"')
         return self

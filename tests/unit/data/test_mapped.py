@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -229,3 +230,59 @@ def test_damaged_bytes_give_one_line_or_sound_readings(tmp_path: Path) -> None:
     assert sound > 0
     assert len(messages) > 20
     assert all("t.csv" in m and "\n" not in m for m in messages)
+
+
+def test_three_targets_side_by_side(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    q, p = rng.uniform(-2, 2, (11, 6)), rng.uniform(-0.9, 0.9, (11, 3, 3)) + 1.5
+    sigma = rng.uniform(0.01, 0.03, (11, 3, 3))
+    names = [f"{axis}{k}" for k in (1, 2, 3) for axis in "xyz"]
+    stds = [f"s{axis}{k}" for k in (1, 2, 3) for axis in "xyz"]
+    text = ",".join([*names, *stds, *Q]) + "\n"
+    block = np.hstack([1e3 * p.reshape(11, 9), sigma.reshape(11, 9), q])
+    rows = [[f"{v:.9f}" for v in row] for row in block]
+    rows[4][3] = ""  # x2 of the fifth row was not seen
+    path = tmp_path / "t.csv"
+    path.write_text(text + "\n".join(",".join(row) for row in rows))
+    mapping = {
+        "position": {"columns": names, "unit": "mm", "targets": ["A", "B", "C"]},
+        "std": {"columns": stds, "unit": "mm"},
+        "joints": {"columns": Q, "unit": "rad"},
+    }
+    result = mapped(path, mapping, targets=("A", "B", "C"))
+    x = result.readings
+    kept = np.delete(np.arange(33), 13)
+    np.testing.assert_allclose(x.value, p.reshape(33, 3)[kept], atol=1e-11)
+    expected = (1e-3 * sigma.reshape(33, 3)[kept]) ** 2
+    np.testing.assert_allclose(x.covariance[:, range(3), range(3)], expected, rtol=1e-6)
+    assert x.states.target is not None
+    np.testing.assert_array_equal(x.states.target, np.tile([0, 1, 2], 11)[kept])
+    np.testing.assert_array_equal(x.pose, np.repeat(np.arange(11), 3)[kept])
+    assert result.notes[0] == "1 of 33 rows left out (6): no value in x1/x2/x3"
+    found = propose(path).proposal.sections
+    assert found["position"]["columns"] == names
+    assert found["position"]["targets"] == ["1", "2", "3"]
+    with pytest.raises(InputError, match=r"\[\[tool.targets\]\]"):
+        mapped(path, mapping)
+
+
+def test_angles_that_the_encoders_reported(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    q = np.repeat(rng.uniform(-2, 2, (6, 6)), 2, axis=0) + rng.uniform(-1e-4, 1e-4, (12, 6))
+    p = rng.uniform(-0.9, 0.9, (12, 3)) + 1.5
+    rows = [f"P{k // 2}," + ",".join(f"{v:.9f}" for v in (*q[k], *p[k])) for k in range(12)]
+    path = tmp_path / "t.csv"
+    path.write_text("\n".join([",".join(["pose", *Q, "x_m", "y_m", "z_m"]), *rows]))
+    mapping = {
+        "position": {"columns": ["x_m", "y_m", "z_m"], "unit": "m"},
+        "joints": {"columns": Q, "unit": "rad"},
+        "pose": {"column": "pose"},
+    }
+    with pytest.raises(InputError, match="row 3: pose 'P0' commands joint 1"):
+        mapped(path, mapping)
+    mapping["joints"]["reported"] = True
+    states = mapped(path, mapping).readings.states
+    np.testing.assert_allclose(states.q, q[np.arange(12) // 2 * 2], atol=1e-9)
+    assert states.q_actual is not None
+    np.testing.assert_allclose(states.q_actual, q, atol=1e-9)
+    assert propose(path).proposal.mapping() == check_section(mapping, Mapping, "m.toml")
