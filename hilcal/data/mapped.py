@@ -128,20 +128,14 @@ def readings_of_grid(
 def _raw(grid: Grid, mapping: Mapping, arm: Arm) -> dict[str, Floats]:
     """Number columns that a reading cannot do without, by the file's names, in its units."""
     needed: list[Column] = []
-    for section, count in (
-        (mapping.joints, arm.n),
-        (mapping.actual_joints, arm.n),
-        (mapping.approach, arm.n),
-        (mapping.joint_temperatures, arm.n),
-        (mapping.position, 3),
-        (mapping.orientation, None),
-    ):
+    per_joint = ("joints", "actual_joints", "approach", "joint_temperatures")
+    for name in (*per_joint, "position", "orientation"):
+        section = getattr(mapping, name)
         if section is None:
             continue
-        if count is not None and len(section.columns) != count:
-            where = type(section).__name__.lower()
+        if name in per_joint and len(section.columns) != arm.n:
             raise InputError(
-                f"{grid.path}: the mapping has {len(section.columns)} columns of {where}; "
+                f"{grid.path}: the mapping has {len(section.columns)} columns of {name}; "
                 f"{arm.name} has {arm.n} joints"
             )
         needed += section.columns
