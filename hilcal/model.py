@@ -10,7 +10,7 @@ from hilcal.cell import Cell
 from hilcal.data.readings import Readings, States
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.effects.options import typical_compliances
-from hilcal.effects.protocol import Effect, Situation
+from hilcal.effects.protocol import Columns, Effect, Situation
 from hilcal.effects.spec import EffectSpec
 from hilcal.equilibrium import Block, at_equilibrium, by_wrench_changes, compliance
 from hilcal.errors import CannotAnswerError, InputError
@@ -198,7 +198,7 @@ class Model:
         place[live] = np.arange(len(live))
         places = np.split(place, np.cumsum(sizes)[:-1]) if sizes else []
         out = np.empty((count, m, len(live)))
-        for rows in chunks(count):
+        for rows in chunks(count, m * len(live)):
             self._fill(out[rows], effects, places, prediction[rows], theta)
         return out
 
@@ -226,13 +226,10 @@ class Model:
             if e in self.effects and e.compliance(at) is not None:
                 for other, part in mine:
                     columns += tuple(map(e.of_compliance, other.compliance_columns(part, s)))
-            block = zeros(len(s.states), m, len(wanted))
-            for c in columns:
-                c = c.only(within[c.parameter] >= 0)
-                _add_columns(block, within[c.parameter], moves.by_columns(c))
+            block = _sum_columns(columns, within, moves, zeros(len(s.states), m, len(wanted)))
             change = e.wrench_columns(at, s) if blocks else None
             if change is not None:
-                block += by_wrench_changes(moves, blocks, change[:, wanted])
+                block = block + by_wrench_changes(moves, blocks, change[:, wanted])
             # A slice is written several times as fast as columns by index.
             at_once = slice(place[wanted[0]], place[wanted[-1]] + 1)
             out[:, :, at_once] = block
@@ -301,13 +298,24 @@ class Model:
         return replace(recorded, wrench=sum(given, recorded.wrench)) if given else recorded
 
 
-def _add_columns(block: Floats, at: Ints, moved: Floats) -> None:
-    """Add columns (N, m, P) where they belong, also where one parameter moves several elements."""
-    if len(np.unique(at)) == len(at):
-        block[:, :, at] += moved
-    else:
-        for column, place in enumerate(at):
-            block[:, :, place] += moved[:, :, column]
+def _sum_columns(
+    columns: tuple[Columns, ...], within: Ints, moves: Motion, block: Floats
+) -> Floats:
+    """Derivative (N, m, P) by the parameters with `within` ≥ 0, their places in `block` of zeros.
+
+    One parameter may move several elements.
+    """
+    for c in columns:
+        c = c.only(within[c.parameter] >= 0)
+        at, moved = within[c.parameter], moves.by_columns(c)
+        if len(columns) == 1 and np.array_equal(at, np.arange(block.shape[2])):
+            return moved
+        if len(np.unique(at)) == len(at):
+            block[:, :, at] += moved
+        else:
+            for column, place in enumerate(at):
+                block[:, :, place] += moved[:, :, column]
+    return block
 
 
 def _flange_motion(a: Chain, b: Chain, reach: float) -> float:

@@ -12,6 +12,7 @@ together. The blocks are kept stacked by size; nothing of size (readings)² exis
     gc     G = blockdiag(S_i⁻¹), V_i = S_i S_iᵀ
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -21,6 +22,7 @@ import numpy as np
 from hilcal.data.readings import Readings
 from hilcal.errors import InputError
 from hilcal.robot import se3
+from hilcal.robot.batch import chunks
 from hilcal.types import Bools, Floats, Ints
 
 Scaling = Literal["none", "gu", "gc"]
@@ -129,18 +131,30 @@ class Whitening:
 
     def whiten(self, raw: Floats) -> Floats:
         """Whitened rows (D·m, P) of measurements (D, m) or (D, m, P)."""
-        tail = raw.shape[2:]
-        width = int(np.prod(tail))
-        flat = raw.reshape(len(raw) * self.m, width)
-        out = np.empty_like(flat)
+        return self._whiten(raw, np.empty((len(raw) * self.m, *raw.shape[2:])))
+
+    def whiten_readings(self, x: Floats) -> Floats:
+        """Whitened rows (D·m, P) of values at the readings (N, m, P), which are overwritten.
+
+        There is no second array of that size, which a Jacobian of many parameters can be.
+        """
+        raw = np.ascontiguousarray(self.raw(x))
+        return self._whiten(raw, raw.reshape(len(raw) * self.m, *raw.shape[2:]))
+
+    def _whiten(self, raw: Floats, out: Floats) -> Floats:
+        """Write the whitened rows of measurements (D, m, ...) to `out`, which may be the same."""
+        width = math.prod(out.shape[1:])
+        flat, to = raw.reshape(len(out), width), out.reshape(len(out), width)
         start = 0
         for b in self.buckets:
-            groups, size = len(b.loaded), b.factor.shape[-1]
-            stop = start + groups * size
-            block = flat[start:stop].reshape(groups, size, width)
-            np.matmul(b.factor, block, out=out[start:stop].reshape(groups, size, width))
-            start = stop
-        return out.reshape(len(out), *tail)
+            size = b.factor.shape[-1]
+            for groups in chunks(len(b.loaded), size * width):
+                factor = b.factor[groups]
+                stop = start + len(factor) * size
+                block = flat[start:stop].reshape(len(factor), size, -1)
+                to[start:stop] = (factor @ block).reshape(stop - start, -1)
+                start = stop
+        return out
 
     def rows_of(self, measurements: Ints) -> Ints:
         """Repeat a number per measurement (D,) for each of its rows (D·m,)."""

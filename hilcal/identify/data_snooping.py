@@ -62,14 +62,16 @@ def find_gross_errors(
     """
     e, q = _projection(model, solution, readings, w)
     c = _candidates(w)
-    g, a = c.gradients(e[:, None])[:, :, 0], c.information(q)
+    g = c.gradients(e[:, None])[:, :, 0]
+    off = _Elimination(c, c.gradients(q))
+    del q
+    a = off.information()
     trace = np.trace(a, axis1=1, axis2=2)
     drop: list[Ints] = []
     taken: list[int] = []
     largest, found, candidate = 0.0, 0, np.ones(len(c.row), dtype=bool)
     t2 = _t2(g, a, trace)
     least, patience = limit(w.m, len(c.row)), most // 2 + PATIENCE
-    added = np.empty((len(e), 0))
     while len(drop) <= min(2 * most, found + patience) and (candidate & c.loaded).any():
         k = int(np.argmax(np.where(candidate, t2, 0.0)))
         top = float(t2[k])
@@ -80,13 +82,9 @@ def find_gross_errors(
         taken.append(k)
         candidate &= ~np.isin(c.row, c.drops[k])
         # P becomes P − P S (Sᵀ P S)⁻¹ Sᵀ P; it is no projection where parts have a prior.
-        shift = c.column(k, len(e))
         inverse_root = _inverse_root(a[k], float(trace[k]))
-        freed = shift - q @ (q.T @ shift) - added @ (added.T @ shift)
-        new = freed @ inverse_root
-        slope = c.gradients(new)
+        slope = off.eliminate(k, inverse_root)
         size = inverse_root.T @ g[k]
-        added = np.concatenate([added, new], axis=1)
         g = g - slope @ size
         a = a - slope @ np.swapaxes(slope, 1, 2)
         t2 = _t2(g, a, trace)
@@ -154,26 +152,66 @@ class _Shifts:
         ]
         return np.concatenate(out)
 
-    def information(self, q: Floats) -> Floats:
-        """(N, m, m) Sᵀ P S."""
-        slope = self.gradients(q)
-        own = []
-        for _, s in self.blocks:
-            parts = s.reshape(*s.shape[:2], -1, self.m)
-            own.append(np.einsum("grci,grcj->gcij", parts, parts).reshape(-1, self.m, self.m))
-        return np.asarray(np.concatenate(own) - slope @ np.swapaxes(slope, 1, 2))
-
-    def column(self, k: int, size: int) -> Floats:
-        """(R, m) effect of the shift of candidate k."""
-        out = np.zeros((size, self.m))
+    def place(self, k: int) -> tuple[Floats, slice, slice]:
+        """Shifts (r, c·m) of the group of candidate k, its candidates, and its columns of them."""
+        first = 0
         for rows, s in self.blocks:
             each = s.shape[2] // self.m
-            if k < len(rows) * each:
-                g, i = divmod(k, each)
-                out[rows[g]] = s[g][:, i * self.m : (i + 1) * self.m]
-                break
-            k -= len(rows) * each
-        return out
+            group, i = divmod(k - first, each)
+            if group < len(rows):
+                start = first + group * each
+                own = slice(i * self.m, (i + 1) * self.m)
+                return s[group], slice(start, start + each), own
+            first += len(rows) * each
+        raise IndexError(k)
+
+
+class _Elimination:
+    """P of the model, and of the shifts that were selected, as the candidates see it.
+
+    A shift acts on the rows of its own group alone. With L the projection off the selected shifts,
+    group by group, and P = I − Q Qᵀ before,
+
+        P = L − L Q C Qᵀ L,    C = (I − Qᵀ (I − L) Q)⁻¹
+
+    so that only G_k = S_kᵀ L Q (m, K) of each candidate and C (K, K) have to be kept.
+    """
+
+    def __init__(self, shifts: _Shifts, seen: Floats) -> None:
+        """Begin without selected shifts; `seen` (N, m, K) is SᵀQ, and is changed."""
+        self._shifts, self._seen = shifts, seen
+        self._c = np.eye(seen.shape[2])
+        self._local: dict[int, Floats] = {}
+
+    def information(self) -> Floats:
+        """(N, m, m) Sᵀ P S before the first selection."""
+        m, own = self._shifts.m, []
+        for _, s in self._shifts.blocks:
+            parts = s.reshape(*s.shape[:2], -1, m)
+            own.append(np.einsum("grci,grcj->gcij", parts, parts).reshape(-1, m, m))
+        return np.asarray(np.concatenate(own) - self._seen @ np.swapaxes(self._seen, 1, 2))
+
+    def eliminate(self, k: int, inverse_root: Floats) -> Floats:
+        """Project off candidate k, too; returns Sᵀ P S_k times the root, (N, m, r).
+
+        Args:
+            k: the candidate.
+            inverse_root: (m, r) root of the pseudo-inverse of S_kᵀ P S_k.
+        """
+        m, seen = self._shifts.m, self._seen
+        shifts, members, own = self._shifts.place(k)
+        local = self._local.get(members.start, shifts)
+        along = self._c @ (seen[k].T @ inverse_root)
+        flat = seen.reshape(-1, seen.shape[2])  # one product of matrices is faster than N
+        slope = -(flat @ along).reshape(*seen.shape[:2], -1)
+        mine = local[:, own] @ inverse_root
+        slope[members] += (local.T @ mine).reshape(-1, m, mine.shape[1])
+        self._c += along @ along.T
+        unit, r = np.linalg.qr(mine)
+        gone = np.linalg.solve(r.T, inverse_root.T @ seen[k])
+        seen[members] -= ((local.T @ unit) @ gone).reshape(-1, m, seen.shape[2])
+        self._local[members.start] = local - unit @ (unit.T @ local)
+        return np.asarray(slope)
 
 
 def _candidates(w: Whitening) -> _Shifts:

@@ -217,7 +217,7 @@ def whitened_jacobian(
 ) -> Floats:
     """Whitened derivative (R, L) of the measurements by the live parameters."""
     jacobian = model.jacobian(prediction, theta, w.m, live)
-    return w.whiten(w.raw(jacobian)).reshape(w.m * len(w), len(live))
+    return w.whiten_readings(jacobian)
 
 
 def _step(linear: LinearProblem, by: Regularisation, groups: Ints) -> tuple[Regularisation, Floats]:

@@ -19,7 +19,7 @@ from hilcal.regression.evidence import FamilyScore, score_family
 from hilcal.regression.leave_out import Fold, left_out_residual
 from hilcal.regression.paired_test import improves
 from hilcal.regression.projection import Projection
-from hilcal.types import Floats
+from hilcal.types import Floats, Ints
 
 LEAST_MISFIT = 3.0
 """A misfit counts as at least so many standard deviations of χ²; a choice."""
@@ -157,33 +157,60 @@ def effect_columns(fit: Fit, effect: Effect) -> EffectColumns:
     s, w = fit.solution, fit.whitening
     jacobian = fit.model.jacobian_of((effect,), s.prediction, s.theta, w.m)
     scale = np.array([q.scale for q in effect.parameters])
-    at_reading = jacobian * scale
-    raw = w.raw(at_reading)
-    white = w.whiten(raw).reshape(w.m * len(w), len(scale))
-    return EffectColumns(effect, scale, white, raw[:, :3], at_reading[:, :3])
+    jacobian *= scale
+    at_reading = jacobian[:, :3].copy()
+    motion = w.raw(at_reading)
+    return EffectColumns(effect, scale, w.whiten_readings(jacobian), motion, at_reading)
 
 
-def model_columns(fit: Fit) -> Floats:
-    """Whitened Jacobian (R, P) of all parameters of a fit, in ordinary magnitudes."""
-    scale, s, w = scales_of(fit.model), fit.solution, fit.whitening
-    jacobian = fit.model.jacobian(s.prediction, s.theta, w.m) * scale
-    return w.whiten(w.raw(jacobian)).reshape(w.m * len(w), len(scale))
+@dataclass(frozen=True, slots=True, eq=False)
+class ModelColumns:
+    """The columns of a fitted model in ordinary magnitudes of its parameters.
+
+    Those of parameters that are held at zero are left out, but for those by which their effect
+    would be scored as a suspect.
+
+    Attributes:
+        parameter: (L,) indices of the parameters, ascending.
+        scale: (L,) ordinary magnitudes, SI.
+        white: (R, L) whitened columns.
+    """
+
+    parameter: Ints
+    scale: Floats
+    white: Floats
 
 
-def eliminate_effect(fit: Fit, columns: Floats, effect: str) -> ReducedModel:
+def model_columns(fit: Fit) -> ModelColumns:
+    """Return the columns of a fitted model."""
+    model, s, w = fit.model, fit.solution, fit.whitening
+    states = s.prediction.situation.states
+    scored = [
+        q.name in {p.name for p in effect.for_scoring(states).parameters}
+        for effect in model.effects
+        for q in effect.parameters
+    ]
+    parameter = np.flatnonzero((s.prior > 0) | np.array(scored, dtype=np.bool_))
+    scale = scales_of(model)[parameter]
+    jacobian = model.jacobian(s.prediction, s.theta, w.m, parameter)
+    jacobian *= scale
+    return ModelColumns(parameter, scale, w.whiten_readings(jacobian))
+
+
+def eliminate_effect(fit: Fit, columns: ModelColumns, effect: str) -> ReducedModel:
     """Take an effect out of a fit, at the same linearisation.
 
     Args:
         fit: the fit.
-        columns: (R, P) its `model_columns`.
+        columns: of its model.
         effect: name of the effect, which is in its model.
     """
-    out = np.zeros(columns.shape[1], dtype=np.bool_)
-    out[fit.model.slices()[fit.model.names.index(effect)]] = True
-    s, scale = fit.solution, scales_of(fit.model)
-    return eliminate_columns(
-        columns, fit.white, s.theta / scale, s.prior / scale, out, s.beta, fit.whitening.rank
-    )
+    mine = fit.model.slices()[fit.model.names.index(effect)]
+    index, scale, s = columns.parameter, columns.scale, fit.solution
+    theta, prior = s.theta[index] / scale, s.prior[index] / scale
+    out = (index >= mine.start) & (index < mine.stop)
+    rank = fit.whitening.rank
+    return eliminate_columns(columns.white, fit.white, theta, prior, out, s.beta, rank)
 
 
 def by_pose(fit: Fit, white: Floats) -> Floats:

@@ -3,7 +3,8 @@
 import numpy as np
 
 from hilcal.effects.protocol import Effect
-from hilcal.identify.linearisation import computable, effect_columns, model_columns
+from hilcal.identify.gauss_newton import whitened_jacobian
+from hilcal.identify.linearisation import computable, effect_columns
 from hilcal.identify.priors import scales_of
 from hilcal.plan.nominal_model import NominalModel
 from hilcal.types import Floats
@@ -25,7 +26,9 @@ def information_of(nominal: NominalModel, more: tuple[Effect, ...], scale: Float
     if fit is None:
         return np.zeros((len(scale), len(scale)))
     ordinary = [scales_of(fit.model)[nominal.live]]
-    columns = [model_columns(fit)[:, nominal.live]]
+    s = fit.solution
+    own = whitened_jacobian(fit.model, s.prediction, s.theta, fit.whitening, nominal.live)
+    columns = [own * ordinary[0]]
     for e in more:
         ordinary.append(np.array([p.scale for p in e.parameters]))
         missing = np.zeros((len(fit.white), len(e.parameters)))

@@ -67,8 +67,10 @@ def eliminate_columns(
         rank: number of rows that carry information.
     """
     stay = ~out & (prior > 0)
-    basis = find_basis(columns[:, stay], np.ones(int(stay.sum())), prior[stay])
-    p = projection(columns[:, stay] @ basis.transform, beta * basis.prior_precision)
+    kept = columns[:, stay]
+    basis = find_basis(kept, np.ones(kept.shape[1]), prior[stay])
+    p = projection(kept @ basis.transform, beta * basis.prior_precision)
+    del kept  # the largest array here
     # Priors pull to zero, not to where the fit stands.
     z = np.zeros(len(p.ridge))
     z[len(basis.singular) :] = (theta[stay] / prior[stay])[basis.held]

@@ -23,7 +23,7 @@ prior for a global scale parameter*, Bayesian Analysis 7 (2012) 887-902.
 
 import numpy as np
 
-from hilcal.regression.projection import Projection, projection
+from hilcal.regression.projection import Projection
 from hilcal.regression.schur import inverse_root
 from hilcal.types import Floats, Ints
 
@@ -89,15 +89,18 @@ def dropped_group_factors(
         groups: (Q,) their groups.
         beta: noise factor that priors are weighed against.
     """
-    free = np.maximum(np.diag(p.information(columns)), 0.0)
-    norm2 = np.sum(columns**2, axis=0)
+    cross, gram = p.rows.T @ columns, columns.T @ columns
+    norm2 = np.diag(gram)
+    free = np.maximum(norm2 - np.sum((p.inverse_root @ cross) ** 2, axis=0), 0.0)
     reach = np.bincount(groups, weights=free) / np.maximum(np.bincount(groups), 1)
     # Columns in the span of the others have no information of their own: left out.
     seen = reach[groups] > ROUNDING * np.maximum(norm2, 1e-300)
     if not seen.any():
         return np.ones(len(transform))
-    dropped = projection(columns[:, seen], beta * reach[groups][seen] / HIDDEN)
-    wide = inverse_root(dropped.information(p.rows) + np.diag(p.ridge))
+    hidden = gram[np.ix_(seen, seen)] + np.diag(beta * reach[groups][seen] / HIDDEN)
+    own = p.rows.T @ p.rows + np.diag(p.ridge)
+    explained = inverse_root(hidden) @ cross[:, seen].T
+    wide = inverse_root(own - explained.T @ explained)
     before = np.sum((transform @ p.inverse_root.T) ** 2, axis=1)
     after = np.sum((transform @ wide.T) ** 2, axis=1)
     there = before > 0

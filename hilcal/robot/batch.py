@@ -16,6 +16,11 @@ import numpy as np
 from hilcal.types import Floats
 
 CHUNK = 8192
+"""States of a chunk, at most; a choice by timing."""
+BUDGET = 1 << 20
+"""Numbers of a chunk's largest array, 8 MB; a choice by timing."""
+LEAST_CHUNK = 256
+"""States of a chunk, at least: Python's share of the time grows with the number of chunks."""
 
 
 class Record(Protocol):
@@ -42,10 +47,16 @@ def along_states(x: Floats) -> Floats:
     return np.asfortranarray(x)
 
 
-def chunks(count: int) -> Iterator[slice]:
-    """Yield slices that cover `count` states; one empty slice where there is none."""
-    for start in range(0, max(count, 1), CHUNK):
-        yield slice(start, min(start + CHUNK, count))
+def chunks(count: int, numbers: int = 0) -> Iterator[slice]:
+    """Yield slices that cover `count` states; one empty slice where there is none.
+
+    Args:
+        count: number of states.
+        numbers: that are computed for each state, where they are many: chunks are smaller then.
+    """
+    size = CHUNK if numbers == 0 else max(LEAST_CHUNK, min(CHUNK, BUDGET // numbers))
+    for start in range(0, max(count, 1), size):
+        yield slice(start, min(start + size, count))
 
 
 def take(record: R, rows: slice, axis: int = 0) -> R:
