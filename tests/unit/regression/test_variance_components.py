@@ -1,0 +1,93 @@
+"""REML: against the balanced one-way layout, a grid of the dense likelihood, and many draws."""
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize_scalar
+
+from hilcal.regression.variance_components import BlockRows, variance_components
+from hilcal.types import Floats
+
+
+def one_way(groups: int, size: int, between: float, seed: int) -> BlockRows:
+    """Groups with a common normal shift of variance `between`, unit noise, and a mean."""
+    rng = np.random.default_rng(seed)
+    y = rng.standard_normal((groups, size)) + np.sqrt(between) * rng.standard_normal((groups, 1))
+    ones = np.ones((1, groups, size, size))
+    return BlockRows(y + 5.0, np.ones((groups, size, 1)), ones)
+
+
+@pytest.mark.parametrize("between", [0.0, 0.5, 40.0])
+def test_the_balanced_layout_has_a_closed_form(between: float) -> None:
+    """With known noise, 1 + n s is the variance of √n times the groups' means, mean free."""
+    b = one_way(30, 4, between, 3)
+    means = 2.0 * b.y.mean(axis=1)
+    closed = max((float(np.var(means, ddof=1)) - 1.0) / 4.0, 0.0)
+    found = variance_components([b], np.zeros(1))
+    assert found.variance[0] == pytest.approx(closed, rel=2e-3, abs=1e-6)
+    if closed > 0:
+        std = np.sqrt(2 / 29) * (1 + 4 * closed) / 4
+        assert np.sqrt(found.covariance[0, 0]) == pytest.approx(std, rel=0.02)
+
+
+def dense(b: BlockRows, ridge: Floats, s: float) -> float:
+    """The log of the marginal likelihood; columns without a prior integrated over all values."""
+    size = b.y.size
+    sigma = np.eye(size)
+    for g, k in enumerate(b.components[0]):
+        at = slice(g * len(k), (g + 1) * len(k))
+        sigma[at, at] += s * k
+    x = b.rows.reshape(size, -1)
+    inverse = np.linalg.inv(sigma)
+    h = x.T @ inverse @ x + np.diag(ridge)
+    p = inverse - inverse @ x @ np.linalg.solve(h, x.T @ inverse)
+    y = b.y.reshape(-1)
+    return -0.5 * float(np.linalg.slogdet(sigma)[1] + np.linalg.slogdet(h)[1] + y @ p @ y)
+
+
+def test_blocks_of_two_sizes_and_columns_with_priors_against_the_dense_likelihood() -> None:
+    rng, parts = np.random.default_rng(1), []
+    ridge = np.array([0.0, 0.0, 2.0])
+    for groups, size in ((12, 3), (5, 6)):
+        z = rng.standard_normal((1, groups, size, 2))
+        y = rng.standard_normal((groups, size))
+        y += 1.5 * (z[0] @ rng.standard_normal((groups, 2, 1)))[:, :, 0]
+        rows = rng.standard_normal((groups, size, 3))
+        parts.append(BlockRows(y, rows, z @ np.swapaxes(z, 2, 3)))
+    # Both sizes as one block each, for the dense likelihood.
+    size = sum(b.y.size for b in parts)
+    k, at = np.zeros((1, 1, size, size)), 0
+    for b in parts:
+        for one in b.components[0]:
+            k[0, 0, at : at + len(one), at : at + len(one)] = one
+            at += len(one)
+    y = np.concatenate([b.y.reshape(-1) for b in parts])[None]
+    rows = np.concatenate([b.rows.reshape(-1, 3) for b in parts])[None]
+    whole = BlockRows(y, rows, k)
+    best = minimize_scalar(lambda s: -dense(whole, ridge, s), bounds=(0, 50), method="bounded")
+    found = variance_components(parts, ridge)
+    assert found.variance[0] == pytest.approx(best.x, rel=0.02)
+    gain = dense(whole, ridge, float(best.x)) - dense(whole, ridge, 0.0)
+    assert found.log_likelihood == pytest.approx(gain, abs=2e-3)
+
+
+def test_two_components_are_told_apart_without_bias_and_their_uncertainty_is_right() -> None:
+    rng, truth, z = np.random.default_rng(0), np.array([2.0, 0.5]), []
+    rows = rng.standard_normal((40, 3, 30))
+    components = np.stack([v[:, :, None] * v[:, None, :] for v in rng.standard_normal((2, 40, 3))])
+    vectors = np.sqrt(np.einsum("cgii->cgi", components)) * np.sign(components[:, :, :, 0])
+    for _ in range(60):
+        y = rng.standard_normal((40, 3))
+        y += np.einsum("cgi,c,cg->gi", vectors, np.sqrt(truth), rng.standard_normal((2, 40)))
+        found = variance_components([BlockRows(y, rows, components)], np.zeros(30))
+        z.append(found.variance)
+    mean, error = np.mean(z, axis=0), np.std(z, axis=0) / np.sqrt(60)
+    assert np.all(np.abs(mean - truth) < 4 * error)
+
+
+@pytest.mark.parametrize("scale", [1e-8, 1e8])
+def test_the_scale_of_a_component_does_not_matter(scale: float) -> None:
+    b = one_way(30, 4, 2.0, 5)
+    whole = variance_components([b], np.zeros(1))
+    scaled = BlockRows(b.y, b.rows, scale * b.components)
+    found = variance_components([scaled], np.zeros(1))
+    assert scale * found.variance[0] == pytest.approx(whole.variance[0], rel=1e-3)
