@@ -9,7 +9,6 @@ import numpy as np
 
 from hilcal.campaign import Campaign
 from hilcal.cell import Cell
-from hilcal.data.covariance import WHOLE
 from hilcal.data.importing import import_readings
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import MODES, SCALINGS, Mode, usual_mode
@@ -18,7 +17,7 @@ from hilcal.errors import InputError
 from hilcal.identify import baseline as starting_models
 from hilcal.identify import fit as fits
 from hilcal.identify.fit import Fit
-from hilcal.identify.full_covariance import with_joint_scatter
+from hilcal.identify.full_covariance import full_readings
 from hilcal.model import Model
 from hilcal.plan.checked_plan import CheckedPlan, checked
 from hilcal.plan.planner import Request, make
@@ -49,10 +48,7 @@ def read_table(path: str | Path, cell: Cell, mapping: str | Path | None = None) 
     """
     form, config = "table" if mapping is None else mapping, cell.configured()
     found = import_readings(Path(path), form, config, cell.arm)
-    if found.covers == WHOLE:
-        return found.readings
-    joint_std = config.repeatability.per_joint(cell.arm.n)
-    return with_joint_scatter(cell, found.readings, joint_std)
+    return full_readings(found.readings, found.covers, cell, config)
 
 
 def baseline(

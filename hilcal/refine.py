@@ -11,12 +11,15 @@ from hilcal.diagnose.promise import LEAST_KEPT, kept_by_refit
 from hilcal.diagnose.stepwise import Refits, add, exchange, predicts_better, remove
 from hilcal.diagnose.stepwise_alternatives import Alternative
 from hilcal.diagnose.verdict import NOTHING, judge
+from hilcal.identify.arm_scatter import with_arm_scatter
 from hilcal.identify.fit import Fit, fit
 from hilcal.model import Model
 
 __all__ = ["Refinement", "Step", "add", "predicts_better", "refine", "remove"]
 
 MOST_REVISIONS = 15
+MOST_SCATTERS = 2
+"""Estimates of the arm's scatter at most: the first, and one more with what was added after it."""
 FAR = 0.1
 """Share of an effect's evidence by which others must be better while the model is not adequate;
 a guess."""
@@ -82,7 +85,9 @@ def refine(
     the first suspect from others it is added all the same, since any of them lowers the error.
     When no suspect is left, every addition is reconsidered: a redundant one is removed, one that
     others replace better is exchanged for them. Effects that were tried or taken out enter the
-    history by which `verdict.judge` judges each step.
+    history by which `verdict.judge` judges each step. Where the arm's scatter is what is left, the
+    last step is a fit with it in the covariance, so that weights, uncertainties and p-values have
+    it, too.
 
     Args:
         model: the starting model; its effects are never taken out.
@@ -96,7 +101,7 @@ def refine(
     changed = True
     while changed:
         path.extend()
-        changed = path.reconsider()
+        changed = path.reconsider() or path.take_scatter()
     return Refinement(tuple(path.steps))
 
 
@@ -115,6 +120,8 @@ class Path:
         self._given, self._before, self._say = first.model.names, before, say
         self._rejected, self._removed = [*before.rejected], [*before.removed]
         self._refits = Refits()
+        taken = first.readings.arm_scatter is not None
+        self._scattered = [first.model.names] if taken else []
         say("diagnosing")
         self.append(first, None)
 
@@ -185,6 +192,28 @@ class Path:
             if self._better(last, others[name]) and self._exchange(last, others[name]):
                 return True
         return False
+
+    def take_scatter(self) -> bool:
+        """Fit with the arm's scatter in the covariance; returns whether anything was changed.
+
+        It is estimated anew, once, where effects were added since.
+        """
+        last = self.steps[-1]
+        fitted, names = last.fit, last.fit.model.names
+        if not self._room or len(self._scattered) == MOST_SCATTERS or names in self._scattered:
+            return False
+        judged = last.diagnosis
+        if fitted.readings.arm_scatter is not None:
+            stated = fitted.readings.as_stated()
+            fitted = fit(fitted.model, stated, fitted.mode, start=fitted.theta)
+            judged = judge(Evidence(fitted, self._refits.add), self._history(fitted))
+        if judged.reason != "arm_scatter" or judged.scatter is None:
+            return False
+        self._scattered.append(names)
+        self._say("the arm's scatter enters the covariance; diagnosing")
+        readings = with_arm_scatter(fitted.model.cell, fitted.readings, judged.scatter)
+        self.append(fit(fitted.model, readings, fitted.mode, start=fitted.theta), None)
+        return True
 
     def _better(self, last: Step, other: Alternative) -> bool:
         """Whether others are worth a trial: far better ones while the residual is not noise."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from hilcal import __version__
 from hilcal.cell import Cell
+from hilcal.data.arm_scatter import ArmScatter
 from hilcal.data.readings import Readings
 from hilcal.data.records import content_hash
 from hilcal.data.revision import RevisionRecord
@@ -17,6 +18,7 @@ from hilcal.diagnose.diagnosis import History
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError
 from hilcal.identify import fit_document
+from hilcal.identify.arm_scatter import with_arm_scatter
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.predictive import Predictive, predictive
 from hilcal.model import Model
@@ -44,6 +46,7 @@ def to_record(
         removed: the effect that was taken out of the revision before.
     """
     effects, cell = found.model.effects, found.model.cell
+    scatter = found.readings.arm_scatter
     result: dict[str, object] = {"identify": fit_document.to_json(found)}
     if diagnosis is not None:
         result["diagnose"] = fit_document.plain(diagnosis)
@@ -68,6 +71,7 @@ def to_record(
             "target": cell.target.tolist(),
             **({} if cell.targets is None else {"targets": cell.targets.tolist()}),
             "outliers": np.flatnonzero(found.outlier).tolist(),
+            **({} if scatter is None else {"arm_scatter": scatter.to_json()}),
         },
         result_json=result,
     )
@@ -90,6 +94,9 @@ def restore(
     prior = np.array(
         [np.inf if s is None else float(s) for s in record.parameters_json["prior"]], dtype=float
     )
+    scatter = record.parameters_json.get("arm_scatter")
+    if scatter is not None:
+        readings = with_arm_scatter(model.cell, readings, ArmScatter.from_json(scatter))
     return fit(model, readings, mode_of(record), scaling_of(record), theta, prior)
 
 

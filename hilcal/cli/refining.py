@@ -65,7 +65,8 @@ class Row:
     @property
     def shown(self) -> tuple[int, str, Fit, str]:
         """The same as `revisions_table` takes it."""
-        return self.number, change(self.added, self.removed), self.fit, self.verdict
+        scatter = self.fit.readings.arm_scatter is not None
+        return self.number, change(self.added, self.removed, scatter), self.fit, self.verdict
 
 
 def diagnose(run: Run, effects_from: EffectsFrom = None, as_json: Json = False) -> None:
@@ -213,9 +214,11 @@ def refine(
         mode = mode_of_option(o, readings)
         check_options(o, named or {})
         with working(t.progress) as say:
+            fitted = o.readings
             if latest is not None:
                 say(f"restoring revision {latest.number}")
-                model = o.restore(latest).model
+                restored = o.restore(latest)
+                model, fitted = restored.model, restored.readings
             elif named is None:
                 say("registering")
                 model = baseline(o.cell, o.readings, mode, catalogue)
@@ -223,7 +226,7 @@ def refine(
                 say("registering")
                 model = with_effects(o.cell, o.readings, mode, named, named, catalogue)
             how = NOTHING if latest is None else o.history()
-            found = refine_model(model, o.readings, mode, say, how)
+            found = refine_model(model, fitted, mode, say, how)
         rows: list[Row] = []
         for k, step in enumerate(found.steps):
             if k == 0 and latest is not None:

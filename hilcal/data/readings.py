@@ -5,6 +5,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
+from hilcal.data.arm_scatter import ArmScatter
 from hilcal.types import Bools, Floats, Ints
 
 
@@ -71,6 +72,11 @@ class Readings:
         common: (N, m, n) factors F of the error that all readings of one arrival have in common:
             Cov(i, j) = F_i F_jᵀ for two readings i, j of one arrival (see `arrivals`); F_i F_iᵀ
             is part of `covariance`. None where no such error is known.
+        scatter_stated: whether the arm's own scatter is in the covariances, as far as it is known;
+            where False, `hilcal.diagnose` may find what is left to be that scatter.
+        stated: (N, m, m) the covariance without a scatter that was estimated; None where
+            `covariance` has none.
+        arm_scatter: the estimate that `covariance` includes beside `stated`.
     """
 
     states: States
@@ -83,6 +89,9 @@ class Readings:
     pose_names: tuple[str, ...]
     target_names: tuple[str, ...] = ()
     common: Floats | None = None
+    scatter_stated: bool = True
+    stated: Floats | None = None
+    arm_scatter: ArmScatter | None = None
 
     def __len__(self) -> int:
         """Return the number of readings N."""
@@ -99,6 +108,7 @@ class Readings:
             value=self.value[rows],
             covariance=self.covariance[rows],
             common=None if self.common is None else self.common[rows],
+            stated=None if self.stated is None else self.stated[rows],
         )
 
     @staticmethod
@@ -116,6 +126,12 @@ class Readings:
             covariance=np.concatenate([p.covariance for p in parts]),
             common=None,
         )
+
+    def as_stated(self) -> "Readings":
+        """Return the readings without an estimated scatter of the arm."""
+        if self.stated is None:
+            return self
+        return replace(self, covariance=self.stated, common=None, stated=None, arm_scatter=None)
 
     @property
     def m(self) -> int:

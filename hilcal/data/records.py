@@ -90,8 +90,10 @@ def content_hash(readings: Readings) -> str:
     """SHA-256 (hex) of what was measured, in order.
 
     Depends on every number and on the names of poses, loads and targets, but not on how names are
-    numbered, on names without readings, or on how the readings were appended.
+    numbered, on names without readings, or on how the readings were appended; nor on a scatter of
+    the arm that was estimated from them.
     """
+    readings = readings.as_stated()
     sha = hashlib.sha256()
     columns = []
     named = [(readings.pose, readings.pose_names), (readings.load, readings.load_names)]

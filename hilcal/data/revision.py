@@ -43,11 +43,25 @@ class RevisionRecord:
     @property
     def follows(self) -> bool:
         """Whether it was made from the revision before."""
-        return self.added is not None or self.removed is not None
+        return self.added is not None or self.removed is not None or self.scatter_alone
+
+    @property
+    def scatter_alone(self) -> bool:
+        """Whether it changed the covariance alone, by the arm's scatter as estimated."""
+        taken = self.parameters_json.get("arm_scatter") is not None
+        return taken and self.added is None and self.removed is None
 
 
-def change(added: str | None, removed: str | None) -> str:
-    """Return what a revision changed, as "+ a", "− b" or "+ a − b"; empty for a first model."""
+def change(added: str | None, removed: str | None, scatter: bool = False) -> str:
+    """Return what a revision changed, as "+ a", "− b" or "+ a − b"; empty for a first model.
+
+    Args:
+        added: an effect.
+        removed: an effect.
+        scatter: whether the arm's estimated scatter is in its covariance.
+    """
+    if scatter and added is None and removed is None:
+        return "arm's scatter"
     parts = [f"+ {added}"] if added else []
     return " ".join([*parts, f"− {removed}"] if removed else parts)
 

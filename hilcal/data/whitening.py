@@ -337,6 +337,16 @@ def _group_covariance(readings: Readings, loaded: Ints, reference: Ints, weights
     return c.reshape(groups, size, size)
 
 
+def covariance_blocks(readings: Readings, w: Whitening) -> list[Floats]:
+    """Return the covariance (G, L·m, L·m) of the measurements of each bucket of a scaling.
+
+    Args:
+        readings: those of the scaling, with any covariance.
+        w: the scaling.
+    """
+    return [_group_covariance(readings, b.loaded, b.reference, b.weights) for b in w.buckets]
+
+
 def usual_mode(readings: Readings) -> Mode:
     """Deflections where every loaded reading has an unloaded one in its pose and cycle."""
     if readings.unloaded.all():

@@ -7,6 +7,7 @@ It holds data only; `hilcal.report.verdict_words` writes its sentence, and
 from dataclasses import dataclass
 from typing import Literal
 
+from hilcal.data.arm_scatter import ArmScatter
 from hilcal.diagnose.catalogue_sufficiency import Insufficiency
 from hilcal.diagnose.effect_ranking import Suspect
 from hilcal.diagnose.misfit_breakdown import MisfitShare
@@ -26,6 +27,7 @@ Reason = Literal[
     "insufficient_catalogue",
     "no_suspect",
     "misjudged_noise",
+    "arm_scatter",
 ]
 VERDICTS: dict[Reason, Verdict] = {
     "residual_is_noise": "adequate",
@@ -35,6 +37,7 @@ VERDICTS: dict[Reason, Verdict] = {
     "insufficient_catalogue": "unknown_effect",
     "no_suspect": "unknown_effect",
     "misjudged_noise": "noise_misjudged",
+    "arm_scatter": "adequate",
 }
 """The verdict that each reason leads to."""
 
@@ -67,8 +70,8 @@ class Diagnosis:
             that explain the misfit but do not surely lower the error on poses left out, then
             the others; by decreasing evidence in each of these three groups.
         misfit_breakdown: variables that the misfit follows, largest share first.
-        predictable_share: share of the misfit that a generic regression predicts; 0 where there
-            is no misfit.
+        predictable_share: largest share of the misfit that anything predicts on poses left out: a
+            generic regression, one variable, or one effect; 0 where there is no misfit.
         dependences: variables that carry what is predictable, with the curve of each; those of
             the residual after the refit where the catalogue is insufficient.
         follows: names of at most two variables that the unexplained misfit follows.
@@ -80,6 +83,8 @@ class Diagnosis:
         insufficiency: what all effects of the catalogue together leave of the misfit, where
             that is not noise.
         alternatives: for each effect of `history.added`, the effects that could replace it.
+        scatter: the arm's scatter as estimated: where nothing else explains the residual, or in the
+            covariance of the fit.
     """
 
     fit: Fit
@@ -96,6 +101,7 @@ class Diagnosis:
     separability: tuple[Separability, ...]
     insufficiency: Insufficiency | None
     alternatives: tuple[Alternative, ...]
+    scatter: ArmScatter | None = None
 
     @property
     def verdict(self) -> Verdict:
@@ -111,6 +117,14 @@ class Diagnosis:
     def lead(self) -> Suspect | None:
         """The first suspect, where it passes all tests."""
         return self.suspects[0] if self.suspects and self.suspects[0].passes else None
+
+    @property
+    def repeated_share(self) -> float:
+        """Share of the misfit that repeats of a state have in common; 0 without repeats."""
+        excess = self.fit.variance_factor - 1
+        if self.pure_error is None or excess <= 0:
+            return 0.0
+        return min(max(1 - (self.pure_error.factor - 1) / excess, 0.0), 1.0)
 
     @property
     def residual_is_noise(self) -> bool:

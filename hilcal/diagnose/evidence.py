@@ -5,6 +5,7 @@ from functools import cached_property
 
 from scipy.stats import chi2
 
+from hilcal.data.arm_scatter import ArmScatter
 from hilcal.diagnose.backward_elimination import backward_elimination
 from hilcal.diagnose.catalogue_sufficiency import Insufficiency, insufficiency
 from hilcal.diagnose.effect_ranking import Suspect, candidates, rank_suspects
@@ -16,6 +17,7 @@ from hilcal.diagnose.stepwise import add
 from hilcal.diagnose.stepwise_alternatives import Alternative, StepwiseAlternatives
 from hilcal.effects.protocol import Effect
 from hilcal.errors import InputError
+from hilcal.identify.arm_scatter import estimate_arm_scatter
 from hilcal.identify.fit import Fit
 from hilcal.identify.linearisation import Linearisation, linearise
 
@@ -77,6 +79,11 @@ class Evidence:
     def regression(self) -> ResidualRegression:
         """What smooth laws, or trees, predict of the misfit on poses left out."""
         return residual_regression(self.linearisation)
+
+    @cached_property
+    def arm_scatter(self) -> ArmScatter | None:
+        """The arm's scatter, if it is what is left; None where the residual shows none."""
+        return estimate_arm_scatter(self.fit)
 
     @cached_property
     def tree_share(self) -> float:

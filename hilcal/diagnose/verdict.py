@@ -6,15 +6,31 @@ The rules, in this order:
    catalogue together leave more than noise (see `catalogue_sufficiency`): `unknown_effect`.
 2. A suspect passes, and the readings separate it from every other: `missing_effect`; else
    `ambiguous`.
-3. None passes. Repeated readings, or their absence, decide whether the noise is misjudged (see
-   `noise_verdict`): `noise_misjudged`.
-4. The residual is larger than the noise: `unknown_effect`.
-5. The residual is noise: `adequate`; or `ambiguous` where another effect could replace one that
-   an earlier diagnosis chose.
+3. None passes, and χ² is what chance allows: `adequate`; or `ambiguous` where another effect could
+   replace one that an earlier diagnosis chose.
+4. χ² is too large, and something recorded predicts a share of the misfit on poses left out, or
+   repeats of a pose have it in common: `unknown_effect`, with that share.
+5. χ² is too large, nothing predicts the residual, repeats do not scatter less, and the arm's own
+   scatter is not in the stated covariance. It is estimated (see `identify.arm_scatter`):
+   a. the readings prefer a noisier instrument at more than 20 : 1: `noise_misjudged`;
+   b. the scatter is larger than an arm's repeatability can be (see `arm_repeatability`):
+      `noise_misjudged`, be it the instrument, or an arm or a target that was loose;
+   c. else `adequate`. An arm whose scatter is not stated was taken for one without any, which no
+      arm is; so where the readings do not tell its scatter from a noisier instrument, that is said
+      and the verdict stays.
+6. Otherwise the stated noise is too small, or too large: `noise_misjudged` (see `noise_verdict`).
+   This holds where the arm's repeatability is stated, too: the noise is then complete, and wrong.
+
+A fit whose covariance has the estimated scatter in it (`Readings.arm_scatter`) is judged by the
+same rules; its χ² is near its degrees of freedom by construction, so that only suspects and
+repeats can object.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 
+from hilcal.data.arm_scatter import ArmScatter
+from hilcal.diagnose.arm_repeatability import instrument_instead, of_repeatability_size
 from hilcal.diagnose.diagnosis import Diagnosis, History, Reason
 from hilcal.diagnose.effect_ranking import FALSE_ALARM, LEAST_SHARE, ranked
 from hilcal.diagnose.evidence import Evidence
@@ -27,6 +43,9 @@ from hilcal.identify.fit import Fit
 NOTHING = History()
 MOST_NAMED = 2
 """Variables that a sentence names."""
+SAME_IN_POSE = 0.5
+"""Share of the misfit in common to all readings of a pose from which on it is not the scatter of
+single arrivals; a choice."""
 
 
 def diagnose(
@@ -56,12 +75,13 @@ def judge(e: Evidence, history: History) -> Diagnosis:
     suspects = ranked(e.suspects, history.rejected)
     alternatives = tuple(e.alternative(name, history.removed) for name in history.added)
     lead = suspects[0] if suspects and suspects[0].passes else None
-    insufficiency, noise = None, None
+    insufficiency, noise, scatter = None, None, e.fit.readings.arm_scatter
     rivals: tuple[Separability, ...] = ()
     reason: Reason
     if lead is not None:
         regression = ResidualRegression(e.tree_share if e.misfit else 0.0, ())
         insufficiency = e.insufficiency
+        predicted = max(regression.share, lead.holdout_share) if e.misfit else 0.0
         if insufficiency is not None:
             reason = "insufficient_catalogue"
             regression = ResidualRegression(regression.share, insufficiency.dependences)
@@ -72,13 +92,19 @@ def judge(e: Evidence, history: History) -> Diagnosis:
     else:
         regression = e.regression if e.misfit else ResidualRegression(0.0, ())
         significant = _significant(e.misfit_breakdown)
-        follows = _carrying(regression) or tuple(
-            v.variable for v in significant if v.share >= LEAST_SHARE
-        )
-        unsure = any(s.explains for s in suspects)
-        predictable = regression.share > PREDICTABLE or bool(significant) or unsure
-        noise = judge_noise(e.fit, e.pure_error, predictable)
-        if noise.misjudged:
+        follows = _carrying(regression) or tuple(v.variable for v in significant)
+        sizes = [
+            *(v.share for v in significant),
+            *(s.holdout_share for s in suspects if s.explains),
+        ]
+        predicted = max([regression.share, *sizes]) if e.misfit else 0.0
+        noise = judge_noise(e.fit, e.pure_error, regression.share > PREDICTABLE or bool(sizes))
+        found = e.arm_scatter if noise.misjudged and e.misfit and _may_scatter(e) else None
+        if found is not None:
+            scatter = replace(found, predicted_share=predicted)
+        if found is not None and _explained_by_arm(e.fit, found):
+            reason = "arm_scatter"
+        elif noise.misjudged:
             reason = "misjudged_noise"
         elif noise.off:
             reason = "no_suspect"
@@ -91,7 +117,7 @@ def judge(e: Evidence, history: History) -> Diagnosis:
         reason=reason,
         suspects=suspects,
         misfit_breakdown=e.misfit_breakdown,
-        predictable_share=regression.share,
+        predictable_share=predicted,
         dependences=regression.dependences,
         follows=follows[:MOST_NAMED],
         pure_error=e.pure_error,
@@ -100,7 +126,24 @@ def judge(e: Evidence, history: History) -> Diagnosis:
         separability=rivals,
         insufficiency=insufficiency,
         alternatives=alternatives,
+        scatter=scatter,
     )
+
+
+def _may_scatter(e: Evidence) -> bool:
+    """Whether what is left can be the arm's scatter: not stated, and not the same within a pose."""
+    same = any(
+        v.variable == "pose" and v.share > SAME_IN_POSE and v.p_value < FALSE_ALARM
+        for v in e.misfit_breakdown
+    )
+    readings = e.fit.readings
+    return not readings.scatter_stated and readings.arm_scatter is None and not same
+
+
+def _explained_by_arm(fit: Fit, scatter: ArmScatter) -> bool:
+    """Whether an arm's repeatability is the explanation of what is left."""
+    arm = fit.model.cell.arm
+    return not instrument_instead(scatter) and of_repeatability_size(scatter, arm)
 
 
 def _carrying(of: ResidualRegression) -> tuple[str, ...]:
@@ -109,6 +152,7 @@ def _carrying(of: ResidualRegression) -> tuple[str, ...]:
 
 
 def _significant(found: tuple[MisfitShare, ...]) -> tuple[MisfitShare, ...]:
-    """Variables that the misfit follows beyond chance, all of them counted."""
+    """Variables that predict a share of the misfit worth naming, beyond chance among all."""
     kinds = [v for v in found if v.variable.split()[0] not in ("pose", "direction")]
-    return tuple(v for v in kinds if v.p_value * len(kinds) < FALSE_ALARM)
+    alarm = FALSE_ALARM / max(len(kinds), 1)
+    return tuple(v for v in kinds if v.p_value < alarm and v.share >= LEAST_SHARE)

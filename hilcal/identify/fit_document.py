@@ -16,7 +16,7 @@ def to_json(fit: Fit) -> dict[str, object]:
     `value` and `std` are null where the data do not determine a parameter, conditions where
     there is nothing to condition.
     """
-    basis = fit.solution.equations.basis
+    basis, scatter = fit.solution.equations.basis, fit.readings.arm_scatter
     return {
         "model": list(fit.model.names),
         "readings": fit.mode,
@@ -39,6 +39,7 @@ def to_json(fit: Fit) -> dict[str, object]:
         "error": {"fit": fit.error.to_json(), "holdout": fit.holdout.to_json()},
         "noise_floor_m": full_prediction(fit).noise_floor,
         "outliers": outliers(fit),
+        "arm_scatter": None if scatter is None else scatter.to_json(),
         "registration": frames_of_fit(fit)[0].tolist(),
         "frames": fit_to_json(fit),
         "notes": list(notes(fit)),

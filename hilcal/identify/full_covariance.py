@@ -36,14 +36,27 @@ def campaign_readings(campaign: CampaignFile, cell: Cell, config: CellConfig) ->
     Raises:
         InputError: there are no readings yet, or they are damaged.
     """
-    readings = campaign.readings()
-    parts = covariance_parts(campaign.about(COVERS), config)
+    return full_readings(campaign.readings(), campaign.about(COVERS), cell, config)
+
+
+def full_readings(
+    readings: Readings, covers: str | None, cell: Cell, config: CellConfig
+) -> Readings:
+    """Return readings with their full covariance.
+
+    Args:
+        readings: with the covariance of a file or a table.
+        covers: what that covers; None for a file that does not say.
+        cell: the cell.
+        config: its configuration.
+    """
+    parts = covariance_parts(covers, config)
     joint_std = config.repeatability.per_joint(cell.arm.n)
     if parts == "instrument and repeatability":
         return with_joint_scatter(cell, readings, joint_std)
     if parts == "instrument and arm as stated":
         return with_common_scatter(cell, readings, joint_std)
-    return readings
+    return replace(readings, scatter_stated=False)
 
 
 def covariance_parts(covers: str | None, config: CellConfig) -> CovarianceParts:

@@ -133,7 +133,7 @@ def _revision(c: Chapter, e: FullPrediction, axes: Floats, measured: Floats) -> 
     curves = () if d is None else _curves(d)
     return StoryRevision(
         revision=c.number,
-        change=change(c.added, c.removed),
+        change=change(c.added, c.removed, c.fit.readings.arm_scatter is not None),
         model=c.fit.model.names,
         verdict=UNDIAGNOSED if d is None else d.verdict,
         message="run hilcal diagnose for a verdict" if d is None else message(d),

@@ -16,6 +16,7 @@ from hilcal.identify.fit_document import notes
 from hilcal.identify.full_prediction import FullPrediction, full_prediction
 from hilcal.identify.gross_errors import gross_errors
 from hilcal.report import numbers
+from hilcal.report.scatter_words import sigmas
 from hilcal.report.text_registration import fitted_lines
 from hilcal.types import Ints
 
@@ -149,6 +150,9 @@ def remarks(fit: Fit) -> Iterator[RenderableType]:
         f"Variance factor {fit.variance_factor:.3g} (95 % interval {low:.3g} to {high:.3g}): the "
         "squared error in units of the noise, 1 where model and noise are right."
     )
+    scatter = fit.readings.arm_scatter
+    if scatter is not None:
+        yield f"The covariance has the arm's scatter as estimated: {sigmas(scatter)}."
     yield scaling_remark(fit)
     null = fit.uncertainty.null
     if null:

@@ -7,6 +7,7 @@ from hilcal.diagnose.noise_verdict import NoiseVerdict
 from hilcal.diagnose.separability import Separability
 from hilcal.diagnose.stepwise_alternatives import Alternative
 from hilcal.report.numbers import sizes
+from hilcal.report.scatter_words import left_to_the_arm, no_repeatability
 
 
 def message(d: Diagnosis) -> str:
@@ -21,10 +22,14 @@ def message(d: Diagnosis) -> str:
         return _no_suspect(d)
     if d.reason == "misjudged_noise":
         return _misjudged(d)
+    if d.reason == "arm_scatter":
+        return left_to_the_arm(d)
     adequate = (
         f"Residuals are what the noise explains: variance factor {d.fit.variance_factor:.2f}; no "
         f"effect of the catalogue is missing{noise_place(d.pure_error)}"
     )
+    if d.scatter is not None:
+        adequate = left_to_the_arm(d)
     if d.reason == "residual_is_noise":
         return adequate
     doubts = "; ".join(_alternative(a) for a in d.alternatives if a.inseparable)
@@ -108,17 +113,29 @@ def _no_suspect(d: Diagnosis) -> str:
             f"of it, but {but}"
         )
     follows = f"; it follows {' and '.join(d.follows)}" if d.follows else ""
+    repeats = _repeats_scatter_less(d.noise, d.pure_error)
+    if d.predictable_share < LEAST_SHARE and repeats:
+        return (
+            f"Residuals are {_spread(d)} and follow nothing recorded, but "
+            f"{100 * d.repeated_share:.0f} % of the misfit is the same when a pose is repeated: "
+            f"the pose itself predicts it{repeats}; {none}"
+        )
     return (
-        f"Residuals are {_spread(d)}, a generic regression predicts "
-        f"{100 * d.predictable_share:.0f} % of the misfit, and {none}{follows}"
-        f"{_repeats_scatter_less(d.noise, d.pure_error)}"
+        f"Residuals are {_spread(d)}, {_percent(d.predictable_share)} of the misfit is predicted "
+        f"on poses left out, and {none}{follows}{repeats}"
     )
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %" if share >= 0.005 else f"{100 * share:.1g} %"
 
 
 def _misjudged(d: Diagnosis) -> str:
     if d.noise is None:
         raise ValueError("a diagnosis of misjudged noise without a judgement of the noise")
     repeats = d.pure_error
+    if d.scatter is not None and d.fit.readings.arm_scatter is None:
+        return f"Residuals are {_spread(d)} and nothing predicts them; {no_repeatability(d)}"
     if d.noise.reason == "repeats" and repeats is not None:
         compared = "less" if d.fit.variance_factor < 1 else "more"
         return (

@@ -34,6 +34,7 @@ class Arm:
         coupling: (n, n) C with θ = C q: the angles of the chain from the controller's values, where
             joints follow others (see `conventions`); None where each turns by itself.
         notes: what its description lacks, and what that means, a sentence each.
+        repeatability: pose repeatability RP of ISO 9283 as the maker states it, m; None if unknown.
     """
 
     name: str
@@ -48,6 +49,7 @@ class Arm:
     source: str
     coupling: Floats | None = None
     notes: tuple[str, ...] = ()
+    repeatability: float | None = None
 
     def chain_angles(self, q: Floats) -> Floats:
         """Angles (..., n) that the axes of the chain turn by, from the controller's values."""

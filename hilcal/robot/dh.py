@@ -50,6 +50,9 @@ class DhTable(Conventions):
     weight_kg: Positive | None = Field(
         None, description="the weight of the whole arm in kg (not used in predictions)"
     )
+    repeatability_m: Positive | None = Field(
+        None, description="the pose repeatability of ISO 9283 in m, more than 0"
+    )
     source: str = Field(min_length=1, description="where the figures come from")
     convention: Literal["standard", "modified"] = Field(
         "standard", description='"standard" (classic rows) or "modified" (Craig\'s rows)'
@@ -95,6 +98,7 @@ def arm_from_dh(path: Path) -> Arm:
         payload=table.payload_kg,
         joint_names=tuple(row.name for row in rows),
         source=table.source,
+        repeatability=table.repeatability_m,
     )
     try:
         return as_counted(arm, table)

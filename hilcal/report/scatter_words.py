@@ -1,0 +1,70 @@
+"""The arm's own scatter, in words."""
+
+from hilcal.data.arm_scatter import ArmScatter
+from hilcal.diagnose.arm_repeatability import RP_PER_RMS, instrument_instead, separated
+from hilcal.diagnose.diagnosis import Diagnosis
+from hilcal.report import numbers
+from hilcal.robot.arm import Arm
+
+
+def left_to_the_arm(d: Diagnosis) -> str:
+    """Say that what is left is the arm's repeatability."""
+    s = _scatter(d)
+    doubt = ""
+    if not separated(s):
+        doubt = (
+            f"; these readings do not tell it from an instrument {s.instrument_factor:.2g} times "
+            "as noisy as stated"
+        )
+    return (
+        f"What is left, {numbers.length(s.size_m)} rms, is predictable by nothing recorded "
+        f"({100 * s.predicted_share:.0f} % on poses left out) and of the size of the arm's "
+        f"repeatability: {sigmas(s)}{_maker(s, d.fit.model.cell.arm)}; no effect of the catalogue "
+        f"is missing{doubt}"
+    )
+
+
+def no_repeatability(d: Diagnosis) -> str:
+    """Say why what is left is not the arm's repeatability; the start of it is said already."""
+    s, arm = _scatter(d), d.fit.model.cell.arm
+    if instrument_instead(s):
+        return (
+            f"they are as if the instrument were {s.instrument_factor:.2g} times as noisy as "
+            "stated, and not as if the arm scattered: mend the stated noise, or repeat some "
+            "readings to be sure"
+        )
+    return (
+        f"the arm would have to scatter by {numbers.length(s.size_m)} rms{_maker(s, arm)}, more "
+        "than an arm's repeatability: the instrument is noisier than stated, or the arm or the "
+        "target was loose"
+    )
+
+
+def sigmas(s: ArmScatter) -> str:
+    """Write the standard deviations with their uncertainties."""
+    if s.kind == "isotropic":
+        value, error = numbers.with_std(1e6 * s.std[0], 1e6 * s.std_error[0])
+        return f"the target scatters by σ = {value} ± {error} µm along each axis"
+    pairs = [numbers.with_std(1e6 * v, 1e6 * e) for v, e in zip(s.std, s.std_error, strict=True)]
+    if s.kind == "joints":
+        return f"each joint scatters by σ_q = {pairs[0][0]} ± {pairs[0][1]} µrad"
+    told = ", ".join(
+        f"joint {j + 1} {value} ± {error}"
+        for j, (value, error) in enumerate(pairs)
+        if s.std[j] > s.std_error[j]
+    )
+    return f"the joints scatter by σ_q [µrad] = {told}, the others by less than can be told"
+
+
+def _maker(s: ArmScatter, arm: Arm) -> str:
+    """Compare with ISO 9283's figure."""
+    own = f" (RP of ISO 9283 about {numbers.length(RP_PER_RMS * s.size_m)}"
+    if arm.repeatability is None:
+        return f"{own}; arms of industry have 0.02 to 0.1 mm)"
+    return f"{own}; the maker states {numbers.digits(1e3 * arm.repeatability, 2)} mm)"
+
+
+def _scatter(d: Diagnosis) -> ArmScatter:
+    if d.scatter is None:
+        raise ValueError("a diagnosis of the arm's scatter without an estimate of it")
+    return d.scatter

@@ -1,0 +1,188 @@
+"""The arm's scatter, where nothing states it: estimated, judged, taken into the fit, kept."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import kstest
+
+import hilcal as hc
+from hilcal.cell import Cell
+from hilcal.data.arm_scatter import ArmScatter, ScatterKind
+from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.covariance import COVERS, INSTRUMENT
+from hilcal.data.readings import Readings
+from hilcal.data.records import content_hash
+from hilcal.data.whitening import Mode
+from hilcal.diagnose.diagnosis import Diagnosis
+from hilcal.diagnose.effect_ranking import candidates
+from hilcal.diagnose.verdict import diagnose
+from hilcal.identify.arm_scatter import estimate_arm_scatter, factors, with_arm_scatter
+from hilcal.identify.baseline import baseline
+from hilcal.identify.fit import Fit, fit
+from hilcal.identify.linearisation import effect_columns, linearise
+from hilcal.identify.registration import register
+from hilcal.robot import se3
+from hilcal.types import Floats
+from tests.support.campaigns import cell_of, configuration, noiseless, plan, with_noise, world_of
+
+MODES: tuple[Mode, ...] = ("absolute", "deflection")
+POSES = 16
+
+
+def scattering(
+    std: Floats, mode: Mode = "absolute", m: int = 3, seed: int = 0, noise: float = 1.0
+) -> tuple[Cell, Readings]:
+    """Each reading is an arrival with joints off by `std` (n,), by the world's own kinematics."""
+    cell, rng = cell_of(registration_known=True), np.random.default_rng(seed)
+    world = replace(world_of(cell, rng), joint_std=std)
+    p = plan(POSES, 3)
+    still = noiseless(replace(world, joint_std=np.zeros(6)), p, m)
+    off = replace(p.states, q=p.states.q + std * rng.standard_normal(p.states.q.shape))
+    value = world.sight(off).value(m)
+    readings = with_noise(replace(still, value=value), rng, noise)
+    return cell, replace(readings, scatter_stated=False)
+
+
+def fitted(cell: Cell, readings: Readings, mode: Mode) -> Fit:
+    return fit(baseline(cell, readings, mode), readings, mode)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("m", [3, 6])
+def test_the_scatter_comes_out_as_it_is(mode: Mode, m: int) -> None:
+    truth, found = 2e-5, []
+    for seed in range(3):
+        cell, readings = scattering(np.full(6, truth), mode, m, seed)
+        s = estimate_arm_scatter(fitted(cell, readings, mode))
+        assert s is not None
+        assert s.kind == "joints"
+        found.append((s.std[0] - truth) / s.std_error[0])
+        assert s.std_error[0] < 0.15 * truth
+        assert s.log_evidence > 5
+    assert np.sqrt(np.mean(np.square(found))) < 2.2
+
+
+def test_joints_are_told_apart_where_the_readings_do() -> None:
+    truth = np.array([6.0, 0.0, 6.0, 0.0, 0.0, 0.0]) * 1e-5
+    cell, readings = scattering(truth)
+    s = estimate_arm_scatter(fitted(cell, readings, "absolute"))
+    assert s is not None
+    assert s.kind == "each joint"
+    off = (np.array(s.std) - truth)[[0, 2]] / np.array(s.std_error)[[0, 2]]
+    assert np.all(np.abs(off) < 4)
+
+
+def judged(std: float, mode: Mode, noise: float = 1.0) -> Diagnosis:
+    cell, readings = scattering(np.full(6, std), mode, noise=noise)
+    return diagnose(fitted(cell, readings, mode))
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_what_is_left_to_the_arm_is_adequate_and_says_how_much(mode: Mode) -> None:
+    d = judged(2e-5, mode)
+    assert (d.verdict, d.reason) == ("adequate", "arm_scatter")
+    words = str(d.to_dict()["message"])
+    assert "predictable by nothing recorded" in words
+    assert "each joint scatters by σ_q =" in words
+    assert "the maker states 0.050 mm" in words
+    assert d.scatter is not None
+    assert d.scatter.size_m == pytest.approx(27e-6, rel=0.2)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_noisier_instrument_is_not_the_arm(mode: Mode) -> None:
+    d = judged(0.0, mode, noise=2.0)
+    assert d.verdict == "noise_misjudged"
+    assert d.scatter is not None
+    assert d.scatter.instrument_factor == pytest.approx(2, rel=0.15)
+    assert "and not as if the arm scattered" in str(d.to_dict()["message"])
+
+
+def test_no_arm_scatters_by_half_a_millimetre() -> None:
+    d = judged(4e-4, "absolute")
+    assert d.verdict == "noise_misjudged"
+    assert "the arm or the target was loose" in str(d.to_dict()["message"])
+
+
+def test_scatter_that_is_stated_is_not_estimated() -> None:
+    cell, readings = scattering(np.full(6, 2e-5))
+    d = diagnose(fitted(cell, replace(readings, scatter_stated=True), "absolute"))
+    assert d.verdict == "noise_misjudged"
+    assert d.scatter is None
+
+
+def test_refine_ends_with_the_scatter_in_the_fit_and_the_file_keeps_it(tmp_path: Path) -> None:
+    cell, readings = scattering(np.full(6, 2e-5))
+    config = configuration()
+    config = config.model_copy(
+        update={
+            "repeatability": type(config.repeatability)(),
+            "tracker": config.tracker.model_copy(
+                update={
+                    "base_xyz_m": tuple(cell.registration[:3, 3]),
+                    "base_rotvec_rad": tuple(se3.rotation_vector(cell.registration[:3, :3])),
+                }
+            ),
+        }
+    )
+    path, about = tmp_path / "run.hilcal", {COVERS: INSTRUMENT}
+    with CampaignFile.create(path, config.to_json(), str(tmp_path), "made", more=about) as file:
+        file.append_readings(readings)
+    with hc.Campaign.open(path) as run:
+        assert not run.readings.scatter_stated
+        found = hc.refine(hc.baseline(run.cell, run.readings, "absolute"), run.readings, "absolute")
+        first, last = found.steps[0], found.steps[-1]
+        assert (first.diagnosis.reason, last.diagnosis.verdict) == ("arm_scatter", "adequate")
+        assert last.added is None
+        assert last.fit.variance_factor == pytest.approx(1, abs=0.15)
+        assert "predictable by nothing" in str(last.diagnosis.to_dict()["message"])
+        assert content_hash(last.fit.readings) == content_hash(run.readings)
+        run.append(found)
+    with hc.Campaign.open(path) as run:
+        again, record = run.fit(), run.latest()
+        assert record is not None
+        assert record.follows
+        assert [r.number for r in run.file.revisions()] == [1, 2]
+        np.testing.assert_allclose(again.theta, last.fit.theta, rtol=1e-6, atol=1e-12)
+        np.testing.assert_allclose(again.uncertainty.std, last.fit.uncertainty.std, rtol=1e-6)
+        assert again.chi2 == pytest.approx(last.fit.chi2, rel=1e-6)
+        assert diagnose(again).verdict == "adequate"
+
+
+@pytest.mark.parametrize("kind", ["joints", "each joint", "isotropic"])
+def test_an_estimate_goes_through_json(kind: ScatterKind) -> None:
+    count = 6 if kind == "each joint" else 1
+    s = ArmScatter(kind, (1e-5,) * count, (1e-6,) * count, 2e-5, 4.0, 1.5, 0.01)
+    assert ArmScatter.from_json(s.to_json()) == s
+    cell, readings = scattering(np.zeros(6))
+    with_it = with_arm_scatter(register(cell, readings).cell, readings, s)
+    added = with_it.covariance - readings.covariance
+    unit = sum(f @ np.swapaxes(f, 1, 2) for f in factors(cell, readings, kind))
+    np.testing.assert_allclose(added, 1e-10 * unit, rtol=1e-6, atol=1e-22)
+    np.testing.assert_array_equal(with_it.as_stated().covariance, readings.covariance)
+
+
+def null_p_values(seeds: int) -> list[float]:
+    """p-values of an effect that is not there, with the covariance as estimated each time."""
+    out = []
+    for seed in range(seeds):
+        cell, readings = scattering(np.full(6, 2e-5), "absolute", seed=seed)
+        plain = fitted(cell, readings, "absolute")
+        s = estimate_arm_scatter(plain)
+        assert s is not None
+        with_it = with_arm_scatter(plain.model.cell, readings, s)
+        found = fit(plain.model, with_it, "absolute", start=plain.theta)
+        absent = next(e for e in candidates(found) if e.name == "joint_tilt_compliance")
+        out.append(linearise(found).score(effect_columns(found, absent).white).p_value)
+    return out
+
+
+def test_p_values_stay_uniform_with_an_estimated_covariance() -> None:
+    assert kstest(null_p_values(12), "uniform").pvalue > 1e-3
+
+
+@pytest.mark.slow
+def test_p_values_stay_uniform_over_many_seeds() -> None:
+    assert kstest(null_p_values(300), "uniform").pvalue > 1e-3
