@@ -20,16 +20,15 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.data.arm_scatter import ArmScatter, ScatterKind
-from hilcal.data.covariance import scatter_factor
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Whitening, covariance_blocks, whitening
 from hilcal.identify.fit import Fit
+from hilcal.identify.full_covariance import joint_factors
 from hilcal.regression.variance_components import (
     BlockRows,
     VarianceComponents,
     variance_components,
 )
-from hilcal.robot.chain import evaluate, joint_jacobian
 from hilcal.types import Floats, Ints
 
 MOST_ROWS = 6000
@@ -49,10 +48,7 @@ def factors(cell: Cell, readings: Readings, kind: ScatterKind) -> tuple[Floats, 
     m = readings.m
     if kind == "isotropic":
         return (np.tile(np.eye(m)[:, :3], (len(readings), 1, 1)),)
-    chain = evaluate(cell.arm, readings.states.q)
-    at = cell.target_of(readings.states.target)
-    jac = joint_jacobian(chain, chain.point(at[..., :3, 3]))
-    f = scatter_factor(jac, np.ones(cell.arm.n), cell.registration[:3, :3], m)
+    f = joint_factors(cell, readings, np.ones(cell.arm.n))
     return (f,) if kind == "joints" else tuple(f[:, :, [j]] for j in range(f.shape[2]))
 
 

@@ -125,7 +125,18 @@ def _scatter(cell: Cell, readings: Readings, joint_std: Floats) -> Floats | None
         registered = register(cell, readings).cell
     except CannotAnswerError:
         return None
+    return joint_factors(registered, readings, joint_std)
+
+
+def joint_factors(cell: Cell, readings: Readings, joint_std: Floats) -> Floats:
+    """Return the factors F (N, m, n) of the joints' scatter, see `data.covariance`.
+
+    Args:
+        cell: with its registration and targets as they are.
+        readings: N readings.
+        joint_std: (n,) standard deviations, rad.
+    """
     chain = evaluate(cell.arm, readings.states.q)
-    at = registered.target_of(readings.states.target)
+    at = cell.target_of(readings.states.target)
     jac = command_jacobian(cell.arm, chain, chain.point(at[..., :3, 3]))
-    return scatter_factor(jac, joint_std, registered.registration[:3, :3], readings.m)
+    return scatter_factor(jac, joint_std, cell.registration[:3, :3], readings.m)
