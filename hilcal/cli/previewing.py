@@ -1,23 +1,32 @@
 """`import --preview`: propose how a table is to be read."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.padding import Padding
 
-from hilcal.cell import cell_from_config
+from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.terminal import Terminal
 from hilcal.config import CellConfig, load_config
-from hilcal.data.guess import GUESSED, SIDE_BY_SIDE
+from hilcal.data.guess_values import BY_VALUES, RIVALS
+from hilcal.data.guesser import FAR, GUESSED, SIDE_BY_SIDE, TURN
 from hilcal.data.importing import import_readings
-from hilcal.data.mapping import ANGLES, LENGTHS
+from hilcal.data.mapping import ANGLES, LENGTHS, Mapping
 from hilcal.data.proposal import Understood
 from hilcal.data.propose import Proposed, propose
-from hilcal.errors import InputError
-from hilcal.identify.conventions import Fit, choose_convention
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.identify.conventions import CLEARER, Fit, choose_convention
+from hilcal.identify.registration import register
 from hilcal.report import text
 from hilcal.report.text_import import preview
 from hilcal.robot.arm import Arm
+from hilcal.toml import check_section
+
+CLOSE = 0.02
+"""Part of the reach that a nominal arm may be off; arms are better by ten times; a choice."""
+MOST_TRIED = 8
+"""Choices of columns that are tried; each takes a registration."""
 
 
 def show_preview(
@@ -34,14 +43,16 @@ def show_preview(
     if output is not None and output.exists() and not force:
         raise InputError(f"{output}: the file exists; choose another name or give --force")
     settings = None if config is None else load_config(config)
-    arm = None
+    cell = None
     if settings is not None and config is not None:
-        arm = cell_from_config(settings, config.absolute().parent).arm
-    found = propose(table, second, None if arm is None else arm.n)
+        cell = cell_from_config(settings, config.absolute().parent)
+    found = propose(table, second, None if cell is None else cell.arm.n)
     proposal, outcome = found.proposal, None
-    if arm is not None and settings is not None:
+    if cell is not None and settings is not None:
         _name_targets(found, [target.name for target in settings.tool.targets])
-        outcome = [*_decide_convention(found, arm), *_try(table, found, settings, arm)]
+        outcome = _decide_columns(table, found, settings, cell)
+        outcome += _decide_convention(found, cell.arm)
+        outcome += _try(table, found, settings, cell)
     t.show(preview(proposal, len(found.grid.rows), table.name))
     if outcome:
         t.show(text.heading("with this mapping:"))
@@ -146,17 +157,69 @@ def _same(one: str, other: str, numbers: np.ndarray, unit: float) -> bool:
     return bool(np.allclose(rotations(one, numbers, unit), rotations(other, numbers, unit)))
 
 
-def _try(table: Path, found: Proposed, settings: CellConfig, arm: Arm) -> list[str]:
+def _decide_columns(table: Path, found: Proposed, settings: CellConfig, cell: Cell) -> list[str]:
+    """Choose columns that their values leave open by the nominal arm; a sentence where it tells."""
+    proposal, grid = found.proposal, found.grid
+    if len(proposal.alternatives) < 2:
+        return []
+    fits: list[tuple[float, dict[str, dict[str, Any]]]] = []
+    for position, joints in proposal.alternatives[:MOST_TRIED]:
+        changed = dict(proposal.sections)
+        for name, columns, limit, units in (
+            ("position", position, FAR, ("mm", "m")),
+            ("joints", joints, TURN, ("deg", "rad")),
+        ):
+            if columns:
+                size = max(np.nanmax(np.abs(grid.numbers(c))) for c in columns)
+                changed[name] = {"columns": columns, "unit": units[0 if size > limit else 1]}
+        rms = _left_by_the_arm(table, changed, settings, cell)
+        if rms is not None:
+            fits.append((rms, changed))
+    fits.sort(key=lambda fit: fit[0])
+    clear = len(fits) > 1 and fits[1][0] > CLEARER * fits[0][0]
+    if not fits or fits[0][0] > CLOSE * cell.arm.reach or not (clear or len(fits) == 1):
+        return []
+    proposal.sections = fits[0][1]
+    for k, u in enumerate(proposal.understood):
+        if u.what in ("position", "joints"):
+            section = proposal.sections[u.what]
+            chosen = tuple(section["columns"])
+            example = tuple(grid.text(c)[0] for c in chosen)
+            proposal.understood[k] = Understood(u.what, chosen, section["unit"], example)
+    doubts = [d for d in proposal.unsure if RIVALS not in d[1] and BY_VALUES not in d[1]]
+    proposal.unsure[:] = doubts
+    others = f", others {1e3 * fits[1][0]:.0f} mm" if len(fits) > 1 else ""
+    return [f"columns: as {cell.arm.name} tells: {1e3 * fits[0][0]:.2f} mm are left{others}"]
+
+
+def _left_by_the_arm(
+    table: Path, sections: dict[str, dict[str, Any]], settings: CellConfig, cell: Cell
+) -> float | None:
+    """Rms distance, m, that the nominal arm leaves with a mapping; None where it cannot be."""
+    only = {k: v for k, v in sections.items() if k in ("file", "second_file", "position", "joints")}
+    try:
+        mapping = check_section(only, Mapping, "the proposed mapping")
+        return register(cell, import_readings(table, mapping, settings, cell.arm).readings).rms
+    except (InputError, CannotAnswerError):
+        return None
+
+
+def _try(table: Path, found: Proposed, settings: CellConfig, cell: Cell) -> list[str]:
     """Import with the proposed mapping; what comes of it, in sentences."""
     if found.proposal.lacking:
         return []
     try:
-        result = import_readings(table, found.proposal.mapping(), settings, arm)
+        result = import_readings(table, found.proposal.mapping(), settings, cell.arm)
     except InputError as error:
         return [f"refused: {error}"]
     readings = result.readings
+    try:
+        rms = f"the nominal {cell.arm.name} leaves {1e3 * register(cell, readings).rms:.3g} mm rms"
+    except CannotAnswerError as error:
+        rms = str(error)
     return [
         f"{len(readings)} readings of {len(np.unique(readings.pose))} poses, "
         f"{'positions' if readings.m == 3 else 'positions and orientations'}",
         *result.notes,
+        rms,
     ]

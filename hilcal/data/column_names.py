@@ -57,7 +57,7 @@ TEMPERATURE = {"temp", "temperature", "temperatur", "temperatura"}
 APPROACH = {"approach", "richtung", "direction", "anfahrt"}
 POSE = {
     "pose", "poses", "point", "punkt", "pt", "messpunkt", "posenr", "id", "name", "nr", "no",
-    "number", "index", "position", "punto", "target", "p", "pkt", "label",
+    "number", "index", "position", "punto", "target", "p", "pkt", "label", "repere",
 }  # fmt: skip
 LOAD = {"load", "last", "payload", "charge", "carga", "loadcase", "lastfall", "zuladung"}
 MASS = {"mass", "masse", "weight", "gewicht", "masa", "peso"}
@@ -75,6 +75,15 @@ ARM_JOINTS = (
     ("wrist", "3"),
 )
 """Joint names of Universal Robots arms under ROS, in order."""
+
+DIFFERENCE = {"dev", "delta", "diff", "difference", "error", "err", "residual", "abweichung"}
+"""Words of what is no reading but compared with one."""
+CHINESE = {
+    "关节": " joint ", "轴": " joint ", "坐标": " ", "位置": " ", "测量": " measured ",
+    "温度": " temperature ", "负载": " load ", "编号": " point ", "点号": " point ",
+    "时间": " time ", "实际": " actual ", "理论": " nominal ",
+}  # fmt: skip
+"""Words without letters, as those with."""
 
 _PREFIXES = STD | ROTATION | FORCE | MOMENT | QUATERNION | MEASURED | NOMINAL | {"p", "pos", "d"}
 
@@ -111,6 +120,8 @@ def parse(name: str, unit_cell: str = "") -> ColumnName:
     """
     rest, unit = _unit(name)
     told = UNITS.get(unit_cell.strip(" []()<>").replace("µ", "u").replace("μ", "u").lower())
+    for sign, word in CHINESE.items():
+        rest = rest.replace(sign, word)
     rest = re.sub(r"(?<=[a-zµ])(?=[A-Z])", " ", rest)
     plain = unicodedata.normalize("NFKD", rest.replace("ß", "ss")).encode("ascii", "ignore")
     words: list[str] = []

@@ -1,16 +1,14 @@
 """What the values of columns tell where their names do not."""
 
 from datetime import datetime
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from hilcal.data import column_names as words
 from hilcal.data.grid import Grid
+from hilcal.data.guesser import FAR, TURN, Guesser, angle_unit, length_unit
 from hilcal.types import Floats
-
-if TYPE_CHECKING:
-    from hilcal.data.guess import Guesser
 
 NORM = 3e-3
 """How far the length of a quaternion may be from 1: three digits."""
@@ -27,6 +25,10 @@ FORMATS = (
     "%H:%M:%S.%f",
 )
 """Forms of dates that are tried, in this order."""
+RIVAL = 0.5
+"""Difference of the score within which another choice of columns is as good; a choice."""
+BY_VALUES = "found by their values: check the columns"
+RIVALS = "as good by their values:"
 _EXCEL = (30000.0, 60000.0)
 
 
@@ -91,19 +93,18 @@ def _all_parse(texts: list[str], form: str | None) -> bool:
     return True
 
 
-def guess_by_values(g: "Guesser") -> None:
+def guess_by_values(g: Guesser) -> None:
     """Find positions and joints among columns whose names say nothing.
 
     Neighbouring columns are tried: positions vary by hundreds (mm) or stay small (m), joint
     angles stay within one turn. Where several choices are as good, that is said.
     """
-    from hilcal.data.guess import FAR, TURN, angle_unit, length_unit
-
     told = words.NOMINAL | words.STD | words.TIME | words.TEMPERATURE | words.LOAD | words.MASS
     free = [
         name
         for name, c in g.free.items()
         if g.number(name) and c.axis is None and not c.has(told) and not c.has(words.POSE)
+        if not _counts(g.block([name])[:, 0])
     ]
     free = [name for name in free if np.ptp(g.block([name])[np.isfinite(g.block([name]))]) > 0]
     _orientation_by_values(g, free)
@@ -139,22 +140,28 @@ def guess_by_values(g: "Guesser") -> None:
         return
     ranked.sort(key=lambda r: -r[0])
     best, position, joints = ranked[0]
-    rivals = [r for r in ranked[1:] if r[0] >= best - 1e-9]
+    rivals = [r for r in ranked[1:] if r[0] >= best - RIVAL]
+    g.proposal.alternatives = [(p, j) for score, p, j in ranked if score >= best - RIVAL]
     if position:
         unit = length_unit(g, "position", position)
         g.take("position", position, unit, unit=unit)
-        g.unsure("position", "found by their values: check the columns")
+        g.unsure("position", BY_VALUES)
     if joints:
         unit = angle_unit(g, "joints", joints)
         g.take("joints", joints, unit, unit=unit)
-        g.unsure("joints", "found by their values: check the columns")
+        g.unsure("joints", BY_VALUES)
     if rivals:
         other = rivals[0]
         pair = [", ".join(part) for part in other[1:] if part]
-        g.unsure("joints", f"as good by their values: {' and '.join(pair)}")
+        g.unsure("joints", f"{RIVALS} {' and '.join(pair)}")
 
 
-def _orientation_by_values(g: "Guesser", free: list[str]) -> None:
+def _counts(values: Floats) -> bool:
+    """Whether numbers count the rows."""
+    return len(values) > 2 and bool(np.all(np.diff(values) == 1))
+
+
+def _orientation_by_values(g: Guesser, free: list[str]) -> None:
     """Quaternions and rotation matrices are told by their length and orthogonality."""
     if "orientation" in g.proposal.sections:
         return

@@ -35,6 +35,8 @@ class Proposal:
         unused: columns without a meaning, with the reason.
         lacking: sentences on what an import needs and was not found.
         open_convention: whether the orientation's convention is a guess.
+        alternatives: columns of the position and of the joints that are as good by their values,
+            the chosen ones first; empty lists where names tell.
     """
 
     sections: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -43,6 +45,7 @@ class Proposal:
     unused: list[tuple[str, str]] = field(default_factory=list)
     lacking: list[str] = field(default_factory=list)
     open_convention: bool = False
+    alternatives: list[tuple[list[str], list[str]]] = field(default_factory=list)
 
     def mapping(self) -> Mapping:
         """Return the mapping.

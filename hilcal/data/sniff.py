@@ -157,9 +157,16 @@ def _layout(rows: Rows, how: FileFormat) -> tuple[dict[str, Any], tuple[str, ...
     first = next(
         (k for k, (_, c) in enumerate(rows) if share[k] >= 0.5 * usual and len(c) >= length - 1), 0
     )
-    above = [k for k in range(first) if len(rows[k][1]) >= length - 1 and _filled(rows[k][1]) > 1]
+    titled = [k for k in range(first) if len(rows[k][1]) >= length - 1 and _filled(rows[k][1]) > 1]
+    above = [k for k in titled if _trim(rows[k][1]) <= length]
     out: dict[str, Any] = {"header_row": 0}
     doubts: list[str] = []
+    if titled and not above:
+        row, cells = rows[titled[-1]]
+        doubts.append(
+            f"row {row} names {_trim(cells)} columns, the readings have {length}: the columns are "
+            f"numbered"
+        )
     header: Sequence[Cell] = ()
     if above:
         at = above[-1]

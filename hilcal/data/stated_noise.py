@@ -154,7 +154,7 @@ def check_joint_rounding(
     if std * reach <= noise:
         return ()
     return (
-        f"joint angles are rounded to {size:g} {name}, up to {1e6 * std * reach:.2g} µm at the "
+        f"joint angles are rounded to {size:g} {name}, up to {1e3 * std * reach:.2g} mm at the "
         f"target, more than the noise; write more digits, or count it: [repeatability] "
         f"joint_std_rad = {std:.2g}",
     )
