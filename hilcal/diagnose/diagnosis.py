@@ -13,6 +13,7 @@ from hilcal.diagnose.effect_ranking import Suspect
 from hilcal.diagnose.misfit_breakdown import MisfitShare
 from hilcal.diagnose.noise import PureError
 from hilcal.diagnose.noise_verdict import NoiseVerdict
+from hilcal.diagnose.pose_alone import PoseAlone
 from hilcal.diagnose.residual_regression import Dependence
 from hilcal.diagnose.separability import Separability
 from hilcal.diagnose.stepwise_alternatives import Alternative
@@ -28,6 +29,7 @@ Reason = Literal[
     "no_suspect",
     "misjudged_noise",
     "arm_scatter",
+    "pose_alone",
 ]
 VERDICTS: dict[Reason, Verdict] = {
     "residual_is_noise": "adequate",
@@ -38,6 +40,7 @@ VERDICTS: dict[Reason, Verdict] = {
     "no_suspect": "unknown_effect",
     "misjudged_noise": "noise_misjudged",
     "arm_scatter": "adequate",
+    "pose_alone": "ambiguous",
 }
 """The verdict that each reason leads to."""
 
@@ -85,6 +88,8 @@ class Diagnosis:
         alternatives: for each effect of `history.added`, the effects that could replace it.
         scatter: the arm's scatter as estimated: where nothing else explains the residual, or in the
             covariance of the fit.
+        pose_alone: the misfit where it is the same under every load of a pose, nothing predicts it
+            on poses left out, and more poses would tell what it is.
     """
 
     fit: Fit
@@ -102,6 +107,7 @@ class Diagnosis:
     insufficiency: Insufficiency | None
     alternatives: tuple[Alternative, ...]
     scatter: ArmScatter | None = None
+    pose_alone: PoseAlone | None = None
 
     @property
     def verdict(self) -> Verdict:

@@ -12,6 +12,7 @@ from hilcal.diagnose.effect_ranking import Suspect, candidates, rank_suspects
 from hilcal.diagnose.misfit_breakdown import MisfitShare, misfit_breakdown
 from hilcal.diagnose.noise import PureError, pure_error
 from hilcal.diagnose.noise_verdict import MISFIT_ALARM
+from hilcal.diagnose.pose_alone import PoseAlone, pose_alone
 from hilcal.diagnose.residual_regression import ResidualRegression, residual_regression, tree_share
 from hilcal.diagnose.stepwise import add
 from hilcal.diagnose.stepwise_alternatives import Alternative, StepwiseAlternatives
@@ -84,6 +85,11 @@ class Evidence:
     def arm_scatter(self) -> ArmScatter | None:
         """The arm's scatter, if it is what is left; None where the residual shows none."""
         return estimate_arm_scatter(self.fit)
+
+    @cached_property
+    def pose_alone(self) -> PoseAlone | None:
+        """A misfit that is the same under every load of a pose."""
+        return pose_alone(self.linearisation, self.effects)
 
     @cached_property
     def tree_share(self) -> float:

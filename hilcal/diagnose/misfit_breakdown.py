@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import chi2
-from scipy.stats import f as f_distribution
 
+from hilcal.diagnose.pose_alone import pose_constants
 from hilcal.identify.linearisation import Linearisation
 from hilcal.observe import motion
 from hilcal.types import Floats
@@ -70,7 +70,7 @@ def misfit_breakdown(p: Linearisation) -> tuple[MisfitShare, ...]:
         result = p.score(x)
         share = max(p.held_out(x, result).share, 0.0)
         out.append(MisfitShare(name, share, result.p_value))
-    out += [*_poses(p, axes[w.reading]), *_axes(p)]
+    out += [*_poses(p), *_axes(p)]
     return tuple(sorted(out, key=lambda v: (-v.share, v.p_value)))
 
 
@@ -120,28 +120,18 @@ def _powers(x: Floats, centre: float | None = None) -> Floats:
     return np.asarray(scaled[:, None] ** np.arange(1, POLYNOMIAL + 1))
 
 
-def _poses(p: Linearisation, axes: Floats) -> list[MisfitShare]:
+def _poses(p: Linearisation) -> list[MisfitShare]:
     """How far the misfit is common to all readings of a pose, where poses have several.
 
     A pose that is left out cannot be predicted from itself, so the share is in-sample, less
     what as many columns explain by chance.
     """
-    fit, w = p.fit, p.fit.whitening
-    poses = int(fit.pose.max()) + 1
-    if poses * 3 > fit.dof / 2 or len(fit.pose) < 2 * poses:
+    found = pose_constants(p)
+    if found is None:
         return []
-    member = (fit.pose[:, None] == np.arange(poses)).astype(float)
-    raw = 1e-3 * _times(axes, member)
-    free = p.project_out(w.whiten(raw).reshape(-1, raw.shape[2]))
-    u, s, _ = np.linalg.svd(free, full_matrices=False)
-    u = u[:, s > 1e-6 * s.max(initial=0.0)]
-    rank = u.shape[1]
-    if rank == 0 or fit.dof - rank <= 0:
-        return []
-    gain = float(np.sum((u.T @ p.residual) ** 2))
-    within = max((p.rss - gain) / (fit.dof - rank), 1e-300)
-    p_value = float(f_distribution.sf(gain / rank / within, rank, fit.dof - rank))
-    return [MisfitShare("pose", p.share(gain - rank * within), p_value)]
+    rank = found.basis.shape[1]
+    within = max((p.rss - found.gain) / (p.fit.dof - rank), 1e-300)
+    return [MisfitShare("pose", p.share(found.gain - rank * within), found.p_value)]
 
 
 def _axes(p: Linearisation) -> list[MisfitShare]:

@@ -10,6 +10,9 @@ The rules, in this order:
    replace one that an earlier diagnosis chose.
 4. χ² is too large, and something recorded predicts a share of the misfit on poses left out, or
    repeats of a pose have it in common: `unknown_effect`, with that share.
+   Where χ² is too large, no variable predicts the misfit on poses left out beyond chance, and it
+   is the same under every load of a pose, so that more poses would tell (see `pose_alone`):
+   `ambiguous`.
 5. χ² is too large, nothing predicts the residual, repeats do not scatter less, and the arm's own
    scatter is not in the stated covariance. It is estimated (see `identify.arm_scatter`):
    a. the readings prefer a noisier instrument at more than 20 : 1: `noise_misjudged`;
@@ -29,6 +32,8 @@ repeats can object.
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
+
 from hilcal.data.arm_scatter import ArmScatter
 from hilcal.diagnose.arm_repeatability import instrument_instead, of_repeatability_size
 from hilcal.diagnose.diagnosis import Diagnosis, History, Reason
@@ -41,6 +46,8 @@ from hilcal.diagnose.separability import Separability, separability
 from hilcal.identify.fit import Fit
 
 NOTHING = History()
+IN_SAMPLE = ("pose", "direction")
+"""First words of variables whose share is not of poses left out."""
 MOST_NAMED = 2
 """Variables that a sentence names."""
 SAME_IN_POSE = 0.5
@@ -111,6 +118,10 @@ def judge(e: Evidence, history: History) -> Diagnosis:
         else:
             in_doubt = any(a.inseparable for a in alternatives)
             reason = "inseparable_addition" if in_doubt else "residual_is_noise"
+    alone = None
+    if reason in ("misjudged_noise", "no_suspect") and e.misfit and not _predicted(e, regression):
+        alone = e.pose_alone
+        reason = reason if alone is None else "pose_alone"
     return Diagnosis(
         fit=e.fit,
         history=history,
@@ -127,6 +138,7 @@ def judge(e: Evidence, history: History) -> Diagnosis:
         insufficiency=insufficiency,
         alternatives=alternatives,
         scatter=scatter,
+        pose_alone=alone,
     )
 
 
@@ -146,6 +158,16 @@ def _explained_by_arm(fit: Fit, scatter: ArmScatter) -> bool:
     return not instrument_instead(scatter) and of_repeatability_size(scatter, arm)
 
 
+def _predicted(e: Evidence, regression: ResidualRegression) -> bool:
+    """Whether something recorded predicts the misfit on poses left out.
+
+    Where every pose errs by itself, n of them follow a variable by chance to a share of 1/√n.
+    """
+    shares = (v.share for v in e.misfit_breakdown if v.variable.split()[0] not in IN_SAMPLE)
+    chance = 2.0 / np.sqrt(int(e.fit.pose.max()) + 1)
+    return regression.share > PREDICTABLE or max(shares, default=0.0) > chance
+
+
 def _carrying(of: ResidualRegression) -> tuple[str, ...]:
     """Variables that carry a share worth naming, largest first."""
     return tuple(v.variable for v in of.dependences if v.share >= LEAST_SHARE)
@@ -153,6 +175,6 @@ def _carrying(of: ResidualRegression) -> tuple[str, ...]:
 
 def _significant(found: tuple[MisfitShare, ...]) -> tuple[MisfitShare, ...]:
     """Variables that predict a share of the misfit worth naming, beyond chance among all."""
-    kinds = [v for v in found if v.variable.split()[0] not in ("pose", "direction")]
+    kinds = [v for v in found if v.variable.split()[0] not in IN_SAMPLE]
     alarm = FALSE_ALARM / max(len(kinds), 1)
     return tuple(v for v in kinds if v.p_value < alarm and v.share >= LEAST_SHARE)

@@ -292,6 +292,14 @@ class Effect(ABC):
         """Return a version that is cheap to score as a suspect; the same unless overridden."""
         return self
 
+    def fine(self, states: States) -> "Effect | None":
+        """Return the effect as fine as it may really be; None where the readings do not limit that.
+
+        For families whose number of parameters follows from the number of poses: what they cannot
+        resolve may be there all the same.
+        """
+        return None
+
     def with_options(self, states: States, **options: object) -> Self:
         """Return the same effect with some options changed."""
         return type(self)(self.cell, states, {**self.options, **options})

@@ -62,6 +62,12 @@ class TransmissionError(PerJoint):
         """One variance per group of joints and harmonic."""
         return np.repeat(np.arange(len(self.shared.labels) * len(self.harmonics)), 2)
 
+    def fine(self, states: States) -> Effect | None:
+        """As many harmonics as are scored at most, where the poses allow fewer."""
+        if len(self.harmonics) >= SCORED_HARMONICS:
+            return None
+        return self.with_options(states, harmonics=SCORED_HARMONICS)
+
     def for_scoring(self, states: States) -> Effect:
         """As a suspect, fewer harmonics are scored than a fit tries."""
         return self.with_options(states, harmonics=min(len(self.harmonics), SCORED_HARMONICS))

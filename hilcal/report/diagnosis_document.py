@@ -1,6 +1,7 @@
 """A diagnosis as JSON: in documents of commands and in campaign files."""
 
 from collections.abc import Sequence
+from dataclasses import asdict
 
 from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.diagnose.effect_ranking import Suspect
@@ -37,6 +38,7 @@ def to_json(d: Diagnosis) -> dict[str, object]:
             "share": d.insufficiency.share,
             "variance_factor": d.insufficiency.variance_factor,
         },
+        "pose_alone": None if d.pose_alone is None else asdict(d.pose_alone),
         "rejected": list(d.history.rejected),
         "alternatives": [
             {"effect": a.effect, "same_as": list(a.same_as), "others": list(a.others)}

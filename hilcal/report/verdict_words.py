@@ -4,6 +4,7 @@ from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.diagnose.effect_ranking import LEAST_SHARE, Suspect
 from hilcal.diagnose.noise import PureError
 from hilcal.diagnose.noise_verdict import NoiseVerdict
+from hilcal.diagnose.pose_alone import PoseAlone
 from hilcal.diagnose.separability import Separability
 from hilcal.diagnose.stepwise_alternatives import Alternative
 from hilcal.report.numbers import sizes
@@ -24,6 +25,8 @@ def message(d: Diagnosis) -> str:
         return _misjudged(d)
     if d.reason == "arm_scatter":
         return left_to_the_arm(d)
+    if d.pose_alone is not None:
+        return _pose_alone(d, d.pose_alone)
     adequate = (
         f"Residuals are what the noise explains: variance factor {d.fit.variance_factor:.2f}; no "
         f"effect of the catalogue is missing{noise_place(d.pure_error)}"
@@ -128,6 +131,17 @@ def _no_suspect(d: Diagnosis) -> str:
 
 def _percent(share: float) -> str:
     return f"{100 * share:.0f} %" if share >= 0.005 else f"{100 * share:.1g} %"
+
+
+def _pose_alone(d: Diagnosis, a: PoseAlone) -> str:
+    first, *rest = a.effects
+    others = f", or {' or '.join(rest[:2])}," if rest else ""
+    return (
+        f"Residuals are {_spread(d)}, and {100 * a.share:.0f} % of the misfit is the same under "
+        f"every load of a pose: it depends on the pose alone. {first} finer than {a.poses} poses "
+        f"can resolve{others} would do that, and so would an arm that repeats worse than stated, "
+        f"where each pose was arrived at once; {a.more} more poses tell"
+    )
 
 
 def _misjudged(d: Diagnosis) -> str:

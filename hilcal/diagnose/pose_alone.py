@@ -1,0 +1,114 @@
+"""A misfit that is the same under every load of a pose, and which effects do that.
+
+With few poses a fine transmission error is no pattern: every pose errs by itself, and no pose
+predicts another. But all readings of a pose err alike, whatever hangs on the arm. That alone says
+much: what is missing depends on the pose, and on nothing else that changed within it.
+
+The residual is split by constants of each pose, three displacements of the target. Where they leave
+noise and take nearly all of the misfit, the effects are listed whose own columns are such constants
+to nearly all of their square. A family tells its parameters from each other when the poses measure
+as many elements as it has parameters; so many more poses are stated.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+from scipy.stats import f as f_distribution
+
+from hilcal.diagnose.noise_verdict import MISFIT_ALARM
+from hilcal.effects.protocol import Effect
+from hilcal.identify.linearisation import Linearisation, effect_columns
+from hilcal.types import Floats
+
+LEAST = 0.9
+"""Share of the misfit that pose constants must take; a choice, they take 0.99 of a transmission
+error of 2 σ."""
+ALIKE = 0.98
+"""Share of the square of an effect's columns that pose constants take where it depends on the pose
+alone; a choice."""
+
+
+@dataclass(frozen=True, slots=True)
+class PoseAlone:
+    """A misfit that depends on the pose alone.
+
+    Attributes:
+        share: share of the misfit that constants of each pose take, less what chance would.
+        effects: those that depend on the pose alone, most parameters first.
+        poses: number of poses that were measured.
+        more: how many more would measure as many elements as the first of them has parameters.
+    """
+
+    share: float
+    effects: tuple[str, ...]
+    poses: int
+    more: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseConstants:
+    """Constants of each pose beside a model.
+
+    Attributes:
+        basis: (R, K) orthonormal, beside the model's columns.
+        gain: reduction of ‖r‖² by them.
+        p_value: of that.
+    """
+
+    basis: Floats
+    gain: float
+    p_value: float
+
+
+def pose_constants(p: Linearisation) -> PoseConstants | None:
+    """Split the residual by displacements of each pose; None where poses have too few readings."""
+    fit, w = p.fit, p.fit.whitening
+    poses = int(fit.pose.max()) + 1
+    if poses * 3 > fit.dof / 2 or len(fit.pose) < 2 * poses:
+        return None
+    member = (fit.pose[:, None] == np.arange(poses)).astype(float)
+    axes = np.zeros((len(fit.pose), w.m, 3))
+    axes[:, :3] = 1e-3 * fit.solution.prediction.observation.axes[w.reading]
+    raw = (axes[:, :, :, None] * member[:, None, None, :]).reshape(len(axes), w.m, -1)
+    free = p.project_out(w.whiten(raw).reshape(-1, raw.shape[2]))
+    u, s, _ = np.linalg.svd(free, full_matrices=False)
+    u = u[:, s > 1e-6 * s.max(initial=0.0)]
+    rank = u.shape[1]
+    if rank == 0 or fit.dof - rank <= 0:
+        return None
+    gain = float(np.sum((u.T @ p.residual) ** 2))
+    within = (p.rss - gain) / (fit.dof - rank)
+    p_value = float(f_distribution.sf(gain / rank / within, rank, fit.dof - rank))
+    return PoseConstants(u, gain, p_value)
+
+
+def pose_alone(p: Linearisation, effects: Sequence[Effect]) -> PoseAlone | None:
+    """Return a misfit that depends on the pose alone; None where it does not, or nothing does that.
+
+    Args:
+        p: linearisation of the fit.
+        effects: that are not in the model.
+    """
+    found = pose_constants(p)
+    if found is None:
+        return None
+    fit, rank = p.fit, found.basis.shape[1]
+    rest = p.rss - found.gain
+    share = p.share(found.gain - rank * rest / (fit.dof - rank))
+    if share < LEAST or float(chi2.sf(rest, fit.dof - rank)) < MISFIT_ALARM:
+        return None
+    able, states = [], fit.readings[~fit.outlier].states
+    for e in (*(e for e in fit.model.effects if e.fine(states)), *effects):
+        full = e.fine(states) or e
+        x = p.project_out(effect_columns(fit, full).white)
+        square = float(np.sum(x**2))
+        if square > 0 and float(np.sum((found.basis.T @ x) ** 2)) >= ALIKE * square:
+            able.append((len(full.parameters), e.name))
+    if not able:
+        return None
+    able.sort(key=lambda pair: -pair[0])
+    poses = int(fit.pose.max()) + 1
+    more = max(int(np.ceil(able[0][0] / fit.whitening.m)) - poses, 0)
+    return PoseAlone(share, tuple(name for _, name in able), poses, more) if more else None
