@@ -40,6 +40,7 @@ _PLACES = {
     "fit": "hilcal.library",
     "installed": "hilcal.effects.catalogue",
     "plan": "hilcal.library",
+    "preview_table": "hilcal.identify.table_preview",
     "read_table": "hilcal.library",
     "refine": "hilcal.library",
     "view": "hilcal.library",
@@ -59,6 +60,7 @@ if TYPE_CHECKING:
     from hilcal.effects.spec import effect
     from hilcal.errors import CannotAnswerError, DeviceError, HilcalError, InputError
     from hilcal.identify.fit import Fit
+    from hilcal.identify.table_preview import preview_table
     from hilcal.library import baseline, fit, plan, read_table, refine, view
     from hilcal.model import Model
     from hilcal.refine import Refinement

@@ -64,7 +64,7 @@ MASS = {"mass", "masse", "weight", "gewicht", "masa", "peso"}
 CYCLE = {"cycle", "zyklus", "repeat", "repetition", "wiederholung", "lauf", "ciclo"}
 TIME = {"time", "zeit", "timestamp", "date", "datum", "datetime", "zeitstempel", "temps", "hora",
         "t"}  # fmt: skip
-REFLECTOR = {"reflector", "reflektor", "prism", "prisma", "smr", "nest"}
+REFLECTOR = {"target", "reflector", "reflektor", "prism", "prisma", "smr", "nest"}
 AIR = {"air", "luft", "ambient", "umgebung", "room", "raum", "aire"}
 ARM_JOINTS = (
     ("shoulder", "pan"),

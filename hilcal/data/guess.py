@@ -4,6 +4,7 @@ import numpy as np
 
 from hilcal.data import column_names as words
 from hilcal.data.column_names import ColumnName, parse
+from hilcal.data.columns import required_columns
 from hilcal.data.grid import Grid
 from hilcal.data.guess_axes import guess_axes
 from hilcal.data.guess_names import guess_names, guess_scalars
@@ -34,6 +35,8 @@ def guess(grid: Grid, joints: int | None = None) -> Proposal:
     guess_scalars(g)
     for name, column in list(g.free.items()):
         g.drop(name, _why_unused(g, column))
+    if set(required_columns(joints or 6)) <= set(grid.names):
+        g.unsure("file", "this is an exchange table: it is imported without --format")
     if g.proposal.open_convention:
         g.unsure("orientation", GUESSED)
     for what, sentence in (

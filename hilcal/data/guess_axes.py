@@ -25,11 +25,16 @@ def _kind(c: ColumnName) -> str:
 _KINDS = words.STD | words.ROTATION | words.QUATERNION | words.FORCE | words.MOMENT
 
 
+LARGE = 1e-6
+"""m²; a larger variance, of more than 1 mm, is in mm²."""
+
+
 def guess_axes(g: Guesser) -> None:
     """Positions, orientations, forces and standard deviations, which come by axes."""
     sets: dict[str, dict[tuple[object, ...], dict[str, str]]] = {}
+    _covariance(g)
     for c in g.columns:
-        if c.axis and c.name in g.free and g.number(c.name):
+        if c.axis and c.name in g.free and g.number(c.name) and not c.has({"cov", "kov"}):
             stem = (*(w for w in c.words if w not in _KINDS | {"pos", "position", "p"}), *c.numbers)
             sets.setdefault(_kind(c), {}).setdefault(stem, {})[c.axis] = c.name
     if "force" not in sets and "moment" in sets:  # tx, ty, tz are then translations
@@ -39,7 +44,6 @@ def guess_axes(g: Guesser) -> None:
         kind: {stem: axes for stem, axes in found.items() if set("xyz") <= set(axes)}
         for kind, found in sets.items()
     }
-    _covariance(g)
     positions = whole.get("position", {})
     if not positions:
         return
@@ -100,8 +104,9 @@ def _covariance(g: Guesser) -> None:
     upper = ["xx", "xy", "xz", "yy", "yz", "zz"]
     if all(axes in by_axes for axes in upper):
         names = [by_axes[axes] for axes in upper]
-        g.unsure("covariance", "the unit is that of the position, squared")
-        g.take("covariance", names, "upper triangle", unit="m")
+        unit = "mm" if np.nanmedian(g.block(names[:1])) > LARGE else "m"
+        g.unsure("covariance", f"in {unit}², by their size")
+        g.take("covariance", names, f"upper triangle, {unit}²", unit=unit)
 
 
 Group = dict[str, dict[tuple[object, ...], dict[str, str]]]

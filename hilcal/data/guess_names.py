@@ -67,7 +67,8 @@ def _whole(g: Guesser, name: str) -> bool:
 
 
 def _few(g: Guesser, name: str) -> bool:
-    return 1 < len(set(g.grid.text(name))) <= 20
+    count = len(set(g.grid.text(name)))
+    return 1 < count <= min(20, len(g.grid.rows) // 2)
 
 
 def _one_pose_each(g: Guesser, name: str, joints: dict[str, Any]) -> bool:
