@@ -25,6 +25,9 @@ BLANK = ("", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--", "---")
 SEPARATORS = {"tab": "\t", "blanks": " "}
 """Separators that have a name in a mapping file."""
 
+_PLAIN = str.maketrans({"\u2212": "-", "\u00a0": " ", "\u202f": " ", "\u2019": "'"})
+"""Signs that programs write in place of minus, blank and apostrophe."""
+
 BYTE_ORDER_MARKS = (
     (b"\xef\xbb\xbf", "utf-8-sig"),
     (b"\xff\xfe", "utf-16"),
@@ -141,7 +144,7 @@ def number(cell: Cell, how: FileFormat) -> float:
         return float("nan")
     if not isinstance(cell, str):
         return float(cell)
-    plain = cell.strip()
+    plain = cell.translate(_PLAIN).strip()
     if plain.lower() in BLANK or plain in how.missing:
         return float("nan")
     if how.thousands and how.thousands in plain:
@@ -263,7 +266,8 @@ def table(path: str, found: Sequence[tuple[int, Sequence[Cell]]], how: FileForma
             f"{path}: row {how.header_row} holds no header; set [file] header_row to its row, 0 "
             f"where there is none"
         )
-    header = [_text(c) for c in by_row[how.header_row]] if how.header_row else []
+    titles = by_row[how.header_row] if how.header_row else []
+    header = [" ".join(_text(c).split()) for c in titles]
     skipped = {how.units_row, *how.skip_rows}
     body = [(row, c) for row, c in found if row > how.header_row and row not in skipped]
     if not body:

@@ -30,6 +30,8 @@ MOST_LOST = 0.5
 UNIT_LENGTH = 0.01
 """How far a quaternion's length may be from 1, and a matrix from orthogonal; rounding to three
 digits stays below."""
+MOST_TURN = 2 * np.pi + 1e-3
+"""rad; a larger angle of an orientation is in another unit."""
 _LISTED = 8
 
 
@@ -98,7 +100,9 @@ def readings_of_grid(
     """
     grid, mapping = one_target_per_row(grid, mapping)
     raw = _raw(grid, mapping, arm)
+    nowhere = _nowhere(grid, mapping, raw)
     keep, notes = _complete(grid, raw)
+    notes += nowhere
     grid = grid.rows_with(keep)
     raw = {column: values[keep] for column, values in raw.items()}
     found = _Found()
@@ -143,6 +147,17 @@ def _raw(grid: Grid, mapping: Mapping, arm: Arm) -> dict[str, Floats]:
     return {grid.name(column): grid.numbers(column) for column in needed}
 
 
+def _nowhere(grid: Grid, mapping: Mapping, raw: dict[str, Floats]) -> list[str]:
+    """Take positions of exactly 0, 0, 0 for missing, which instruments write for no measurement."""
+    names = [grid.name(column) for column in mapping.position.columns]
+    bad = np.asarray((_block(raw, grid, names) == 0).all(axis=1))
+    if not bad.any():
+        return []
+    for name in names:
+        raw[name][bad] = np.nan
+    return [f"positions of exactly 0, 0, 0 ({int(bad.sum())} of {len(bad)} rows) count as missing"]
+
+
 def _complete(grid: Grid, raw: dict[str, Floats]) -> tuple[Bools, list[str]]:
     """Rows that have a value in every column that is used, and a note on the others."""
     missing = np.stack([np.isnan(values) for values in raw.values()], axis=1)
@@ -184,6 +199,14 @@ def _motion(
             what = "a quaternion of length 1" if angles.shape[1] == 4 else "a rotation matrix"
             raise InputError(f"{grid.at(i, grid.name(o.columns[0]))}: not {what}")
         unit = units.ANGLES[o.unit]
+        turn = np.abs(unit * angles) > MOST_TURN
+        if angles.shape[1] == 3 and turn.any():
+            i, k = divmod(int(np.argmax(turn)), 3)
+            seems = " (looks like degrees)" if o.unit == "rad" else ""
+            raise InputError(
+                f"{grid.at(i, grid.name(o.columns[k]))}: {angles[i, k]:g} {o.unit} is more than a "
+                f"turn{seems}; see [orientation] unit"
+            )
         vector = se3.rotation_vector(rotations(o.convention, angles, unit))
         for k, name in enumerate(columns.ROTATION):
             found.add(grid, name, o.columns[k], vector[:, k])

@@ -142,6 +142,10 @@ BAD: dict[str, tuple[Callable[[str], str], Callable[[str], str], tuple[str, ...]
         same, lambda t: t + '[orientation]\ncolumns = ["A1", "A2", "A3", "A4"]\n'
         'convention = "abb"\n', ("row 2", "quaternion of length 1"),
     ),
+    "orientation in degrees": (
+        same, lambda t: t + '[orientation]\ncolumns = ["A1", "A2", "A3"]\nconvention = "kuka"\n',
+        ("row 2", "column 'A1'", "looks like degrees", "[orientation] unit"),
+    ),
     "unknown convention": (
         same, lambda t: t + '[orientation]\ncolumns = ["A1", "A2", "A3"]\n'
         'convention = "kuka-abc"\n', ('did you mean "kuka"', "intrinsic-zyx"),
@@ -212,6 +216,23 @@ def test_rows_without_a_value_are_left_out_and_counted(tmp_path: Path, capsys: C
     d = imported(capsys, tmp_path, text, mapping)
     assert d["n_readings"] == 10
     assert d["notes"][0] == "2 of 12 rows left out (4, 6): no value in X, Z"
+
+
+def test_points_that_were_not_measured(tmp_path: Path, capsys: Capsys) -> None:
+    text = cell(4, "X", "0.000")(cell(4, "Y", "0")(cell(4, "Z", "-0.0")(GOOD)))
+    d = imported(capsys, tmp_path, text)
+    assert d["n_readings"] == 11
+    assert d["notes"][:2] == [
+        "1 of 12 rows left out (4): no value in X, Y, Z",
+        "positions of exactly 0, 0, 0 (1 of 12 rows) count as missing",
+    ]
+
+
+def test_signs_that_programs_write(tmp_path: Path, capsys: Capsys) -> None:
+    text = cell(3, "X", "\u22121\u00a0234.5")(GOOD)
+    mapping = MAPPING.replace('";"', '";"\nthousands = " "')
+    imported(capsys, tmp_path, text, mapping)
+    assert values(tmp_path).value[1, 0] == pytest.approx(-1.2345)
 
 
 def test_zero_standard_deviations_are_the_instruments(tmp_path: Path, capsys: Capsys) -> None:
