@@ -20,8 +20,9 @@ from hilcal.data.importing import import_readings
 from hilcal.data.readings import Readings
 from hilcal.data.table import write_table
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identify import frames_document
+from hilcal.identify import description_words, frames_document
 from hilcal.identify.full_covariance import covariance_parts
+from hilcal.identify.gate import examine
 from hilcal.identify.registration import Registration, register
 from hilcal.report import text
 from hilcal.report.covariance_words import covariance_words
@@ -102,8 +103,13 @@ def import_(
     )
     t.show(Padding(note, (0, 0, 0, 2)) for note in notes)
     registered = _registered(cell, readings)
-    if registered is not None:
+    wrong = None if registered is None else examine(registered, readings)
+    if registered is not None and not (wrong is not None and wrong.refused):
         t.show(Padding(line, (0, 0, 0, 2)) for line in registration_lines(registered))
+    if wrong is not None:
+        said = description_words.words(wrong, cell, readings)
+        begin = "Nothing can be fitted yet" if wrong.refused else "Note"
+        t.show(Padding(f"{begin}: {said}.", (0, 0, 0, 2)))
     t.document(
         {
             "campaign": str(output),
@@ -114,6 +120,9 @@ def import_(
             "loads": loads,
             "covariance": parts,
             "notes": list(notes),
+            "description": None
+            if wrong is None
+            else description_words.document(wrong, cell, readings),
             "frames": None if registered is None else frames_document.document(registered),
         }
     )

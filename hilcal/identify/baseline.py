@@ -10,6 +10,7 @@ from hilcal.data.whitening import Mode
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.effects.options import Options
 from hilcal.effects.spec import EffectSpec
+from hilcal.identify.description_words import refuse_misdescribed
 from hilcal.identify.registration import register
 from hilcal.identify.rigid_frames import TARGET_M, TELL
 from hilcal.model import Model
@@ -70,6 +71,7 @@ def with_effects(
     """
     known, given = catalogue or installed(), options or {}
     registered = register(cell, readings)
+    refuse_misdescribed(registered, readings)
     model = Model(registered.cell, (), known, readings)
     frames = known.unknown_frames(cell)
     for name in dict.fromkeys((*frames, *names)):

@@ -1,0 +1,332 @@
+"""Random arms, registrations and errors of description, for the gate after registration.
+
+Each case draws an arm (DH rows, signs, couplings, with or without masses, or one of the catalogue),
+poses of one kind, frames, noise, geometric errors of an uncalibrated arm, and in half of the cases
+one error of description. Readings are made with the arm as it truly is.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hilcal.cell import STANDARD_GRAVITY, Cell
+from hilcal.data.readings import Readings, States
+from hilcal.errors import CannotAnswerError
+from hilcal.identify.description import Change, Described, couplings
+from hilcal.identify.gate import Finding, examine
+from hilcal.identify.registration import register
+from hilcal.robot import se3
+from hilcal.robot.arm import Arm
+from hilcal.robot.catalogue import load_arm, robot_names
+from hilcal.robot.chain import evaluate, joint_jacobian
+from hilcal.robot.conventions import with_conventions
+from hilcal.types import Floats
+
+POSES = ("general", "one orientation", "plane", "one axis", "small region")
+ERRORS = (
+    "sign",
+    "quarter",
+    "zero",
+    "coupling",
+    "degrees",
+    "attitude degrees",
+    "millimetres",
+    "mirrored",
+    "inverse",
+    "swapped rows",
+    "other arm",
+    "two signs",
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Case:
+    """One draw.
+
+    Attributes:
+        cell: as it is described.
+        readings: as they were given.
+        truth: what is otherwise than described; empty where nothing is, or rows are swapped.
+        error: kind of the error, or None.
+        poses: kind of the poses.
+        best: misfit with the true description, m; attitudes count with the gate's lever.
+        hidden: whether the frames hide the error in these poses.
+    """
+
+    cell: Cell
+    readings: Readings
+    truth: tuple[Change, ...]
+    error: str | None
+    poses: str
+    best: float
+    hidden: bool
+
+
+def random_arm(rng: np.random.Generator) -> Arm:
+    """Return an arm of six joints with rows as industrial arms have them."""
+    turns = rng.choice([0.0, np.pi / 2, -np.pi / 2], 6, p=[0.3, 0.35, 0.35])
+    turns[[0, 4]] = rng.choice([np.pi / 2, -np.pi / 2], 2)  # no two parallel axes in a wrist
+    turns[3] = rng.choice([np.pi / 2, -np.pi / 2])
+    links = [np.eye(4)]
+    for turn in turns:
+        link = np.eye(4)
+        link[:3, :3] = se3.rotation(np.array([turn, 0.0, 0.0]))
+        link[:3, 3] = [rng.uniform(0.0, 0.6), 0.0, rng.uniform(-0.3, 0.4)]
+        links.append(link)
+    mass = rng.random() < 0.5
+    arm = Arm(
+        name="drawn",
+        links=np.array(links),
+        masses=rng.uniform(1, 9, 6) * mass,
+        coms=rng.normal(0, 0.1, (6, 3)),
+        q_min=np.full(6, -2 * np.pi),
+        q_max=np.full(6, 2 * np.pi),
+        torque_max=np.full(6, 200.0),
+        payload=10.0,
+        joint_names=tuple(f"j{k}" for k in range(1, 7)),
+        source="drawn",
+    )
+    if rng.random() < 0.3:
+        return load_arm(str(rng.choice(robot_names())))
+    sign, zero, coupled = rng.choice([-1.0, 1.0], 6), np.zeros(6), np.zeros((6, 6))
+    if rng.random() < 0.3:
+        joint, follows = couplings(6)[rng.integers(6)]
+        coupled[joint - 1, follows - 1] = rng.choice([-1.0, 1.0])
+    return with_conventions(arm, sign, zero, coupled)
+
+
+def random_error(kind: str, arm: Arm, rng: np.random.Generator) -> tuple[Change, ...]:
+    """Return what is truly otherwise than described."""
+    j = int(rng.integers(1, 7))
+    if kind == "sign":
+        return (Change("joint", j, -1),)
+    if kind == "two signs":
+        i, k = sorted(rng.choice(6, 2, replace=False) + 1)
+        return Change("joint", int(i), -1), Change("joint", int(k), -1)
+    if kind == "quarter":
+        return (Change("joint", j, 1, float(rng.choice([1, -1, 2])) * np.pi / 2),)
+    if kind == "zero":
+        return (
+            Change("joint", j, 1, float(np.radians(rng.uniform(3, 170)) * rng.choice([-1, 1]))),
+        )
+    if kind == "coupling":
+        joint, follows = couplings(6)[int(rng.integers(1, 6))]
+        return (Change("coupling", joint, follows=follows, factor=float(rng.choice([-1.0, 1.0]))),)
+    if kind == "other arm":
+        names = [n for n in robot_names() if n != arm.name]
+        return (Change("arm", arm=str(rng.choice(names))),)
+    simple = {
+        "degrees": Change("joint_degrees"),
+        "attitude degrees": Change("turn_degrees"),
+        "millimetres": Change("millimetres"),
+        "mirrored": Change("mirrored"),
+        "inverse": Change("inverse"),
+    }
+    return (simple[kind],) if kind in simple else ()
+
+
+def random_poses(kind: str, arm: Arm, count: int, rng: np.random.Generator) -> Floats:
+    """Return joint values (N, 6) of one kind of poses."""
+    middle = rng.uniform(-1.5, 1.5, 6)
+    if kind == "one axis":
+        q = np.tile(middle, (count, 1))
+        q[:, rng.integers(6)] += np.linspace(-0.8, 0.8, count)
+        return q
+    if kind == "small region":
+        return middle + rng.uniform(-0.04, 0.04, (count, 6))
+    if kind == "general":
+        return rng.uniform(-2, 2, (count, 6))
+    q = middle + rng.uniform(-0.5, 0.5, (count, 6))
+    first = evaluate(arm, middle[None])
+    base, turn = first.position[-1][0], first.rotation[-1][0]
+    for _ in range(30):  # Newton, damped, towards one orientation or into one plane
+        chain = evaluate(arm, q)
+        jac = joint_jacobian(chain, chain.position[-1])
+        if arm.coupling is not None:
+            jac = jac @ arm.coupling
+        if kind == "plane":
+            off, rows = (chain.position[-1] - base)[:, 2:3], jac[:, 2:3]
+        else:
+            back = turn @ np.swapaxes(chain.rotation[-1], 1, 2)
+            off, rows = -se3.rotation_vector(back), jac[:, 3:]
+        square = rows @ np.swapaxes(rows, 1, 2) + 1e-6 * np.eye(rows.shape[1])
+        step = np.swapaxes(rows, 1, 2) @ np.linalg.solve(square, off[..., None])
+        q = q - np.clip(step[..., 0], -0.3, 0.3)
+    return np.asarray(q[np.abs(off).max(axis=1) < 1e-6])
+
+
+def draw(rng: np.random.Generator) -> Case:
+    """Draw a case; one whose poses do not register at all is drawn anew."""
+    while True:
+        case = _draw(rng)
+        if case is not None:
+            return case
+
+
+def _draw(rng: np.random.Generator) -> Case | None:
+    m = int(rng.choice([3, 6]))
+    kind = str(rng.choice(POSES))
+    error = str(rng.choice(ERRORS)) if rng.random() < 0.5 else None
+    if m == 3 and error in ("attitude degrees", "inverse"):
+        error = "sign"
+    arm = random_arm(rng)
+    if error == "other arm":
+        arm = load_arm(str(rng.choice(robot_names())))
+    truth = random_error(error, arm, rng) if error else ()
+    true_arm = arm
+    for change in truth:
+        if change.kind in ("joint", "coupling", "arm"):
+            nothing = np.zeros((1, 6))
+            described = Described(true_arm, nothing, nothing[:, :3], None, True, True)
+            true_arm = change.applied(described).arm
+    q = random_poses(kind, true_arm, int(rng.integers(25, 90)), rng)
+    if len(q) < 12:
+        return None
+    cell = _cell(arm, rng)
+    noise = 10 ** rng.uniform(-5, -3.7)
+    sigma = np.repeat([noise, 2 * noise], 3)[:m]
+    geometry = rng.choice([0.0, 2e-4])
+    own = [se3.matrix(*se3.exp(t)) for t in geometry * rng.normal(size=(7, 6))]
+    bent = replace(true_arm, links=true_arm.links @ np.array(own))
+    base, target = _pose(rng, 3.0), _pose(rng, 0.2)
+    if cell.registration_known:
+        base = cell.registration
+    if cell.target_known:
+        target[:3, 3] = cell.target[:3, 3]
+        if cell.registration_known:  # then nothing is estimated, the target's axes neither
+            target = cell.target
+    value = read(bent, q, base, target, m)
+    error_m = rng.normal(size=value.shape) * sigma
+    value[:, :3] += error_m[:, :3]
+    if m == 6:
+        turned = se3.rotation(error_m[:, 3:]) @ se3.rotation(value[:, 3:])
+        value[:, 3:] = se3.rotation_vector(turned)
+    clean = readings_of(q, value, sigma)
+    given = _misdescribed(clean, error, rng)
+    true_cell = replace(cell, arm=true_arm)
+    try:
+        best = _size(true_cell, clean)
+        seen = _size(cell, given)
+    except CannotAnswerError:
+        return None
+    return Case(cell, given, truth, error, kind, best, seen < 3.0 * best + 1e-6)
+
+
+def _cell(arm: Arm, rng: np.random.Generator) -> Cell:
+    target = np.eye(4)
+    target[:3, 3] = rng.uniform(-0.2, 0.2, 3)
+    known, base_known = bool(rng.random() < 0.5), bool(rng.random() < 0.15)
+    return Cell(
+        arm=arm,
+        target=target if known else np.eye(4),
+        load_point=np.zeros(3),
+        tool_mass=0.0,
+        tool_com=np.zeros(3),
+        gravity=STANDARD_GRAVITY,
+        registration=_pose(rng, 3.0) if base_known else np.eye(4),
+        registration_known=base_known,
+        target_known=known,
+    )
+
+
+def _pose(rng: np.random.Generator, size: float) -> Floats:
+    turn = rng.normal(size=3)
+    turn *= rng.uniform(0, np.pi) / np.linalg.norm(turn)
+    return se3.matrix(se3.rotation(turn), rng.uniform(-size, size, 3))
+
+
+def read(arm: Arm, q: Floats, base: Floats, target: Floats, m: int) -> Floats:
+    """Readings of an arm without noise, by products of homogeneous matrices."""
+    theta = arm.chain_angles(q)
+    at = np.broadcast_to(base @ arm.links[0], (len(q), 4, 4))
+    for k in range(6):
+        turn = np.tile(np.eye(4), (len(q), 1, 1))
+        turn[:, 0, 0] = turn[:, 1, 1] = np.cos(theta[:, k])
+        turn[:, 1, 0] = np.sin(theta[:, k])
+        turn[:, 0, 1] = -turn[:, 1, 0]
+        at = at @ turn @ arm.links[k + 1]
+    at = at @ target
+    turn_vector = se3.rotation_vector(np.ascontiguousarray(at[:, :3, :3]))
+    return np.hstack([at[:, :3, 3], turn_vector])[:, :m]
+
+
+def readings_of(q: Floats, value: Floats, sigma: Floats) -> Readings:
+    """Readings (N, m) of joint values (N, 6) without loads, with standard deviations (m,)."""
+    count = len(q)
+    zero = np.zeros(count, dtype=np.int64)
+    return Readings(
+        states=States(q, np.zeros((count, 6))),
+        pose=np.arange(count),
+        load=zero,
+        cycle=zero,
+        value=value,
+        covariance=np.tile(np.diag(sigma**2), (count, 1, 1)),
+        load_names=("none",),
+        pose_names=tuple(f"p{k + 1}" for k in range(count)),
+    )
+
+
+def _misdescribed(clean: Readings, error: str | None, rng: np.random.Generator) -> Readings:
+    """Return the readings as they are given, with the error in the table."""
+    value, q = clean.value.copy(), clean.states.q
+    mirror = np.array([1.0, -1.0, 1.0])
+    if error == "degrees":
+        q = np.degrees(q)
+    elif error == "attitude degrees":
+        value[:, 3:] = np.degrees(value[:, 3:])
+    elif error == "millimetres":
+        value[:, :3] *= 1e3
+    elif error == "mirrored":
+        value[:, :3] *= mirror
+        value[:, 3:] *= -mirror[: value.shape[1] - 3]
+    elif error == "inverse":
+        turn = se3.rotation(value[:, 3:])
+        value[:, :3] = -np.einsum("nji,nj->ni", turn, value[:, :3])
+        value[:, 3:] *= -1.0
+    elif error == "swapped rows":
+        i, j = rng.choice(len(value), 2, replace=False)
+        value[[i, j]] = value[[j, i]]
+    return replace(clean, value=value, states=replace(clean.states, q=q))
+
+
+def _size(cell: Cell, readings: Readings) -> float:
+    found = register(cell, readings)
+    lever = 0.3 if found.turn_rms is not None else 0.0
+    return float(np.hypot(found.rms, lever * (found.turn_rms or 0.0)))
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What the program said of a case.
+
+    Attributes:
+        right: registered to the noise, or refused with a reason that is right.
+        named: the error was named, or an equivalent that fits as well with no more changes; None
+            where there is none, or the frames hide it.
+        exact: the very error was among those named.
+    """
+
+    right: bool
+    named: bool | None
+    exact: bool
+
+
+def judge(case: Case) -> tuple[Outcome, Finding | None]:
+    """Run the program on a case."""
+    found = examine(register(case.cell, case.readings), case.readings)
+    refused = found is not None and found.refused
+    if case.error is None or case.hidden:
+        return Outcome(not refused, None, False), found
+    if case.error == "swapped rows":
+        named = found is not None and bool(found.rows.any()) and not found.explanations
+        return Outcome(named, named, named), found
+    ways = [] if found is None else list(found.explanations)
+    exact = any(_about(e.changes) == _about(case.truth) for e in ways)
+    fits = bool(ways) and ways[0].rms < 3.0 * case.best + 1e-6
+    fewer = bool(ways) and len(ways[0].changes) <= len(case.truth)
+    named = exact or (fits and fewer)
+    return Outcome(named or (refused and fits), named, exact), found
+
+
+def _about(changes: tuple[Change, ...]) -> list[tuple[object, ...]]:
+    return sorted((c.kind, c.joint, c.follows, c.sign, c.factor, c.arm) for c in changes)
