@@ -118,7 +118,7 @@ def compare(run: Run, effects_from: EffectsFrom = None, as_json: Json = False) -
     name = text.model_name(titles(found.model, found.readings))
     t.show(text.heading(f"Revision {number}: {name}"))
     t.show([text.misses(found), text.follows(places), "", text.errors(found), ""])
-    t.show([text.where_table(places), ""])
+    t.show([*text.where_table(places), ""])
     t.show(text.worst_table(worst))
     t.document(
         {

@@ -8,6 +8,7 @@ it predicts on poses left out. It names no cause.
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from scipy.stats import chi2
@@ -18,8 +19,22 @@ from hilcal.observe import motion
 from hilcal.types import Floats
 
 POLYNOMIAL = 3
+ROW_ORDER = "row order"
+"""The variable in place of the time where the readings do not state it: a drift shows by it."""
 MANY = 4000
 """Degrees of freedom from which the families of joint angles are finer."""
+
+
+Group = Literal["joints", "load and target", "time and air", "pose", "direction"]
+"""Kinds of variables. The share of a pose is what its readings have in common, that of a direction
+what points along it; the shares of the others are predicted on poses left out, and overlap."""
+_GROUPS: dict[str, Group] = {
+    "joint": "joints",
+    "load": "load and target",
+    "target": "load and target",
+    "pose": "pose",
+    "direction": "direction",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,13 +43,19 @@ class MisfitShare:
 
     Attributes:
         variable: e.g. "joint 2 angle", "joint 2 torque", "load", "time".
-        share: share of the misfit that it predicts on poses left out.
+        share: share of the misfit that it predicts on poses left out; see `Group` for others.
         p_value: of the joint test.
     """
 
     variable: str
     share: float
     p_value: float
+
+    @property
+    def group(self) -> Group:
+        """What kind of variable it is."""
+        head = self.variable.split()[0]
+        return _GROUPS.get(head, "time and air")
 
 
 def misfit_breakdown(p: Linearisation) -> tuple[MisfitShare, ...]:
@@ -99,8 +120,9 @@ def _variables(p: Linearisation) -> list[tuple[str, Floats, bool]]:
             out.append((f"joint {j + 1} approach", s.approach[:, [j]], True))
         if s.joint_temperature is not None and np.ptp(s.joint_temperature[:, j]) > 0:
             out.append((f"joint {j + 1} temperature", _powers(s.joint_temperature[:, j]), True))
+    rows = np.flatnonzero(~fit.outlier).astype(float)
     for name, values in (
-        ("time", s.time),
+        ("time", s.time) if s.time is not None else (ROW_ORDER, rows),
         ("time under load", s.load_time),
         ("air temperature", s.air_temperature),
     ):

@@ -5,6 +5,7 @@ from itertools import combinations
 
 import numpy as np
 
+from hilcal.diagnose.misfit_breakdown import ROW_ORDER
 from hilcal.identify.linearisation import Linearisation
 from hilcal.observe import motion
 from hilcal.types import Floats, Ints
@@ -84,7 +85,10 @@ def recorded(p: Linearisation) -> list[Variable]:
             out.append(Variable(f"joint {j + 1} approach", "side", side, sides))
         if s.joint_temperature is not None:
             smooth(f"joint {j + 1} temperature", "°C", s.joint_temperature[:, j])
-    smooth("time", "s", s.time)
+    if s.time is None:
+        smooth(ROW_ORDER, "row", np.flatnonzero(~p.fit.outlier).astype(float))
+    else:
+        smooth("time", "s", s.time)
     smooth("time under load", "s", s.load_time)
     smooth("air temperature", "°C", s.air_temperature)
     loads = np.unique(readings.load)

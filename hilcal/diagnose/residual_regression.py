@@ -50,6 +50,8 @@ MOST_MEASUREMENTS = 4000
 LITTLE = 0.1
 """Share that smooth laws predict below which trees are fitted as well; a guess."""
 """Prior standard deviations that are tried: fewer than for effects, since laws are many."""
+DETERMINED = 2.0
+"""How many times its rms standard error a curve must be; a choice: of less, much is error."""
 LEAST_RIDGE, LAW_RIDGE = 1e-6, 1e-3
 """Least ridge of the model's directions, not all of which some rows determine; of laws. Guesses."""
 
@@ -66,7 +68,7 @@ class Dependence:
         direction: (3,) base axes; zero for a joint.
         x: (K,) centres of the bins.
         y: (K,) mean error in each bin, rad of the joint or m of the target.
-        error: (K,) its standard error.
+        error: (K,) its standard error; y and error are of the differences from the bins' mean.
         y_unit: "rad" or "m".
         labels: names of the loads that x counts.
     """
@@ -81,6 +83,11 @@ class Dependence:
     error: Floats
     y_unit: str
     labels: tuple[str, ...] = ()
+
+    @property
+    def determined(self) -> bool:
+        """Whether the readings determine the curve: it is larger than its standard error."""
+        return bool(np.sum(self.y**2) > DETERMINED**2 * np.sum(self.error**2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,7 +146,8 @@ def _features(p: Linearisation) -> Floats:
     situation = fit.solution.prediction.situation
     angle = situation.angle[w.reading]
     columns = [angle, np.cos(angle), np.sin(angle), situation.torque[w.reading], s.wrench]
-    for extra in (s.time, s.load_time, s.air_temperature):
+    order = np.flatnonzero(~fit.outlier).astype(float)[w.reading]
+    for extra in (order if s.time is None else s.time, s.load_time, s.air_temperature):
         if extra is not None:
             columns.append(extra[:, None])
     for wide in (s.joint_temperature, s.approach):
@@ -308,7 +316,9 @@ def _curve(p: Linearisation, v: Variable, number: int, way: Floats, share: float
         direction = direction * np.sign(direction[np.argmax(np.abs(direction))])
         raw = np.einsum("nik,k->ni", way, direction)[:, :, None] * member[:, None, :]
     y, covariance = _least(p, w.whiten(w.raw(raw)).reshape(len(p.fit.white), -1))
-    error = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    # A constant may be a parameter of the model: only differences between bins are shown.
+    centre = np.eye(len(y)) - 1.0 / len(y)
+    error = np.sqrt(np.maximum(np.diag(centre @ covariance @ centre), 0.0))
     joint = way.shape[2] == 1
     return Dependence(
         variable=v.name,

@@ -13,8 +13,9 @@ The rules, in this order:
    Where χ² is too large, no variable predicts the misfit on poses left out beyond chance, and it
    is the same under every load of a pose, so that more poses would tell (see `pose_alone`):
    `ambiguous`.
-5. χ² is too large, nothing predicts the residual, repeats do not scatter less, and the arm's own
-   scatter is not in the stated covariance. It is estimated (see `identify.arm_scatter`):
+5. χ² is too large, nothing predicts the residual (no suspect, no learner; single variables less
+   than `FAINT` of it, which is said), repeats do not scatter less, and the arm's own scatter is not
+   in the stated covariance. It is estimated (see `identify.arm_scatter`), before rule 4:
    a. the readings prefer a noisier instrument at more than 20 : 1: `noise_misjudged`;
    b. the scatter is larger than an arm's repeatability can be (see `arm_repeatability`):
       `noise_misjudged`, be it the instrument, or an arm or a target that was loose;
@@ -50,6 +51,9 @@ IN_SAMPLE = ("pose", "direction")
 """First words of variables whose share is not of poses left out."""
 MOST_NAMED = 2
 """Variables that a sentence names."""
+FAINT = 0.05
+"""Share of the misfit, its rms then less than a quarter of the whole, that single variables may
+predict beside the arm's scatter without being an effect to look for; a choice. It is stated."""
 SAME_IN_POSE = 0.5
 """Share of the misfit in common to all readings of a pose from which on it is not the scatter of
 single arrivals; a choice."""
@@ -106,8 +110,14 @@ def judge(e: Evidence, history: History) -> Diagnosis:
         ]
         predicted = max([regression.share, *sizes]) if e.misfit else 0.0
         noise = judge_noise(e.fit, e.pure_error, regression.share > PREDICTABLE or bool(sizes))
-        found = e.arm_scatter if noise.misjudged and e.misfit and _may_scatter(e) else None
-        if found is not None:
+        faint = (
+            noise.reason == "predictable"
+            and predicted < FAINT
+            and not any(s.explains for s in suspects)
+        )
+        may = e.misfit and (noise.misjudged or faint) and _may_scatter(e)
+        found = e.arm_scatter if may else None
+        if found is not None and (noise.misjudged or _explained_by_arm(e.fit, found)):
             scatter = replace(found, predicted_share=predicted)
         if found is not None and _explained_by_arm(e.fit, found):
             reason = "arm_scatter"

@@ -31,7 +31,7 @@ from hilcal.regression.variance_components import (
 )
 from hilcal.types import Floats, Ints
 
-MOST_ROWS = 6000
+MOST_ROWS = 4000
 """Whitened rows that are used at most, of poses chosen at random, for speed; a choice: a σ of
 hundreds of arrivals is known to a few per cent."""
 KINDS: tuple[ScatterKind, ...] = ("joints", "each joint", "isotropic")

@@ -173,7 +173,8 @@ def _curves(d: Diagnosis) -> tuple[StoryCurve, ...]:
     explained = d.insufficiency is None and known >= LITTLE * d.predictable_share
     if d.verdict == "adequate" or explained:
         return ()
-    return tuple(curve(v) for v in d.dependences if v.share >= LEAST_CARRIED)
+    carried = (v for v in d.dependences if v.share >= LEAST_CARRIED and v.determined)
+    return tuple(curve(v) for v in carried)
 
 
 def curve(d: Dependence) -> StoryCurve:

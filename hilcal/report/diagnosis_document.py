@@ -114,6 +114,7 @@ def carriers(found: Sequence[Dependence]) -> list[dict[str, object]]:
             "y": v.y.tolist(),
             "error": v.error.tolist(),
             "y_unit": v.y_unit,
+            "determined": v.determined,
         }
         for v in found
     ]

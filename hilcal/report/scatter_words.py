@@ -16,9 +16,11 @@ def left_to_the_arm(d: Diagnosis) -> str:
             f"; these readings do not tell it from an instrument {s.instrument_factor:.2g} times "
             "as noisy as stated"
         )
+    share = s.predicted_share
+    but = f"but for {100 * share:.0f} % of it" if share >= 0.005 else "(0 % on poses left out)"
     return (
-        f"What is left, {numbers.length(s.size_m)} rms, is predictable by nothing recorded "
-        f"({100 * s.predicted_share:.0f} % on poses left out) and of the size of the arm's "
+        f"What is left, {numbers.length(s.size_m)} rms, is predictable by nothing recorded {but} "
+        f"and of the size of the arm's "
         f"repeatability: {sigmas(s)}{_maker(s, d.fit.model.cell.arm)}; no effect of the catalogue "
         f"is missing{doubt}"
     )

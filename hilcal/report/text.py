@@ -9,7 +9,8 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from hilcal.diagnose.misfit_breakdown import MisfitShare
+from hilcal.diagnose.effect_ranking import LEAST_SHARE
+from hilcal.diagnose.misfit_breakdown import Group, MisfitShare
 from hilcal.effects.protocol import Effect
 from hilcal.identify.fit import Fit
 from hilcal.identify.fit_document import notes
@@ -25,6 +26,14 @@ STRONGEST = 5
 DIRECTIONS = 8
 GROSS = 8
 POSE = "pose"
+GROUPS: dict[Group, str] = {
+    "joints": "{}",
+    "load and target": "{}",
+    "time and air": "{}",
+    "pose": "same in all readings of a pose",
+    "direction": "points {}",
+}
+"""Groups of the table of variables in their order, and how a row of each is called."""
 CERTAIN = 0.005
 
 
@@ -223,12 +232,28 @@ def follows(places: Sequence[MisfitShare]) -> str:
     return f"{told}."
 
 
-def where_table(places: Sequence[MisfitShare], most: int = 12) -> RenderableType:
-    """Return the table of variables that the misfit follows."""
-    out = table("where the model fails", "share of the misfit", "p-value")
-    for p in places[:most]:
-        out.add_row(p.variable, numbers.percent(p.share), numbers.chance(p.p_value))
-    return out
+def where_table(places: Sequence[MisfitShare]) -> Iterator[RenderableType]:
+    """Yield the table of variables that the misfit follows, by groups, and what a share is."""
+    out = table("where the model fails", "share", "p-value")
+    shown = [p for p in places if p.share >= LEAST_SHARE]
+    for group, words in GROUPS.items():
+        mine = [p for p in shown if p.group == group]
+        if mine and out.row_count:
+            out.add_section()
+        for p in mine:
+            name = p.variable.removeprefix("direction ")
+            out.add_row(words.format(name), numbers.percent(p.share), numbers.chance(p.p_value))
+    if shown:
+        yield out
+    least = numbers.percent(LEAST_SHARE)
+    rest = len([p for p in places if p.share < LEAST_SHARE])
+    more = f"; {rest} more {'is' if rest == 1 else 'are'} below {least}" if rest else ""
+    yield Text(
+        "share of the misfit: what a smooth law of the variable predicts on poses left out (these "
+        "overlap); what is the same in all readings of a pose; what points along a direction"
+        f"{more}.",
+        style="dim",
+    )
 
 
 @dataclass(frozen=True, slots=True)

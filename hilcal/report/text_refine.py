@@ -6,7 +6,7 @@ from rich.console import RenderableType
 from rich.text import Text
 
 from hilcal.diagnose.diagnosis import Diagnosis
-from hilcal.diagnose.effect_ranking import Suspect
+from hilcal.diagnose.effect_ranking import LEAST_SHARE, Suspect
 from hilcal.identify.fit import Fit
 from hilcal.identify.full_prediction import full_prediction
 from hilcal.report import numbers, text
@@ -83,12 +83,11 @@ def diagnosis_report(d: Diagnosis) -> Iterator[RenderableType]:
         )
     if d.verdict != "adequate":
         yield from doubtful(d)
-        yield from (text.where_table(d.misfit_breakdown), "")
+        yield from (*text.where_table(d.misfit_breakdown), "")
     if d.verdict in ("unknown_effect", "noise_misjudged"):
-        yield (
-            f"A generic regression on all that is recorded predicts "
-            f"{numbers.percent(d.predictable_share)} of the misfit."
-        )
+        if d.verdict == "noise_misjudged" or d.predictable_share >= LEAST_SHARE:
+            predicted = numbers.percent(d.predictable_share)
+            yield f"What is recorded predicts {predicted} of the misfit on poses left out."
         if d.insufficiency is not None:
             refitted = d.insufficiency.effects[: d.insufficiency.refitted]
             yield f"The residual{' with ' * bool(refitted)}{numbers.names(refitted)}:"

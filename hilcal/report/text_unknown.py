@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from rich.console import RenderableType
 from rich.text import Text
 
+from hilcal.diagnose.effect_ranking import LEAST_SHARE
 from hilcal.diagnose.noise import PureError
 from hilcal.diagnose.residual_regression import Dependence
 from hilcal.report import numbers, text
@@ -28,11 +29,19 @@ def repeats(e: PureError) -> Iterator[str]:
 
 
 def curves(dependences: Sequence[Dependence], most: int = MOST) -> Iterator[RenderableType]:
-    """Yield the curve of each leading variable as a row of bars and a table."""
-    for d in dependences[:most]:
-        yield f"{d.variable} carries {numbers.percent(d.share)}; {moves(d)} errs by:"
-        yield from (curve(d), "")
-    if dependences:
+    """Yield the curve of each leading variable as a row of bars and a table.
+
+    Only of those that carry `LEAST_SHARE` or more, and by a curve only where it is determined.
+    """
+    carrying = [d for d in dependences if d.share >= LEAST_SHARE][:most]
+    for d in carrying:
+        told = f"{d.variable} carries {numbers.percent(d.share)}"
+        if d.determined:
+            yield f"{told}; {moves(d)} errs by:"
+            yield from (curve(d), "")
+        else:
+            yield f"{told}, but these readings do not determine its curve."
+    if any(d.determined for d in carrying):
         yield Text("±: standard uncertainty; the mean over the bins is taken as zero.", style="dim")
 
 

@@ -123,6 +123,8 @@ def _no_suspect(d: Diagnosis) -> str:
             f"{100 * d.repeated_share:.0f} % of the misfit is the same when a pose is repeated: "
             f"the pose itself predicts it{repeats}; {none}"
         )
+    if repeats:
+        repeats = f"{repeats}: {100 * d.repeated_share:.0f} % of the misfit is the same in them"
     return (
         f"Residuals are {_spread(d)}, {_percent(d.predictable_share)} of the misfit is predicted "
         f"on poses left out, and {none}{follows}{repeats}"
