@@ -45,6 +45,13 @@ class FullPrediction:
         """Pose and load of a measurement."""
         return names(self.readings, int(self.whitening.reading[measurement]))
 
+    def target_name(self, measurement: int) -> str:
+        """Target of a measurement; '' where there is one."""
+        r = self.readings
+        if r.states.target is None:
+            return ""
+        return str(r.target_names[int(r.target[self.whitening.reading[measurement]])])
+
 
 def names(readings: Readings, row: int) -> tuple[str, str]:
     """Pose and load of a reading."""

@@ -104,6 +104,8 @@ def build_story(chapters: Sequence[Chapter]) -> Story:
         revisions=tuple(
             _revision(c, part, axes, measured) for c, part in zip(chapters, parts, strict=True)
         ),
+        target=None if readings.states.target is None else readings.target[rows],
+        target_names=readings.target_names,
     )
 
 

@@ -174,6 +174,8 @@ class Story:
         covariance: (N, 3, 3) covariance of the residual, m².
         noise_floor_m: rms 3-D error that noise alone would leave, m.
         revisions: the revisions, in growing order.
+        target: (N,) number of the target that was read, into `target_names`; None for one.
+        target_names: names of several targets.
     """
 
     arm: Arm
@@ -186,6 +188,8 @@ class Story:
     covariance: Floats
     noise_floor_m: float
     revisions: tuple[StoryRevision, ...]
+    target: Ints | None = None
+    target_names: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         """Return the number of readings N."""

@@ -272,9 +272,10 @@ def worst_poses(e: FullPrediction, most: int = 6) -> list[Worst]:
     found: dict[str, Worst] = {}
     for k in np.argsort(-distance, kind="stable"):
         pose, load = e.name(int(k))
+        of = e.target_name(int(k))
         if pose not in found:
             error = float(np.linalg.norm(e.raw[k, :3]))
-            found[pose] = Worst(pose, load, error, float(distance[k]))
+            found[pose] = Worst(f"{pose} {of}" if of else pose, load, error, float(distance[k]))
         if len(found) == most:
             break
     return list(found.values())

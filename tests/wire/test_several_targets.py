@@ -58,7 +58,7 @@ def test_a_whole_run_with_three_reflectors(
     text = text.replace("[tracker]\n", f"{tables}\n[tracker]\n", 1)
     text = text.replace("seed = 4", 'seed = 4\nhide = "base_compliance"')
     text = text.replace("strength_sigma = 3.0", "strength_sigma = 5.0")
-    (tmp_path / "cell.toml").write_text(text.replace("clock = 20.0", "clock = 60.0"))
+    (tmp_path / "cell.toml").write_text(text)
     run, plan = tmp_path / "r.hilcal", tmp_path / "p.json"
 
     def hilcal(*words: str) -> dict:
@@ -68,7 +68,13 @@ def test_a_whole_run_with_three_reflectors(
 
     cell = str(tmp_path / "cell.toml")
     hilcal("plan", cell, "-o", str(plan), "--poses", "12")
-    told = hilcal("run", cell, "--plan", str(plan), "--rehearse", "-o", str(run))
+    words = ("run", cell, "--rehearse", "-o", str(run))
+    done = command(capsys, *words, "--plan", str(plan), "--json")
+    for _ in range(3):  # a busy machine lets the simulated controller's watchdog bite
+        if done.code == 3:
+            done = command(capsys, *words, "--resume", "--json")
+    assert done.code == 0, done.err
+    told = done.document
     with Campaign.open(run) as campaign:
         r = campaign.readings
         assert told["readings"] == len(r) <= told["planned"]

@@ -55,18 +55,36 @@ def log_bodies(
         )
 
 
-def log_target(
-    rec: rr.RecordingStream, arm: Arm, target: Floats, color: tuple[int, int, int]
+def log_targets(
+    rec: rr.RecordingStream,
+    arm: Arm,
+    targets: Floats,
+    color: tuple[int, int, int],
+    names: Sequence[str] = (),
 ) -> None:
-    """Log the rod from flange to target and a ball on the target (3,), flange axes, m."""
-    reach = max(arm.reach, 0.1)
+    """Log the rods from the flange to targets (T, 3) and a ball on each, flange axes, m.
+
+    Args:
+        rec: the recording.
+        arm: the arm.
+        targets: (T, 3) offsets.
+        color: of the balls.
+        names: of the targets, where there are several.
+    """
+    reach, count = max(arm.reach, 0.1), len(targets)
     rec.log(
         f"world/arm/body{arm.n + 1}",
         capsules(
-            np.stack([np.zeros(3), target]),
-            np.stack([target, target]),
-            np.array([_TOOL, _TARGET]) * reach,
-            np.array([DARK, color], dtype=np.uint8),
+            np.concatenate([np.zeros((count, 3)), targets]),
+            np.concatenate([targets, targets]),
+            np.repeat([_TOOL, _TARGET], count) * reach,
+            np.repeat(np.array([DARK, color], dtype=np.uint8), count, axis=0),
         ),
         static=True,
     )
+    if names:
+        rec.log(
+            f"world/arm/body{arm.n + 1}/names",
+            rr.Points3D(targets, labels=list(names), radii=1e-4, show_labels=True),
+            static=True,
+        )

@@ -37,7 +37,7 @@ class Digest:
         row: (N,) index into `poses` of each reading.
         first: (P,) the first reading of each pose.
         bodies: (P, n + 2, 4, 4) poses of the arm's bodies at each pose.
-        target: (3,) target in flange axes, m.
+        targets: (T, 3) targets in flange axes, m.
         residual_scale: m drawn per m of residual.
         deflection_scale: m drawn per m of deflection.
         half_sizes: (N, 3) half axes of each reading's noise ball as drawn, m.
@@ -50,7 +50,7 @@ class Digest:
     row: Ints
     first: Ints
     bodies: Floats
-    target: Floats
+    targets: Floats
     residual_scale: float
     deflection_scale: float
     half_sizes: Floats
@@ -110,8 +110,9 @@ def digest(story: Story, limits: Limits) -> Digest:
     """Derive what the views need."""
     poses, first, row = np.unique(story.pose, return_index=True, return_inverse=True)
     bodies = body_poses(story.arm, story.q[first])
-    flange = bodies[:, -1]
-    offset = np.einsum("pij,pi->pj", flange[:, :3, :3], story.anchor[first] - flange[:, :3, 3])
+    flange = bodies[row.reshape(-1), -1]
+    offset = np.einsum("nij,ni->nj", flange[:, :3, :3], story.anchor - flange[:, :3, 3])
+    number = np.zeros(len(story), dtype=np.int64) if story.target is None else story.target
     sigma = float(np.sqrt(np.median(np.trace(story.covariance, axis1=1, axis2=2)) / 3))
     scale = style.nice(SIGMA_LENGTH / sigma) if sigma > 0 else 1.0
     moved = deviation(story, story.measured)
@@ -124,7 +125,7 @@ def digest(story: Story, limits: Limits) -> Digest:
         row=row.astype(np.int64).reshape(-1),
         first=first.astype(np.int64),
         bodies=bodies,
-        target=np.median(offset, axis=0),
+        targets=np.array([np.median(offset[number == k], axis=0) for k in np.unique(number)]),
         residual_scale=scale,
         deflection_scale=style.nice(DEFLECTION_LENGTH / typical) if typical > 0 else 1.0,
         half_sizes=np.maximum(style.BALL_SIGMAS * scale * half_sizes, 1e-3),

@@ -164,6 +164,9 @@ def _sight(
     for i in np.flatnonzero(out != SEEN).tolist():
         told = view.problems(q[i : i + 1], loads[load[i]], "").values()
         why[i] = "; ".join(line.removeprefix(": ") for line in told)
+        if not why[i]:  # some of several targets
+            hidden = view.hidden(q[i : i + 1], loads[load[i]])
+            why[i] = f"hidden: {', '.join(view.clearance.cell.target_names[k] for k in hidden)}"
     return out.astype(np.int64), tuple(why)
 
 

@@ -19,7 +19,10 @@ def static_scene(rec: rr.RecordingStream, d: Digest) -> None:
     arm = d.story.arm
     rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     arm_shapes.log_bodies(rec, capsules(arm))
-    arm_shapes.log_target(rec, arm, d.target, style.MEASURED)
+    number = d.story.target
+    seen = () if number is None else np.unique(number)
+    names = [style.safe(d.story.target_names[k]) for k in seen]
+    arm_shapes.log_targets(rec, arm, d.targets, style.MEASURED, names)
 
 
 def revision_scene(rec: rr.RecordingStream, d: Digest, r: StoryRevision) -> None:
@@ -127,7 +130,9 @@ def pose_scene(rec: rr.RecordingStream, d: Digest) -> None:
 def pose_words(d: Digest, r: StoryRevision, i: int) -> str:
     """Return a reading's residual as words: length, and in σ."""
     length = float(np.linalg.norm(r.residual[i]))
-    return f"{style.micrometres(length)} ({np.sqrt(r.whitened_norm2[i]):.1f} σ)"
+    number = d.story.target
+    name = "" if number is None else f"{style.safe(d.story.target_names[number[i]])} "
+    return f"{name}{style.micrometres(length)} ({np.sqrt(r.whitened_norm2[i]):.1f} σ)"
 
 
 def center(d: Digest) -> tuple[Floats, float]:
