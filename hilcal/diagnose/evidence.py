@@ -6,6 +6,7 @@ from functools import cached_property
 from scipy.stats import chi2
 
 from hilcal.data.arm_scatter import ArmScatter
+from hilcal.diagnose.arm_repeatability import instrument_instead
 from hilcal.diagnose.backward_elimination import backward_elimination
 from hilcal.diagnose.catalogue_sufficiency import Insufficiency, insufficiency
 from hilcal.diagnose.effect_ranking import Suspect, candidates, rank_suspects
@@ -18,8 +19,8 @@ from hilcal.diagnose.stepwise import add
 from hilcal.diagnose.stepwise_alternatives import Alternative, StepwiseAlternatives
 from hilcal.effects.protocol import Effect
 from hilcal.errors import InputError
-from hilcal.identify.arm_scatter import estimate_arm_scatter
-from hilcal.identify.fit import Fit
+from hilcal.identify.arm_scatter import estimate_arm_scatter, with_arm_scatter
+from hilcal.identify.fit import Fit, fit
 from hilcal.identify.linearisation import Linearisation, linearise
 
 
@@ -90,6 +91,24 @@ class Evidence:
     def pose_alone(self) -> PoseAlone | None:
         """A misfit that is the same under every load of a pose."""
         return pose_alone(self.linearisation, self.effects)
+
+    @cached_property
+    def by_arrivals(self) -> "Evidence | None":
+        """The evidence with the arm's estimated scatter in the covariance; None where it is this.
+
+        Several targets that are read in one arrival are displaced together by the arm's scatter.
+        Where nothing states that scatter, tests that take their readings for independent count
+        one arrival as several, and find causes in chance.
+        """
+        readings = self.fit.readings
+        known = readings.scatter_stated or readings.arm_scatter is not None
+        if readings.states.target is None or known or not self.misfit or self.arm_scatter is None:
+            return None
+        if instrument_instead(self.arm_scatter):
+            return None
+        model, mode, start = self.fit.model, self.fit.mode, self.fit.theta
+        scattered = with_arm_scatter(model.cell, readings, self.arm_scatter)
+        return Evidence(fit(model, scattered, mode, start=start), self._refit, self._say)
 
     @cached_property
     def tree_share(self) -> float:

@@ -25,6 +25,10 @@ The rules, in this order:
 6. Otherwise the stated noise is too small, or too large: `noise_misjudged` (see `noise_verdict`).
    This holds where the arm's repeatability is stated, too: the noise is then complete, and wrong.
 
+Of several targets that are read in one arrival, where the arm's scatter is not stated and χ² is too
+large, the rules hold for the fit with the estimated scatter in its covariance (see
+`Evidence.by_arrivals`), and 3 becomes 5b or 5c.
+
 A fit whose covariance has the estimated scatter in it (`Readings.arm_scatter`) is judged by the
 same rules; its χ² is near its degrees of freedom by construction, so that only suspects and
 repeats can object.
@@ -83,6 +87,25 @@ def diagnose(
 
 def judge(e: Evidence, history: History) -> Diagnosis:
     """Combine the evidence of a fit with what is known of the way to its model."""
+    inner = e.by_arrivals
+    if inner is None or e.arm_scatter is None:
+        return _judged(e, history)
+    told = _judged(inner, history)
+    scatter = replace(e.arm_scatter, predicted_share=told.predictable_share)
+    if told.reason != "residual_is_noise":
+        return replace(told, fit=e.fit, scatter=scatter)
+    size = of_repeatability_size(scatter, e.fit.model.cell.arm)
+    return replace(
+        told,
+        fit=e.fit,
+        reason="arm_scatter" if size else "misjudged_noise",
+        noise=judge_noise(e.fit, e.pure_error, False),
+        scatter=scatter,
+    )
+
+
+def _judged(e: Evidence, history: History) -> Diagnosis:
+    """Judge by the evidence as it is."""
     suspects = ranked(e.suspects, history.rejected)
     alternatives = tuple(e.alternative(name, history.removed) for name in history.added)
     lead = suspects[0] if suspects and suspects[0].passes else None
