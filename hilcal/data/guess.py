@@ -75,7 +75,7 @@ def _joints(g: Guesser) -> None:
         if not c.numbers or c.axis or not c.has(words.JOINT) or not g.number(c.name):
             continue
         if not c.has(words.STD):
-            groups.setdefault(c.words, {})[c.numbers[-1]] = c.name
+            groups.setdefault(c.words, {}).setdefault(c.numbers[-1], c.name)
     found: list[tuple[ColumnName, list[str]]] = []
     for by_number in groups.values():
         names = [by_number[k] for k in sorted(by_number)]

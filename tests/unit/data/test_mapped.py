@@ -19,6 +19,7 @@ from hilcal.data.imported import ImportResult
 from hilcal.data.mapped import import_mapped
 from hilcal.data.mapping import Mapping
 from hilcal.data.propose import propose
+from hilcal.data.sniff import sniff
 from hilcal.errors import InputError
 from hilcal.robot.se3 import rotation
 from hilcal.toml import check_section
@@ -286,3 +287,19 @@ def test_angles_that_the_encoders_reported(tmp_path: Path) -> None:
     assert states.q_actual is not None
     np.testing.assert_allclose(states.q_actual, q, atol=1e-9)
     assert propose(path).proposal.mapping() == check_section(mapping, Mapping, "m.toml")
+
+
+@settings(
+    deadline=None, max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(w=written())
+def test_the_dialect_is_seen(tmp_path: Path, w: Written) -> None:
+    """However a table is written, the preview reads the same numbers from it."""
+    path = tmp_path / "t.txt"
+    path.write_bytes(w.content)
+    grid = sniff(path).grid
+    named = "A1" in grid.names
+    joints = Q if named else [str(c) for c in w.mapping["joints"]["columns"]]
+    unit = ANGLES[w.mapping["joints"]["unit"]]
+    found = np.stack([grid.numbers(name) for name in joints], axis=1)
+    np.testing.assert_allclose(found, unit * w.q, rtol=1e-9, atol=1e-9)
