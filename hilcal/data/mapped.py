@@ -32,6 +32,8 @@ UNIT_LENGTH = 0.01
 digits stays below."""
 MOST_TURN = 2 * np.pi + 1e-3
 """rad; a larger angle of an orientation is in another unit."""
+MOVED = 0.01
+"""rad; a joint commanded by more is sent to another pose; a choice."""
 _LISTED = 8
 
 
@@ -125,6 +127,7 @@ def readings_of_grid(
     rounded = check_joint_rounding(
         q / joint_unit, joint_unit, mapping.joints.unit, result.readings.covariance, arm.reach
     )
+    notes += _stale(grid, position, q)
     told = covariance.notes or result.notes[:1]
     return ImportResult(result.readings, (*notes, *told, *result.notes[1:], *rounded))
 
@@ -177,6 +180,20 @@ def _complete(grid: Grid, raw: dict[str, Floats]) -> tuple[Bools, list[str]]:
     lacking = [c for c, lost in zip(raw, np.any(missing, axis=0), strict=True) if lost]
     named = ", ".join(lacking[:4]) + (", ..." if len(lacking) > 4 else "")
     return ~bad, [f"{count} of {len(bad)} rows left out ({listed}{more}): no value in {named}"]
+
+
+def _stale(grid: Grid, position: Floats, q: Floats) -> list[str]:
+    """Note rows that read the same position as the row before, though the joints moved on."""
+    same = (np.diff(position, axis=0) == 0).all(axis=1)
+    moved = np.abs(np.diff(q, axis=0)).max(axis=1, initial=0.0) > MOVED
+    rows = grid.rows[1:][same & moved]
+    if not len(rows):
+        return []
+    listed = ", ".join(map(str, rows[:_LISTED].tolist())) + (", ..." if len(rows) > _LISTED else "")
+    return [
+        f"rows {listed} read exactly the position of the row before though the joints moved: was "
+        f"it measured again? [file] skip_rows leaves rows out"
+    ]
 
 
 def _block(raw: dict[str, Floats], grid: Grid, names: Sequence[Column]) -> Floats:

@@ -228,6 +228,15 @@ def test_points_that_were_not_measured(tmp_path: Path, capsys: Capsys) -> None:
     ]
 
 
+def test_a_position_that_was_not_measured_again(tmp_path: Path, capsys: Capsys) -> None:
+    text = GOOD
+    for c in ("X", "Y", "Z"):
+        value = text.splitlines()[4].split(";")[HEADER.index(c)]
+        text = cell(6, c, value)(text)
+    d = imported(capsys, tmp_path, text)
+    assert d["notes"][0].startswith("rows 6 read exactly the position of the row before")
+
+
 def test_signs_that_programs_write(tmp_path: Path, capsys: Capsys) -> None:
     text = cell(3, "X", "\u22121\u00a0234.5")(GOOD)
     mapping = MAPPING.replace('";"', '";"\nthousands = " "')
