@@ -185,11 +185,10 @@ def model_columns(fit: Fit) -> ModelColumns:
     """Return the columns of a fitted model."""
     model, s, w = fit.model, fit.solution, fit.whitening
     states = s.prediction.situation.states
-    scored = [
-        q.name in {p.name for p in effect.for_scoring(states).parameters}
-        for effect in model.effects
-        for q in effect.parameters
-    ]
+    scored: list[bool] = []
+    for effect in model.effects:
+        names = {p.name for p in effect.for_scoring(states).parameters}
+        scored += [p.name in names for p in effect.parameters]
     parameter = np.flatnonzero((s.prior > 0) | np.array(scored, dtype=np.bool_))
     scale = scales_of(model)[parameter]
     jacobian = model.jacobian(s.prediction, s.theta, w.m, parameter)
