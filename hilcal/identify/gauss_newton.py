@@ -144,7 +144,7 @@ def solve(
     point, by, iterations, converged = _minimise(problem, start, prior)
     live = np.flatnonzero(by.prior > 0)
     jacobian = w.raw(model.jacobian(point.prediction, point.theta, w.m, live))
-    rows = w.whiten(jacobian).reshape(point.white.size, len(live)) @ by.basis.transform
+    rows = by.basis.rows(w.whiten(jacobian).reshape(point.white.size, len(live)))
     beta = point.mean_square(len(by.basis.singular)) if w.scaling == "none" else by.beta
     # Formed anew at the solution, so that folds can be taken out of them exactly.
     basis = _all_parameters(by.basis, live, model.size)

@@ -111,7 +111,7 @@ def _with_families(
     ridge[np.arange(flat, len(others)), np.arange(flat, len(others))] = solution.beta
     found = solutions(
         FamilyProblem(
-            rows=np.hstack([rows[:, others], rows[:, kept], w.whiten(more).reshape(len(rows), -1)]),
+            rows=_beside(rows, np.concatenate([others, kept]), w.whiten(more)),
             target=solution.white + rows @ coordinates,
             ridge=ridge,
             pull=np.concatenate([-solution.beta * per.T @ own, np.zeros(len(others) - flat)]),
@@ -127,3 +127,11 @@ def _with_families(
         change = basis.transform[solution.live] @ (z - coordinates)
         predicted[mine] -= jacobian[mine] @ change + more[mine] @ u[count:]
     return predicted
+
+
+def _beside(rows: Floats, order: Ints, more: Floats) -> Floats:
+    """Return columns (R, K) in another order, and more (D·m, ..., Q); `rows` where that is all."""
+    moved = rows if np.array_equal(order, np.arange(len(order))) else rows[:, order]
+    if not more.size:
+        return moved
+    return np.hstack([moved, more.reshape(len(rows), -1)])

@@ -67,12 +67,10 @@ def eliminate_columns(
         rank: number of rows that carry information.
     """
     stay = ~out & (prior > 0)
-    kept = columns[:, stay]
-    basis = find_basis(kept, np.ones(kept.shape[1]), prior[stay])
-    p = projection(kept @ basis.transform, beta * basis.prior_precision)
-    del kept  # the largest array here
+    basis = find_basis(columns, np.ones(columns.shape[1]), np.where(stay, prior, 0.0))
+    p = projection(basis.rows(columns), beta * basis.prior_precision)
     # Priors pull to zero, not to where the fit stands.
     z = np.zeros(len(p.ridge))
-    z[len(basis.singular) :] = (theta[stay] / prior[stay])[basis.held]
+    z[len(basis.singular) :] = (theta / np.where(stay, prior, 1.0))[basis.held]
     y = white + columns[:, out] @ theta[out]
     return ReducedModel(columns[:, out], p, p.residual(y, z), rank - p.effective())

@@ -25,6 +25,8 @@ INFORMATION = 0.2
 """In units of the residual's spread: a direction is estimated where five times the ordinary
 magnitude along it would move all data together by one σ."""
 ROUNDING = 1e-10
+_ROWS = 4096
+"""Rows that are worked on at a time; a choice by memory."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,6 +56,22 @@ class Basis:
     structural: int
     condition_unscaled: float
     condition_scaled: float
+
+    def rows(self, a: Floats) -> Floats:
+        """Return rows (R, K) by z of rows A (R, P) by the parameters: A T.
+
+        A column with a prior is only scaled, and a part of the rows is worked on at a time: for a
+        thousand columns of many rows, products with all of T take long, and copies much memory.
+        """
+        count, flat = len(self.singular), np.flatnonzero(self.flat)
+        out = np.empty((len(a), self.transform.shape[1]))
+        sigma = self.transform[self.held, count + np.arange(len(self.held))]
+        turned = self.transform[flat, :count]
+        for start in range(0, len(a), _ROWS):
+            part = slice(start, start + _ROWS)
+            out[part, :count] = a[part][:, flat] @ turned
+            out[part, count:] = a[part][:, self.held] * sigma
+        return out
 
 
 def find_basis(a: Floats, scale: Floats, prior: Floats, spread: float | None = 1.0) -> Basis:
