@@ -90,7 +90,8 @@ def test_what_no_effect_predicts_is_never_called_adequate(poses, seed):
     r = refine(baseline(c.cell, readings, "absolute"), readings, "absolute")
     check_steps(r)
     assert r.steps[-1].fit.holdout.rms_sigma > 3
-    assert r.verdict in ("unknown_effect", "noise_misjudged"), message(r.diagnosis)
+    # Few poses cannot tell an error of each pose from a family with many parameters.
+    assert r.verdict in ("unknown_effect", "noise_misjudged", "ambiguous"), message(r.diagnosis)
 
 
 def test_shares_on_poses_left_out_are_what_a_refit_reaches_there():
