@@ -51,7 +51,13 @@ def odd_campaigns(draw: st.DrawFn) -> tuple[Readings, Cell, Mode]:
     covariance = some.covariance * 10.0 ** draw(st.sampled_from([0, 0, -6, -12, 6, 12]))
     if draw(st.booleans()):
         covariance[::2, 0] = covariance[::2, :, 0] = 0.0
-    odd = replace(some, states=states, value=value, covariance=covariance)
+    odd = replace(
+        some,
+        states=states,
+        value=value,
+        covariance=covariance,
+        scatter_stated=draw(st.booleans()),
+    )
     twice = np.append(np.arange(len(q)), np.arange(len(q)))
     return odd[twice] if draw(st.booleans()) else odd, cell, mode
 
