@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import typer
 
 from hilcal.cli import application, execute
+from studies.descriptions_command import descriptions
 from studies.diagnosis_command import diagnosis
 from studies.plans_command import plans
 from studies.real_command import real
@@ -22,6 +23,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     app: typer.Typer = application("Evaluate the program itself on simulated campaigns.")
     app.command("diagnosis")(diagnosis)
     app.command("plans")(plans)
+    app.command("descriptions")(descriptions)
     app.command("scaling")(scaling)
     app.command("real")(real)
     app.command("results")(results)

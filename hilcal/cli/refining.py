@@ -38,6 +38,7 @@ from hilcal.effects.written import read_effects_text, write_effect
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline, with_effects
 from hilcal.identify.fit import Fit
+from hilcal.identify.frames_document import fit_to_json
 from hilcal.refine import add as add_effect
 from hilcal.refine import predicts_better
 from hilcal.refine import refine as refine_model
@@ -46,6 +47,7 @@ from hilcal.report import numbers, text, text_refine
 from hilcal.report.build_story import Chapter, build_story
 from hilcal.report.diagnosis_document import suspect_json, to_json
 from hilcal.report.progress import working
+from hilcal.report.text_registration import fitted_lines
 from hilcal.report.text_unknown import curves
 from hilcal.report.verdict_words import message
 
@@ -238,6 +240,7 @@ def refine(
         t.show(text_refine.key())
         t.show(options_line(rows[-1].fit))
         t.show(text_refine.verdict_line(found.diagnosis))
+        t.show([*fitted_lines(found.fit)])
         if found.rejected:
             t.show(
                 f"Tried and left out, since the error on poses left out did not fall: "
@@ -256,6 +259,7 @@ def refine(
             "verdict": last.verdict,
             "message": message(last),
             "rejected": list(found.rejected),
+            "frames": fit_to_json(found.fit),
             "diagnosis": to_json(last),
         }
     )
