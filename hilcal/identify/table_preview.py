@@ -16,7 +16,9 @@ from hilcal.data.orientation import rotations
 from hilcal.data.proposal import Proposal, Understood
 from hilcal.data.propose import Proposed, propose
 from hilcal.errors import CannotAnswerError, InputError
+from hilcal.identify import description_words
 from hilcal.identify.conventions import CLEARER, Fit, choose_convention
+from hilcal.identify.gate import examine
 from hilcal.identify.registration import register
 from hilcal.robot.arm import Arm
 from hilcal.toml import check_section
@@ -192,13 +194,16 @@ def _try(table: Path, found: Proposed, settings: CellConfig, cell: Cell) -> list
     except InputError as error:
         return [f"refused: {error}"]
     readings = result.readings
+    told = [*result.notes]
     try:
-        rms = f"the nominal {cell.arm.name} leaves {1e3 * register(cell, readings).rms:.3g} mm rms"
+        registered = register(cell, readings)
+        told.append(f"the nominal {cell.arm.name} leaves {1e3 * registered.rms:.3g} mm rms")
+        if (wrong := examine(registered, readings)) is not None:
+            told.append(description_words.words(wrong, cell, readings))
     except CannotAnswerError as error:
-        rms = str(error)
+        told.append(str(error))
     return [
         f"{len(readings)} readings of {len(np.unique(readings.pose))} poses, "
         f"{'positions' if readings.m == 3 else 'positions and orientations'}",
-        *result.notes,
-        rms,
+        *told,
     ]

@@ -313,6 +313,18 @@ def test_the_preview_writes_nothing_unless_asked(tmp_path: Path, capsys: Capsys)
     assert "exists" in refused(capsys, 2, "import", path, "--preview", "-o", mapping)
 
 
+def test_the_preview_says_what_is_wrong_with_the_description(
+    tmp_path: Path, capsys: Capsys
+) -> None:
+    c = campaign(30)
+    q = np.rad2deg(c.q) * [1, 1, 1, -1, 1, 1]
+    path = write(tmp_path / "t.csv", lines([*NAMES, "X", "Y", "Z"], q, 1e3 * c.position))
+    cell = tmp_path / "CELL.toml"
+    cell.write_text('[robot]\nmodel = "ur10e"\n')
+    d = ok(capsys, "import", path, "--preview", "--config", cell, "--json").document
+    assert "joint 4 turns the other way" in d["outcome"][-1]
+
+
 def test_words_fit_eighty_columns(
     tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
