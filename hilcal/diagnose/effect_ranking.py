@@ -15,6 +15,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hilcal.diagnose.family_detection import large, least_of_family
+from hilcal.diagnose.gravity import beyond_geometry, geometry_columns, through_load, unloaded
 from hilcal.diagnose.minimum_detectable_effect import Strength, least_strength
 from hilcal.diagnose.plausible_size import Unloaded, most, unloaded_readings
 from hilcal.diagnose.promise import LEAST_KEPT, kept, kept_by_refit
@@ -50,7 +52,8 @@ class Suspect:
         holdout_share: the same on poses left out.
         explains: whether it passes the tests of the fitted readings and of its share.
         sure: whether the error on poses left out falls by more than it scatters from pose to
-            pose; not so where a refit has shown that it does not fall.
+            pose, beside geometry, too, where no load was hung (see `gravity`); not so where a refit
+            has shown that it does not fall.
         least: the smallest strength of it that these readings would reveal.
         needs: where it is implausible, its size: (unit, rms of the parameters that it would need,
             rms that is plausible), SI.
@@ -135,10 +138,17 @@ def rank_suspects(
     bare = unloaded_readings(p.fit)
     found = [_suspect(p, effect_columns(p.fit, e), bare, level / len(effects)) for e in effects]
     tested = max(sum(s.score.rank > 0 for s in found), 1)
-    out = []
+    out: list[Suspect] = []
+    geometry: Floats | None = None
     for s, e in zip(found, effects, strict=True):
         explains = s.score.p_value * tested < level and s.score.log_evidence > 0
         s = replace(s, explains=explains and s.holdout_share >= LEAST_SHARE)
+        if s.passes and unloaded(p) and through_load(e):
+            if geometry is None:
+                geometry = geometry_columns(p, effects)
+            s = replace(
+                s, sure=beyond_geometry(p, effect_columns(p.fit, e), geometry, SAME_EVIDENCE)
+            )
         out.append(replace(s, kept=kept(p, e, s.score, refit)) if s.passes else s)
     return ranked(out)
 
@@ -190,6 +200,17 @@ def _suspect(p: Linearisation, of: EffectColumns, bare: Unloaded | None, level: 
     largest = most(of, bare)
     result = p.score(of.white, s, largest)
     held = p.held_out(of.white, result)
+    least = least_strength(
+        s,
+        of.motion,
+        of.scale,
+        tuple(q.unit for q in of.effect.parameters),
+        p.fit.dof,
+        max(p.fit.variance_factor, 1.0),
+        level,
+    )
+    if large(of, s, p.fit.dof):
+        least = least_of_family(p, of, s, least, level, LEAST_SHARE, largest)
     return Suspect(
         effect=of.effect.name,
         score=result,
@@ -198,15 +219,7 @@ def _suspect(p: Linearisation, of: EffectColumns, bare: Unloaded | None, level: 
         explains=False,
         sure=held.sure,
         needs=_implausible(p, of, s, result, largest),
-        least=least_strength(
-            s,
-            of.motion,
-            of.scale,
-            tuple(q.unit for q in of.effect.parameters),
-            p.fit.dof,
-            max(p.fit.variance_factor, 1.0),
-            level,
-        ),
+        least=least,
     )
 
 

@@ -28,10 +28,13 @@ class Strength:
         displacement_m: rms displacement of the target (of the deflection), m; infinite where
             these readings cannot show the effect.
         parameters: the same in the effect's own units: (unit, rms of its parameters), SI.
+        finest_m: displacement from which the effect would have been revealed were it finer than the
+            poses resolve (see `Effect.fine`), infinite where never; None where no such limit is.
     """
 
     displacement_m: float
     parameters: tuple[tuple[str, float], ...]
+    finest_m: float | None = None
 
     @property
     def visible(self) -> bool:

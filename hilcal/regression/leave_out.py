@@ -124,3 +124,38 @@ def left_out_residual(
         step = positive_solve(h, b)
         left[fold.out] = r - own @ (solved[:, -1] - solved[:, :-1] @ step) - out @ step
     return left
+
+
+def left_out_residuals(
+    folds: tuple[Fold, ...],
+    p: Projection,
+    y: Floats,
+    x: Floats | None = None,
+    ridge: float = 0.0,
+) -> Floats:
+    """Return `left_out_residual` (R, K) of K residuals of models at zero, as simulated ones are.
+
+    Args:
+        folds: of the model; their right-hand sides are not used.
+        p: the model's columns.
+        y: (R, K) what remains where all parameters are zero.
+        x: (R, F) whitened columns of the family; None for the model alone.
+        ridge: of the family's parameters.
+    """
+    x = np.zeros((len(y), 0)) if x is None else x
+    width, total = x.shape[1], p.rows.T @ y
+    cross, gram, rhs = p.rows.T @ x, x.T @ x, x.T @ y
+    gram[np.diag_indices_from(gram)] += max(ridge, FAMILY_ROUNDING * float(gram.max(initial=0.0)))
+    left = np.zeros(y.shape)
+    for fold in folds:
+        out, own, r = x[fold.out], p.rows[fold.out], y[fold.out]
+        c = cross - own.T @ out
+        both = np.column_stack([c, total - own.T @ r])
+        solved = fold.solve(both)
+        at, steps = solved[:, :width], solved[:, width:]
+        left[fold.out] = r - own @ steps
+        if width:
+            h, b = gram - out.T @ out - c.T @ at, rhs - out.T @ r - c.T @ steps
+            family = positive_solve(h, b)
+            left[fold.out] += (own @ at - out) @ family
+    return left

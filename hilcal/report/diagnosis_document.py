@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import asdict
 
+import numpy as np
+
 from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.diagnose.effect_ranking import Suspect
 from hilcal.diagnose.minimum_detectable_effect import Strength
@@ -74,9 +76,14 @@ def least(s: Strength) -> dict[str, object] | None:
     """Return the smallest strength that would have been revealed, SI; null where none would."""
     if not s.visible:
         return None
+    finer = None
+    if s.finest_m is not None:
+        seen = bool(np.isfinite(s.finest_m))
+        finer = {"visible": seen, "displacement_m": s.finest_m if seen else None}
     return {
         "displacement_m": s.displacement_m,
         "parameters": [{"unit": unit, "rms": rms} for unit, rms in s.parameters],
+        "finer_than_poses": finer,
     }
 
 

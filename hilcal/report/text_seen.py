@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 
+import numpy as np
 from rich.console import RenderableType
 from rich.text import Text
 
@@ -27,6 +28,11 @@ def could_have_been_seen(d: Diagnosis) -> Iterator[RenderableType]:
             "one in ten would name the effect; rms of the parameters that make it.\n",
             style="dim",
         )
+    for s in rest:
+        if s.least.finest_m is not None:
+            much = numbers.length(s.least.finest_m)
+            when = f"from {much}" if np.isfinite(s.least.finest_m) else "at no size"
+            yield f"A {s.effect} finer than these poses resolve would be seen {when}.\n"
     if hidden:
         yield f"These readings cannot show {', '.join(hidden)}, however strong.\n"
 
