@@ -132,7 +132,12 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
             *(s.holdout_share for s in suspects if s.explains),
         ]
         predicted = max([regression.share, *sizes]) if e.misfit else 0.0
-        noise = judge_noise(e.fit, e.pure_error, regression.share > PREDICTABLE or bool(sizes))
+        # What an implausible size would explain is no noise either.
+        patterned = any(
+            not s.plausible and s.score.p_value * len(suspects) < FALSE_ALARM for s in suspects
+        )
+        predictable = regression.share > PREDICTABLE or bool(sizes) or patterned
+        noise = judge_noise(e.fit, e.pure_error, predictable)
         faint = (
             noise.reason == "predictable"
             and predicted < FAINT
