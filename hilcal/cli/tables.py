@@ -3,7 +3,7 @@
 import csv
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -101,6 +101,9 @@ def import_(
         f"{'position' if readings.m == 3 else 'position and an orientation'}\n"
         f"  loads: {', '.join(loads)}"
     )
+    targets = _targets(cell, readings)
+    if targets:
+        t.show("  targets: " + "; ".join(text.target_words(**x) for x in targets))
     t.show(Padding(note, (0, 0, 0, 2)) for note in notes)
     registered = _registered(cell, readings)
     wrong = None if registered is None else examine(registered, readings)
@@ -118,6 +121,7 @@ def import_(
             "n_poses": poses,
             "elements": readings.m,
             "loads": loads,
+            "targets": targets,
             "covariance": parts,
             "notes": list(notes),
             "description": None
@@ -134,6 +138,18 @@ def _registered(cell: Cell, readings: Readings) -> Registration | None:
         return register(cell, readings)
     except CannotAnswerError:
         return None
+
+
+def _targets(cell: Cell, readings: Readings) -> list[dict[str, Any]]:
+    """Name, number of readings and whether the offset is known, of several targets."""
+    if readings.states.target is None:
+        return []
+    count = np.bincount(readings.target, minlength=len(readings.target_names))
+    known = cell.known_targets
+    return [
+        {"name": name, "n_readings": int(count[k]), "known": known[k]}
+        for k, name in enumerate(readings.target_names)
+    ]
 
 
 def export(

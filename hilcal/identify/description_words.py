@@ -140,7 +140,9 @@ def _rows(finding: Finding, readings: Readings) -> str:
         return ""
 
     def name(k: int) -> str:
-        return f"{readings.pose_names[readings.pose[k]]}/{readings.load_names[readings.load[k]]}"
+        at = f"{readings.pose_names[readings.pose[k]]}/{readings.load_names[readings.load[k]]}"
+        several = readings.states.target is not None
+        return f"{at} {readings.target_names[readings.target[k]]}" if several else at
 
     if finding.swapped:
         pairs = [f"{name(i)} with {name(j)}" for i, j in finding.swapped[:MOST_NAMED]]

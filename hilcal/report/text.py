@@ -266,6 +266,12 @@ class Worst:
     sigma: float
 
 
+def target_words(name: str, n_readings: int, known: bool) -> str:
+    """Return one of several targets in words."""
+    offset = "known" if known else "estimated"
+    return f"{name} ({n_readings} readings, its offset {offset})"
+
+
 def worst_poses(e: FullPrediction, most: int = 6) -> list[Worst]:
     """Measurements of the poses that err most in units of the noise, worst first."""
     distance = np.sqrt(e.mahalanobis2)
