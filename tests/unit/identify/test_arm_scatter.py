@@ -26,6 +26,7 @@ from hilcal.identify.registration import register
 from hilcal.robot import se3
 from hilcal.types import Floats
 from tests.support.campaigns import cell_of, configuration, noiseless, plan, with_noise, world_of
+from tests.support.reflector_cases import reflectors
 
 MODES: tuple[Mode, ...] = ("absolute", "deflection")
 POSES = 16
@@ -186,3 +187,23 @@ def test_p_values_stay_uniform_with_an_estimated_covariance() -> None:
 @pytest.mark.slow
 def test_p_values_stay_uniform_over_many_seeds() -> None:
     assert kstest(null_p_values(300), "uniform").pvalue > 1e-3
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_targets_of_one_arrival_have_it_in_common(mode: Mode) -> None:
+    c = reflectors(joint_std=3e-5, poses=8)
+    true = replace(c.cell, registration=c.world.registration)
+    (f,) = factors(true, c.readings, "joints")
+    alone = c.readings.covariance - 9e-10 * f @ np.swapaxes(f, 1, 2)
+    readings = replace(c.readings, covariance=alone, common=None, scatter_stated=False)
+    plain = fitted(c.cell, readings, mode)
+    s = estimate_arm_scatter(plain)
+    assert s is not None
+    assert s.kind == "joints"
+    assert abs(s.std[0] - 3e-5) < 4 * s.std_error[0]
+    with_it = with_arm_scatter(plain.model.cell, readings, s)
+    assert with_it.common is not None
+    found = fit(plain.model, with_it, mode, start=plain.theta)
+    assert plain.variance_factor > 3
+    # Taken for independent, the scatter would leave about a third of the degrees of freedom.
+    assert found.variance_factor == pytest.approx(1, abs=0.25)
