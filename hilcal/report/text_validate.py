@@ -26,7 +26,7 @@ def validation_report(found: Validation, beyond: Extrapolation) -> Iterator[Rend
     rows = [("never fitted", found.error, everything)]
     if inside is not None and outside is not None:
         rows += [
-            ("inside what was measured", inside, ~beyond.outside),
+            ("inside", inside, ~beyond.outside),
             ("outside", outside, beyond.outside),
         ]
     for name, e, mine in rows:
@@ -66,7 +66,7 @@ def _where(beyond: Extrapolation) -> Iterator[str]:
 
 def _beyond(v: Beyond) -> str:
     if v.variable == "leverage":
-        return f"leverage: {v.count}, far from all fitted poses although in the range of each joint"
+        return f"leverage: {v.count}, far from all fitted poses in several joints together"
     if v.unit == "rad":
         low, high, most = (f"{np.degrees(x):.0f}°" for x in (v.low, v.high, v.most))
     else:
