@@ -30,8 +30,8 @@ large, the rules hold for the fit with the estimated scatter in its covariance (
 `Evidence.by_arrivals`), and 3 becomes 5b or 5c.
 
 A fit whose covariance has the estimated scatter in it (`Readings.arm_scatter`) is judged by the
-same rules; its χ² is near its degrees of freedom by construction, so that only suspects and
-repeats can object.
+same rules, but that it may be smaller than its noise: the scatter is never negative, so that an
+instrument whose noise is stated too large, in some of its elements, shows only then. That is said.
 """
 
 from collections.abc import Callable
@@ -143,15 +143,16 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
             and predicted < FAINT
             and not any(s.explains for s in suspects)
         )
+        in_fit = e.fit.readings.arm_scatter is not None
         may = e.misfit and (noise.misjudged or faint) and _may_scatter(e)
         found = e.arm_scatter if may else None
         if found is not None and (noise.misjudged or _explained_by_arm(e.fit, found)):
             scatter = replace(found, predicted_share=predicted)
         if found is not None and _explained_by_arm(e.fit, found):
             reason = "arm_scatter"
-        elif noise.misjudged:
+        elif noise.misjudged and not (in_fit and noise.reason == "too_large"):
             reason = "misjudged_noise"
-        elif noise.off:
+        elif noise.off and not noise.misjudged:
             reason = "no_suspect"
         else:
             in_doubt = any(a.inseparable for a in alternatives)

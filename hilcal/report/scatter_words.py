@@ -22,7 +22,18 @@ def left_to_the_arm(d: Diagnosis) -> str:
         f"What is left, {numbers.length(s.size_m)} rms, is predictable by nothing recorded {but} "
         f"and of the size of the arm's "
         f"repeatability: {sigmas(s)}{_maker(s, d.fit.model.cell.arm)}; no effect of the catalogue "
-        f"is missing{doubt}"
+        f"is missing{doubt}{_too_large(d)}"
+    )
+
+
+def _too_large(d: Diagnosis) -> str:
+    """Say that the stated noise is too large beside the scatter, where it is."""
+    if d.fit.readings.arm_scatter is None or d.noise is None or d.noise.reason != "too_large":
+        return ""
+    factor = d.fit.variance_factor**0.5
+    return (
+        f"; with it the residuals are {factor:.2g} times the noise, so the instrument's is stated "
+        "too large in some of its elements"
     )
 
 

@@ -207,3 +207,18 @@ def test_targets_of_one_arrival_have_it_in_common(mode: Mode) -> None:
     assert plain.variance_factor > 3
     # Taken for independent, the scatter would leave about a third of the degrees of freedom.
     assert found.variance_factor == pytest.approx(1, abs=0.25)
+
+
+def test_an_orientation_stated_too_noisy_does_not_hide_the_arm() -> None:
+    cell, readings = scattering(np.full(6, 4e-5), m=6)
+    covariance = readings.covariance.copy()
+    covariance[:, 3:, 3:] *= 9.0
+    stated = replace(readings, covariance=covariance)
+    plain = fitted(cell, stated, "absolute")
+    s = estimate_arm_scatter(plain)
+    assert s is not None
+    found = fit(plain.model, with_arm_scatter(plain.model.cell, stated, s), "absolute")
+    assert found.variance_factor < 0.8
+    d = diagnose(found)
+    assert d.verdict == "adequate"
+    assert "stated too large in some of its elements" in str(d.to_dict()["message"])
