@@ -16,9 +16,9 @@ from hilcal.identify.priors import prior_of, scales_of
 from hilcal.identify.regularisation import (
     LinearProblem,
     Regularisation,
-    effective_parameters,
     noise_factor,
     regularise,
+    spent_parameters,
 )
 from hilcal.identify.residual import residual
 from hilcal.model import Model, Prediction
@@ -51,7 +51,7 @@ class Solution:
         prediction: prediction at the solution.
         raw: (D, m) residual.
         white: (R,) whitened residual.
-        effective: effective number of estimated parameters.
+        effective: degrees of freedom that the fit spends, the choice of strengths included.
         iterations: steps taken.
         converged: whether the last step was negligible.
     """
@@ -160,7 +160,7 @@ def solve(
         prediction=point.prediction,
         raw=point.raw,
         white=point.white,
-        effective=effective_parameters(equations, beta),
+        effective=spent_parameters(equations, beta, prior_of(model)[1]),
         iterations=iterations,
         converged=converged,
     )

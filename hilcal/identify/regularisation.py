@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilcal.regression.empirical_bayes import maximise_evidence
+from hilcal.regression.empirical_bayes import maximise_evidence, spent_by_groups
 from hilcal.regression.normal_equations import Basis, NormalEquations, find_basis, normal_equations
 from hilcal.types import Floats, Ints
 
@@ -127,11 +127,36 @@ def noise_factor(p: LinearProblem, equations: NormalEquations) -> float:
 
 def effective_parameters(equations: NormalEquations, beta: float) -> float:
     """Effective number of parameters: flat directions + Σ (1 − β Λ_kk H⁻¹_kk) over the others."""
+    return len(equations.basis.singular) + float(np.sum(_determined(equations, beta)))
+
+
+def spent_parameters(equations: NormalEquations, beta: float, groups: Ints) -> float:
+    """Degrees of freedom that a fit spends: `effective_parameters`, and the choice of strengths.
+
+    Args:
+        equations: normal equations over all parameters.
+        beta: noise variance factor that the priors are weighed against.
+        groups: (P,) shrinkage group of each parameter, or −1.
+    """
+    held = equations.basis.held
+    determined = _determined(equations, beta)
+    chosen = groups[held] >= 0
+    own = float(np.sum(determined[~chosen])) + len(equations.basis.singular)
+    if not chosen.any():
+        return own
+    _, group = np.unique(groups[held[chosen]], return_inverse=True)
+    size = np.bincount(group)
+    share = np.bincount(group, weights=determined[chosen]) / size
+    return own + float(np.sum(spent_by_groups(share, size)))
+
+
+def _determined(equations: NormalEquations, beta: float) -> Floats:
+    """Share (H,) of each parameter with a prior that the data determine: 1 − β Λ_kk H⁻¹_kk."""
     flat, precision = len(equations.basis.singular), equations.basis.prior_precision
     if flat == len(precision):
-        return float(flat)
+        return np.zeros(0)
     covariance = np.diag(equations.inverse(beta))[flat:]
-    return flat + float(np.sum(1 - beta * precision[flat:] * covariance))
+    return np.asarray(1 - beta * precision[flat:] * covariance)
 
 
 def _family_priors(

@@ -15,9 +15,12 @@ Faul, *Fast marginal likelihood maximisation for sparse Bayesian models*, AISTAT
 """
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import scipy.linalg as sl
+from scipy.special import exp1
+from scipy.stats import chi2
 
 from hilcal.regression.schur import eliminate
 from hilcal.types import Floats, Ints
@@ -115,6 +118,46 @@ def maximise_evidence(
             break
     std_all = np.sqrt(np.where(active, variance, 0.0))[groups]
     return EmpiricalPrior(std_all, float(beta), effective)
+
+
+def spent_by_groups(share: Floats, size: Ints) -> Floats:
+    """Degrees of freedom (G,) by which kept groups lower the sum of squares.
+
+    γ = Σ (1 − Σ_pp/σ²) counts the parameters for given strengths. But a group is kept because its
+    parameters came out large, and its strength is what they came out as. With x = |z|² of k
+    orthonormal parameters z, a group is kept where x > k and shrunk by t = 1 − k/x, which lowers
+    the sum of squares by x − k²/x. So does noise alone, χ² distributed, so that a kept group spends
+
+        k + c_k (1 − t),    c_k = E[x − k²/x − k; x > k] / E[k/x; x > k]
+
+    which is k for a group far above the noise, and right on average for groups of noise, kept or
+    dropped (those spend nothing).
+
+    Args:
+        share: t, the share γ/k of each group that the data determine.
+        size: k, its number of parameters.
+    """
+    return np.asarray(size + _excess(size) * (1.0 - np.clip(share, 0.0, 1.0)))
+
+
+def _excess(size: Ints) -> Floats:
+    """c_k of `spent_by_groups`."""
+    k = np.asarray(size, dtype=float)
+    kept, mean = chi2.sf(k, k), k * chi2.sf(k, k + 2.0)
+    # E[1/x; x > k], by parts where χ² of k − 2 degrees of freedom does not exist.
+    inverse = np.array([_mean_inverse(float(v)) for v in k.reshape(-1)]).reshape(k.shape)
+    return np.asarray((mean - k**2 * inverse - k * kept) / (k * inverse))
+
+
+@cache
+def _mean_inverse(k: float) -> float:
+    """E[1/x; x > k] of χ²_k."""
+    if k > 2:
+        return float(chi2.sf(k, k - 2.0)) / (k - 2.0)
+    if k == 2:
+        return float(exp1(1.0)) / 2.0
+    density = float(np.exp(-0.5) / np.sqrt(2.0 * np.pi))
+    return 2.0 * density - float(chi2.sf(1.0, 1.0))
 
 
 def _inverse_root(h: Floats) -> Floats:

@@ -6,7 +6,7 @@ import pytest
 from hilcal.identify.baseline import baseline, with_effects
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.validation import validate
-from hilcal.regression.empirical_bayes import EmpiricalPrior, maximise_evidence
+from hilcal.regression.empirical_bayes import EmpiricalPrior, maximise_evidence, spent_by_groups
 from tests.support.campaigns import campaign, measured, noiseless, plan
 from tests.support.effect_cases import make
 
@@ -113,7 +113,8 @@ def test_nothing_there_leaves_almost_nothing_and_costs_less_than_two_percent():
         worse.append(off[0].error.rms_sigma / off[1].error.rms_sigma)
         effective.append(found.solution.effective - plain.solution.effective)
     assert np.mean(worse) < 1.02
-    assert np.mean(effective) < 0.1 * 72
+    # Of 36 groups of two, noise keeps those with χ² > 2, each of which spends 2 to 2.7.
+    assert np.mean(effective) < 36 * np.exp(-1) * 2.7
 
 
 def test_without_noise_shrinkage_costs_no_accuracy():
@@ -133,3 +134,37 @@ def test_a_dropped_harmonic_is_not_counted_nor_listed():
     listed = [p for p in found.parameters if p.name.startswith("transmission_error")]
     assert len(listed) == np.count_nonzero(prior)
     assert np.all(found.theta[found.model.slices()[-1]][prior == 0] == 0)
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 8])
+def test_groups_of_noise_spend_what_they_lower_the_sum_of_squares_by(size):
+    x = np.random.default_rng(size).chisquare(size, 200_000)
+    kept = x > size
+    lowered = np.where(kept, x - size**2 / x, 0.0)
+    share = np.where(kept, 1 - size / x, 0.0)
+    spent = np.where(kept, spent_by_groups(share, np.full(len(x), size)), 0.0)
+    assert spent.mean() == pytest.approx(lowered.mean(), abs=5 * lowered.std() / np.sqrt(len(x)))
+    assert spent_by_groups(np.ones(1), np.array([size])) == pytest.approx(size)
+
+
+def test_the_variance_is_right_where_the_data_choose_which_groups_to_keep():
+    """A third of the groups is far above the noise; without the choice it would be 9 % off."""
+    rng, rows, groups = np.random.default_rng(11), 600, np.repeat(np.arange(120), 2)
+    ratios, naive = [], []
+    for _ in range(30):
+        a = rng.normal(size=(rows, 240))
+        truth = np.where(groups < 40, 1.0, 0.0) * rng.normal(size=240)
+        y = a @ truth + rng.normal(size=rows)
+        found = maximise_evidence(a.T @ a, a.T @ y, y @ y, rows, 0, groups, np.ones(240))
+        live = found.std > 0
+        h = a[:, live].T @ a[:, live] + np.diag(found.beta / found.std[live] ** 2)
+        theta = np.linalg.solve(h, a[:, live].T @ y)
+        determined = 1 - found.beta * np.diag(np.linalg.inv(h)) / found.std[live] ** 2
+        share = np.bincount(groups[live], weights=determined, minlength=120) / 2
+        kept = share > 0
+        rss = np.sum((y - a[:, live] @ theta) ** 2)
+        spent = np.sum(spent_by_groups(share[kept], np.full(int(kept.sum()), 2)))
+        ratios.append(rss / (rows - spent))
+        naive.append(rss / (rows - determined.sum()))
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.025)
+    assert np.mean(naive) < 0.95
