@@ -116,7 +116,11 @@ def _array(data: dict[str, Any]) -> Floats:
 
 def _differences(a: Cell, b: Cell) -> list[str]:
     """Return the names of what is not the same in two cells; registrations do not count."""
-    out = [name for name in _CELL if not np.array_equal(getattr(a, name), getattr(b, name))]
+    out = [
+        name.removeprefix("all_")
+        for name in _CELL
+        if not np.array_equal(getattr(a, name), getattr(b, name))
+    ]
     return out + [
         f"arm.{name}"
         for name in _ARM

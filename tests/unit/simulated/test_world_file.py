@@ -47,7 +47,7 @@ def test_a_world_without_harmonics_keeps_the_shape_of_nothing(tmp_path):
 def test_a_configuration_of_another_cell_is_refused(tmp_path):
     world = world_of(config())
     other = config(tool={"mass_kg": 0.9, "load_point_m": [0.1, -0.03, 0.15]})
-    with pytest.raises(InputError, match="differ in target, tool_mass, tool_com;"):
+    with pytest.raises(InputError, match="differ in targets, tool_mass, tool_com;"):
         write_world(tmp_path / "world.json", world, other)
     assert not (tmp_path / "world.json").exists()
 
