@@ -75,9 +75,13 @@ class Model:
     effects: tuple[Effect, ...]
     catalogue: Catalogue = field(default_factory=installed)
     readings: Readings | None = None
+    _slices: tuple[slice, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Refuse an effect that is there twice."""
+        ends = accumulate((len(e.parameters) for e in self.effects), initial=0)
+        # Asked for at every step; an effect with a thousand parameters takes long to name them.
+        object.__setattr__(self, "_slices", tuple(slice(a, b) for a, b in pairwise(ends)))
         names = self.names
         for name in names:
             if names.count(name) > 1:
@@ -91,12 +95,11 @@ class Model:
     @property
     def size(self) -> int:
         """Number of parameters."""
-        return sum(len(e.parameters) for e in self.effects)
+        return self._slices[-1].stop if self._slices else 0
 
     def slices(self) -> tuple[slice, ...]:
         """Where each effect's parameters lie in the vector of all."""
-        ends = accumulate((len(e.parameters) for e in self.effects), initial=0)
-        return tuple(slice(a, b) for a, b in pairwise(ends))
+        return self._slices
 
     def __add__(self, effect: Effect | EffectSpec) -> "Model":
         """Return the model with one more effect; one that is only named is built for it.
