@@ -8,8 +8,8 @@ import typer
 
 from hilcal.cell import Cell
 from hilcal.cli.terminal import Json, terminal
-from hilcal.data.ipa_ur10 import read_ipa_ur10
 from hilcal.identify.baseline import baseline
+from hilcal.library import read_table
 from hilcal.refine import refine
 from hilcal.report.numbers import length
 from hilcal.report.progress import working
@@ -33,7 +33,7 @@ def real(
         begun = time.monotonic()
         with working(t.progress) as say:
             say(f"reading {path}")
-            readings = read_ipa_ur10(path, cell.arm).readings
+            readings = read_table(path, cell, "ipa-ur10")
             found = refine(baseline(cell, readings, "absolute"), readings, "absolute", say)
         first, last = found.steps[0].fit, found.fit
         errors = [length(f.holdout.mean_m) for f in (first, last)]
