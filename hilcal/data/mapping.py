@@ -1,6 +1,6 @@
 """A mapping file: which column of a table holds what, in which unit and convention.
 
-A mapping is TOML, its sections are those of `Mapping`; docs/how-to/import-a-table.md explains it.
+TOML with the sections of `Mapping`; docs/how-to/import-a-table.md explains it.
 """
 
 from pathlib import Path
@@ -31,22 +31,11 @@ MASSES = {"kg": 1.0, "g": 1e-3, "lb": 0.45359237}
 """Kilograms in a unit."""
 SECONDS = {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}
 """Seconds in a unit of time."""
-UNLOADED = (
-    *(
-        "none",
-        "0",
-        "no",
-        "no load",
-        "unloaded",
-        "empty",
-        "-",
-        "ohne",
-        "leer",
-        "keine",
-        "unbelastet",
-    ),
-    *("sans", "sans charge", "vide", "sin carga", "vacío", "senza", "无", "空载"),
+_UNLOADED = (
+    "none|0|no|no load|unloaded|empty|-|ohne|leer|keine|unbelastet|sans|sans charge|vide|"
+    "sin carga|vacío|senza|无|空载"
 )
+UNLOADED = tuple(_UNLOADED.split("|"))
 """Names that mean "no load" unless the mapping lists others, in small letters; a choice."""
 
 _COLUMN = "the name of a column, or its number from 1"

@@ -13,9 +13,9 @@ The rules, in this order:
    Where χ² is too large, no variable predicts the misfit on poses left out beyond chance, and it
    is the same under every load of a pose, so that more poses would tell (see `pose_alone`):
    `ambiguous`.
-5. χ² is too large, nothing predicts the residual (no suspect, no learner; single variables less
-   than `FAINT` of it, which is said), repeats do not scatter less, and the arm's own scatter is not
-   in the stated covariance. It is estimated (see `identify.arm_scatter`), before rule 4:
+5. χ² is too large, nothing predicts the residual (no suspect, no learner, no variable) or repeated
+   readings scatter as much, and the arm's own scatter is not in the stated covariance. It is
+   estimated (see `identify.arm_scatter`), before rule 4:
    a. the readings prefer a noisier instrument at more than 20 : 1: `noise_misjudged`;
    b. the scatter is larger than an arm's repeatability can be (see `arm_repeatability`):
       `noise_misjudged`, be it the instrument, or an arm or a target that was loose;
@@ -55,9 +55,6 @@ IN_SAMPLE = ("pose", "direction")
 """First words of variables whose share is not of poses left out."""
 MOST_NAMED = 2
 """Variables that a sentence names."""
-FAINT = 0.05
-"""Share of the misfit, its rms then less than a quarter of the whole, that single variables may
-predict beside the arm's scatter without being an effect to look for; a choice. It is stated."""
 SAME_IN_POSE = 0.5
 """Share of the misfit in common to all readings of a pose from which on it is not the scatter of
 single arrivals; a choice."""
@@ -138,15 +135,10 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
         )
         predictable = regression.share > PREDICTABLE or bool(sizes) or patterned
         noise = judge_noise(e.fit, e.pure_error, predictable)
-        faint = (
-            noise.reason == "predictable"
-            and predicted < FAINT
-            and not any(s.explains for s in suspects)
-        )
         in_fit = e.fit.readings.arm_scatter is not None
-        may = e.misfit and (noise.misjudged or faint) and _may_scatter(e)
+        may = e.misfit and noise.misjudged and _may_scatter(e)
         found = e.arm_scatter if may else None
-        if found is not None and (noise.misjudged or _explained_by_arm(e.fit, found)):
+        if found is not None:
             scatter = replace(found, predicted_share=predicted)
         if found is not None and _explained_by_arm(e.fit, found):
             reason = "arm_scatter"

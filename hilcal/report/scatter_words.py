@@ -17,10 +17,11 @@ def left_to_the_arm(d: Diagnosis) -> str:
             "as noisy as stated"
         )
     share = s.predicted_share
-    but = f"but for {100 * share:.0f} % of it" if share >= 0.005 else "(0 % on poses left out)"
+    predicted = "is predictable by nothing recorded (0 % on poses left out) and"
+    if share >= 0.005:
+        predicted = f"is predicted to {100 * share:.0f} % by what was recorded and"
     return (
-        f"What is left, {numbers.length(s.size_m)} rms, is predictable by nothing recorded {but} "
-        f"and of the size of the arm's "
+        f"What is left, {numbers.length(s.size_m)} rms, {predicted} is of the size of the arm's "
         f"repeatability: {sigmas(s)}{_maker(s, d.fit.model.cell.arm)}; no effect of the catalogue "
         f"is missing{doubt}{_too_large(d)}"
     )
