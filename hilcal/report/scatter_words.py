@@ -13,8 +13,8 @@ def left_to_the_arm(d: Diagnosis) -> str:
     doubt = ""
     if not separated(s):
         doubt = (
-            f"; these readings do not tell it from an instrument {s.instrument_factor:.2g} times "
-            "as noisy as stated"
+            "; these readings cannot separate it from an instrument "
+            f"{s.instrument_factor:.2g} times as noisy as stated"
         )
     share = s.predicted_share
     predicted = "is predictable by nothing recorded (0 % on poses left out) and"

@@ -48,11 +48,12 @@ def fitted_lines(fit: Fit) -> Iterator[str]:
 
 
 def undetermined_lines(found: Registration) -> Iterator[str]:
-    """Yield a sentence for each direction of the frames that the poses do not tell."""
+    """Yield a sentence for each direction of the frames that the poses do not determine."""
     names = found.cell.target_names if found.cell.targets is not None else ()
     for u in found.undetermined:
-        why = _why(found.still)
-        yield f"The poses do not tell {_told(u, names)}{why}; it stays near the start."
+        why, what = _why(found.still), _told(u, names)
+        verb = "separate" if " from " in what else "determine"
+        yield f"The poses cannot {verb} {what}{why}; it stays near the start."
 
 
 def _told(u: Undetermined, names: tuple[str, ...]) -> str:

@@ -5,6 +5,7 @@ import pytest
 
 from hilcal.identify.baseline import baseline, with_effects
 from hilcal.identify.fit import Fit, fit
+from hilcal.identify.regularisation import effective_parameters
 from hilcal.identify.validation import validate
 from hilcal.regression.empirical_bayes import EmpiricalPrior, maximise_evidence, spent_by_groups
 from tests.support.campaigns import campaign, measured, noiseless, plan
@@ -103,7 +104,7 @@ def test_harmonics_that_are_there_are_kept_and_absent_ones_are_not(seed):
 
 def test_nothing_there_leaves_almost_nothing_and_costs_less_than_two_percent():
     """On poses that were never there."""
-    worse, effective = [], []
+    worse, effective, determined = [], [], []
     for seed in range(5):
         found, _ = with_harmonics("none", seed, 6)
         c = campaign("none", "absolute", seed, plan_seed=0, poses=40)
@@ -112,7 +113,10 @@ def test_nothing_there_leaves_almost_nothing_and_costs_less_than_two_percent():
         off = [validate(f.model, f.theta, f.readings, new, f.mode) for f in (found, plain)]
         worse.append(off[0].error.rms_sigma / off[1].error.rms_sigma)
         effective.append(found.solution.effective - plain.solution.effective)
+        s = found.solution
+        determined.append(effective_parameters(s.equations, s.beta) - plain.solution.effective)
     assert np.mean(worse) < 1.02
+    assert np.mean(determined) < 0.1 * 72
     # Of 36 groups of two, noise keeps those with χ² > 2, each of which spends 2 to 2.7.
     assert np.mean(effective) < 36 * np.exp(-1) * 2.7
 
