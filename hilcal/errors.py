@@ -23,3 +23,9 @@ class CannotAnswerError(HilcalError):
     """The data cannot answer the question; says what to measure."""
 
     exit_code = 4
+
+
+class StoppedError(HilcalError):
+    """A person stopped it; says what is safe and how to go on."""
+
+    exit_code = 130

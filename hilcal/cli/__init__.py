@@ -1,34 +1,55 @@
 """The command line: one file per group of commands, imported where it is used."""
 
+import json
 import os
+import shlex
 import sys
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
-from typing import Annotated
+from typing import Annotated, Any, TextIO
 
 import typer
 
 from hilcal import __version__
 from hilcal.cli.commands import COMMANDS, Command, load
-from hilcal.errors import HilcalError
+from hilcal.cli.help import EXIT_CODES, EXIT_CODES_OF_RUN, Group, InOrderOfWork
+from hilcal.errors import CannotAnswerError, DeviceError, HilcalError, InputError, StoppedError
 
 DEBUG = "HILCAL_DEBUG"
+_COMPLETE = "_HILCAL_COMPLETE"
 _BROKEN_PIPE = 141
-_INTERRUPTED = 130
+_INTERRUPTED = StoppedError.exit_code
 _USAGE = 2
+_KINDS = {
+    InputError: "input",
+    DeviceError: "device",
+    CannotAnswerError: "cannot_answer",
+    StoppedError: "interrupted",
+}
 
 
-def application(help_text: str, *, alone: bool = False) -> typer.Typer:
+def application(
+    help_text: str,
+    *,
+    alone: bool = False,
+    group: type[Group] = Group,
+    completion: bool = False,
+) -> typer.Typer:
     """Return an empty application.
 
     Args:
         help_text: what it is for.
         alone: whether it does something without a command.
+        group: lists its commands in the help.
+        completion: whether it completes words in a shell.
     """
     return typer.Typer(
-        add_completion=False,
+        cls=group,
+        add_completion=completion,
+        context_settings={"help_option_names": ["-h", "--help"]},
+        epilog=EXIT_CODES,
         pretty_exceptions_enable=False,
         no_args_is_help=not alone,
         invoke_without_command=alone,
@@ -39,7 +60,7 @@ def application(help_text: str, *, alone: bool = False) -> typer.Typer:
 
 def _hilcal(arguments: Sequence[str]) -> typer.Typer:
     """Return the application; of its commands only the one that the arguments name is imported."""
-    app = application(str(_top.__doc__))
+    app = application(str(_top.__doc__), group=InOrderOfWork, completion=True)
     words = [word for word in arguments if not word.startswith("-")]
     for name, command in COMMANDS.items():
         if words[:1] != [name]:
@@ -47,7 +68,8 @@ def _hilcal(arguments: Sequence[str]) -> typer.Typer:
         elif command.subcommands:
             app.add_typer(_group(command), name=name)
         else:
-            app.command(name)(load(command.place))
+            epilog = EXIT_CODES_OF_RUN if name == "run" else EXIT_CODES
+            app.command(name, epilog=epilog)(load(command.place))
     app.callback()(_top)
     return app
 
@@ -83,13 +105,24 @@ def _top(
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command of `hilcal` and exit; see `execute`."""
     given = sys.argv[1:] if arguments is None else list(arguments)
-    execute(lambda: _hilcal(given), "hilcal", given)
+    words = _words_to_complete() if os.environ.get(_COMPLETE) else given
+    execute(lambda: _hilcal(words), "hilcal", given)
+
+
+def _words_to_complete() -> list[str]:
+    """Return the words of the line that a shell asks to complete, without the program's name."""
+    line = os.environ.get("COMP_WORDS") or os.environ.get("_TYPER_COMPLETE_ARGS", "")
+    try:
+        return shlex.split(line)[1:]
+    except ValueError:  # a quote that is still open
+        return line.split()[1:]
 
 
 def execute(make: Callable[[], typer.Typer], name: str, arguments: Sequence[str]) -> None:
     """Run a command and exit: 0 done, 2 wrong input, 3 a device failed, 4 cannot be answered.
 
     Wrong input and failures are one line on stderr; HILCAL_DEBUG=1 shows where they came from.
+    With --json the error is a JSON document on stdout, too, unless the command has printed one.
 
     Args:
         make: returns the application; what it raises is reported like what a command raises.
@@ -100,10 +133,54 @@ def execute(make: Callable[[], typer.Typer], name: str, arguments: Sequence[str]
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")
     debug = os.environ.get(DEBUG, "") not in ("", "0")
-    with warnings.catch_warnings(), redirect_stdout(sys.stdout):
+    given = list(arguments)
+    out = Watched(sys.stdout)
+    with warnings.catch_warnings(), redirect_stdout(out):
         if not debug:
             warnings.simplefilter("ignore")
-        sys.exit(_run(make, name, list(arguments), debug))
+        failed = Failures("--json" in given, out, debug)
+        sys.exit(_run(make, name, given, failed))
+
+
+class Watched:
+    """A stream that knows whether anything was written to it."""
+
+    def __init__(self, stream: TextIO) -> None:
+        """Stand before a stream; everything but `write` is the stream's own."""
+        self.written = False
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        """Write, and take note."""
+        self.written = self.written or bool(text)
+        return self._stream.write(text)
+
+    def __getattr__(self, name: str) -> Any:
+        """Return what the stream has."""
+        return getattr(self._stream, name)
+
+
+class Failures:
+    """Tells people, and with --json scripts, why a command failed."""
+
+    def __init__(self, as_json: bool, out: Watched, debug: bool) -> None:
+        """Remember where the document goes, and whether people want to know more."""
+        self.out = out
+        self._json, self._debug = as_json, debug
+
+    def tell(self, error: BaseException | None, message: str, code: int) -> int:
+        """Say what failed in one line, and in one document; returns the exit code."""
+        if self._debug and error is not None:
+            traceback.print_exception(error)
+        line = " ".join(message.split())
+        print(f"error: {line}", file=sys.stderr)
+        if self._json and not self.out.written:
+            kinds = {kind.exit_code: name for kind, name in _KINDS.items()}
+            kind = kinds.get(code, "unexpected")
+            found = {"error": {"message": line, "kind": kind, "exit_code": code}}
+            self.out.write(json.dumps(found, indent=2) + "\n")
+            self.out.flush()
+        return code
 
 
 @contextmanager
@@ -118,21 +195,23 @@ def _one_thread() -> Iterator[None]:
         yield
 
 
-def _run(make: Callable[[], typer.Typer], name: str, arguments: list[str], debug: bool) -> int:
-    out = sys.stdout
+def _run(
+    make: Callable[[], typer.Typer], name: str, arguments: list[str], failures: Failures
+) -> int:
+    out = failures.out
     try:
         app = make()
         with _one_thread():
             result = app(arguments, prog_name=name, standalone_mode=False)
         out.flush()
     except HilcalError as error:
-        return _fail(error, str(error), error.exit_code, debug)
+        return failures.tell(error, str(error), error.exit_code)
     except BrokenPipeError:
         # Nobody reads any more; what is still in the buffer must not raise again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), out.fileno())
         return _BROKEN_PIPE
     except KeyboardInterrupt:
-        return _fail(None, "interrupted", _INTERRUPTED, debug)
+        return failures.tell(None, "interrupted", _INTERRUPTED)
     except Exception as error:
         # Usage errors are of the command-line library, which one depends on its version.
         if type(error).__name__ == "NoArgsIsHelpError":
@@ -140,25 +219,21 @@ def _run(make: Callable[[], typer.Typer], name: str, arguments: list[str], debug
             return _USAGE
         told = getattr(error, "format_message", None)
         if told is not None:
-            return _fail(error, f"{told()}".replace("\n", " "), _USAGE, debug)
+            where = getattr(getattr(error, "ctx", None), "command_path", name)
+            what = str(told()).rstrip(".")
+            hint = f" See {where} -h" if what.endswith("?") else f"; see {where} -h"
+            return failures.tell(error, what + hint, _USAGE)
         if type(error).__name__ == "Abort":
-            return _fail(error, "interrupted", _INTERRUPTED, debug)
+            return failures.tell(error, "interrupted", _INTERRUPTED)
         from hilcal.effects.failure import failure_of  # loads numpy, which takes a while
 
         if failed := failure_of(error):
-            return _fail(error, str(failed), failed.exit_code, debug)
+            return failures.tell(error, str(failed), failed.exit_code)
         words = " ".join(str(error).split())
         report = (
             f"unexpected {type(error).__name__}: {words}; please report it ({DEBUG}=1 shows more)"
         )
-        return _fail(error, report, 1, debug)
+        return failures.tell(error, report, 1)
     if result == _INTERRUPTED:
-        print("error: interrupted", file=sys.stderr)
+        return failures.tell(None, "interrupted", _INTERRUPTED)
     return result if isinstance(result, int) else 0
-
-
-def _fail(error: BaseException | None, message: str, code: int, debug: bool) -> int:
-    if debug and error is not None:
-        traceback.print_exception(error)
-    print(f"error: {' '.join(message.split())}", file=sys.stderr)
-    return code

@@ -28,6 +28,18 @@ def load(place: str) -> Callable[..., Any]:
     return found
 
 
+SECTIONS = {
+    "Try it": ("demo", "simulate"),
+    "Prepare": ("init", "config", "check", "plan"),
+    "Measure": ("run", "import", "info"),
+    "Fit, and find what is missing": (
+        *("identify", "compare", "diagnose", "add", "remove", "refine", "next"),
+    ),
+    "Use the result": ("validate", "view", "export"),
+    "Look up": ("effects", "study"),
+}
+"""The commands in the order of the work, as `hilcal --help` lists them."""
+
 COMMANDS = {
     "demo": Command(
         "demo:demo", "Rehearse the whole story on a simulated cell, through real drivers and wires."

@@ -33,6 +33,19 @@ except SystemExit as ended:
     assert loaded(code) == set()
 
 
+def test_completing_a_command_loads_no_library_of_the_computation() -> None:
+    code = """
+import os
+os.environ.update(_HILCAL_COMPLETE="complete_bash", COMP_WORDS="hilcal di", COMP_CWORD="1")
+from hilcal.cli import main
+try:
+    main([])
+except SystemExit as ended:
+    assert ended.code == 0
+"""
+    assert loaded(code) <= {"pydantic"}  # typer parses by it
+
+
 def test_the_package_loads_nothing_until_a_name_is_used() -> None:
     assert loaded("import hilcal") == set()
     assert "numpy" in loaded("import hilcal.model")  # the measurement itself can find something

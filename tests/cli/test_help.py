@@ -1,0 +1,119 @@
+"""The help of every command, the completion of a shell, and errors as JSON."""
+
+import pytest
+
+from hilcal.cli.commands import COMMANDS, SECTIONS
+from tests.support.cli_cases import ok, refused, run
+
+Capsys = pytest.CaptureFixture[str]
+ALL = [
+    (),
+    *((name,) for name in COMMANDS),
+    *((name, sub) for name, command in COMMANDS.items() for sub, _ in command.subcommands),
+]
+
+
+def words(text: str) -> list[str]:
+    """What is said, wherever its lines are broken; the line of usage has its own layout."""
+    return text.partition("\n\n")[2].split()
+
+
+@pytest.mark.parametrize("command", ALL, ids=" ".join)
+def test_help_breaks_and_cuts_no_word_at_any_width(
+    command: tuple[str, ...], capsys: Capsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = {}
+    for width in (60, 80, 120):
+        monkeypatch.setenv("COLUMNS", str(width))
+        text = ok(capsys, *command, "-h").out
+        assert max(map(len, text.splitlines())) <= width
+        told[width] = words(text)
+    assert told[60] == told[80] == told[120]
+    assert not [word for word in told[80] if word.endswith("...")]
+    assert "130 interrupted with Ctrl-C" in " ".join(told[80]) or len(command) == 2
+
+
+def test_the_list_of_commands_is_in_the_order_of_the_work(capsys: Capsys) -> None:
+    listed = [name for section in SECTIONS.values() for name in section]
+    assert sorted(set(listed)) == sorted(listed)  # none twice
+    assert set(COMMANDS) <= set(listed)  # none without a heading
+    text = ok(capsys, "--help").out
+    at = [text.index(f"\n{title}:\n") for title in SECTIONS]
+    assert at == sorted(at)
+    shown = [line.split()[0] for line in text[at[0] :].splitlines() if line[2:3].isalpha()]
+    assert [name for name in shown if name in COMMANDS] == [n for n in listed if n in COMMANDS]
+    told = " ".join(text.split())
+    assert all(command.summary in told for command in COMMANDS.values())
+
+
+def test_a_shell_completes_commands_and_options(
+    capsys: Capsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def completed(line: str, word: int) -> list[str]:
+        """What bash is offered for a word of a line."""
+        monkeypatch.setenv("_HILCAL_COMPLETE", "complete_bash")
+        monkeypatch.setenv("COMP_WORDS", line)
+        monkeypatch.setenv("COMP_CWORD", str(word))
+        return ok(capsys).out.split()
+
+    assert completed("hilcal di", 1) == ["diagnose"]
+    assert {"demo", "run", "refine"} <= set(completed("hilcal ", 1))
+    assert completed("hilcal run --re", 2) == ["--resume", "--rehearse"]
+    assert completed("hilcal effects ", 2) == ["new"]
+    assert completed("hilcal run ce", 2) == []  # a file: the shell's own business
+    assert completed("hilcal run 'ce", 2) == []  # a quote that is still open
+
+
+def test_a_shell_is_told_how_to_complete(capsys: Capsys) -> None:
+    script = ok(capsys, "--show-completion", "bash").out
+    assert "complete -o default -F _hilcal_completion hilcal" in script
+
+
+@pytest.mark.parametrize(
+    ("arguments", "kind", "code"),
+    [
+        (("diagnose", "none.hilcal"), "input", 2),
+        (("plan",), "input", 2),
+        (("plan", "CELL", "--no-such-option"), "input", 2),
+    ],
+)
+def test_an_error_is_one_document_with_json(
+    arguments: tuple[str, ...], kind: str, code: int, capsys: Capsys
+) -> None:
+    result = run(capsys, *arguments, "--json")
+    line = refused(capsys, code, *arguments)  # without it: the same line, and nothing on stdout
+    assert result.code == code
+    message = line.removeprefix("error: ")
+    assert result.document == {"error": {"message": message, "kind": kind, "exit_code": code}}
+    assert result.err.splitlines()[-1] == line
+
+
+def test_an_unexpected_error_and_an_interrupt_are_documents(
+    capsys: Capsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from hilcal.cli import effects
+
+    def fails(error: BaseException) -> object:
+        def raises(*_: object) -> None:
+            raise error
+
+        return raises
+
+    monkeypatch.delenv("HILCAL_DEBUG", raising=False)
+    monkeypatch.setattr(effects, "example_cell", fails(ZeroDivisionError("by\nzero")))
+    found = run(capsys, "effects", "--json")
+    assert (found.code, found.document["error"]["kind"]) == (1, "unexpected")
+    assert "ZeroDivisionError: by zero" in found.document["error"]["message"]
+    monkeypatch.setattr(effects, "example_cell", fails(KeyboardInterrupt()))
+    found = run(capsys, "effects", "--json")
+    assert found.code == 130
+    assert found.document["error"] == {
+        "message": "interrupted",
+        "kind": "interrupted",
+        "exit_code": 130,
+    }
+
+
+def test_a_usage_error_names_the_help(capsys: Capsys) -> None:
+    assert refused(capsys, 2, "run", "x", "--foo").endswith("see hilcal run -h")
+    assert refused(capsys, 2, "diagnos").endswith("Did you mean 'diagnose'? See hilcal -h")
