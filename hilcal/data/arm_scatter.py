@@ -19,7 +19,8 @@ class ArmScatter:
         size_m: rms over the readings of the 3-D displacement of the target.
         log_evidence: log odds of this against noise of the instrument that is larger than stated.
         instrument_factor: by how much the instrument's standard deviations were larger, then.
-        predicted_share: share of the misfit that a generic regression predicts on poses left out.
+        predicted_share: share of the misfit that something recorded predicts on poses left out.
+        predicted_by: the variables that predict it, at most two.
     """
 
     kind: ScatterKind
@@ -29,6 +30,7 @@ class ArmScatter:
     log_evidence: float
     instrument_factor: float
     predicted_share: float = 0.0
+    predicted_by: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, object]:
         """Return the attributes by name, SI."""
@@ -38,4 +40,5 @@ class ArmScatter:
     def from_json(cls, content: Mapping[str, Any]) -> "ArmScatter":
         """Return what `to_json` wrote."""
         given: dict[str, Any] = dict(content)
-        return cls(**{**given, **{k: tuple(given[k]) for k in ("std", "std_error")}})
+        lists = given.keys() & {"std", "std_error", "predicted_by"}
+        return cls(**{**given, **{k: tuple(given[k]) for k in lists}})

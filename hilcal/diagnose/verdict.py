@@ -15,7 +15,9 @@ The rules, in this order:
    `ambiguous`.
 5. χ² is too large, nothing predicts the residual (no suspect, no learner, no variable) or repeated
    readings scatter as much, and the arm's own scatter is not in the stated covariance. It is
-   estimated (see `identify.arm_scatter`), before rule 4:
+   estimated (see `identify.arm_scatter`), before rule 4. Where something predicts no more of the
+   misfit than is negligible in an uncertainty budget (`noise_verdict.PREDICTABLE`), c holds too,
+   and the share is said; a and b then leave it to rule 4:
    a. the readings prefer a noisier instrument at more than 20 : 1: `noise_misjudged`;
    b. the scatter is larger than an arm's repeatability can be (see `arm_repeatability`):
       `noise_misjudged`, be it the instrument, or an arm or a target that was loose;
@@ -88,7 +90,8 @@ def judge(e: Evidence, history: History) -> Diagnosis:
     if inner is None or e.arm_scatter is None:
         return _judged(e, history)
     told = _judged(inner, history)
-    scatter = replace(e.arm_scatter, predicted_share=told.predictable_share)
+    share, by = told.predictable_share, told.follows
+    scatter = replace(e.arm_scatter, predicted_share=share, predicted_by=by)
     if told.reason != "residual_is_noise":
         return replace(told, fit=e.fit, scatter=scatter)
     size = of_repeatability_size(scatter, e.fit.model.cell.arm)
@@ -130,17 +133,22 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
         ]
         predicted = max([regression.share, *sizes]) if e.misfit else 0.0
         # What an implausible size would explain is no noise either.
-        patterned = any(
-            not s.plausible and s.score.p_value * len(suspects) < FALSE_ALARM for s in suspects
-        )
-        predictable = regression.share > PREDICTABLE or bool(sizes) or patterned
+        patterns = [
+            s.holdout_share
+            for s in suspects
+            if not s.plausible and s.score.p_value * len(suspects) < FALSE_ALARM
+        ]
+        predictable = regression.share > PREDICTABLE or bool(sizes) or bool(patterns)
         noise = judge_noise(e.fit, e.pure_error, predictable)
         in_fit = e.fit.readings.arm_scatter is not None
-        may = e.misfit and noise.misjudged and _may_scatter(e)
+        little = noise.reason == "predictable" and max(predicted, *patterns, 0.0) <= PREDICTABLE
+        may = e.misfit and (noise.misjudged or little) and _may_scatter(e)
         found = e.arm_scatter if may else None
-        if found is not None:
-            scatter = replace(found, predicted_share=predicted)
-        if found is not None and _explained_by_arm(e.fit, found):
+        by_arm = found is not None and _explained_by_arm(e.fit, found)
+        if found is not None and (by_arm or noise.misjudged):
+            by = follows[:MOST_NAMED]
+            scatter = replace(found, predicted_share=predicted, predicted_by=by)
+        if by_arm:
             reason = "arm_scatter"
         elif noise.misjudged and not (in_fit and noise.reason == "too_large"):
             reason = "misjudged_noise"

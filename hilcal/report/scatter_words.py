@@ -16,14 +16,25 @@ def left_to_the_arm(d: Diagnosis) -> str:
             "; these readings cannot separate it from an instrument "
             f"{s.instrument_factor:.2g} times as noisy as stated"
         )
-    share = s.predicted_share
-    predicted = "is predictable by nothing recorded (0 % on poses left out) and"
-    if share >= 0.005:
-        predicted = f"is predicted to {100 * share:.0f} % by what was recorded and"
+    alone = predicted = ""
+    if s.predicted_share < 0.005:
+        alone = "is predictable by nothing recorded (0 % on poses left out) and "
+    else:
+        predicted = f"; {_predicted(s)}"
     return (
-        f"What is left, {numbers.length(s.size_m)} rms, {predicted} is of the size of the arm's "
-        f"repeatability: {sigmas(s)}{_maker(s, d.fit.model.cell.arm)}; no effect of the catalogue "
-        f"is missing{doubt}{_too_large(d)}"
+        f"What is left, {numbers.length(s.size_m)} rms, {alone}is of the size of the arm's "
+        f"repeatability: {sigmas(s)}{_maker(s, d.fit.model.cell.arm)}{predicted}; no effect of the "
+        f"catalogue is missing{doubt}{_too_large(d)}"
+    )
+
+
+def _predicted(s: ArmScatter) -> str:
+    """Say how much of what is left something recorded predicts, and that it is negligible."""
+    by = " and ".join(s.predicted_by) if s.predicted_by else "what was recorded"
+    size = numbers.length(s.predicted_share**0.5 * s.size_m)
+    return (
+        f"{100 * s.predicted_share:.0f} % of it, {size} rms, follows {by} on poses left out, which "
+        "is negligible beside the rest"
     )
 
 
