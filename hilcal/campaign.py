@@ -68,17 +68,20 @@ class Campaign:
     catalogue: Catalogue
 
     @classmethod
-    def open(cls, path: str | Path, catalogue: Catalogue | None = None) -> Self:
+    def open(
+        cls, path: str | Path, catalogue: Catalogue | None = None, *, read_only: bool = False
+    ) -> Self:
         """Open a campaign file.
 
         Args:
             path: the file.
             catalogue: the effects that a model can have; the installed ones unless given.
+            read_only: write nothing to the file, nor beside it.
 
         Raises:
             InputError: not a sound campaign, or without readings.
         """
-        file = CampaignFile.open(path)
+        file = CampaignFile.open(path, read_only=read_only)
         try:
             config = CellConfig.from_json(file.config_json)
             cell = cell_from_config(config, Path(file.base_dir))
@@ -125,22 +128,42 @@ class Campaign:
         records = self.file.revisions()
         return records[-1] if records else None
 
+    def in_use(self, revision: int | None = None) -> RevisionRecord | None:
+        """Return the revision that is used: as asked, else the accepted, else the latest one.
+
+        Args:
+            revision: its number, where one is asked for.
+
+        Raises:
+            InputError: no such revision.
+        """
+        number = self.file.accepted() if revision is None else revision
+        return self.latest() if number is None else self.file.revision(number)
+
+    def accept(self, revision: int | None) -> None:
+        """Make a revision the one that is used unless another is asked for; None: the latest.
+
+        Raises:
+            InputError: no such revision.
+        """
+        self.file.accept(revision)
+
     def mode(self) -> Mode:
-        """Kind of readings: that of the latest revision, else what the readings allow."""
-        record = self.latest()
+        """Kind of readings: that of the revision in use, else what the readings allow."""
+        record = self.in_use()
         return usual_mode(self.readings) if record is None else mode_of(record)
 
     def fit(self, revision: int | None = None) -> Fit:
         """Return a stored fit, found again from its stored parameters.
 
         Args:
-            revision: its number; the latest where None.
+            revision: its number; the one in use where None, see `in_use`.
 
         Raises:
             InputError: no such revision, or its readings or effects are not at hand as they were
                 when it was stored.
         """
-        record = self.latest() if revision is None else self.file.revision(revision)
+        record = self.in_use(revision)
         if record is None:
             raise InputError(f"{self.path}: no revision yet; fit a model and append it first")
         return self.restore(record)
@@ -163,9 +186,10 @@ class Campaign:
         """Return how the model of a revision was reached, which `diagnose` takes.
 
         Args:
-            revision: its number; the latest where None.
+            revision: its number; the one in use where None.
         """
-        return history(chain(self.file.revisions()[:revision]))
+        record = self.in_use(revision)
+        return history(() if record is None else chain(self.file.revisions(), record.number))
 
     def append(self, found: Fit | Diagnosis | Refinement) -> int:
         """Store a fit, a diagnosed fit, or all steps of a refinement; revisions only append.
@@ -191,6 +215,7 @@ class Campaign:
         diagnosis: Diagnosis | None = None,
         added: str | None = None,
         removed: str | None = None,
+        parent: int | None = None,
     ) -> int:
         """Store a fit, with what was changed in the model since the revision before.
 
@@ -199,6 +224,7 @@ class Campaign:
             diagnosis: of it.
             added: the effect that was added.
             removed: the effect that was taken out.
+            parent: number of the revision that was changed; the one before where None.
 
         Returns:
             The number of the revision.
@@ -206,42 +232,69 @@ class Campaign:
         Raises:
             InputError: it was fitted to other readings than those of this campaign.
         """
+        if parent == len(self.file.revisions()):
+            parent = None
+        return self.file.append_revision(self.record(found, diagnosis, added, removed, parent))
+
+    def record(
+        self,
+        found: Fit,
+        diagnosis: Diagnosis | None = None,
+        added: str | None = None,
+        removed: str | None = None,
+        parent: int | None = None,
+    ) -> RevisionRecord:
+        """Return what `store` stores, without storing it; raises as `store` does."""
         hashed = content_hash(found.readings)
         if hashed != content_hash(self.readings):
             raise InputError(f"{self.path}: the fit is of other readings than this campaign's")
         document = None if diagnosis is None else to_json(diagnosis)
-        return self.file.append_revision(to_record(found, document, added, hashed, removed))
+        return to_record(found, document, added, hashed, removed, parent)
 
-    def latest_fit(self, say: Say = lambda text: None) -> tuple[int, Fit]:
-        """Return number and fit of the latest revision; without any, fit and store the baseline.
+    def fit_in_use(
+        self, say: Say = lambda text: None, revision: int | None = None
+    ) -> tuple[int | None, Fit]:
+        """Return number and fit of the revision in use; without any, fit the baseline.
+
+        Nothing is stored; the number is None where the baseline was fitted.
 
         Args:
             say: takes progress, one line each.
+            revision: number of the revision; see `in_use`.
 
         Raises:
-            InputError: its readings or effects are not at hand as they were when it was stored.
+            InputError: no such revision, or its readings or effects are not at hand as they were
+                when it was stored.
             CannotAnswerError: the readings do not determine the baseline.
         """
-        record = self.latest()
+        record = self.in_use(revision)
         if record is not None:
             say(f"restoring revision {record.number}")
             return record.number, self.restore(record)
         model = baseline(self.cell, self.readings, self.mode(), self.catalogue)
         say(f"fitting {' + '.join(model.names) or 'the nominal arm'}")
-        found = fit(model, self.readings, self.mode())
-        return self.store(found), found
+        return None, fit(model, self.readings, self.mode())
 
-    def chapters(self, say: Say = lambda text: None) -> list[Chapter]:
-        """Return the latest revision and those that it was made from, diagnosed; see `view`.
+    def chapters(self, say: Say = lambda text: None, revision: int | None = None) -> list[Chapter]:
+        """Return the revision in use and those that it was made from, diagnosed; see `view`.
+
+        Without any revision it is the baseline, which is not stored.
 
         Args:
             say: takes progress, one line each.
+            revision: number of the revision; see `in_use`.
 
         Raises:
-            InputError: its readings or effects are not at hand as they were when it was stored.
+            InputError: no such revision, or its readings or effects are not at hand as they were
+                when it was stored.
         """
         out = []
-        for record in chain(self.file.revisions()):
+        last = self.in_use(revision)
+        if last is None:
+            _, found = self.fit_in_use(say)
+            say("diagnosing it")
+            return [Chapter(1, None, found, diagnose(found, say=say))]
+        for record in chain(self.file.revisions(), last.number):
             say(f"restoring revision {record.number}")
             found = self.restore(record)
             judged = None

@@ -167,18 +167,18 @@ def plan(
 
 @contextmanager
 def view(run: Campaign, port: int = 9876) -> Iterator[str]:
-    """Serve the story of a campaign's latest revisions to rerun viewers while the block lasts.
+    """Serve the story of a campaign's revision in use to rerun viewers while the block lasts.
 
     >>> with hc.Campaign.open(RUN) as run, hc.view(run, port=PORT) as url:
     ...     url
     'rerun+http://127.0.0.1:.../proxy'
 
     Args:
-        run: the campaign, with at least one revision.
+        run: the campaign; without a revision the baseline is shown.
         port: on this machine.
 
     Raises:
-        InputError: no revision, the port is taken, or rerun-sdk is not installed.
+        InputError: the port is taken, or rerun-sdk is not installed.
     """
     from hilcal.report.viewer import serve
 

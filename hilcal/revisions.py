@@ -34,6 +34,7 @@ def to_record(
     added: str | None,
     data_hash: str,
     removed: str | None = None,
+    parent: int | None = None,
 ) -> RevisionRecord:
     """Store a fit: enough to find it again, and what was reported of it.
 
@@ -44,6 +45,7 @@ def to_record(
             starts.
         data_hash: `content_hash` of its readings.
         removed: the effect that was taken out of the revision before.
+        parent: number of the revision that it was made from, where that is not the one before.
     """
     effects, cell = found.model.effects, found.model.cell
     scatter = found.readings.arm_scatter
@@ -54,6 +56,7 @@ def to_record(
         effects=found.model.names,
         added=added,
         removed=removed,
+        parent=parent,
         options={
             "readings": found.mode,
             "scaling": found.scaling,
@@ -162,12 +165,22 @@ def scaling_of(record: RevisionRecord) -> Scaling:
     return SCALINGS[SCALINGS.index(record.options["scaling"])]
 
 
-def chain(records: tuple[RevisionRecord, ...]) -> tuple[RevisionRecord, ...]:
-    """Return the latest revision and those that it was made from, oldest first."""
-    first = len(records) - 1
-    while first > 0 and records[first].follows:
-        first -= 1
-    return records[max(first, 0) :]
+def chain(
+    records: tuple[RevisionRecord, ...], last: int | None = None
+) -> tuple[RevisionRecord, ...]:
+    """Return a revision and those that it was made from, oldest first.
+
+    Args:
+        records: all revisions of a campaign.
+        last: number of the revision; the latest where None.
+    """
+    by_number = {r.number: r for r in records}
+    found: list[RevisionRecord] = []
+    number = max(by_number, default=None) if last is None else last
+    while number in by_number:
+        found.append(by_number[number])
+        number = by_number[number].made_from
+    return tuple(reversed(found))
 
 
 def history(records: tuple[RevisionRecord, ...]) -> History:

@@ -35,7 +35,7 @@ SECTIONS = {
     "Fit, and find what is missing": (
         *("identify", "compare", "diagnose", "add", "remove", "refine", "next"),
     ),
-    "Use the result": ("validate", "view", "export"),
+    "Use the result": ("validate", "accept", "view", "export"),
     "Look up": ("effects", "study"),
 }
 """The commands in the order of the work, as `hilcal --help` lists them."""
@@ -63,21 +63,23 @@ COMMANDS = {
     "identify": Command(
         "fitting:identify", "Fit a model to the readings, and keep it as a revision."
     ),
-    "compare": Command("fitting:compare", "Show where the latest model fails."),
-    "diagnose": Command("refining:diagnose", "Say which effect the latest model lacks."),
-    "add": Command("refining:add", "Add an effect to the latest model: error before and after."),
+    "compare": Command("fitting:compare", "Show where the model fails."),
+    "diagnose": Command("refining:diagnose", "Say which effect the model lacks."),
+    "add": Command("refining:add", "Add an effect to the model: error before and after."),
     "remove": Command(
-        "refining:remove", "Take an effect out of the latest model: error before and after."
+        "refining:remove", "Take an effect out of the model: error before and after."
     ),
     "refine": Command("refining:refine", "Diagnose and add until the model is adequate."),
     "next": Command(
         "next:next_",
         "Plan the measurements that separate the leading suspects; exit 4 where none are in doubt.",
     ),
-    "validate": Command(
-        "fitting:validate", "Predict readings of another campaign with the latest model."
+    "validate": Command("fitting:validate", "Predict readings of another campaign with the model."),
+    "accept": Command(
+        "campaigns:accept",
+        "Choose the revision that every command uses from now on, whatever is added later.",
     ),
-    "view": Command("refining:view", "Tell the story of the latest revisions in rerun."),
+    "view": Command("refining:view", "Tell the story of the revisions in rerun."),
     "export": Command("tables:export", "Write readings and parameters as CSV."),
     "effects": Command(
         "effects:effects",

@@ -13,27 +13,46 @@ from hilcal.effects.written import chosen_options, read_effects_text, write_effe
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit
 from hilcal.model import Model
+from hilcal.report import text
 from hilcal.report.build_story import Chapter, build_story
 from hilcal.report.progress import Say, working
 
 
-def latest_fit(t: Terminal, run: Campaign, say: Say) -> tuple[int, Fit]:
-    """Return the latest revision as a fit; without any, make the baseline and say so."""
-    there = run.latest() is not None
-    number, found = run.latest_fit(say)
-    if not there:
+def fit_of(t: Terminal, run: Campaign, say: Say, revision: int | None) -> tuple[int | None, Fit]:
+    """Return number and fit of the revision in use; without any the baseline, which is not kept."""
+    _tell_accepted(t, run, revision)
+    number, found = run.fit_in_use(say, revision)
+    if number is None:
         t.notice(
-            f"no revision yet: made the baseline, revision {number} "
-            f"({' + '.join(found.model.names) or 'the nominal arm'}, {found.mode} readings)"
+            f"no revision yet: taking the baseline ({text.model_name(found.model.names)}; "
+            f"{found.mode} readings); hilcal identify keeps it"
         )
     return number, found
 
 
-def chapters_of(t: Terminal, run: Campaign, say: Say) -> list[Chapter]:
-    """Return the latest revision and those that it was made from, diagnosed."""
-    if run.latest() is None:
-        latest_fit(t, run, say)
-    return run.chapters(say)
+def stored_fit(t: Terminal, run: Campaign, say: Say, revision: int | None) -> tuple[int, Fit]:
+    """Do the same for a command that makes a revision; the baseline becomes revision 1."""
+    _tell_accepted(t, run, revision)
+    number, found = run.fit_in_use(say, revision)
+    if number is None:
+        number = run.store(found)
+        t.notice(
+            f"no revision yet: made the baseline, revision {number} "
+            f"({text.model_name(found.model.names)}; {found.mode} readings)"
+        )
+    return number, found
+
+
+def _tell_accepted(t: Terminal, run: Campaign, revision: int | None) -> None:
+    """Say that an accepted revision is used where there are later ones."""
+    accepted, latest = run.file.accepted(), run.latest()
+    if revision is None and latest is not None and accepted not in (None, latest.number):
+        t.notice(f"using revision {accepted}, which is accepted; the latest is {latest.number}")
+
+
+def called(number: int | None) -> str:
+    """Return how a revision is called in a heading; None is the baseline that is not kept."""
+    return "Baseline, not kept" if number is None else f"Revision {number}"
 
 
 def mode_of_option(run: Campaign, asked: str | None) -> Mode:
@@ -71,24 +90,24 @@ def scalings(name: str) -> tuple[Scaling, ...]:
     return found
 
 
-def wanted_effects(text: str | None, catalogue: Catalogue) -> dict[str, dict[str, object]] | None:
+def wanted_effects(given: str | None, catalogue: Catalogue) -> dict[str, dict[str, object]] | None:
     """Read `--effects "a, b(option=value)"`: options by name, see `read_effects_text`.
 
     Raises:
         InputError: an unknown name (lists the valid ones), one that is there twice, or options
             that cannot be read.
     """
-    if text is None:
+    if given is None:
         return None
-    wanted = read_effects_text(text, "--effects", catalogue)
+    wanted = read_effects_text(given, "--effects", catalogue)
     if not wanted:
         raise InputError("--effects is empty; give one name or several, separated by commas")
     return wanted
 
 
-def effect_names(text: str | None, catalogue: Catalogue) -> tuple[str, ...] | None:
+def effect_names(asked: str | None, catalogue: Catalogue) -> tuple[str, ...] | None:
     """Read names of effects where they cannot have options; raises as `wanted_effects` does."""
-    wanted = wanted_effects(text, catalogue)
+    wanted = wanted_effects(asked, catalogue)
     for name, options in (wanted or {}).items():
         if options:
             raise InputError(f"--effects: {name} takes no options here; valid: {name}")

@@ -9,15 +9,16 @@ import typer
 from hilcal.campaign import Campaign
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import (
+    called,
     check_options,
     chosen,
-    latest_fit,
+    fit_of,
     mode_of_option,
     scalings,
     titles,
     wanted_effects,
 )
-from hilcal.cli.terminal import Json, Run, terminal
+from hilcal.cli.terminal import Json, Revision, Run, terminal
 from hilcal.data.whitening import Scaling
 from hilcal.diagnose.misfit_breakdown import misfit_breakdown
 from hilcal.effects.written import write_effect
@@ -101,11 +102,16 @@ def options_json(found: Fit) -> dict[str, dict[str, object]]:
     return {e.name: dict(e.options) for e in found.model.effects}
 
 
-def compare(run: Run, effects_from: EffectsFrom = None, as_json: Json = False) -> None:
-    """Show where the latest model fails."""
+def compare(
+    run: Run,
+    revision: Revision = None,
+    effects_from: EffectsFrom = None,
+    as_json: Json = False,
+) -> None:
+    """Show where the model fails."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
-    with Campaign.open(run, catalogue) as o, working(t.progress) as say:
-        number, found = latest_fit(t, o, say)
+    with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
+        number, found = fit_of(t, o, say, revision)
         if found.scaling != "gc":
             raise InputError(
                 f"revision {number} has scaling {found.scaling}; comparing needs gc: run hilcal "
@@ -116,7 +122,7 @@ def compare(run: Run, effects_from: EffectsFrom = None, as_json: Json = False) -
     e = full_prediction(found)
     worst = text.worst_poses(e)
     name = text.model_name(titles(found.model, found.readings))
-    t.show(text.heading(f"Revision {number}: {name}"))
+    t.show(text.heading(f"{called(number)}: {name}"))
     t.show([text.misses(found), text.follows(places), "", text.errors(found), ""])
     t.show([*text.where_table(places), ""])
     t.show(text.worst_table(worst))
@@ -145,24 +151,24 @@ def validate(
     register: Annotated[
         bool, typer.Option("--register", help="The tracker was set up anew: fit its place first.")
     ] = False,
+    revision: Revision = None,
     effects_from: EffectsFrom = None,
     as_json: Json = False,
 ) -> None:
-    """Predict readings of another campaign with the latest model."""
+    """Predict readings of another campaign with the model."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     with (
-        Campaign.open(run, catalogue) as o,
-        Campaign.open(other) as unseen,
+        Campaign.open(run, catalogue, read_only=True) as o,
+        Campaign.open(other, read_only=True) as unseen,
         working(t.progress) as say,
     ):
         if o.cell.arm.name != unseen.cell.arm.name:
             raise InputError(
                 f"{other}: robot {unseen.cell.arm.name}; the model of {run} is of {o.cell.arm.name}"
             )
-        record = o.latest()
+        record = o.in_use(revision)
         if record is None:
-            latest_fit(t, o, say)
-            record = o.file.revision(1)
+            record = o.record(fit_of(t, o, say, revision)[1])
         model, theta = o.restore_model(record)
         say(f"predicting {len(unseen.readings)} readings")
         found = predict_other(
@@ -171,7 +177,7 @@ def validate(
         say("comparing with what was measured")
         beyond = extrapolation(o.predictive(record, model, theta), o.readings, found)
     name = text.model_name(titles(model, o.readings))
-    t.show(text.heading(f"Revision {record.number}: {name}"))
+    t.show(text.heading(f"{called(record.number or None)}: {name}"))
     what = "deflections" if mode_of(record) == "deflection" else "positions"
     e = found.error
     t.show(
@@ -186,7 +192,7 @@ def validate(
         )
     t.document(
         {
-            "revision": record.number,
+            "revision": record.number or None,
             "model": list(model.names),
             "readings": mode_of(record),
             "registered": register,

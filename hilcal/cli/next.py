@@ -8,10 +8,10 @@ import typer
 
 from hilcal.campaign import Campaign
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
-from hilcal.cli.files import check_record, effect_names, latest_fit
+from hilcal.cli.files import check_record, effect_names, fit_of
 from hilcal.cli.plan_output import POSES, Csv, Output, Poses, Quick, Seed, generator, write
 from hilcal.cli.planning import read_cell
-from hilcal.cli.terminal import Json, Record, Run, Terminal, terminal
+from hilcal.cli.terminal import Json, Record, Revision, Run, Terminal, terminal
 from hilcal.data.plan import REFERENCE, Plan, read_plan
 from hilcal.data.run_log import PLAN
 from hilcal.diagnose.diagnosis import Diagnosis
@@ -47,6 +47,7 @@ def next_(
     seed: Seed = 0,
     quick: Quick = False,
     csv: Csv = None,
+    revision: Revision = None,
     record: Record = None,
     effects_from: EffectsFrom = None,
     as_json: Json = False,
@@ -57,9 +58,9 @@ def next_(
     rng = generator(seed)
     if poses < 1:
         raise InputError(f"--poses {poses}; valid: a whole number from 1")
-    with Campaign.open(run, catalogue) as o, working(t.progress) as say:
+    with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
         config, numbers = (o.config, o.cell) if cell is None else read_cell(cell)
-        before, effects = _without_suspects(t, o, _named(suspects, catalogue), say)
+        before, effects = _without_suspects(t, o, revision, _named(suspects, catalogue), say)
         place = reference_of(o)
         found = measure_next(numbers, config, before, effects, Request(poses), rng, say, place)
         summary = summarise(found.planned, config, rng, say, compare=not quick)
@@ -100,15 +101,15 @@ def plan_of(found: Next, suspects: tuple[str, ...]) -> Plan:
 
 
 def _without_suspects(
-    t: Terminal, o: Campaign, named: tuple[str, ...] | None, say: Say
+    t: Terminal, o: Campaign, revision: int | None, named: tuple[str, ...] | None, say: Say
 ) -> tuple[Fit, tuple[str, ...]]:
     """Return a fit, and the effects to separate that its model does not hold.
 
     Raises:
-        InputError: the latest revision is not in scaling gc.
+        InputError: the revision is not in scaling gc.
         CannotAnswerError: nothing is in doubt; says what else to do.
     """
-    number, newest = latest_fit(t, o, say)
+    number, newest = fit_of(t, o, say, revision)
     if newest.scaling != "gc":
         raise InputError(
             f"revision {number} has scaling {newest.scaling}; next needs gc: run hilcal identify "
@@ -116,7 +117,7 @@ def _without_suspects(
         )
     suspects = named
     if suspects is None:
-        say(f"diagnosing revision {number}")
+        say("diagnosing" if number is None else f"diagnosing revision {number}")
         d = diagnose(newest, o.history(number), say)
         suspects = in_doubt(d)
         if not suspects:

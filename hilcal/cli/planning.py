@@ -11,9 +11,9 @@ from hilcal.acquire.dry_run import dry_run
 from hilcal.campaign import Campaign
 from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
-from hilcal.cli.files import check_record, latest_fit
+from hilcal.cli.files import check_record, fit_of
 from hilcal.cli.plan_output import POSES, Csv, Output, Poses, Quick, Seed, generator, write
-from hilcal.cli.terminal import Json, Record, Terminal, terminal
+from hilcal.cli.terminal import Json, Record, Revision, Terminal, terminal
 from hilcal.config import CellConfig, load_config
 from hilcal.data.plan import Plan, load_plan
 from hilcal.effects.catalogue import Catalogue
@@ -48,6 +48,7 @@ def plan(
         Path | None,
         typer.Option("--after", metavar="RUN.hilcal", help="Plan on from what it knows already."),
     ] = None,
+    revision: Revision = None,
     seed: Seed = 0,
     unloaded_first: Annotated[
         bool,
@@ -65,11 +66,13 @@ def plan(
     """Choose poses, loads and their order, with a proof of how near to the best they are."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     check_record(record)
+    if revision is not None and after is None:
+        raise InputError("--revision is one of a campaign; give the campaign with --after")
     config, numbers = read_cell(cell)
     unloaded: Literal["around", "first"] = "first" if unloaded_first else "around"
     wanted = Request(poses, readings, _criterion(criterion), unloaded=unloaded)
     with working(t.progress) as say:
-        known = None if after is None else _known(t, after, catalogue, say)
+        known = None if after is None else _known(t, after, revision, catalogue, say)
         rng = generator(seed)
         chosen = make(numbers, config, wanted, rng, known, say, catalogue)
         plan_ = replace(chosen.ordered.plan, about=about(chosen))
@@ -93,10 +96,10 @@ def _criterion(name: str | None) -> str | None:
     return name
 
 
-def _known(t: Terminal, path: Path, catalogue: Catalogue, say: Say) -> Fit:
-    """Return the newest fit of a campaign."""
-    with Campaign.open(path, catalogue) as run:
-        return latest_fit(t, run, say)[1]
+def _known(t: Terminal, path: Path, revision: int | None, catalogue: Catalogue, say: Say) -> Fit:
+    """Return the fit of a campaign that is in use."""
+    with Campaign.open(path, catalogue, read_only=True) as run:
+        return fit_of(t, run, say, revision)[1]
 
 
 def check(cell: CellFile, plan: PlanFile = None, as_json: Json = False) -> None:

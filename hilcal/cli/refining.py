@@ -17,16 +17,16 @@ from hilcal.campaign import Campaign
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.ending import told_to_end
 from hilcal.cli.files import (
-    chapters_of,
     check_options,
     check_record,
-    latest_fit,
+    fit_of,
     mode_of_option,
     record_story,
+    stored_fit,
     wanted_effects,
 )
 from hilcal.cli.fitting import Readings, options_json, options_line
-from hilcal.cli.terminal import Json, Record, Run, terminal
+from hilcal.cli.terminal import Json, Record, Revision, Run, terminal
 from hilcal.data.revision import change
 from hilcal.diagnose.diagnosis import History
 from hilcal.diagnose.effect_ranking import addition
@@ -71,12 +71,17 @@ class Row:
         return self.number, change(self.added, self.removed, scatter), self.fit, self.verdict
 
 
-def diagnose(run: Run, effects_from: EffectsFrom = None, as_json: Json = False) -> None:
-    """Say which effect the latest model lacks."""
+def diagnose(
+    run: Run,
+    revision: Revision = None,
+    effects_from: EffectsFrom = None,
+    as_json: Json = False,
+) -> None:
+    """Say which effect the model lacks."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
-    with Campaign.open(run, catalogue) as o, working(t.progress) as say:
-        number, found = latest_fit(t, o, say)
-        say(f"diagnosing revision {number}")
+    with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
+        number, found = fit_of(t, o, say, revision)
+        say("diagnosing" if number is None else f"diagnosing revision {number}")
         d = judge(found, o.history(number), say)
     t.show(text_refine.diagnosis_report(d))
     t.document({"revision": number, **to_json(d)})
@@ -90,34 +95,38 @@ def add(
             metavar="EFFECT", help='See hilcal effects; with options: "creep(joints=each)".'
         ),
     ],
+    revision: Revision = None,
     record: Record = None,
     effects_from: EffectsFrom = None,
     as_json: Json = False,
 ) -> None:
-    """Add an effect to the latest model: error before and after."""
+    """Add an effect to the model: error before and after."""
     catalogue = catalogue_with(effects_from)
     wanted = read_effects_text(effect, "EFFECT", catalogue)
     if len(wanted) != 1:
         raise InputError(f"EFFECT {effect!r} has {len(wanted)} effects; valid: one")
     ((name, options),) = wanted.items()
-    _change(run, name, record, as_json, catalogue, partial(add_effect, options=options), options)
+    make = partial(add_effect, options=options)
+    _change(run, revision, name, record, as_json, catalogue, make, options)
 
 
 def remove(
     run: Run,
-    effect: Annotated[str, typer.Argument(metavar="EFFECT", help="One of the latest model.")],
+    effect: Annotated[str, typer.Argument(metavar="EFFECT", help="One of the model.")],
+    revision: Revision = None,
     record: Record = None,
     effects_from: EffectsFrom = None,
     as_json: Json = False,
 ) -> None:
-    """Take an effect out of the latest model: error before and after."""
+    """Take an effect out of the model: error before and after."""
     catalogue = catalogue_with(effects_from)
     catalogue[effect]  # an unknown name is refused
-    _change(run, effect, record, as_json, catalogue, remove_effect)
+    _change(run, revision, effect, record, as_json, catalogue, remove_effect)
 
 
 def _change(
     run: Path,
+    revision: int | None,
     effect: str,
     record: Path | None,
     as_json: bool,
@@ -132,7 +141,7 @@ def _change(
     with Campaign.open(run, catalogue) as o:
         check_options(o, {effect: options or {}} if adds else {})
         with working(t.progress) as say:
-            before_number, before = latest_fit(t, o, say)
+            before_number, before = stored_fit(t, o, say, revision)
             say(f"{'adding' if adds else 'removing'} {named}")
             after = make(before, effect)
             say("diagnosing")
@@ -143,7 +152,7 @@ def _change(
                 removed=(*before_it.removed, *([] if removed is None else [removed])),
             )
             d = judge(after, how, say)
-            number = o.store(after, d, added, removed)
+            number = o.store(after, d, added, removed, before_number)
         stored = o.file.revision(before_number)
         verdict = str(stored.result_json.get("diagnose", {}).get("verdict", ""))
         rows: list[Row] = [
@@ -157,7 +166,7 @@ def _change(
         t.show(["", text_refine.verdict_line(d)])
         if record is not None:
             with working(t.progress) as say:
-                chapters = chapters_of(t, o, say)
+                chapters = o.chapters(say, number)
             record_story(t, chapters, record)
     t.document(
         {
@@ -199,6 +208,9 @@ def refine(
     from_latest: Annotated[
         bool, typer.Option("--from-latest", help="Start from the latest revision.")
     ] = False,
+    revision: Annotated[
+        int | None, typer.Option("--revision", metavar="N", help="Start from this revision.")
+    ] = None,
     record: Record = None,
     effects_from: EffectsFrom = None,
     as_json: Json = False,
@@ -207,12 +219,13 @@ def refine(
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     named = wanted_effects(effects, catalogue)
     check_record(record)
-    if from_latest and (named is not None or readings is not None):
-        raise InputError("--from-latest keeps effects and readings; leave out the other options")
+    start = "--revision" if revision is not None else "--from-latest" if from_latest else ""
+    if start and (named is not None or readings is not None or (from_latest and revision)):
+        raise InputError(f"{start} keeps effects and readings; leave out the other options")
     with Campaign.open(run, catalogue) as o:
-        latest = o.latest() if from_latest else None
-        if from_latest and latest is None:
-            raise InputError(f"{run}: no revision yet; leave out --from-latest")
+        latest = o.latest() if from_latest else None if not start else o.in_use(revision)
+        if start and latest is None:
+            raise InputError(f"{run}: no revision yet; leave out {start}")
         mode = mode_of_option(o, readings)
         check_options(o, named or {})
         with working(t.progress) as say:
@@ -227,14 +240,15 @@ def refine(
             else:
                 say("registering")
                 model = with_effects(o.cell, o.readings, mode, named, named, catalogue)
-            how = NOTHING if latest is None else o.history()
+            how = NOTHING if latest is None else o.history(latest.number)
             found = refine_model(model, fitted, mode, say, how)
         rows: list[Row] = []
         for k, step in enumerate(found.steps):
             if k == 0 and latest is not None:
                 number = latest.number
             else:
-                number = o.store(step.fit, step.diagnosis, step.added, step.removed)
+                parent = rows[-1].number if rows else None
+                number = o.store(step.fit, step.diagnosis, step.added, step.removed, parent)
             rows.append(Row(number, step.fit, step.diagnosis.verdict, step.added, step.removed))
         t.show(text_refine.revisions_table([r.shown for r in rows]))
         t.show(text_refine.key())
@@ -286,16 +300,17 @@ def revisions_json(rows: Sequence[Row]) -> list[dict[str, object]]:
 
 def view(
     run: Run,
+    revision: Revision = None,
     record: Record = None,
     port: Annotated[int, typer.Option("--port", help="Port to serve viewers on.")] = 9876,
     effects_from: EffectsFrom = None,
     as_json: Json = False,
 ) -> None:
-    """Tell the story of the latest revisions in rerun."""
+    """Tell the story of the revisions in rerun."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     check_record(record)
-    with Campaign.open(run, catalogue) as o, working(t.progress) as say:
-        chapters = chapters_of(t, o, say)
+    with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
+        chapters = o.chapters(say, revision)
     if record is not None:
         record_story(t, chapters, record)
         t.document({"recording": str(record), "revisions": [c.number for c in chapters]})

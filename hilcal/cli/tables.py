@@ -12,7 +12,7 @@ from rich.padding import Padding
 from hilcal.campaign import Campaign
 from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.previewing import show_preview
-from hilcal.cli.terminal import Json, Run, terminal
+from hilcal.cli.terminal import Json, Revision, Run, terminal
 from hilcal.config import load_config
 from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.covariance import COVERS
@@ -159,8 +159,9 @@ def export(
     ] = None,
     parameters: Annotated[
         Path | None,
-        typer.Option("--parameters", metavar="F.csv", help="Parameters of the latest revision."),
+        typer.Option("--parameters", metavar="F.csv", help="Parameters of the model."),
     ] = None,
+    revision: Revision = None,
     force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
     as_json: Json = False,
 ) -> None:
@@ -172,8 +173,10 @@ def export(
     for path in wanted:
         if path.exists() and not force:
             raise InputError(f"{path}: the file exists; choose another name or give --force")
-    with Campaign.open(run) as opened_run:
-        record = opened_run.latest()
+    if revision is not None and parameters is None:
+        raise InputError("--revision is about the parameters; give --parameters F.csv, too")
+    with Campaign.open(run, read_only=True) as opened_run:
+        record = opened_run.in_use(revision)
         if parameters is not None and record is None:
             raise InputError(f"{run}: no revision yet, so no parameters; run hilcal identify first")
         if table is not None:

@@ -18,6 +18,12 @@ Json = Annotated[
     bool, typer.Option("--json", help="One JSON document on stdout; words and progress on stderr.")
 ]
 Run = Annotated[Path, typer.Argument(metavar="RUN.hilcal", help="The campaign file.")]
+Revision = Annotated[
+    int | None,
+    typer.Option(
+        "--revision", metavar="N", help="This revision, not the accepted or the latest one."
+    ),
+]
 Record = Annotated[
     Path | None, typer.Option("--record", metavar="F.rrd", help="Write a recording for rerun.")
 ]

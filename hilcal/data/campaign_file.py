@@ -19,6 +19,8 @@ from hilcal.data.revision import RevisionRecord, from_text, to_text, utc_now
 from hilcal.errors import InputError
 
 _TARGETS = "targets"
+_ACCEPTED = "accepted {}"
+"""Keys of the acceptances, numbered from 1; the last one holds."""
 _META = ("config", "base_dir", "source", "created", "program_version")
 
 
@@ -79,8 +81,12 @@ class CampaignFile:
         return cls.open(path)
 
     @classmethod
-    def open(cls, path: str | Path) -> Self:
+    def open(cls, path: str | Path, *, read_only: bool = False) -> Self:
         """Open a campaign and check that it is whole.
+
+        Args:
+            path: the file.
+            read_only: write nothing, see `schema.connect`.
 
         Raises:
             InputError: no such file, another format, a newer version, damaged or truncated.
@@ -97,7 +103,7 @@ class CampaignFile:
             what = "is empty" if not head else "is not a hilcal campaign (not an SQLite file)"
             raise InputError(f"{path}: the file {what}")
         with schema.sqlite_errors(path):
-            connection = schema.connect(path)
+            connection = schema.connect(path, read_only)
             try:
                 schema.check_file(connection, path)
                 return cls(path, connection)
@@ -212,9 +218,38 @@ class CampaignFile:
                 "SELECT ifnull(max(id), 0) FROM revisions"
             ).fetchone()
             number = int(last) + 1
+            if record.parent is not None:
+                schema.require(self._connection, schema.CHOSEN_REVISION)
             row = (number, text, rows.text_crc(str(number), text))
             self._connection.execute("INSERT INTO revisions VALUES (?, ?, ?)", row)
         return number
+
+    def accepted(self) -> int | None:
+        """Number of the accepted revision; None where the latest one is used."""
+        found = self._acceptances()
+        return found[-1] if found else None
+
+    def accept(self, number: int | None) -> None:
+        """Make a revision the one that is used; None lets the latest one be used again.
+
+        Raises:
+            InputError: no such revision, or the file cannot be written.
+        """
+        if number is not None:
+            self.revision(number)
+        with schema.sqlite_errors(self.path), schema.transaction(self._connection):
+            key = _ACCEPTED.format(len(self._acceptances()) + 1)
+            rows.insert_meta(self._connection, key, json.dumps(number))
+            schema.require(self._connection, schema.CHOSEN_REVISION)
+
+    def _acceptances(self) -> list[int | None]:
+        """All that was accepted, in order."""
+        with schema.sqlite_errors(self.path):
+            meta = self._read_meta()
+        found: list[int | None] = []
+        while (text := meta.get(_ACCEPTED.format(len(found) + 1))) is not None:
+            found.append(json.loads(text))
+        return found
 
     def revisions(self) -> tuple[RevisionRecord, ...]:
         """All revisions, oldest first.
@@ -278,7 +313,7 @@ class CampaignFile:
         if text is None:
             text = json.dumps(readings.target_names)
             rows.insert_meta(self._connection, _TARGETS, text)
-            self._connection.execute(f"PRAGMA user_version = {schema.SEVERAL_TARGETS}")
+            schema.require(self._connection, schema.SEVERAL_TARGETS)
         names = list(json.loads(text))
         new = [name for name in readings.target_names if name not in names]
         if new:

@@ -27,6 +27,7 @@ class RevisionRecord:
         created: ISO 8601, UTC.
         number: 1, 2, ... in one campaign; the campaign gives it.
         removed: the effect that this revision took out of the one before.
+        parent: number of the revision that it was made from; None where that is the one before.
     """
 
     effects: tuple[str, ...]
@@ -39,10 +40,18 @@ class RevisionRecord:
     created: str = field(default_factory=utc_now)
     number: int = 0
     removed: str | None = None
+    parent: int | None = None
+
+    @property
+    def made_from(self) -> int | None:
+        """Number of the revision that it was made from; None for a first model."""
+        if not self.follows or self.number <= 1:
+            return None
+        return self.number - 1 if self.parent is None else self.parent
 
     @property
     def follows(self) -> bool:
-        """Whether it was made from the revision before."""
+        """Whether it was made from another revision."""
         return self.added is not None or self.removed is not None or self.scatter_alone
 
     @property
@@ -74,6 +83,8 @@ def to_text(record: RevisionRecord) -> str:
         TypeError: a value is not of JSON.
     """
     content = {f.name: getattr(record, f.name) for f in fields(record) if f.name != "number"}
+    if record.parent is None:
+        del content["parent"]
     return json.dumps(content, allow_nan=False, sort_keys=True, ensure_ascii=False)
 
 

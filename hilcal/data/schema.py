@@ -14,7 +14,10 @@ from pathlib import Path
 from hilcal.errors import DeviceError, InputError
 
 APPLICATION_ID = 0x68696C63  # "hilc"
-VERSION = 3
+VERSION = 4
+CHOSEN_REVISION = 4
+"""Version of a file with an accepted revision, or one made from another than the one before:
+programs that know neither would go on from the latest one."""
 SEVERAL_TARGETS = 3
 """Version of a file whose readings are of several targets; all others stay at `ONE_TARGET`."""
 ONE_TARGET = 2
@@ -102,10 +105,19 @@ def sqlite_errors(path: Path) -> Iterator[None]:
         raise InputError(f"{path}: the campaign file cannot be used ({text})") from e
 
 
-def connect(path: Path) -> sqlite3.Connection:
-    """Open an existing file, every commit durable before it returns."""
+def connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
+    """Open an existing file, every commit durable before it returns.
+
+    Args:
+        path: the file.
+        read_only: write nothing, neither to the file nor beside it. A journal beside the file is
+            what a killed program left unfinished; SQLite has to undo that before anybody can
+            read, and then the file is opened for writing all the same.
+    """
+    unfinished = path.with_name(f"{path.name}-journal").exists()
+    mode = "ro" if read_only and not unfinished else "rw"
     connection = sqlite3.connect(
-        f"{path.absolute().as_uri()}?mode=rw", uri=True, isolation_level=None, timeout=5.0
+        f"{path.absolute().as_uri()}?mode={mode}", uri=True, isolation_level=None, timeout=5.0
     )
     for pragma in ("synchronous = EXTRA", "foreign_keys = ON", "trusted_schema = OFF"):
         connection.execute(f"PRAGMA {pragma}")
@@ -124,6 +136,13 @@ def transaction(connection: sqlite3.Connection) -> Iterator[None]:
         if connection.in_transaction:
             connection.execute("ROLLBACK")
         raise
+
+
+def require(connection: sqlite3.Connection, version: int) -> None:
+    """Raise the version of the schema where it is lower; older programs refuse the file then."""
+    (now,) = connection.execute("PRAGMA user_version").fetchone()
+    if now < version:
+        connection.execute(f"PRAGMA user_version = {version}")
 
 
 def check_file(connection: sqlite3.Connection, path: Path) -> None:

@@ -103,12 +103,13 @@ def test_all_scalings_stand_side_by_side(campaign: Path, capsys: Capsys) -> None
     assert "The same readings with every scaling" in words
 
 
-def test_the_baseline_is_made_and_stored_where_there_is_no_revision(
+def test_the_baseline_is_taken_where_there_is_no_revision_and_kept_by_what_changes_it(
     campaign: Path, capsys: Capsys
 ) -> None:
     result = ok(capsys, "compare", campaign, "--json")
-    assert "made the baseline" in result.err
+    assert "no revision yet: taking the baseline" in result.err
     d = result.document
+    assert d["revision"] is None
     assert {"fit", "holdout"} == set(d["error"])
     assert all(set(w) == {"variable", "share", "p_value"} for w in d["where"])
     assert d["where"][0]["share"] > 0.3
@@ -116,10 +117,11 @@ def test_the_baseline_is_made_and_stored_where_there_is_no_revision(
     assert "approach" in strongest["variable"]  # what hysteresis depends on
     assert d["worst"][0]["sigma"] > d["worst"][-1]["sigma"] > 3
     with CampaignFile.open(campaign) as stored:
-        assert len(stored.revisions()) == 1
-    again = ok(capsys, "compare", campaign, "--json")
+        assert stored.revisions() == ()
+    assert "made the baseline, revision 1" in ok(capsys, "add", campaign, "load_point").err
+    again = ok(capsys, "compare", campaign, "--revision", "1", "--json")
     assert again.document["error"]["fit"] == pytest.approx(d["error"]["fit"])
-    assert "made the baseline" not in again.err
+    assert "baseline" not in again.err
 
 
 def test_diagnose_names_the_missing_effect(campaign: Path, capsys: Capsys) -> None:

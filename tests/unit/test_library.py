@@ -54,9 +54,6 @@ def test_the_examples_of_a_docstring_run(name: str, site: SimpleNamespace) -> No
         port = probe.getsockname()[1]
     known = {"hc": hc, "np": np, "CELL": site.cell, "TABLE": site.table, "RUN": site.run}
     known["PORT"] = port
-    if name == "view":
-        with hc.Campaign.open(site.run) as run:
-            run.latest_fit()
     finder = doctest.DocTestFinder(recurse=True)
     tests = [t for t in finder.find(thing, name, module=False, globs=known) if t.examples]
     if name in WITHOUT_EXAMPLE:
@@ -93,7 +90,6 @@ def test_an_absent_viewer_is_named(site: SimpleNamespace) -> None:
     code = (
         "import sys; sys.modules['rerun'] = None\nimport hilcal as hc\n"
         f"with hc.Campaign.open({str(site.run)!r}) as run:\n"
-        "    run.latest_fit()\n"
         "    try:\n        hc.view(run).__enter__()\n"
         "    except hc.InputError as error:\n        print(error)"
     )

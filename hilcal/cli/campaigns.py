@@ -1,0 +1,52 @@
+"""`accept`: which revision of a campaign is used."""
+
+from typing import Annotated
+
+import typer
+
+from hilcal.cli.terminal import Json, Run, terminal
+from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.revision import RevisionRecord
+from hilcal.errors import InputError
+from hilcal.report import text
+
+
+def accept(
+    run: Run,
+    number: Annotated[
+        int | None, typer.Argument(metavar="N", help="The revision; the latest one if left out.")
+    ] = None,
+    release: Annotated[
+        bool, typer.Option("--release", help="Accept none: the latest one is used again.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Choose the revision that every command uses from now on, whatever is added later."""
+    t = terminal(as_json)
+    if release and number is not None:
+        raise InputError("--release accepts no revision; leave out the number")
+    with CampaignFile.open(run) as file:
+        records = file.revisions()
+        if not records:
+            raise InputError(f"{run}: no revision yet; make one with hilcal identify or refine")
+        chosen = None if release else file.revision(len(records) if number is None else number)
+        file.accept(None if chosen is None else chosen.number)
+    if chosen is None:
+        t.show(f"No revision of {run} is accepted: the latest one is used, {_named(records[-1])}.")
+    else:
+        t.show(
+            f"Accepted: {_named(chosen)}. Every command uses it unless --revision names "
+            f"another; take it back with: hilcal accept {run} --release"
+        )
+    used = records[-1] if chosen is None else chosen
+    t.document(
+        {
+            "accepted": None if chosen is None else chosen.number,
+            "in_use": used.number,
+            "latest": records[-1].number,
+        }
+    )
+
+
+def _named(record: RevisionRecord) -> str:
+    return f"revision {record.number} ({text.model_name(record.effects)})"

@@ -1,0 +1,238 @@
+"""Which revision a command reads, and that commands which only read leave the file alone."""
+
+import hashlib
+import os
+import re
+from pathlib import Path
+
+import pytest
+
+from hilcal.campaign import Campaign
+from hilcal.cli import main
+from hilcal.config import load_config
+from hilcal.data import schema
+from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.revision import from_text, to_text
+from hilcal.errors import InputError
+from tests.support.cli_cases import CELL, ok, refused, table
+
+Capsys = pytest.CaptureFixture[str]
+BASE = ["base_frame", "joint_compliance"]
+
+
+def done(*arguments: str | Path) -> None:
+    """Run a command that must succeed."""
+    with pytest.raises(SystemExit) as ended:
+        main([str(a) for a in arguments])
+    assert ended.value.code == 0
+
+
+@pytest.fixture(scope="module")
+def cell(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The cell of the demo with few candidates, which makes plans fast."""
+    path, text = tmp_path_factory.mktemp("cell") / "cell.toml", CELL.read_text(encoding="utf-8")
+    path.write_text(re.sub(r"candidates = \d+", "candidates = 60", text), encoding="utf-8")
+    assert load_config(path).planning.candidates == 60
+    return path
+
+
+@pytest.fixture(scope="module")
+def fresh(cell: Path) -> bytes:
+    """A campaign without revisions."""
+    run = cell.with_name("fresh.hilcal")
+    csv = table(run.with_suffix(".csv"), "hysteresis", poses=8)
+    done("import", csv, "--config", cell, "-o", run)
+    return run.read_bytes()
+
+
+@pytest.fixture(scope="module")
+def fitted(fresh: bytes, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """The same with three revisions: the baseline, hysteresis added, another first model."""
+    path = tmp_path_factory.mktemp("fitted") / "run.hilcal"
+    path.write_bytes(fresh)
+    done("identify", path)
+    done("add", path, "hysteresis")
+    done("identify", path, "--effects", "joint_compliance,base_compliance")
+    return path.read_bytes()
+
+
+@pytest.fixture
+def run(fitted: bytes, tmp_path: Path) -> Path:
+    path = tmp_path / "run.hilcal"
+    path.write_bytes(fitted)
+    return path
+
+
+def state(folder: Path) -> dict[str, tuple[str, int]]:
+    """Hash and time of change of every file in a folder."""
+    return {
+        p.name: (hashlib.sha256(p.read_bytes()).hexdigest(), p.stat().st_mtime_ns)
+        for p in folder.iterdir()
+    }
+
+
+READING = (
+    ("diagnose",),
+    ("compare",),
+    ("view", "--record", "{out}/story.rrd"),
+    ("export", "--table", "{out}/t.csv"),
+    ("validate", "{run}"),
+    ("next", "-o", "{out}/p.json", "--suspects", "creep,hysteresis", "--poses", "2", "--quick"),
+)
+
+
+@pytest.mark.parametrize(
+    ("command", "revisions"),
+    [*((c, True) for c in READING), *((c, False) for c in READING[:3])],
+    ids=lambda x: x[0] if isinstance(x, tuple) else ("fresh", "fitted")[x],
+)
+def test_a_command_that_reads_writes_nothing_to_the_campaign(
+    command: tuple[str, ...],
+    revisions: bool,
+    fresh: bytes,
+    fitted: bytes,
+    tmp_path: Path,
+    capsys: Capsys,
+) -> None:
+    home, out = tmp_path / "home", tmp_path / "out"
+    home.mkdir()
+    out.mkdir()
+    run = home / "run.hilcal"
+    run.write_bytes(fitted if revisions else fresh)
+    run.chmod(0o444)
+    home.chmod(0o555)
+    before = state(home)
+    name, *rest = (part.format(run=run, out=out) for part in command)
+    ok(capsys, name, run, *rest)
+    assert state(home) == before
+    home.chmod(0o755)
+
+
+def test_a_reading_connection_can_write_nothing(run: Path) -> None:
+    with Campaign.open(run, read_only=True) as o:
+        record = o.latest()
+        assert record is not None
+        with pytest.raises(InputError, match="readonly"):
+            o.file.append_revision(record)
+
+
+def test_what_a_killed_program_left_unfinished_is_undone_before_it_is_read(run: Path) -> None:
+    """A journal beside the file: SQLite must undo it, which a read-only connection cannot."""
+    before = run.read_bytes()
+    child = os.fork()
+    if child == 0:  # pragma: no cover  (killed in the middle of a transaction)
+        connection = schema.connect(run)
+        connection.execute("PRAGMA cache_size = 1")
+        connection.execute("BEGIN IMMEDIATE")
+        for k in range(400):
+            row = (f"key {k}", "x" * 3000, 0)
+            connection.execute("INSERT INTO meta VALUES (?, ?, ?)", row)
+        os._exit(9)
+    os.waitpid(child, 0)
+    assert run.with_name("run.hilcal-journal").exists()
+    assert run.read_bytes() != before
+    with Campaign.open(run, read_only=True) as o:
+        assert len(o.file.revisions()) == 3
+    assert run.read_bytes() == before
+    assert [p.name for p in run.parent.iterdir()] == ["run.hilcal"]
+
+
+def test_every_command_that_reads_a_model_takes_a_revision(
+    run: Path, cell: Path, tmp_path: Path, capsys: Capsys
+) -> None:
+    two = [*BASE, "hysteresis"]
+    for command in ("compare", "diagnose"):
+        assert ok(capsys, command, run, "--json").document["model"][-1] == "base_compliance"
+        d = ok(capsys, command, run, "--revision", "2", "--json").document
+        assert (d["revision"], d["model"]) == (2, two)
+    d = ok(capsys, "validate", run, run, "--revision", "2", "--json").document
+    assert (d["revision"], d["model"]) == (2, two)
+    story = ("view", run, "--record", tmp_path / "s.rrd", "--json")
+    assert ok(capsys, *story).document["revisions"] == [3]
+    assert ok(capsys, *story, "--revision", "2").document["revisions"] == [1, 2]
+    parameters = tmp_path / "p.csv"
+    ok(capsys, "export", run, "--parameters", parameters, "--revision", "2")
+    assert "hysteresis.j2" in parameters.read_text()
+    said = refused(capsys, 2, "export", run, "--table", tmp_path / "t.csv", "--revision", "2")
+    assert "--parameters" in said
+    plan = ("plan", cell, "-o", tmp_path / "plan.json", "--poses", "2", "--quick", "--json")
+    d = ok(capsys, *plan, "--after", run, "--revision", "2").document
+    assert any("hysteresis" in name for name in d["predicted_std"])
+    assert "--after" in refused(capsys, 2, *plan, "--revision", "2")
+    for command in ("compare", "diagnose", "view"):
+        said = refused(capsys, 2, command, run, "--revision", "9")
+        assert said.endswith("no revision 9; there are 1 to 3")
+
+
+def test_a_change_of_an_earlier_revision_follows_that_one(
+    run: Path, tmp_path: Path, capsys: Capsys
+) -> None:
+    arguments = ("add", run, "load_point", "--revision", "2", "--json")
+    before, after = ok(capsys, *arguments).document["revisions"]
+    assert (before["revision"], after["revision"]) == (2, 4)
+    assert after["model"] == [*BASE, "hysteresis", "load_point"]
+    with Campaign.open(run, read_only=True) as o:
+        assert o.file.revision(4).parent == 2
+        assert set(o.history(4).added) == {"hysteresis", "load_point"}
+    story = ("view", run, "--record", tmp_path / "s.rrd", "--json")
+    assert ok(capsys, *story).document["revisions"] == [1, 2, 4]
+    d = ok(capsys, "remove", run, "load_point", "--json").document
+    assert [r["revision"] for r in d["revisions"]] == [4, 5]
+    assert ok(capsys, *story).document["revisions"] == [1, 2, 4, 5]
+    d = ok(capsys, "refine", run, "--revision", "1", "--json").document
+    assert [r["revision"] for r in d["revisions"]] == [1, 6]
+    assert ok(capsys, *story).document["revisions"] == [1, 6]
+
+
+def test_exploring_does_not_change_what_others_use_once_a_revision_is_accepted(
+    run: Path, capsys: Capsys
+) -> None:
+    words = ok(capsys, "accept", run, "2").out
+    assert "Accepted: revision 2" in words
+    for command in ("compare", "diagnose"):
+        result = ok(capsys, command, run, "--json")
+        assert result.document["revision"] == 2
+        assert "using revision 2, which is accepted; the latest is 3" in result.err
+    ok(capsys, "add", run, "load_point")  # from the accepted one; it stays accepted
+    ok(capsys, "identify", run)
+    assert ok(capsys, "compare", run, "--json").document["revision"] == 2
+    with Campaign.open(run) as o:
+        assert o.file.revision(4).made_from == 2
+        assert o.fit().model.names == (*BASE, "hysteresis")
+        assert len(o.file.revisions()) == 5
+    d = ok(capsys, "accept", run, "--json").document  # the latest, whatever comes later
+    assert d == {"accepted": 5, "in_use": 5, "latest": 5}
+    assert ok(capsys, "compare", run, "--json").document["revision"] == 5
+    d = ok(capsys, "accept", run, "--release", "--json").document
+    assert d == {"accepted": None, "in_use": 5, "latest": 5}
+    ok(capsys, "identify", run)
+    assert ok(capsys, "compare", run, "--json").document["revision"] == 6
+
+
+def test_what_cannot_be_accepted_is_refused(run: Path, fresh: bytes, capsys: Capsys) -> None:
+    assert "there are 1 to 3" in refused(capsys, 2, "accept", run, "7")
+    assert "there are 1 to 3" in refused(capsys, 2, "accept", run, "0")
+    assert "leave out the number" in refused(capsys, 2, "accept", run, "1", "--release")
+    run.write_bytes(fresh)
+    assert "no revision yet" in refused(capsys, 2, "accept", run)
+
+
+def version(path: Path) -> int:
+    with CampaignFile.open(path, read_only=True) as file:
+        return int(file.connection.execute("PRAGMA user_version").fetchone()[0])
+
+
+def test_only_a_file_that_needs_it_is_closed_to_older_programs(run: Path, capsys: Capsys) -> None:
+    assert version(run) == schema.ONE_TARGET
+    ok(capsys, "add", run, "load_point")  # from the one before: as always
+    assert version(run) == schema.ONE_TARGET
+    ok(capsys, "accept", run, "2")
+    assert version(run) == schema.CHOSEN_REVISION
+
+
+def test_a_record_of_an_older_program_has_no_parent(run: Path) -> None:
+    with CampaignFile.open(run, read_only=True) as file:
+        record = file.revision(2)
+    assert '"parent"' not in to_text(record)
+    again = from_text(to_text(record), 2)
+    assert (again.parent, again.made_from) == (None, 1)
