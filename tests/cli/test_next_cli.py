@@ -100,8 +100,8 @@ def test_nothing_in_doubt_is_said_so(tmp_path: Path, capsys: Capsys) -> None:
 
 
 def refused_after(capsys: Capsys, *arguments: str | Path) -> str:
-    """The line of a refusal with exit 4; the first use of a campaign makes its baseline."""
-    ok(capsys, "diagnose", arguments[1])
+    """The line of a refusal with exit 4, of a campaign that has its baseline."""
+    ok(capsys, "identify", arguments[1])
     return refused(capsys, 4, *arguments)
 
 
