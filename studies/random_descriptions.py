@@ -12,14 +12,14 @@ import numpy as np
 from hilcal.cell import STANDARD_GRAVITY, Cell
 from hilcal.data.readings import Readings, States
 from hilcal.errors import CannotAnswerError
-from hilcal.identify.description import Change, Described, couplings
+from hilcal.identify.description import Change, Described
 from hilcal.identify.gate import Finding, examine
 from hilcal.identify.registration import register
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm, robot_names
 from hilcal.robot.chain import evaluate, joint_jacobian
-from hilcal.robot.conventions import with_conventions
+from hilcal.robot.conventions import may_follow, with_conventions
 from hilcal.types import Floats
 
 POSES = ("general", "one orientation", "plane", "one axis", "small region")
@@ -90,7 +90,7 @@ def random_arm(rng: np.random.Generator) -> Arm:
         return load_arm(str(rng.choice(robot_names())))
     sign, zero, coupled = rng.choice([-1.0, 1.0], 6), np.zeros(6), np.zeros((6, 6))
     if rng.random() < 0.3:
-        joint, follows = couplings(6)[rng.integers(6)]
+        joint, follows = may_follow(6)[rng.integers(6)]
         coupled[joint - 1, follows - 1] = rng.choice([-1.0, 1.0])
     return with_conventions(arm, sign, zero, coupled)
 
@@ -110,7 +110,7 @@ def random_error(kind: str, arm: Arm, rng: np.random.Generator) -> tuple[Change,
             Change("joint", j, 1, float(np.radians(rng.uniform(3, 170)) * rng.choice([-1, 1]))),
         )
     if kind == "coupling":
-        joint, follows = couplings(6)[int(rng.integers(1, 6))]
+        joint, follows = may_follow(6)[int(rng.integers(1, 6))]
         return (Change("coupling", joint, follows=follows, factor=float(rng.choice([-1.0, 1.0]))),)
     if kind == "other arm":
         names = [n for n in robot_names() if n != arm.name]

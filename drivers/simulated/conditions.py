@@ -18,7 +18,7 @@ _CROSSING = 0.01  # of the rated torque: within it a joint crosses its play
 def joint_errors(hidden: Truth, states: States, reference: float) -> Floats:
     """Return the joint displacements (N, n) that do not depend on the load, rad.
 
-    dq_j = o_j + h_j s_j + kappa_j (T_j - reference)
+    dq_j = o_j + h_j s_j + kappa_j (T_j - reference) + sum_i k_ji q_i
            + sum_k a_jk cos k q_j + b_jk sin k q_j
 
     Args:
@@ -40,6 +40,7 @@ def joint_errors(hidden: Truth, states: States, reference: float) -> Floats:
         error += hidden.hysteresis * states.approach
     if np.any(hidden.thermal_joint_drift):
         error += hidden.thermal_joint_drift * (joint_temperature(states) - reference)
+    error += np.einsum("ji,ni->nj", hidden.joint_coupling, states.q)
     order = np.arange(1, hidden.transmission_error.shape[1] + 1)
     phase = states.q[:, :, None] * order
     error += (np.cos(phase) * hidden.transmission_error[:, :, 0]).sum(axis=2)

@@ -77,6 +77,8 @@ class Draw:
             return 5e-5 * rng.uniform(0.3, 1.0, n)
         if name == "encoder_offset":
             return 2e-4 * rng.standard_normal(n)
+        if name == "joint_coupling":
+            return self._couplings(rng)
         if name == "transmission_error":
             decay = 1.0 / np.arange(1, self.harmonics + 1)[:, None]
             return 1e-4 * decay * rng.standard_normal((n, self.harmonics, 2))
@@ -89,6 +91,14 @@ class Draw:
         if name == "tracker_drift":
             return np.repeat([1e-8, 3e-9], 3) * rng.standard_normal(6)
         return self._by_load(name, rng) if name in _BY_LOAD else self._by_heat(name, rng)
+
+    def _couplings(self, rng: np.random.Generator) -> Floats:
+        """Draw k (n, n) of joints that the one before, or the last but two, takes along."""
+        n = self.arm.n
+        out = np.diag(rng.standard_normal(n - 1), -1) if n > 1 else np.zeros((n, n))
+        if n > 2:
+            out[n - 1, n - 3] = rng.standard_normal()
+        return np.asarray(2e-4 * out)
 
     def _by_load(self, name: str, rng: np.random.Generator) -> Floats:
         """Draw what depends on the load: further elasticity, and what its sensor misreads."""

@@ -42,6 +42,7 @@ follow it; a scale of parts in a million changes a deflection by as little.
 EFFECTS = (
     *DEFLECTION_EFFECTS,
     "encoder_offset",
+    "joint_coupling",
     "transmission_error",
     "link_geometry",
     "target_offset",

@@ -41,6 +41,7 @@ class Truth:
         link_compliance: (b, 2) 1/EI and 1/GJ of the long links, 1/(N·m²).
         hysteresis: (n,) h in dq = h s, rad.
         encoder_offset: (n,) rad.
+        joint_coupling: (n, n) k in dq_j = sum_i k_ji q_i, q as commanded, 1.
         transmission_error: (n, h, 2) a_k, b_k in dq = sum a_k cos k q + b_k sin k q, rad;
             q is the commanded angle.
         link_geometry: (n + 1, 6) twist of everything beyond slot k, its axes, m and rad.
@@ -70,6 +71,7 @@ class Truth:
     link_compliance: Floats
     hysteresis: Floats
     encoder_offset: Floats
+    joint_coupling: Floats
     transmission_error: Floats
     link_geometry: Floats
     load_point: Floats
@@ -100,6 +102,7 @@ class Truth:
             link_compliance=np.zeros((len(long_links(arm)), 2)),
             hysteresis=np.zeros(n),
             encoder_offset=np.zeros(n),
+            joint_coupling=np.zeros((n, n)),
             transmission_error=np.zeros((n, harmonics, 2)),
             link_geometry=np.zeros((n + 1, 6)),
             load_point=np.zeros(3),
@@ -141,6 +144,9 @@ def _labels(effect: str, shape: tuple[int, ...], arm: Arm) -> Iterator[str]:
         for j in range(shape[0]):
             for k in range(shape[1]):
                 yield from (f"j{j + 1}.cos{k + 1}", f"j{j + 1}.sin{k + 1}")
+    elif effect == "joint_coupling":
+        for j in range(shape[0]):
+            yield from (f"j{j + 1}.q{i + 1}" for i in range(shape[1]))
     elif effect == "link_geometry":
         for k in range(shape[0]):
             yield from (f"link{k}.{part}" for part in _TWIST)

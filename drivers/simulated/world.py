@@ -110,7 +110,7 @@ class World:
     def joint_errors(self, states: States) -> Floats:
         """Return the joint displacements (N, n) that do not depend on the load, rad.
 
-        dq_j = o_j + h_j s_j + kappa_j (T_j - reference)
+        dq_j = o_j + h_j s_j + kappa_j (T_j - reference) + sum_i k_ji q_i
                + sum_k a_jk cos k q_j + b_jk sin k q_j
 
         Raises:

@@ -18,7 +18,9 @@ from hilcal.types import Floats
 FORMAT = "hilcal-world"
 VERSION = 2
 _CELL = ("all_targets", "load_point", "tool_mass", "tool_com", "gravity")
-_ARM = ("links", "masses", "coms", "q_min", "q_max", "torque_max")
+_ARM = ("links", "masses", "coms", "q_min", "q_max", "torque_max", "coupling")
+_LATER = ("joint_coupling",)
+"""Parameters that world files may lack, since they were added later."""
 
 
 def write_world(path: Path, world: World, config: CellConfig, base_dir: Path | None = None) -> None:
@@ -82,9 +84,10 @@ def read_world(path: Path) -> tuple[World, CellConfig]:
         config = CellConfig.from_json(json.dumps(data["config"]))
         base_dir = None if data["base_dir"] is None else Path(data["base_dir"])
         noise = data["noise"]
+        cell = cell_from_config(config, base_dir)
         world = World(
-            cell=cell_from_config(config, base_dir),
-            physics=Truth(**{f.name: _array(data["physics"][f.name]) for f in fields(Truth)}),
+            cell=cell,
+            physics=_physics(cell, data["physics"]),
             registration=_array(data["registration"]),
             station=_array(data["station"]),
             noise=SimulatedNoise(
@@ -102,6 +105,14 @@ def read_world(path: Path) -> tuple[World, CellConfig]:
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise InputError(f"{path}: damaged: {type(error).__name__} {error}") from None
     return world, config
+
+
+def _physics(cell: Cell, data: dict[str, Any]) -> Truth:
+    """Return the hidden parameters; zero for what no world had when the file was written."""
+    rigid = Truth.rigid(cell.arm)
+    later = {name: getattr(rigid, name) for name in _LATER if name not in data}
+    given = {f.name: _array(data[f.name]) for f in fields(Truth) if f.name not in later}
+    return Truth(**given, **later)
 
 
 def _listed(array: Floats) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from hilcal.effects.encoder_offset import EncoderOffset
 from hilcal.effects.from_file import EffectFile, read_effects
 from hilcal.effects.hysteresis import Hysteresis
 from hilcal.effects.joint_compliance import JointCompliance
+from hilcal.effects.joint_coupling import JointCoupling
 from hilcal.effects.joint_stiffening import JointStiffening
 from hilcal.effects.joint_tilt_compliance import JointTiltCompliance
 from hilcal.effects.link_compliance import LinkCompliance
@@ -44,6 +45,7 @@ BUILT_IN: tuple[type[Effect], ...] = (
     BaseFrame,
     TargetOffset,
     EncoderOffset,
+    JointCoupling,
     LinkGeometry,
     TransmissionError,
     Hysteresis,

@@ -72,6 +72,14 @@ class Situation:
     compliance: Floats
 
     @property
+    def values(self) -> Floats:
+        """(N, n) the controller's joint values, rad: the actual ones where recorded.
+
+        They differ from `angle` where joints of the arm are coupled.
+        """
+        return self.states.q if self.states.q_actual is None else self.states.q_actual
+
+    @property
     def torque(self) -> Floats:
         """(N, n) static torques about the joint axes, N·m."""
         return self.wrench[:, :-1, 5]

@@ -12,7 +12,7 @@ import numpy as np
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm, robot_names
-from hilcal.robot.conventions import with_conventions
+from hilcal.robot.conventions import may_follow, with_conventions
 from hilcal.types import Floats
 
 Kind = Literal[
@@ -144,7 +144,7 @@ def changes(d: Described) -> Iterator[Change]:
             for quarter in (0, 2, 1, -1):
                 if sign < 0 or quarter:
                     yield Change("joint", j, sign, quarter * np.pi / 2)
-    for joint, follows in couplings(n):
+    for joint, follows in may_follow(n):
         for factor in (1.0, -1.0):
             yield Change("coupling", joint, follows=follows, factor=factor)
     yield Change("millimetres")
@@ -170,8 +170,3 @@ def pairs(n: int) -> Iterator[tuple[Change, ...]]:
             for b in (1, -1, 2):
                 zeros = (a * np.pi / 2, b * np.pi / 2)
                 yield Change("joint", j, 1, zeros[0]), Change("joint", j + 1, 1, zeros[1])
-
-
-def couplings(n: int) -> tuple[tuple[int, int], ...]:
-    """Joints and the joints that they may follow: the one before, and the last but one wrist."""
-    return tuple((j, j - 1) for j in range(2, n + 1)) + (((n, n - 2),) if n > 2 else ())

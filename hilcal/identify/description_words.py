@@ -6,12 +6,15 @@ from dataclasses import asdict
 import numpy as np
 
 from hilcal.cell import Cell
+from hilcal.config.joints import Conventions
 from hilcal.data.readings import Readings
 from hilcal.errors import InputError
 from hilcal.identify.description import Change
 from hilcal.identify.gate import Explanation, Finding, examine
 from hilcal.identify.registration import Registration
 
+SIGN, OFFSET, COUPLING = Conventions.model_fields
+"""Keys that say how joints are counted, in their order there."""
 MOST_NAMED = 8
 """Rows, or explanations, that are named; a choice."""
 TRIED = (
@@ -114,21 +117,21 @@ def keys(changes: tuple[Change, ...], cell: Cell) -> dict[str, str]:
         if c.kind == "joint":
             if c.offset:
                 zero[j] += sign[j] * np.degrees(c.offset)
-                said.add("joint_offset_deg")
+                said.add(OFFSET)
             if c.sign < 0:
                 sign[j] *= -1
-                said.add("joint_sign")
+                said.add(SIGN)
         elif c.kind == "coupling":
             factor = float(sign[j] * c.factor)
             coupled.append({"joint": c.joint, "follows": c.follows, "factor": factor})
-            said.add("joint_coupling")
+            said.add(COUPLING)
     entries = ", ".join(
         "{ " + ", ".join(f"{k} = {v}" for k, v in entry.items()) + " }" for entry in coupled
     )
     out = {
-        "joint_sign": json.dumps([int(s) for s in sign]),
-        "joint_offset_deg": json.dumps([round(float(z), 4) + 0.0 for z in zero]),
-        "joint_coupling": f"[{entries}]",
+        SIGN: json.dumps([int(s) for s in sign]),
+        OFFSET: json.dumps([round(float(z), 4) + 0.0 for z in zero]),
+        COUPLING: f"[{entries}]",
     }
     return {key: value for key, value in out.items() if key in said}
 

@@ -80,6 +80,15 @@ def with_conventions(arm: Arm, sign: Floats, offset: Floats, coupling: Floats) -
     return replace(arm, links=links, coms=coms, coupling=None if one else follows)
 
 
+def may_follow(n: int) -> tuple[tuple[int, int], ...]:
+    """Joints of arms with couplings, and the joints that they follow, from 1.
+
+    The one before it (parallelograms, wrists driven through one another), and the last joint the
+    last but two (a wrist whose three motors stand in the forearm).
+    """
+    return tuple((j, j - 1) for j in range(2, n + 1)) + (((n, n - 2),) if n > 2 else ())
+
+
 def _about_z(angle: float) -> Floats:
     c, s = math.cos(angle), math.sin(angle)
     turn = np.eye(4)

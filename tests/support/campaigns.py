@@ -146,4 +146,13 @@ def true_parameters(world: World, effect: str, *, m: int = 3) -> Floats:
     truth = np.asarray(getattr(world.physics, effect)).reshape(-1)
     if effect == "target_offset" and m == 6:
         return np.concatenate([truth, np.zeros(3)])
+    if effect == "joint_coupling":
+        return truth[followed(len(world.physics.encoder_offset))]
     return truth
+
+
+def followed(n: int) -> Ints:
+    """Where among n x n factors, row by row, those of joints behind one another are."""
+    pairs = np.eye(n, k=-1)
+    pairs[n - 1, n - 3] = 1.0
+    return np.flatnonzero(pairs)

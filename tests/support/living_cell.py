@@ -99,6 +99,7 @@ def everything(rng):
         "link_compliance": 8e-6,
         "hysteresis": 5e-5,
         "encoder_offset": 2e-4,
+        "joint_coupling": 1e-4,
         "transmission_error": 1e-4,
         "link_geometry": 3e-4,
         "load_point": 5e-3,

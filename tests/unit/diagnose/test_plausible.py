@@ -21,7 +21,7 @@ from studies.study_cases import study_case
 from tests.support.campaigns import campaign, configuration
 from tests.support.paths import ROOT
 
-SECOND_ORDER = {"link_geometry", "encoder_offset", "link_mass"}
+SECOND_ORDER = {"link_geometry", "encoder_offset", "joint_coupling", "link_mass"}
 
 
 def unmodelled(law: str, robot: str) -> Fit:

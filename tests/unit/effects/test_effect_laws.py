@@ -12,7 +12,7 @@ from hilcal.cell import Cell
 from hilcal.data.readings import States
 from hilcal.effects.protocol import Situation
 from hilcal.model import Model
-from tests.support.campaigns import true_parameters
+from tests.support.campaigns import followed, true_parameters
 from tests.support.effect_cases import CELLS, NAMES, make, options_of, situation, some_states
 
 # --- laws, against the simulated world ------------------------------------------------------
@@ -35,6 +35,9 @@ def truth_of(name: str, cell: Cell, rng: np.random.Generator, scale: float) -> n
     drawn = rng.normal(size=len(ordinary))
     if name == "joint_compliance":  # an arm that gives way, also where it stiffens
         drawn = 1 + np.abs(drawn)
+    if name == "joint_coupling":
+        zero.reshape(-1)[followed(cell.arm.n)] = scale * ordinary * drawn
+        return zero
     return (scale * ordinary * drawn).reshape(zero.shape)
 
 
@@ -42,7 +45,9 @@ def both(names: tuple[str, ...], cell: Cell, states: States, scale: float) -> Bo
     rng = np.random.default_rng(11)
     truth = Truth.rigid(cell.arm)
     for name in names:
-        truth = truth.with_effect(name, truth_of(name, cell, rng, scale))
+        # Apart, so that the others are drawn as without it: a gear may not stiffen too much.
+        own = np.random.default_rng(13) if name == "joint_coupling" else rng
+        truth = truth.with_effect(name, truth_of(name, cell, own, scale))
     world = World(cell, truth, cell.registration, np.eye(4), SimulatedNoise(), np.zeros(cell.arm.n))
     model = Model(cell, tuple(make(n, cell, states, options_of(n)) for n in names))
     theta = np.concatenate([true_parameters(world, n) for n in names])

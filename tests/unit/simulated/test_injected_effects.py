@@ -91,6 +91,9 @@ def test_effects_without_load_follow_their_laws():
     dq = sum(ab[:, k - 1, 0] * np.cos(k * q) + ab[:, k - 1, 1] * np.sin(k * q) for k in (1, 2))
     world = rigid_world(transmission_error=ab)
     same(world, by_hand(world, STATES, dq))
+    k = 1e-3 * rng.standard_normal((6, 6))
+    world = rigid_world(joint_coupling=k)
+    same(world, by_hand(world, STATES, np.array([[row @ at for row in k] for at in q])))
     twist = 1e-2 * rng.standard_normal((7, 6))
     world = rigid_world(link_geometry=twist)
     links = [link @ exp(t) for link, t in zip(CELL.arm.links, twist, strict=True)]

@@ -257,6 +257,7 @@ def test_parameters_are_named_in_the_order_of_their_arrays():
         "periodic_joint_compliance": " ".join(f"j{j}.cos2 j{j}.sin2" for j in range(1, 7)),
         "backlash": "j1 j2 j3 j4 j5 j6",
         "creep": "k",
+        "joint_coupling": " ".join(f"j{j}.q{i}" for j in range(1, 7) for i in range(1, 7)),
         "thermal_growth": "alpha",
         "thermal_joint_drift": "j1 j2 j3 j4 j5 j6",
         "link_mass": " ".join(f"link{k}.{axis}" for k in range(1, 7) for axis in "xyz"),

@@ -59,6 +59,19 @@ def test_another_file_is_no_world(tmp_path, text):
         read_world(tmp_path / "world.json")
 
 
+def test_a_world_written_before_an_effect_was_known_has_none_of_it(tmp_path):
+    path = tmp_path / "world.json"
+    world = world_of(config(), **everything(np.random.default_rng(3)))
+    write_world(path, world, config())
+    content = json.loads(path.read_text())
+    del content["physics"]["joint_coupling"]
+    path.write_text(json.dumps(content))
+    back = read_world(path)[0]
+    assert back.truth == {
+        k: v for k, v in world.truth.items() if not k.startswith("joint_coupling")
+    }
+
+
 def test_a_damaged_world_says_so(tmp_path):
     path = tmp_path / "world.json"
     write_world(path, world_of(config()), config())

@@ -1,0 +1,77 @@
+"""`joint_coupling`: a joint is taken along by another one."""
+
+import re
+from typing import ClassVar
+
+import numpy as np
+
+from hilcal.data.readings import States
+from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
+from hilcal.errors import InputError
+from hilcal.robot.conventions import may_follow
+
+_PAIR = re.compile(r"([0-9]{1,3}):([0-9]{1,3})")
+
+
+class JointCoupling(Effect):
+    """dq_j = Σ_i k_ji q_i, for the pairs (j, i) of the option `pairs` [rad].
+
+    q are the controller's values, so that k_ji is what the factor of a coupling in the arm's
+    description is off by (`[robot] joint_coupling`, 0 where there is none); i = j is an error of a
+    joint's own ratio.
+
+    Unless given, the pairs are those of `may_follow`: couplings that arms have. Errors of a joint's
+    own ratio are not among them: gears have whole numbers of teeth, and the first harmonics of
+    `transmission_error` describe a slope over the range of a joint.
+    """
+
+    name = "joint_coupling"
+    summary = "dq_j = Σ k_ji q_i: a joint is taken along by another one"
+    plausible = 50.0
+    """0.01: a strain wave gear of ratio 100 whose reaction on the next joint is not made up for.
+    More is a wrong description, which the gate before the fit names."""
+    option_help: ClassVar = {
+        "pairs": "which joint is taken along by which, as 3:2/6:5 for joint 3 by joint 2 and joint "
+        "6 by joint 5; 4:4 is an error of joint 4's own ratio. Unless given, each joint by the one "
+        "before it, and the last joint by the last but two."
+    }
+
+    def setup(self, states: States) -> None:
+        """Read the pairs."""
+        n = self.cell.arm.n
+        usual = "/".join(f"{j}:{i}" for j, i in may_follow(n)) or "1:1"
+        given = self.options.setdefault("pairs", usual)
+        found = _pairs(given, n)
+        if not found:
+            raise InputError(
+                f"effect {self.name}: pairs = {given!r}; valid: pairs of joints 1 to {n}, each "
+                "once, as 3:2/6:5 for joint 3 taken along by joint 2, joint 6 by joint 5"
+            )
+        self.options["pairs"] = "/".join(f"{j}:{i}" for j, i in found)
+        self._pairs = np.array(found) - 1
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """One factor per pair; 2e-4, a length of 0.04 mm in 200 mm of a parallelogram, is usual."""
+        return tuple(
+            Parameter(
+                f"j{j}.q{i}",
+                "1",
+                2e-4,
+                f"own ratio of joint {j}" if i == j else f"joint {j} per turn of joint {i}",
+            )
+            for j, i in self._pairs + 1
+        )
+
+    def columns(self, s: Situation) -> tuple[Columns, ...]:
+        """Controller's values: ∂dq_j/∂k_ji = q_i."""
+        turned, by = self._pairs.T
+        return (Columns("dq", np.arange(len(turned)), turned, s.values[:, by]),)
+
+
+def _pairs(given: object, n: int) -> list[tuple[int, int]]:
+    """Return the pairs (j, i) that are written, or none where they are not valid."""
+    found = [_PAIR.fullmatch(p.strip()) for p in given.split("/")] if isinstance(given, str) else []
+    pairs = sorted((int(p[1]), int(p[2])) for p in found if p)
+    good = len(pairs) == len(found) == len(set(pairs))
+    return pairs if good and all(1 <= k <= n for p in pairs for k in p) else []
