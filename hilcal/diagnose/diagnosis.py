@@ -120,6 +120,11 @@ class Diagnosis:
         return tuple(s.effect for s in self.suspects if s.passes)
 
     @property
+    def tested(self) -> int:
+        """Number of effects that were tested; the level of the test is shared by them."""
+        return sum(s.score.rank > 0 for s in self.suspects)
+
+    @property
     def lead(self) -> Suspect | None:
         """The first suspect, where it passes all tests."""
         return self.suspects[0] if self.suspects and self.suspects[0].passes else None

@@ -1,5 +1,6 @@
 """From fits and diagnoses to the `Story` that the viewer draws."""
 
+import itertools
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +11,7 @@ from hilcal.cell import Cell
 from hilcal.data.revision import change
 from hilcal.data.whitening import Mode
 from hilcal.diagnose.diagnosis import Diagnosis
-from hilcal.diagnose.effect_ranking import Suspect, candidates
+from hilcal.diagnose.effect_ranking import FALSE_ALARM, Suspect, candidates
 from hilcal.diagnose.residual_regression import Dependence
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit, mahalanobis2
@@ -106,15 +107,22 @@ def build_story(chapters: Sequence[Chapter]) -> Story:
         ),
         target=None if readings.states.target is None else readings.target[rows],
         target_names=readings.target_names,
+        pose_names=tuple(readings.pose_names[k] for k in readings.pose[rows]),
     )
 
 
 def pose_numbers(names: Sequence[str]) -> Ints:
-    """Number of each pose: that which its name ends in, where all have their own; else 1, 2, ..."""
+    """Number of each pose, by which the viewer orders them.
+
+    It is that which its name ends in, 13 of "p13". A pose without, as the reference, has the
+    smallest number from 0 that is free. Where two names end in the same number: 1, 2, ...
+    """
     ends = [re.search(r"[0-9]+$", name) for name in names]
-    numbers = [int(end.group()) for end in ends if end is not None]
-    if len(set(numbers)) < len(names) or max(numbers) >= MOST_NUMBER:
+    given = [int(end.group()) for end in ends if end is not None]
+    if not given or len(set(given)) < len(given) or max(given) >= MOST_NUMBER:
         return np.arange(1, len(names) + 1)
+    free = (k for k in itertools.count() if k not in set(given))
+    numbers = [next(free) if end is None else int(end.group()) for end in ends]
     return np.array(numbers, dtype=np.int64)
 
 
@@ -156,6 +164,8 @@ def _revision(c: Chapter, e: FullPrediction, axes: Floats, measured: Floats) -> 
         if d is None
         else tuple(StoryRival(r.effect, r.unlike, r.times) for r in d.separability),
         limits=() if d is None else _limits(d),
+        tested=0 if d is None else d.tested,
+        level=FALSE_ALARM,
     )
 
 

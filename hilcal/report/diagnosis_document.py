@@ -6,7 +6,7 @@ from dataclasses import asdict
 import numpy as np
 
 from hilcal.diagnose.diagnosis import Diagnosis
-from hilcal.diagnose.effect_ranking import Suspect
+from hilcal.diagnose.effect_ranking import FALSE_ALARM, Suspect
 from hilcal.diagnose.minimum_detectable_effect import Strength
 from hilcal.diagnose.noise import PureError
 from hilcal.diagnose.residual_regression import Dependence
@@ -28,6 +28,11 @@ def to_json(d: Diagnosis) -> dict[str, object]:
             for v in d.misfit_breakdown
         ],
         "suspects": [suspect_json(s) for s in d.suspects],
+        "tests": {
+            "count": d.tested,
+            "level": FALSE_ALARM,
+            "each": FALSE_ALARM / max(d.tested, 1),
+        },
         "apart": [
             {"effect": a.effect, "unlike": a.unlike, "times": a.times if a.possible else None}
             for a in d.separability

@@ -78,6 +78,21 @@ def chance(p: float) -> str:
     return f"{p:.0e}" if p < 1e-3 else f"{p:.2g}"
 
 
+def p_equals(p: float) -> str:
+    """Write "p = " or "p < " with a p-value, in the digits of the tables."""
+    told = chance(p)
+    return f"p {told}" if told.startswith("<") else f"p = {told}"
+
+
+def many_tests(count: int, level: float, what: str = "effects") -> str:
+    """Say how many were tested, and at which level one counts so that chance names none."""
+    each = digits(level / max(count, 1), 1)
+    return (
+        f"{count} {what} were tested: one counts from p < {each}, which is {level:g} / {count}, so "
+        f"that chance alone names any of them once in {1 / level:.0f} diagnoses."
+    )
+
+
 def condition(value: float | None) -> str:
     """Write a condition number."""
     return "-" if value is None else digits(value, 2)

@@ -138,6 +138,8 @@ class StoryRevision:
             explains little of it or there is none; else empty.
         rivals: effects that the readings do not separate from the leading suspect.
         limits: from which strength the effects that were not found would have been named.
+        tested: how many effects were tested; 0 where it was not diagnosed.
+        level: chance of naming any of them where none is missing.
     """
 
     revision: int
@@ -157,6 +159,8 @@ class StoryRevision:
     curves: tuple[StoryCurve, ...] = ()
     rivals: tuple[StoryRival, ...] = ()
     limits: tuple[StoryLimit, ...] = ()
+    tested: int = 0
+    level: float = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -176,6 +180,7 @@ class Story:
         revisions: the revisions, in growing order.
         target: (N,) number of the target that was read, into `target_names`; None for one.
         target_names: names of several targets.
+        pose_names: (N,) name of each reading's pose; empty where its number is its name.
     """
 
     arm: Arm
@@ -190,6 +195,11 @@ class Story:
     revisions: tuple[StoryRevision, ...]
     target: Ints | None = None
     target_names: tuple[str, ...] = ()
+    pose_names: tuple[str, ...] = ()
+
+    def pose_name(self, i: int) -> str:
+        """Return the name of reading i's pose, as everywhere else."""
+        return self.pose_names[i] if self.pose_names else str(self.pose[i])
 
     def __len__(self) -> int:
         """Return the number of readings N."""
@@ -209,6 +219,8 @@ def check(story: Story) -> None:
         raise InputError("story.revisions: empty; at least one fitted revision is needed")
     if len(story.load_names) != n:
         raise InputError(f"story.load_names: {len(story.load_names)} names for {n} readings")
+    if len(story.pose_names) not in (0, n):
+        raise InputError(f"story.pose_names: {len(story.pose_names)} names for {n} readings")
     _array("story.q", story.q, (n, story.arm.n))
     _array("story.anchor", story.anchor, (n, 3))
     _array("story.measured", story.measured, (n, 3))

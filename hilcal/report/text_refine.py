@@ -6,7 +6,7 @@ from rich.console import RenderableType
 from rich.text import Text
 
 from hilcal.diagnose.diagnosis import Diagnosis
-from hilcal.diagnose.effect_ranking import LEAST_SHARE, Suspect
+from hilcal.diagnose.effect_ranking import FALSE_ALARM, LEAST_SHARE, Suspect
 from hilcal.identify.fit import Fit
 from hilcal.identify.full_prediction import full_prediction
 from hilcal.report import numbers, text
@@ -78,7 +78,8 @@ def diagnosis_report(d: Diagnosis) -> Iterator[RenderableType]:
         yield suspects_table(d)
         yield Text(
             "explains: share of the misfit, the error beyond noise, that adding the effect would "
-            "remove; p-value: chance of that much if it were not there.\n",
+            "remove; p-value: chance of that much if it were not there. "
+            f"{numbers.many_tests(d.tested, FALSE_ALARM)}\n",
             style="dim",
         )
     if d.verdict != "adequate":

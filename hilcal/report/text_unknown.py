@@ -24,7 +24,7 @@ def repeats(e: PureError) -> Iterator[str]:
         low, high = (v**0.5 for v in e.where.interval)
         yield (
             f"Most of all {e.where.name}: {e.where.factor**0.5:.2f} times as much as stated "
-            f"(95 % interval {low:.2f} to {high:.2f}; p = {numbers.chance(e.where.p_value)})."
+            f"(95 % interval {low:.2f} to {high:.2f}; {numbers.p_equals(e.where.p_value)})."
         )
 
 

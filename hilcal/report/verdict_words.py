@@ -7,7 +7,7 @@ from hilcal.diagnose.noise_verdict import NoiseVerdict
 from hilcal.diagnose.pose_alone import PoseAlone
 from hilcal.diagnose.separability import Separability
 from hilcal.diagnose.stepwise_alternatives import Alternative
-from hilcal.report.numbers import sizes
+from hilcal.report.numbers import p_equals, sizes
 from hilcal.report.scatter_words import left_to_the_arm, no_repeatability
 
 
@@ -42,7 +42,7 @@ def message(d: Diagnosis) -> str:
 def _explains(s: Suspect) -> str:
     return (
         f"explains {100 * s.share:.0f} % of the misfit, {100 * max(s.holdout_share, 0):.0f} % on "
-        f"poses left out (p = {s.score.p_value:.1g})"
+        f"poses left out ({p_equals(s.score.p_value)})"
     )
 
 

@@ -1,4 +1,4 @@
-"""The flat views: bars per pose, error per revision, parameters."""
+"""The flat views: bars per pose, error per revision, residual, parameters."""
 
 import numpy as np
 import rerun as rr
@@ -6,68 +6,28 @@ import rerun as rr
 from hilcal.report.story import StoryParameter, StoryRevision
 from hilcal.report.viewer import style
 from hilcal.report.viewer.digest import Digest
+from hilcal.report.viewer.errors import error_now
 from hilcal.report.viewer.flat import BELOW, FOOT, HEIGHT, RAISED, WIDTH, nothing, write
 from hilcal.report.viewer.residuals import residual_chart
 from hilcal.types import Floats, Ints
 
-SERIES = (
-    ("fit", "fitted poses, rms", style.MEASURED, 3.0),
-    ("holdout", "poses left out, rms", style.HOLDOUT, 3.0),
-    ("worst", "worst reading", style.RED, 1.5),
-    ("noise", "noise floor, rms", style.NOISE, 2.0),
-)
 _FOREST_SIGMAS = 10.0
 _FOREST_ROWS = 10
 
 
-def static_charts(rec: rr.RecordingStream, revisions: int) -> None:
-    """Log the names and colours of the series; one revision makes a dot, not a line."""
-    for name, words, color, width in SERIES:
-        line = rr.SeriesLines(names=[words], colors=[color], widths=[width])
-        dots = rr.SeriesPoints(names=[words], colors=[color], marker_sizes=[3.5])
-        bare = name == "noise" and revisions > 1
-        rec.log(f"error/{name}", line, *([] if bare else [dots]), static=True)
-    rec.log(
-        "error/along/residual",
-        rr.SeriesLines(names=["residual, rms"], colors=[style.MEASURED], widths=[1.5]),
-        static=True,
-    )
-    rec.log(
-        "error/along/noise",
-        rr.SeriesLines(names=["noise floor, rms"], colors=[style.NOISE], widths=[2.0]),
-        static=True,
-    )
-
-
 def revision_charts(rec: rr.RecordingStream, d: Digest, r: StoryRevision) -> None:
     """Log one revision at the recording's current time."""
+    error_now(rec, d, r)
     pose_bars(rec, d, r)
     residual_chart(rec, d, r)
     parameter_chart(rec, r)
 
 
-def error_series(rec: rr.RecordingStream, d: Digest, r: StoryRevision) -> None:
-    """Log one revision's errors, µm."""
-    values = {
-        "fit": r.error_fit["rms_m"],
-        "holdout": r.error_holdout["rms_m"],
-        "worst": r.error_fit["max_m"],
-        "noise": d.story.noise_floor_m,
-    }
-    for name, value in values.items():
-        rec.log(f"error/{name}", rr.Scalars(value * 1e6))
-
-
 def pose_charts(rec: rr.RecordingStream, d: Digest) -> None:
-    """Send the last revision's residual along `pose`, and the bar of the current pose."""
-    rms = d.pose_rms(d.story.revisions[-1]) * 1e6
-    time = [rr.TimeColumn("pose", sequence=d.poses)]
-    for name, series in (("residual", rms), ("noise", rms * 0 + 1e6 * d.story.noise_floor_m)):
-        rec.send_columns(
-            f"error/along/{name}", indexes=time, columns=rr.Scalars.columns(scalars=series)
-        )
+    """Send the bar of the current pose along `pose`, with the last revision."""
+    sigma = np.sqrt(d.pose_norm2(d.story.revisions[-1]))
     starts, left, width = _bar_places(d)
-    for k, height in enumerate(np.maximum.reduceat(rms, starts)):
+    for k, height in enumerate(np.maximum.reduceat(sigma, starts)):
         rec.set_time("pose", sequence=int(d.poses[starts[k]]))
         one = slice(k, k + 1)
         bar = rr.BarChart([height], abscissa=left[one], widths=width[one], color=style.MEASURED)
@@ -76,10 +36,13 @@ def pose_charts(rec: rr.RecordingStream, d: Digest) -> None:
 
 
 def pose_bars(rec: rr.RecordingStream, d: Digest, r: StoryRevision) -> None:
-    """Log the bars, one series per level of Mahalanobis distance; a bar is its worst pose."""
+    """Log the worst reading of each pose in σ, its Mahalanobis distance, one series per level.
+
+    The tallest bar is the worst reading of all. A bar of several poses is that of the worst.
+    """
     starts, left, width = _bar_places(d)
-    height = np.maximum.reduceat(d.pose_rms(r) * 1e6, starts)
-    level = style.levels(np.maximum.reduceat(d.pose_norm2(r), starts))
+    norm2 = np.maximum.reduceat(d.pose_norm2(r), starts)
+    height, level = np.sqrt(norm2), style.levels(norm2)
     for i, name in enumerate(style.LEVEL_NAMES):
         of = np.flatnonzero(level == i)
         some = of if len(of) else np.arange(1)

@@ -21,15 +21,16 @@ _GRID = (70, 72, 80)
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """Ranges of x and y that fill the picture."""
+    """Ranges of x and y that fill a picture of some width."""
 
     x: tuple[float, float]
     y: tuple[float, float]
+    width: float = WIDTH
 
     def place(self, x: Floats, y: Floats) -> Floats:
         """(K, 2) points of the picture."""
         (a, b), (c, d) = self.x, self.y
-        return np.stack([(x - a) / (b - a) * WIDTH, (d - y) / (d - c) * HEIGHT], axis=1)
+        return np.stack([(x - a) / (b - a) * self.width, (d - y) / (d - c) * HEIGHT], axis=1)
 
     def lines(self, x: Floats, y: Floats) -> rr.LineStrips2D:
         """Return thin lines at ticks of x and y, brighter where they are zero, and the left."""
@@ -67,18 +68,24 @@ def numbers_at(values: Floats) -> list[str]:
 
 
 def write(
-    rec: rr.RecordingStream, path: str, places: list[tuple[float, float]], texts: list[str]
+    rec: rr.RecordingStream,
+    path: str,
+    places: list[tuple[float, float]],
+    texts: list[str],
+    colors: list[style.Color] | None = None,
+    static: bool = False,
 ) -> None:
-    """Log words at places of the picture."""
+    """Log words at places of the picture, grey unless they have colours."""
     rec.log(
         path,
         rr.Points2D(
             places,
             labels=[style.safe(t) for t in texts],
             radii=rr.Radius.ui_points(0.1),
-            colors=[style.GREY],
+            colors=colors or [style.GREY],
             show_labels=True,
         ),
+        static=static,
     )
 
 

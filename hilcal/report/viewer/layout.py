@@ -1,39 +1,44 @@
 """The blueprint: which view stands where, and what its title says."""
 
 import numpy as np
-import rerun as rr
 import rerun.blueprint as rrb
 
-from hilcal.report.viewer import charts, flat, style
+from hilcal.report.viewer import errors, flat
 from hilcal.report.viewer.digest import Digest
 from hilcal.report.viewer.scene import center
 
 FOLLOWS = "Residual against suspect"
 LIMITS = "Could have been seen"
+ERRORS = "Error of each revision [µm, logarithmic]; framed: this one"
 _EYE = np.array([1.05, -1.35, 0.55])
-_CHART_TOP = 4.0  # the error axis reaches at most so many times the second revision's error
 # Views that draw with light colours stay dark in the light theme too.
 _DARK = rrb.Background(color=(22, 24, 29), kind=rrb.BackgroundKind.SolidColor)
 
 
 def blueprint(d: Digest) -> rrb.Blueprint:
-    """Left: 3-D over bars per pose. Right: the verdict, error per revision, details."""
+    """Left: 3-D over the error of each revision. Right: the verdict over residual and details.
+
+    It opens at the first revision and stands there.
+    """
     left = rrb.Vertical(
         rrb.Tabs(_residuals(d), _deflections(d)),
-        rrb.BarChartView(
-            origin="bars",
-            name=bars_title(d),
-            plot_legend=rrb.PlotLegend(visible=False),
+        rrb.Tabs(
+            _flat(errors.ORIGIN, ERRORS, errors.WIDTH, errors.BOUNDS),
+            rrb.BarChartView(
+                origin="bars",
+                name=bars_title(d),
+                plot_legend=rrb.PlotLegend(visible=False),
+            ),
         ),
-        row_shares=[3, 1],
+        row_shares=[11, 4],
     )
     right = rrb.Vertical(
         rrb.Tabs(
             rrb.TextDocumentView(origin="words/verdict", name="Verdict"),
+            rrb.TextDocumentView(origin="words/details", name="Details"),
             rrb.TextDocumentView(origin="words/limits", name=LIMITS),
             rrb.TextDocumentView(origin="words/guide", name="How to read this"),
         ),
-        _errors(d),
         rrb.Tabs(
             _flat("regressor", FOLLOWS),
             _flat("parameters", "Parameters in σ (whiskers ±2 σ)"),
@@ -41,11 +46,11 @@ def blueprint(d: Digest) -> rrb.Blueprint:
             rrb.TextDocumentView(origin="words/revisions", name="Table"),
             rrb.TextLogView(origin="log", name="Log"),
         ),
-        row_shares=[11, 8, 8],
+        row_shares=[5, 4],
     )
     return rrb.Blueprint(
         rrb.Horizontal(left, right, column_shares=[3, 2]),
-        rrb.TimePanel(timeline="revision", state="collapsed", fps=1.0),
+        rrb.TimePanel(timeline="revision", state="collapsed", fps=1.0, play_state="paused"),
         rrb.SelectionPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),
         auto_views=False,
@@ -69,16 +74,8 @@ def deflection_title(d: Digest) -> str:
 
 def bars_title(d: Digest) -> str:
     """Return the title of the bars, with what one bar stands for."""
-    part = f", worst of {d.poses_per_bar} poses per bar" if d.poses_per_bar > 1 else ""
-    return f"Residual per pose [µm]{part}: grey noise, amber doubtful, red model wrong"
-
-
-def error_top(d: Digest) -> float:
-    """Return the top of the error axis, µm: what is left stays legible, a first huge error not."""
-    rms = [max(r.error_fit["rms_m"], r.error_holdout["rms_m"]) for r in d.story.revisions]
-    worst = max(r.error_fit["max_m"] for r in d.story.revisions)
-    later = max([*(rms[1:] or rms), d.story.noise_floor_m])
-    return 1.1e6 * min(max(worst, *rms, later), _CHART_TOP * later) or 1.0
+    part = f" ({d.poses_per_bar} poses per bar)" if d.poses_per_bar > 1 else ""
+    return f"Worst reading of each pose, in σ{part}: grey noise, amber doubtful, red model wrong"
 
 
 def _view3d(d: Digest, name: str, hidden: str) -> rrb.Spatial3DView:
@@ -108,31 +105,13 @@ def _deflections(d: Digest) -> rrb.Spatial3DView:
     return _view3d(d, deflection_title(d), "residual")
 
 
-def _errors(d: Digest) -> rrb.TimeSeriesView:
-    top = error_top(d)
-    first = d.story.revisions[0]
-    beyond = 1e6 * max(first.error_fit["rms_m"], first.error_holdout["rms_m"]) > top
-    name = "Error per revision [µm]; on timeline pose: per pose"
-    if beyond:
-        name += f" (begins at {style.micrometres(first.error_fit['rms_m'])}, above the picture)"
-    return rrb.TimeSeriesView(
-        origin="error",
-        name=name,
-        axis_y=rrb.ScalarAxis(range=(0.0, top), zoom_lock=False),
-        plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop),
-        overrides={
-            f"error/{name}": [rr.SeriesLines.from_fields(), rr.SeriesPoints.from_fields()]
-            for name, *_ in charts.SERIES
-            if name != "noise" or len(d.story.revisions) == 1
-        },
-    )
-
-
-def _flat(origin: str, name: str) -> rrb.Spatial2DView:
-    w = flat.WIDTH
+def _flat(
+    origin: str, name: str, w: float = flat.WIDTH, y: tuple[float, float] = flat.BOUNDS
+) -> rrb.Spatial2DView:
+    x = 0.03 * w + 7.0
     return rrb.Spatial2DView(
         origin=origin,
         name=name,
         background=_DARK,
-        visual_bounds=rrb.VisualBounds2D(x_range=(-0.06 * w, 1.06 * w), y_range=flat.BOUNDS),
+        visual_bounds=rrb.VisualBounds2D(x_range=(-x, w + x), y_range=y),
     )

@@ -12,6 +12,8 @@ from hilcal.types import Floats
 
 _DEFLECTION_CAP = 0.6
 _LABEL_ABOVE = np.array([0.0, 0.0, 0.3])
+_DOT = 0.012  # m, half the distance of two dots of a leader
+LEADER_RADIUS = rr.Radius.ui_points(0.5)
 
 
 def static_scene(rec: rr.RecordingStream, d: Digest) -> None:
@@ -52,19 +54,17 @@ def revision_scene(rec: rr.RecordingStream, d: Digest, r: StoryRevision) -> None
         ),
     )
     level = int(style.levels(r.whitened_norm2[worst : worst + 1])[0])
-    color = style.LABEL_COLORS[level]
-    at = story.anchor[worst]
     rec.log(
         "world/residual/worst",
         _label(
-            at + _LABEL_ABOVE,
-            f"worst: pose {story.pose[worst]}, {pose_words(d, r, worst)}",
-            color,
+            story.anchor[worst] + _LABEL_ABOVE,
+            f"worst: pose {story.pose_name(worst)}, {pose_words(d, r, worst)}",
+            style.LABEL_COLORS[level],
         ),
     )
     rec.log(
         "world/residual/leader",
-        rr.LineStrips3D([[at, at + _LABEL_ABOVE]], colors=[color], radii=rr.Radius.ui_points(1.0)),
+        rr.LineStrips3D(list(leader(d, worst)), colors=[style.LEADER], radii=LEADER_RADIUS),
     )
     _deflections(rec, d, r)
 
@@ -105,13 +105,12 @@ def pose_scene(rec: rr.RecordingStream, d: Digest) -> None:
             colors=np.tile(np.array(style.PREDICTED, dtype=np.uint8), (len(worst), 1)),
         ),
     )
-    strips = np.stack([story.anchor[worst], story.anchor[worst] + _LABEL_ABOVE], 1)
+    dots = [leader(d, int(i)) for i in worst]
     rec.send_columns(
         "world/residual/leader",
         indexes=[time],
-        columns=rr.LineStrips3D.columns(
-            strips=strips,
-            colors=style.LABEL_COLORS[style.levels(r.whitened_norm2[worst])],
+        columns=rr.LineStrips3D.columns(strips=np.concatenate(dots)).partition(
+            [len(x) for x in dots]
         ),
     )
     rec.send_columns(
@@ -119,7 +118,7 @@ def pose_scene(rec: rr.RecordingStream, d: Digest) -> None:
         indexes=[time],
         columns=rr.Points3D.columns(
             positions=story.anchor[worst] + _LABEL_ABOVE,
-            labels=[f"pose {story.pose[i]}: {pose_words(d, r, i)}" for i in worst],
+            labels=[style.safe(f"pose {story.pose_name(i)}: {pose_words(d, r, i)}") for i in worst],
             colors=style.LABEL_COLORS[style.levels(r.whitened_norm2[worst])],
             radii=np.full(len(worst), 1e-4),
             show_labels=[True] * len(worst),
@@ -133,6 +132,18 @@ def pose_words(d: Digest, r: StoryRevision, i: int) -> str:
     number = d.story.target
     name = "" if number is None else f"{style.safe(d.story.target_names[number[i]])} "
     return f"{name}{style.micrometres(length)} ({np.sqrt(r.whitened_norm2[i]):.1f} σ)"
+
+
+def leader(d: Digest, i: int) -> Floats:
+    """(K, 2, 3) dots from above a reading's noise ball to its label, m.
+
+    Thin, dotted and grey, so that nobody takes them for a residual, which is a solid arrow.
+    """
+    ball = float(d.half_sizes[i].max())
+    top = float(_LABEL_ABOVE[2])
+    z = np.arange(min(1.1 * ball, top - _DOT), top, 2.0 * _DOT)
+    ends = np.stack([z, np.minimum(z + 0.5 * _DOT, top)], 1)
+    return np.asarray(d.story.anchor[i] + ends[:, :, None] * np.array([0.0, 0.0, 1.0]))
 
 
 def center(d: Digest) -> tuple[Floats, float]:

@@ -18,7 +18,7 @@ import rerun.blueprint as rrb
 
 from hilcal.errors import HilcalError, InputError
 from hilcal.report.story import Story, StoryRevision, check
-from hilcal.report.viewer import charts, layout, scene, style, words
+from hilcal.report.viewer import charts, errors, layout, scene, style, words
 from hilcal.report.viewer.digest import Digest, Limits, digest
 
 APPLICATION = "hilcal"
@@ -101,7 +101,9 @@ def serve(
 
 def recording_id(story: Story) -> str:
     """Return an identifier that depends on what the story tells, and on nothing else."""
-    sha = hashlib.sha256(f"{story.arm.name} {story.mode} {story.load_names}".encode())
+    sha = hashlib.sha256(
+        f"{story.arm.name} {story.mode} {story.load_names} {story.pose_names}".encode()
+    )
     for array in (story.q, story.pose, story.anchor, story.measured, story.covariance):
         sha.update(np.ascontiguousarray(array).tobytes())
     for r in story.revisions:
@@ -207,35 +209,33 @@ def _tell(rec: rr.RecordingStream, d: Digest) -> None:
     """Log the whole story, flushed after each revision."""
     rec.send_recording_name(f"hilcal: {style.safe(d.story.arm.name)}, {len(d.story)} readings")
     scene.static_scene(rec, d)
-    charts.static_charts(rec, len(d.story.revisions))
+    errors.error_picture(rec, d)
     rec.log("words/guide", _markdown(words.GUIDE), static=True)
     for r in d.story.revisions:
         rec.set_time("revision", sequence=r.revision)
-        _revision(rec, d, r, on_revisions=True)
+        _revision(rec, d, r)
         flush(rec)
     rec.reset_time()
     _poses(rec, d)
     flush(rec)
 
 
-def _revision(rec: rr.RecordingStream, d: Digest, r: StoryRevision, on_revisions: bool) -> None:
+def _revision(rec: rr.RecordingStream, d: Digest, r: StoryRevision) -> None:
     scene.revision_scene(rec, d, r)
-    if on_revisions:
-        charts.error_series(rec, d, r)
     charts.revision_charts(rec, d, r)
     rec.log("words/verdict", _markdown(words.verdict(d, r)))
     rec.log("words/parameters", _markdown(words.parameters(r, d.limits.parameters)))
     rec.log("words/limits", _markdown(words.limits(r)))
     rec.log("words/revisions", _markdown(words.revisions(d, r.revision)))
-    level = "INFO" if r.verdict == "adequate" else "WARN"
-    rec.log("log", rr.TextLog(words.log_line(d, r), level=level))
+    rec.log("words/details", _markdown(words.details(d, r)))
+    rec.log("log", rr.TextLog(words.log_line(d, r), level="INFO"))
 
 
 def _poses(rec: rr.RecordingStream, d: Digest) -> None:
     """Tell the last revision on the timeline `pose`, and move the arm along it."""
     last = d.story.revisions[-1]
     rec.set_time("pose", sequence=int(d.poses[0]))
-    _revision(rec, d, last, on_revisions=False)
+    _revision(rec, d, last)
     rec.reset_time()
     scene.pose_scene(rec, d)
     time = [rr.TimeColumn("pose", sequence=d.poses)]

@@ -20,6 +20,7 @@ NOISE: Color = (0, 158, 115)
 HOLDOUT: Color = (204, 121, 167)
 LEVEL_COLORS = np.array([GREY, AMBER, RED], dtype=np.uint8)
 LABEL_COLORS = np.array([(225, 226, 230), AMBER, RED], dtype=np.uint8)
+LEADER: Color = (165, 168, 176)
 LEVEL_NAMES = ("inside", "doubtful", "outside")
 
 INSIDE_P = 0.99  # grey up to here: the noise ball drawn
@@ -97,10 +98,3 @@ def bars(share: float, width: int = 10) -> str:
 def percent(share: float) -> str:
     """Return a share as a whole percentage."""
     return f"{100 * share:.0f} %"
-
-
-def p_value(p: float) -> str:
-    """Return a p-value as words."""
-    if p < 1e-16:
-        return "below 1e-16"
-    return f"{p:.2g}" if p < 0.01 else f"{p:.2f}"

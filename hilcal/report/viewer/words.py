@@ -11,33 +11,56 @@ from hilcal.report.viewer import style
 from hilcal.report.viewer.digest import Digest
 from hilcal.report.viewer.style import escaped, micrometres, number
 
-_MARKS = {"adequate": "✓", "missing_effect": "✗", "unknown_effect": "✗"}
-_SUSPECTS = 5
+_MARKS = {"adequate": "✓ ", "missing_effect": "✗ ", "unknown_effect": "✗ "}
+_SUSPECTS = 3
+_BAR = 5
 _POSE_LOADS = 12
 _CARRIERS = 4
 _RIVALS = 2
 _HIDDEN = 4
+_MODEL = 4
 
 
 def verdict(d: Digest, r: StoryRevision) -> str:
-    """Return the verdict of a revision, with its numbers and its ranked suspects."""
-    outside = float(np.mean(r.whitened_norm2 > stats.chi2.ppf(style.INSIDE_P, 3)))
-    mark = _MARKS.get(r.verdict, "⚠")
+    """Return the verdict of a revision with its suspects; short, since a small window cuts it."""
+    mark = _MARKS.get(r.verdict, "")
     lines = [
-        f"# {title(r)}",
-        f"## {mark} {escaped(r.verdict.replace('_', ' ').capitalize())}{_which(r)}",
+        f"### {place(d, r)}: {mark}{escaped(r.verdict.replace('_', ' '))}{_which(r)}",
         escaped(numbers.sentence(r.message, [s.effect for s in r.suspects])),
+        "",
+        suspects(r),
+        f"Model: {model(r, _MODEL)}.",
+    ]
+    return "\n".join(lines)
+
+
+def place(d: Digest, r: StoryRevision) -> str:
+    """Return where in the story a revision stands, e.g. "Revision 2 of 2, the last"."""
+    told = [o.revision for o in d.story.revisions]
+    k, count = told.index(r.revision) + 1, len(told)
+    if told == list(range(1, count + 1)):
+        where = f"Revision {k} of {count}"
+    else:
+        where = f"Revision {r.revision} ({k} of {count})"
+    return f"{where}, the last" if k == count > 1 else where
+
+
+def details(d: Digest, r: StoryRevision) -> str:
+    """Return what the verdict rests on: rivals, what carries the misfit, the worst, the model."""
+    outside = float(np.mean(r.whitened_norm2 > stats.chi2.ppf(style.INSIDE_P, 3)))
+    lines = [
+        f"### {title(r)}",
+        f"Model: {model(r)}.",
         "",
         _errors(d, r),
         "",
         *_doubt(r),
-        suspects(r),
         f"**{style.percent(outside)}** of readings outside their 99 % noise ball "
         f"(noise alone: 1 %); variance factor **{number(r.variance_factor)}** "
         f"(noise alone: 1). Worst: {_worst(d, r)}.",
-        "",
-        f"Model: {model(r)}.",
     ]
+    if r.tested:
+        lines += ["", escaped(numbers.many_tests(r.tested, r.level))]
     return "\n".join(lines)
 
 
@@ -67,8 +90,8 @@ def _worst(d: Digest, r: StoryRevision) -> str:
     i = d.worst(r)
     length = float(np.linalg.norm(r.residual[i]))
     return (
-        f"pose {d.story.pose[i]}, load {escaped(d.story.load_names[i])}, {micrometres(length)} "
-        f"({np.sqrt(r.whitened_norm2[i]):.1f} σ)"
+        f"pose {escaped(d.story.pose_name(i))}, load {escaped(d.story.load_names[i])}, "
+        f"{micrometres(length)} ({np.sqrt(r.whitened_norm2[i]):.1f} σ)"
     )
 
 
@@ -111,7 +134,7 @@ def carriers(r: StoryRevision) -> str:
     named = ", ".join(
         f"**{escaped(c.variable)} {style.percent(c.share)}**" for c in r.curves[:_CARRIERS]
     )
-    which = "the picture below shows the first" if len(r.curves) > 1 else "the picture is below"
+    which = "the picture shows the first" if len(r.curves) > 1 else "see the picture"
     return f"What carries the misfit on poses left out: {named}; {which}."
 
 
@@ -121,19 +144,21 @@ def suspects(r: StoryRevision) -> str:
         return f"{visible(r.limits)}\n"
     if not r.suspects:
         return "No suspect: no effect of the catalogue surely explains the residual.\n"
-    rows = [
-        "| missing effect | explains | | held out | p-value | not separable from |",
-        "|---|---|---|---|---|---|",
-    ]
-    for s in r.suspects[:_SUSPECTS]:
-        same = ", ".join(escaped(e) for e in s.same_as) or " "
-        rows.append(
-            f"| {escaped(s.effect)} | {style.bars(s.share)} | {style.percent(s.share)} "
-            f"| {style.percent(max(s.holdout_share, 0.0))} | {style.p_value(s.p_value)} | {same} |"
-        )
-    if len(r.suspects) > _SUSPECTS:
-        rows.append(f"| and {len(r.suspects) - _SUSPECTS} weaker | | | | | |")
-    return "\n".join(rows) + "\n"
+    shown = r.suspects[:_SUSPECTS]
+    alike = any(s.same_as for s in shown)
+    head = ["missing effect?", "explains", "left out", "p-value", *["inseparable from"] * alike]
+    rows = [head, ["---"] * len(head)]
+    for s in shown:
+        told = [
+            escaped(s.effect),
+            f"{style.bars(s.share, _BAR)} {style.percent(s.share)}",
+            style.percent(max(s.holdout_share, 0.0)),
+            numbers.chance(s.p_value),
+        ]
+        rows.append([*told, *[", ".join(escaped(e) for e in s.same_as) or " "] * alike])
+    if len(r.suspects) > len(shown):
+        rows.append([f"{len(r.suspects) - len(shown)} weaker", *[" "] * (len(head) - 1)])
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows) + "\n"
 
 
 def visible(found: tuple[StoryLimit, ...]) -> str:
@@ -184,7 +209,7 @@ def pose_card(d: Digest, k: int) -> str:
     rows = np.flatnonzero(d.row == k)
     rms = float(np.sqrt((r.residual[rows] ** 2).sum(1).mean()))
     lines = [
-        f"# Pose {d.poses[k]}: {micrometres(rms)} rms",
+        f"### Pose {escaped(d.story.pose_name(int(rows[0])))}: {micrometres(rms)} rms",
         f"With the model of {title(r)[0].lower()}{title(r)[1:]}.",
         "",
         "| load | residual | in σ | |",
@@ -208,7 +233,7 @@ def parameters(r: StoryRevision, limit: int) -> str:
     if not r.parameters:
         return "This revision has no parameters."
     lines = [
-        f"# Parameters of revision {r.revision}",
+        f"### Parameters of revision {r.revision}",
         "| parameter | value | ± σ | unit |",
         "|---|---|---|---|",
     ]
@@ -228,7 +253,7 @@ def _parameter(p: StoryParameter) -> str:
 def revisions(d: Digest, upto: int) -> str:
     """Return the table of revisions up to one of them: errors falling, step by step."""
     lines = [
-        "| revision | change | fit rms | held-out rms | worst | σ rms "
+        "| revision | change | fit rms | held-out rms | largest | σ rms "
         "| variance factor | verdict |",
         "|---|---|---|---|---|---|---|---|",
     ]
@@ -255,23 +280,27 @@ def log_line(d: Digest, r: StoryRevision) -> str:
     )
 
 
-GUIDE = """# How to read this
+GUIDE = """### How to read this
+**Timelines** (bottom left): *revision* goes through the models, the first one first: → steps on.
+*pose* moves the arm through all poses, with the last model; the bright ball is the present pose.
+
 **Residuals** (3-D): each green ball is where noise alone would leave 99 % of the readings.
 An arrow that leaves its ball = the model is wrong there. Grey: noise. Amber: beyond 99 %.
-Red: beyond 99.99 %. The arm stands in the pose with the worst reading.
+Red: beyond 99.99 %. The arm stands in the pose of the worst reading; a dotted line leads from it
+to its label and is no residual.
 
 **Deflection** (3-D): blue is measured, white is predicted, both enlarged; one pair per pose, of
 its largest deflection. The line between their tips is what the model misses. Where only blue is
 seen, the model is right.
 
+**Worst reading of each pose**: the length of its residual in σ of its own noise. The tallest bar
+is the worst reading; the order in µm can be another, where some readings are noisier.
+
+**Error of each revision**: rms over fitted poses, over poses left out, and the longest residual
+in µm, against the noise. Held-out error far above the fitted one = too many parameters.
+
 **Residual against suspect**: what the residual follows. Where the leading suspect explains
 little of it, the mean error in bins of the recorded variable that carries most of it, with ±2 σ.
 
 **Could have been seen**: how strong an effect must be for these readings to show it.
-
-**Error per revision**: rms over fitted poses, over poses left out, and the worst reading,
-against the noise floor. Held-out error far above the fitted one = too many parameters.
-
-**Timelines** (bottom left): *revision* steps through the models; *pose* moves the arm through
-all poses, with the last model; the bright ball is the present pose.
 """

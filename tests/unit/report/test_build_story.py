@@ -227,6 +227,7 @@ def test_other_readings_do_not_make_one_story() -> None:
 def test_poses_keep_the_numbers_of_their_names() -> None:
     assert pose_numbers(("p3", "p12")).tolist() == [3, 12]
     assert pose_numbers(("row 534", "row 7")).tolist() == [534, 7]
+    assert pose_numbers(("reference", "p1", "home", "p2")).tolist() == [0, 1, 3, 2]
     assert pose_numbers(("a", "b")).tolist() == [1, 2]
     assert pose_numbers(("a1", "b1")).tolist() == [1, 2]
     assert pose_numbers(("p" + "9" * 30, "p1")).tolist() == [1, 2]

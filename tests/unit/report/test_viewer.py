@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from hilcal.errors import InputError
 from hilcal.report.story import StoryRevision, StorySuspect
-from hilcal.report.viewer import Limits, digest, layout, save, serve, style, words
+from hilcal.report.viewer import Limits, digest, errors, flat, layout, save, serve, style, words
 from hilcal.report.viewer.stream import executable
 from hilcal.robot.body import body_poses, capsules
 from tests.support.paths import ROOT
@@ -70,17 +70,135 @@ def texts(path: Path) -> list[str]:
     return out
 
 
-def test_errors_are_the_storys(told, recording):
-    for name, value in (
-        ("fit", lambda r: r.error_fit["rms_m"]),
-        ("holdout", lambda r: r.error_holdout["rms_m"]),
-        ("worst", lambda r: r.error_fit["max_m"]),
-        ("noise", lambda _: told.noise_floor_m),
-    ):
-        read = column(recording, f"/error/{name}", "Scalars:scalars", "revision")
-        assert set(read) == {0, 1, 2, 3}
-        for r in told.revisions:
-            assert read[r.revision] == pytest.approx([1e6 * value(r)])
+def static(path: Path, entity: str, component: str) -> object:
+    """Return the value of a component that does not change."""
+    (value,) = (
+        value
+        for chunk in RrdReader(path).stream().filter(content=entity).to_chunks()
+        if component in (batch := chunk.to_record_batch()).schema.names
+        for value in batch.column(component).to_pylist()
+    )
+    return value
+
+
+def drawn_errors(path: Path) -> dict[str, np.ndarray]:
+    """Return the heights, in the picture, of every mark of the errors."""
+    return {
+        name: np.array(static(path, f"/errors/{name}", "Points2D:positions"))
+        for name, *_ in errors.SERIES
+    }
+
+
+def test_errors_are_drawn_to_scale_inside_the_picture_and_nothing_between_them(told, recording):
+    expected = {
+        "fit": [r.error_fit["rms_m"] for r in told.revisions],
+        "holdout": [r.error_holdout["rms_m"] for r in told.revisions],
+        "largest": [r.error_fit["max_m"] for r in told.revisions],
+    }
+    at = drawn_errors(recording)
+    up = np.concatenate([at[name][:, 1] for name in expected])
+    value = np.log10(np.concatenate(list(expected.values())))
+    slope, start = np.polyfit(value, up, 1)
+    assert slope < 0  # y points down
+    np.testing.assert_allclose(up, start + slope * value, atol=1e-3)
+    floor = np.array(static(recording, "/errors/noise", "LineStrips2D:strips"))[0]
+    np.testing.assert_allclose(floor[:, 1], start + slope * np.log10(told.noise_floor_m), atol=1e-3)
+    assert floor[0, 1] == floor[1, 1]  # level
+    for places in (*at.values(), floor):
+        assert (places >= 0).all()
+        assert (places <= (errors.WIDTH, flat.HEIGHT)).all()
+    lines = [
+        chunk
+        for name in expected
+        for chunk in RrdReader(recording).stream().filter(content=f"/errors/{name}").to_chunks()
+        if any("Strip" in c or "Line" in c for c in chunk.to_record_batch().schema.names)
+    ]
+    assert lines == []
+
+
+def test_each_revision_has_one_tick_and_the_present_one_its_change_and_errors(told, recording):
+    labels = column(recording, "/errors/words", "Points2D:labels", "revision")
+    frames = column(recording, "/errors/now", "LineStrips2D:strips", "revision")
+    fit = drawn_errors(recording)["fit"]
+    for k, r in enumerate(told.revisions):
+        ticks = [t for t in labels[r.revision] if t[0].isdigit()]
+        assert sorted(t.split(":")[0] for t in ticks) == ["0", "1", "2", "3"]
+        assert f"{r.revision}: {r.change or 'first model'}" in ticks
+        assert any(style.micrometres(r.error_fit["max_m"]) in t for t in labels[r.revision])
+        x = np.array(frames[r.revision][0])[:, 0]
+        inside = (x.min() < fit[:, 0]) & (fit[:, 0] < x.max())
+        assert np.flatnonzero(inside).tolist() == [k]
+
+
+@pytest.mark.parametrize("size", [1e-3, 1.0, 40.0])
+def test_ticks_of_errors_are_round_few_and_inside(size):
+    for ratio in (1.4, 3.0, 30.0, 1e6):
+        found = errors.decades(size, ratio * size)
+        assert 2 <= len(found) <= 8
+        assert ((found >= size * (1 - 1e-9)) & (found <= ratio * size * (1 + 1e-9))).all()
+
+
+def test_a_story_without_any_error_is_drawn(told, tmp_path):
+    zero = dict.fromkeys(told.revisions[0].error_fit, 0.0)
+    first = replace(told.revisions[0], error_fit=zero, error_holdout=zero)
+    save(replace(told, revisions=(first,), noise_floor_m=0.0), tmp_path / "zero.rrd")
+    at = drawn_errors(tmp_path / "zero.rrd")
+    assert all(np.isfinite(places).all() for places in at.values())
+
+
+def test_it_opens_at_the_first_revision_and_the_end_says_that_it_is_the_end(told, recording):
+    read = column(recording, "/words/verdict", "TextDocument:text", "revision")
+    heads = [read[k][0].splitlines()[0] for k in range(4)]
+    assert [("the last" in head) for head in heads] == [False, False, False, True]
+    assert [f"({k + 1} of 4)" in head for k, head in enumerate(heads)] == [True] * 4
+    reader = RrdReader(recording)
+    (blueprint,) = reader.blueprints()
+    panel: dict[str, object] = {}
+    for chunk in reader.stream(store=blueprint).filter(content="/time_panel").to_chunks():
+        panel |= chunk.to_record_batch().to_pydict()
+    assert panel["TimePanelBlueprint:timeline"] == [["revision"]]
+    assert panel["TimePanelBlueprint:play_state"] == [[1]]  # paused: else it opens at the end
+
+
+def test_the_leader_of_the_worst_reading_is_no_arrow(told, recording):
+    strips = column(recording, "/world/residual/leader", "LineStrips3D:strips", "revision")
+    balls = digest.digest(told, Limits()).half_sizes
+    for r in told.revisions:
+        worst = int(np.argmax(r.whitened_norm2))
+        dots = np.array([np.array(s) for s in strips[r.revision]]) - told.anchor[worst]
+        assert len(dots) >= 5  # dotted
+        np.testing.assert_allclose(dots[:, :, :2], 0.0, atol=1e-6)
+        assert dots[:, :, 2].min() > min(balls[worst].max(), 0.25)  # begins outside of the ball
+        lengths = np.ptp(dots[:, :, 2], axis=1)
+        gaps = dots[1:, 0, 2] - dots[:-1, 1, 2]
+        assert (gaps > lengths[:-1]).all()
+    assert tuple(style.LEADER) not in {tuple(c) for c in style.LEVEL_COLORS.tolist()}
+
+
+def test_the_tallest_bar_is_the_worst_reading_of_the_label(told, recording):
+    labels = column(recording, "/world/residual/worst", "Points3D:labels", "revision")
+    for r in told.revisions:
+        bars = [
+            column(recording, f"/bars/{name}", "BarChart:values", "revision")[r.revision][0]
+            for name in style.LEVEL_NAMES
+        ]
+        tallest = max(max(b["buffer"]) for b in bars)
+        assert f"({tallest:.1f} σ)" in labels[r.revision][0]
+
+
+def test_a_pose_has_its_own_name_in_every_label_and_text(told, tmp_path):
+    named = replace(told, pose_names=tuple(f"p{k + 40}a" for k in told.pose))
+    path = tmp_path / "named.rrd"
+    save(named, path)
+    name = f"p{told.pose[np.argmax(told.revisions[-1].whitened_norm2)] + 40}a"
+    worst = column(path, "/world/residual/worst", "Points3D:labels", "revision")
+    assert f"pose {name}," in worst[3][0]
+    details = column(path, "/words/details", "TextDocument:text", "revision")
+    assert f"pose {name}," in details[3][0]
+    cards = column(path, "/words/verdict", "TextDocument:text", "pose")
+    assert cards[7][0].startswith("### Pose p47a:")
+    with pytest.raises(InputError, match=r"story\.pose_names: 1 names for 90 readings"):
+        save(replace(told, pose_names=("a",)), path)
 
 
 def test_timelines_are_revision_and_pose(recording):
@@ -136,8 +254,8 @@ def test_verdict_names_suspects_with_their_figures(told, recording):
     assert "base_compliance" in first.replace("\\", "")
     assert "86 %" in first
     assert "84 %" in first
-    assert "■■■■■■■■■" in first
-    assert "Adequate" in read[3][0]
+    assert "■■■■ 86 %" in first
+    assert "adequate" in read[3][0]
     assert "86 %" not in read[3][0]
 
 
@@ -167,7 +285,7 @@ def test_user_names_cannot_break_a_table(told):
     r = replace(told.revisions[0], suspects=(StorySuspect("a|b\nc", 0.5, 0.4, 0.01),))
     table = words.suspects(r).splitlines()
     assert len(table) == 3
-    assert {len(re.findall(r"(?<!\\)\|", line)) for line in table} == {7}
+    assert {len(re.findall(r"(?<!\\)\|", line)) for line in table} == {5}
 
 
 def test_unidentifiable_parameters_show_no_number(told):
@@ -299,7 +417,7 @@ def test_a_viewer_that_joins_late_gets_the_whole_story(told, tmp_path, monkeypat
         )
         try:
             end = time.monotonic() + 30
-            while not {"/error/fit", "/error/along/noise"} <= entities(late):
+            while not {"/errors/fit", "/bars/zcurrent"} <= entities(late):
                 assert time.monotonic() < end, "the late viewer did not receive the story"
                 time.sleep(0.1)
         finally:
