@@ -141,15 +141,16 @@ class UrArm:
             told = sample.payload_com
             if told is None:
                 raise failure(
-                    self._host, "it does not tell its payload; that needs PolyScope 5.5.1 or newer"
+                    self._host,
+                    "it does not report its payload; that needs PolyScope 5.5.1 or newer",
                 )
             if abs(sample.payload - mass) <= _MASS_KG and np.abs(told - com).max() <= _COM_M:
                 return
             if time.monotonic() > end:
                 raise failure(
                     self._host,
-                    f"it says {sample.payload:g} kg at {np.round(told, 4).tolist()} m after it was "
-                    f"told a payload of {mass:g} kg at {np.round(com, 4).tolist()} m",
+                    f"it says {sample.payload:g} kg at {np.round(told, 4).tolist()} m after a "
+                    f"payload of {mass:g} kg at {np.round(com, 4).tolist()} m was set",
                     "look at the payload on the pendant",
                 )
 

@@ -89,7 +89,7 @@ def _problems(robot: dashboard.RobotFacts, model: str) -> list[str]:
 def _state(reading: Reading) -> list[tuple[str, str]]:
     sample = reading.sample
     com = "" if sample.payload_com is None else f" at {_list(1e3 * sample.payload_com, 1)} mm"
-    payload = "not told" if math.isnan(sample.payload) else f"{sample.payload:.3f} kg{com}"
+    payload = "not reported" if math.isnan(sample.payload) else f"{sample.payload:.3f} kg{com}"
     return [
         ("robot mode", states.mode_word(reading.mode)),
         ("safety", sample.safety),
@@ -109,7 +109,7 @@ def _hindrances(reading: Reading) -> list[str]:
     if reading.runtime in (states.PLAYING, states.RESUMING):
         out.append("a program runs on the robot; stop it on the pendant")
     if math.isnan(sample.payload) or sample.payload_com is None:
-        out.append("it does not tell its payload; that needs PolyScope 5.5.1 or newer")
+        out.append("it does not report its payload; that needs PolyScope 5.5.1 or newer")
     return out
 
 

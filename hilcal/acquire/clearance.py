@@ -119,7 +119,8 @@ class Clearance:
             if deep > 0.0:
                 out[f"low {load}", where] = (
                     f"{where}: what hangs or pulls ({load}) reaches {deep:.3g} m below the "
-                    f"workspace, whose z ends at {low[2]:g} m; see hang_m and cable_m of [[loads]]"
+                    f"workspace (it begins at z = {low[2]:g} m); see hang_m and cable_m of "
+                    "[[loads]]"
                 )
         return out
 

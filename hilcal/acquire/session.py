@@ -297,7 +297,7 @@ class Session:
             return None
         mean = (measured.before.joint_temperature + measured.after.joint_temperature) / 2
         if not np.isfinite(mean).all():
-            raise DeviceError("arm: it does not tell the temperatures of its joints any more")
+            raise DeviceError("arm: it no longer reports the temperatures of its joints")
         return np.asarray(mean)
 
     def _tell_drift(self, step: Step, shift: Shift) -> None:

@@ -67,7 +67,7 @@ def _found(e: Floats, f: Floats, limit: float, unit: str, gravity: Floats) -> st
     """What the measured vector f looks like where e was asked for."""
     asked, felt = float(np.linalg.norm(e)), float(np.linalg.norm(f))
     if felt <= limit:
-        return "that is about nothing"
+        return "that is nothing"
     along, size = float(f @ gravity), float(np.linalg.norm(gravity))
     weighed = unit == "N" and size > 0.0 and along >= np.cos(np.radians(15.0)) * felt * size
     kilograms = f"about {along / size**2:.1f} kg"

@@ -156,7 +156,7 @@ def _introduce(t: Terminal, r: Rehearsal, choice: str, seed: int) -> None:
     what = {
         NOTHING: "Nothing is hidden in it; the program does not know that.",
         RANDOM: "An effect, drawn at random, is hidden in it.",
-    }.get(choice, f"The effect {r.hidden} is hidden in it; the program is not told.")
+    }.get(choice, f"The effect {r.hidden} is hidden in it; the program does not know which.")
     t.show(text.heading(f"A simulated {r.cell.arm.name} and a laser tracker, seed {seed}"))
     t.show(
         f"{poses} poses, unloaded and under {len(loads)} loads ({', '.join(loads)}): "

@@ -14,7 +14,7 @@ TURN = 2 * np.pi + 0.1
 """rad; a larger angle is in degrees."""
 FAR = 50.0
 """A position beyond this number is in millimetres: no arm is measured from 50 m."""
-GUESSED = "the convention is a guess; --config CELL.toml lets the arm tell"
+GUESSED = "the convention is a guess; --config CELL.toml lets the arm decide"
 SIDE_BY_SIDE = "several targets: name them as in the cell's [[tool.targets]]"
 REPORTED = 5e-3
 """rad; encoders at rest in one pose differ by less, commanded poses by more; a choice."""

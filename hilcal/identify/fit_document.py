@@ -70,7 +70,7 @@ def notes(fit: Fit) -> tuple[str, ...]:
     if fit.mode == "deflection" and registered:
         out.append(
             f"deflections do not see where the base is, only how it is turned: {registered[0]} "
-            "holds what the closed-form registration and the turning of deflections tell"
+            "is determined by the closed-form registration and by how deflections turn"
         )
     weightless = not np.any(fit.model.cell.arm.masses)
     if fit.mode == "absolute" and weightless and any(e.elastic for e in fit.model.effects):

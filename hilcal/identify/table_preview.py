@@ -111,8 +111,8 @@ def _decide_convention(found: Proposed, arm: Arm) -> list[str]:
     best, second = choice.ranked[:2]
     if choice.decided is None:
         words = (
-            f"{arm.name} does not tell the convention: {best.convention} leaves {_left(best)}, "
-            f"{second.convention} {_left(second)}"
+            f"the nominal {arm.name} does not decide the convention: "
+            f"{best.convention} leaves {_left(best)}, {second.convention} {_left(second)}"
         )
         proposal.unsure.append(("orientation", words))
         return []
@@ -124,8 +124,8 @@ def _decide_convention(found: Proposed, arm: Arm) -> list[str]:
             meaning = ", ".join(str(v) for key, v in section.items() if key != "columns")
             proposal.understood[k] = Understood(u.what, u.columns, meaning, u.example)
     return [
-        f"orientation: {section['convention']}, as {arm.name} tells: {_left(best)} are left, with "
-        f"the next convention {_left(second)}"
+        f"orientation: {section['convention']}, since the nominal {arm.name} fits best with it: "
+        f"{_left(best)} are left, with the next convention {_left(second)}"
     ]
 
 
@@ -170,7 +170,10 @@ def _decide_columns(table: Path, found: Proposed, settings: CellConfig, cell: Ce
     doubts = [d for d in proposal.unsure if RIVALS not in d[1] and BY_VALUES not in d[1]]
     proposal.unsure[:] = doubts
     others = f", others {1e3 * fits[1][0]:.0f} mm" if len(fits) > 1 else ""
-    return [f"columns: as {cell.arm.name} tells: {1e3 * fits[0][0]:.2f} mm are left{others}"]
+    return [
+        f"columns: the nominal {cell.arm.name} fits best with these: "
+        f"{1e3 * fits[0][0]:.2f} mm are left{others}"
+    ]
 
 
 def _left_by_the_arm(

@@ -254,7 +254,7 @@ def test_a_load_is_right_within_newtons_or_its_share(size, share, off):
     ("expected", "measured", "text"),
     [
         (WEIGHT, WEIGHT / 2, "asked for 10 kg (98.1 N), felt 49.0 N: that is about 5.0 kg"),
-        (WEIGHT, 0.01 * WEIGHT, "asked for 10 kg (98.1 N), felt 1.0 N: that is about nothing"),
+        (WEIGHT, 0.01 * WEIGHT, "asked for 10 kg (98.1 N), felt 1.0 N: that is nothing"),
         (0 * WEIGHT, WEIGHT / 2, "asked for nothing, felt 49.0 N: about 5.0 kg still hangs"),
         (0 * WEIGHT, PULL, "asked for nothing, felt 50.0 N: something still pulls"),
         (PULL, 0.8 * PULL, "asked for 50.0 N, felt 40.0 N: that is 80 % of it, 0° off its"),
