@@ -27,6 +27,8 @@ TOLERANCE = 1e-8
 """Part of the derivative, root mean square over the states, that may be missing; a choice, with
 room for states whose loads are several times the mean."""
 MAX_TERMS = 40
+TORQUE = 5
+"""Component of a slot's wrench about the axis of its joint."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,7 +55,31 @@ class Block:
 def compliance(parts: Sequence[tuple[Effect, Floats]], s: Situation) -> list[Block]:
     """Derivative of the elastic deviations by the slot wrenches, without what is zero."""
     blocks = (b for e, theta in parts if theta.any() for b in _of_effect(e, theta, s))
-    return [pruned for b in blocks if (pruned := _pruned(b)) is not None]
+    found = [pruned for b in blocks if (pruned := _pruned(b)) is not None]
+    drive = s.cell.arm.drive
+    return found if drive is None else [c for b in found for c in _of_joints(b, drive)]
+
+
+def _of_joints(b: Block, drive: Floats) -> Iterator[Block]:
+    """Compliance of the chain's joints, from that of the drives: D C Dᵀ by torques.
+
+    Forces and moments across an axis are those of the slot itself.
+    """
+    if not b.joint:
+        yield b
+        return
+    by_torque = b.components.stop == TORQUE + 1 and b.slot < len(drive)
+    last = b.components.stop - by_torque
+    for to in np.flatnonzero(drive[:, b.to]):
+        moved = replace(b, to=int(to), values=drive[to, b.to] * b.values)
+        if last > b.components.start:
+            rest = slice(b.components.start, last)
+            yield replace(moved, components=rest, values=moved.values[:, : last - rest.start])
+        if by_torque:
+            for slot in np.flatnonzero(drive[:, b.slot]):
+                values = drive[slot, b.slot] * moved.values[:, -1:]
+                at = slice(TORQUE, TORQUE + 1)
+                yield replace(moved, slot=int(slot), components=at, values=values)
 
 
 def at_equilibrium(moves: Motion, stiffness: GeometricStiffness, blocks: list[Block]) -> Motion:

@@ -146,7 +146,7 @@ class Model:
         chain = chains.evaluate(cell.arm, angle)
         nothing = zeros(len(states), cell.arm.n + 1, 6)
         recorded = self._load(states, theta)
-        turned = along_states(cell.arm.chain_angles(angle))
+        turned = along_states(cell.arm.drive_angles(angle))
         s = Situation(cell, states, turned, chain, nothing, recorded, self._compliance(theta))
         rigid = sum((e.deviation(t, s) for e, t in parts if not e.elastic), Deviation())
         elastic = [(e, t) for e, t in parts if e.elastic]

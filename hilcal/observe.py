@@ -79,7 +79,7 @@ class Motion:
         deviation: the deviation.
         m: number of rows.
         frames: of the slots.
-        dq: (N, m, n) derivative by the joint displacements.
+        dq: (N, m, n) derivative by displacements of the chain's joints.
         yielding: derivative by motions of the chain of what the arm yields to them.
     """
 
@@ -96,7 +96,7 @@ class Motion:
     def by_columns(self, c: Columns) -> Floats:
         """Motion (N, m, P) by the parameters of one block of columns."""
         if c.field == "dq":
-            return self.dq[:, :, c.element] * c.values[:, None, :]
+            return self.drives[:, :, c.element] * c.values[:, None, :]
         if c.field == "scale":
             out = zeros(len(self.dq), self.m, len(c.parameter))
             out[:, :3] = self._unscaled()[:, :, None] * c.values[:, None, :]
@@ -109,6 +109,12 @@ class Motion:
             return out
         sides = {"base": self.by_base, "station": self.by_station, "target": self.by_target}
         return _per_column(sides[c.field](), c.values)
+
+    @property
+    def drives(self) -> Floats:
+        """(N, m, n) derivative by the displacements of the drives, `Deviation.dq`."""
+        drive = self.cell.arm.drive
+        return self.dq if drive is None else np.asarray(self.dq @ drive)
 
     def by_slot(self, slot: int, first: int = 0) -> Floats:
         """Motion (N, m, 6 − first) by the twist of a slot, from its element `first` (0 or 3) on."""

@@ -15,14 +15,15 @@ _UNKNOWN_TORQUE = 150.0  # N·m, rated torque of a drive whose limit is not know
 _CROSSING = 0.01  # of the rated torque: within it a joint crosses its play
 
 
-def joint_errors(hidden: Truth, states: States, reference: float) -> Floats:
-    """Return the joint displacements (N, n) that do not depend on the load, rad.
+def drive_errors(hidden: Truth, arm: Arm, states: States, reference: float) -> Floats:
+    """Return the displacements (N, n) of the drives that do not depend on the load, rad.
 
-    dq_j = o_j + h_j s_j + kappa_j (T_j - reference) + sum_i k_ji q_i
+    dq_j = o_j + h_j s_j + kappa_j (T_j - reference)
            + sum_k a_jk cos k q_j + b_jk sin k q_j
 
     Args:
         hidden: the parameters.
+        arm: the arm.
         states: N states.
         reference: temperature at which joints do not drift, °C.
 
@@ -40,9 +41,8 @@ def joint_errors(hidden: Truth, states: States, reference: float) -> Floats:
         error += hidden.hysteresis * states.approach
     if np.any(hidden.thermal_joint_drift):
         error += hidden.thermal_joint_drift * (joint_temperature(states) - reference)
-    error += np.einsum("ji,ni->nj", hidden.joint_coupling, states.q)
     order = np.arange(1, hidden.transmission_error.shape[1] + 1)
-    phase = states.q[:, :, None] * order
+    phase = arm.drive_angles(states.q)[:, :, None] * order
     error += (np.cos(phase) * hidden.transmission_error[:, :, 0]).sum(axis=2)
     error += (np.sin(phase) * hidden.transmission_error[:, :, 1]).sum(axis=2)
     return error
@@ -62,7 +62,7 @@ def joint_temperature(states: States) -> Floats:
     return states.joint_temperature
 
 
-def further_compliance(hidden: Truth, states: States) -> Floats | None:
+def further_compliance(hidden: Truth, arm: Arm, states: States) -> Floats | None:
     """Return the (N, n) compliances of the drives beyond c_j, rad/(N·m); None: none anywhere.
 
     a_j cos 2 q_j + b_j sin 2 q_j + k c_j log10(1 + t / 1 s), q the commanded angle
@@ -73,7 +73,8 @@ def further_compliance(hidden: Truth, states: States) -> Floats | None:
     extra: Floats | None = None
     if np.any(hidden.periodic_joint_compliance):
         cos, sin = hidden.periodic_joint_compliance.T
-        extra = cos * np.cos(2.0 * states.q) + sin * np.sin(2.0 * states.q)
+        angle = arm.drive_angles(states.q)
+        extra = cos * np.cos(2.0 * angle) + sin * np.sin(2.0 * angle)
     if np.any(hidden.creep):
         if states.load_time is None:
             raise InputError(

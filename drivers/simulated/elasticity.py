@@ -13,12 +13,16 @@ from hilcal.types import Floats
 class Elasticity:
     """delta = (C + diag x) tau + s tau³ + b tanh(tau / tau_0).
 
+    Where drives turn several joints, this is the law of the drives, with their torques; the joints
+    then turn by T delta, and tau = Tᵀ (torques about the axes).
+
     Attributes:
         linear: (v, v) C, symmetric, rad/(N·m) and its like for the tips of beams.
         cubic: (v,) s, rad/(N·m)³; negative where a gear stiffens under load.
         play: (v,) b, rad: half of the play that a joint crosses with the sign of its torque.
         crossing: (v,) tau_0, the torque that takes it most of the way, over 0, N·m.
         extra: (N, v) x, compliance that belongs to one of N states, rad/(N·m); None: nothing.
+        turns: (v, v) T; None: 1.
     """
 
     linear: Floats
@@ -26,6 +30,7 @@ class Elasticity:
     play: Floats
     crossing: Floats
     extra: Floats | None = None
+    turns: Floats | None = None
 
     def give(self, tau: Floats, state: int) -> tuple[Floats, Floats]:
         """Return delta (v,) and its derivative by tau (v, v) in one of the states.
@@ -33,6 +38,12 @@ class Elasticity:
         Raises:
             InputError: the gear would soften to nothing.
         """
+        if self.turns is None:
+            return self._give(tau, state)
+        delta, slack = self._give(tau @ self.turns, state)
+        return self.turns @ delta, self.turns @ slack @ self.turns.T
+
+    def _give(self, tau: Floats, state: int) -> tuple[Floats, Floats]:
         slack, bend = self.linear, None
         if self.extra is not None:
             slack = slack + np.diag(self.extra[state])
@@ -66,6 +77,7 @@ def elasticity(
     play: Floats | None = None,
     crossing: Floats | None = None,
     extra: Floats | None = None,
+    drive: Floats | None = None,
 ) -> Elasticity:
     """Assemble the elastic law from physical constants.
 
@@ -84,6 +96,7 @@ def elasticity(
         play: (n,) half of the play of the drives, rad.
         crossing: (n,) torque that crosses it, over 0, N·m.
         extra: (N, n) compliances of the drives that belong to N states, rad/(N·m).
+        drive: (n, n) how far each drive turns each joint; None: its own.
     """
     size = tree.model.nv
     linear, cubic = np.zeros((size, size)), np.zeros(size)
@@ -109,4 +122,8 @@ def elasticity(
     if extra is not None:
         own = np.zeros((len(extra), size))
         own[:, tree.drive] = extra
-    return Elasticity(linear, cubic, free, torque, own)
+    turns = None
+    if drive is not None:
+        turns = np.eye(size)
+        turns[np.ix_(tree.drive, tree.drive)] = drive
+    return Elasticity(linear, cubic, free, torque, own, turns)

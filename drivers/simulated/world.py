@@ -25,7 +25,7 @@ class IdealReading:
     Attributes:
         position: (N, 3) of the target, sensor axes, m.
         rotation: (N, 3, 3) of the target, sensor axes.
-        jacobian: (N, 6, n) twist of the target per commanded joint angle, sensor axes.
+        jacobian: (N, 6, n) twist of the target per displacement of a drive, sensor axes.
     """
 
     position: Floats
@@ -117,14 +117,16 @@ class World:
             InputError: hysteresis without approach sides, or drifting joints without their
                 temperatures.
         """
-        return conditions.joint_errors(self.physics, states, self.joint_reference)
+        arm, hidden = self.cell.arm, self.physics
+        off = conditions.drive_errors(hidden, arm, states, self.joint_reference)
+        return np.asarray(arm.driven(off) + states.q @ hidden.joint_coupling.T)
 
     def rest(self, states: States, slip: Floats | None = None) -> Equilibrium:
         """Return the static equilibrium of N states.
 
         Args:
             states: commanded joints and wrenches.
-            slip: (N, n) how far each joint missed its command, rad (repeatability).
+            slip: (N, n) how far each drive missed its command, rad (repeatability).
 
         Raises:
             InputError: the states lack what a hidden effect depends on, or find no equilibrium.
@@ -133,7 +135,7 @@ class World:
         return equilibrium(
             self._tree,
             self._elasticity(states),
-            q if slip is None else q + slip,
+            q if slip is None else q + self.cell.arm.driven(slip),
             states.wrench,
             self.cell.load_point + self.physics.load_point,
             growth=conditions.link_growth(self.physics, states),
@@ -153,12 +155,13 @@ class World:
             tool=hidden.tool_compliance,
             play=hidden.backlash,
             crossing=conditions.crossing_torque(self.cell.arm),
-            extra=conditions.further_compliance(hidden, states),
+            extra=conditions.further_compliance(hidden, self.cell.arm, states),
+            drive=self.cell.arm.drive,
         )
 
     def drive_torque(self, states: States) -> Floats:
         """Return the (N, n) torque that weight and load exert at each drive, N·m."""
-        return self.rest(states).torque[:, self.drives]
+        return self.cell.arm.drive_torques(self.rest(states).torque[:, self.drives])
 
     def sight(self, states: States, slip: Floats | None = None) -> IdealReading:
         """Return what the tracker would read of N states without noise of its own.
@@ -180,7 +183,10 @@ class World:
         view = frame[:3, :3]
         pose = frame @ rest.flange @ target
         position, rotation = pose[:, :3, 3], pose[:, :3, :3]
-        jac = moved_by(rest.jacobian, (rest.flange[:, :3, :3] @ target[..., :3, 3:])[:, :, 0])
+        by_drive = (
+            rest.jacobian if self.cell.arm.drive is None else (rest.jacobian @ self.cell.arm.drive)
+        )
+        jac = moved_by(by_drive, (rest.flange[:, :3, :3] @ target[..., :3, 3:])[:, :, 0])
         jac = np.concatenate([view @ jac[:, :3], view @ jac[:, 3:]], axis=1)
         if np.any(hidden.tracker_drift):
             if states.time is None:

@@ -236,7 +236,7 @@ class WorldState:
             targets=targets,
             flange=flange,
             sensor_wrench=self._mount.feels(world, flange[:3, :3], wrench),
-            drive_torque=rest.torque[0, world.drives],
+            drive_torque=world.cell.arm.drive_torques(rest.torque[0, world.drives]),
             arrivals=int(arm["arrivals"]),
             **self._passing(arm, now),
         )

@@ -198,7 +198,8 @@ def _along(shapes: Clearance, q: Floats, load: str, where: str) -> _Problems:
     chain = chains.evaluate(arm, q)
     wrench = np.broadcast_to(pull, (len(q), 6))
     carried = Load(wrench, cell.load_point, cell.tool_mass, cell.tool_com, cell.gravity)
-    torque = np.abs(slot_wrenches(arm, chain, carried)[:, : arm.n, 5]).max(axis=0)
+    about_axes = slot_wrenches(arm, chain, carried)[:, : arm.n, 5]
+    torque = np.abs(arm.drive_torques(about_axes)).max(axis=0)
     under = "" if load == UNLOADED else f" under {load}"
     for k, name in enumerate(arm.joint_names):
         usable = share * arm.torque_max[k]

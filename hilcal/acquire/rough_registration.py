@@ -5,7 +5,7 @@ import numpy as np
 from hilcal.cell import Cell
 from hilcal.data.covariance import joint_scatter
 from hilcal.robot import chain as chains
-from hilcal.robot.chain import command_jacobian
+from hilcal.robot.chain import drive_jacobian
 from hilcal.types import Floats
 
 ENOUGH = 4
@@ -79,7 +79,7 @@ class RoughRegistration:
         """
         chain = chains.evaluate(self._cell.arm, np.asarray(q)[None])
         point = chain.point(self._cell.target[:3, 3])
-        jac, pose = command_jacobian(self._cell.arm, chain, point)[0], self.pose()
+        jac, pose = drive_jacobian(self._cell.arm, chain, point)[0], self.pose()
         if pose is None:
             return np.asarray(np.trace(joint_scatter(jac, joint_std, np.eye(3), 3)) / 3 * np.eye(3))
         return joint_scatter(jac, joint_std, pose[0], 3)

@@ -9,7 +9,7 @@ from hilcal.acquire.rough_registration import RoughRegistration
 from hilcal.cell import Cell
 from hilcal.data.plan import UNLOADED, Step
 from hilcal.robot import chain as chains
-from hilcal.robot.chain import command_jacobian
+from hilcal.robot.chain import drive_jacobian
 from hilcal.types import Floats
 
 
@@ -60,7 +60,7 @@ class SessionState:
         if tared is not None:
             self.tared_wrenches.append(tared)
         chain = chains.evaluate(self._cell.arm, q[None])
-        jac = command_jacobian(self._cell.arm, chain, chain.point(self._cell.target[:3, 3]))[0, :3]
+        jac = drive_jacobian(self._cell.arm, chain, chain.point(self._cell.target[:3, 3]))[0, :3]
         instrument = covariance[:3, :3]
         self._visits.append(UnloadedVisit(step.pose, position, instrument, float(np.sum(jac**2))))
         return self._drift.add(step, position, instrument + scatter)

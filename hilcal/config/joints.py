@@ -11,6 +11,11 @@ class Coupling(Section):
     joint: int = Field(ge=1, description="the number of the joint that follows, from 1")
     follows: int = Field(ge=1, description="the number of the joint that it follows, from 1")
     factor: Number = Field(1.0, description="turns of the joint per turn of the one it follows")
+    mechanical: bool = Field(
+        True,
+        description="true where the motor of the one turns the other along; false where the "
+        "controller only counts so",
+    )
 
     @model_validator(mode="after")
     def _another(self) -> "Coupling":

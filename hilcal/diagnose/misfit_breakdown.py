@@ -73,7 +73,7 @@ def misfit_breakdown(p: Linearisation) -> tuple[MisfitShare, ...]:
     axes = np.zeros((count, w.m, 3))
     axes[:, :3] = prediction.observation.axes
     # Motions of ordinary size: 1 mrad of a joint, 1 mm of the target.
-    generic = 1e-3 * np.concatenate([moves.dq, axes], axis=2)
+    generic = 1e-3 * np.concatenate([moves.drives, axes], axis=2)
     at_measurement = generic[w.reading]
     raws = []
     for name, basis, follows_load in _variables(p):

@@ -110,7 +110,7 @@ def motions(p: Linearisation) -> list[Floats]:
         prediction.situation.chain,
         prediction.deviation,
         m,
-    ).dq
+    ).drives
     axes = np.zeros((len(moves), m, 3))
     axes[:, :3] = prediction.observation.axes
     return [PER_MOTION * moves[:, :, [j]] for j in range(moves.shape[2])] + [PER_MOTION * axes]

@@ -128,7 +128,7 @@ def contrasts(fit: Fit) -> Contrasts | None:
         solution.prediction.situation.chain,
         solution.prediction.deviation,
         w.m,
-    ).dq
+    ).drives
     y = _apply(blocks, w.whiten(fit.raw).reshape(-1, 1))[:, 0]
     other = w.whiten(w.raw(_differences(fit, readings, kind, moves)))
     nuisance = _orthonormal(_apply(blocks, other))

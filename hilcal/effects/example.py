@@ -67,5 +67,5 @@ def example_situation(cell: Cell, states: States) -> Situation:
     load = Load(states.wrench, cell.load_point, cell.tool_mass, cell.tool_com, cell.gravity)
     wrench = slot_wrenches(cell.arm, chain, load)
     wrench.flags.writeable = False
-    turned = cell.arm.chain_angles(angle)
+    turned = cell.arm.drive_angles(angle)
     return Situation(cell, states, turned, chain, wrench, load, typical_compliances(cell))

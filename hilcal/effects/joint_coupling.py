@@ -10,6 +10,8 @@ from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
 from hilcal.errors import InputError
 from hilcal.robot.conventions import may_follow
 
+ABOUT = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+"""Twist of a slot by a turn about its z, the axis of its joint."""
 _PAIR = re.compile(r"([0-9]{1,3}):([0-9]{1,3})")
 
 
@@ -64,9 +66,13 @@ class JointCoupling(Effect):
         )
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:
-        """Controller's values: ∂dq_j/∂k_ji = q_i."""
+        """Controller's values: ∂dq_j/∂k_ji = q_i, a turn of slot j − 1 about the joint's axis.
+
+        Not a displacement of drive j, which turns others along where joints are coupled.
+        """
         turned, by = self._pairs.T
-        return (Columns("dq", np.arange(len(turned)), turned, s.values[:, by]),)
+        twist = s.values[:, by, None] * ABOUT
+        return (Columns("twist", np.arange(len(turned)), turned, twist),)
 
 
 def _pairs(given: object, n: int) -> list[tuple[int, int]]:

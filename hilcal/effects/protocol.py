@@ -53,10 +53,11 @@ class Situation:
     Attributes:
         cell: arm, tool and target.
         states: the N states.
-        angle: (N, n) joint angles at which laws are evaluated, rad: the actual ones where recorded.
+        angle: (N, n) joint angles at which laws are evaluated, rad: the actual ones where
+            recorded; those of the drives where joints are coupled (`Arm.drive_angles`).
         chain: the deviated chain, or None before it is known.
         wrench: (N, n + 1, 6) wrench transmitted through each slot, slot axes; element
-            (j, 5) is the torque τ of joint j + 1.
+            (j, 5) is the torque τ about the axis of joint j + 1.
         load: the recorded wrench (`states.wrench`) as the model corrects it, where it acts, and
             the weights.
         compliance: (n,) joint compliances, rad/(N·m): those of the model, or typical ones where
@@ -81,8 +82,8 @@ class Situation:
 
     @property
     def torque(self) -> Floats:
-        """(N, n) static torques about the joint axes, N·m."""
-        return self.wrench[:, :-1, 5]
+        """(N, n) static torques that the drives carry, N·m; about the axes unless coupled."""
+        return self.cell.arm.drive_torques(self.wrench[:, :-1, 5])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -226,7 +227,10 @@ class Effect(ABC):
         return found
 
     def response(self, theta: Floats, s: Situation, change: Floats) -> Response:
-        """Change of the deviation by changes (N, P, n + 1, 6) of the slot wrenches."""
+        """Change of the deviation by changes (N, P, n + 1, 6) of the slot wrenches.
+
+        For `dq`, element (j, 5) is the torque of drive j + 1 (see `Situation.torque`).
+        """
         return Response()
 
     def load_change(self, theta: Floats) -> LoadChange | None:

@@ -110,7 +110,7 @@ def keys(changes: tuple[Change, ...], cell: Cell) -> dict[str, str]:
     sign = np.array((robot and robot.joint_sign) or (1,) * n)
     zero = np.array((robot and robot.joint_offset_deg) or (0.0,) * n)
     given = robot.joint_coupling if robot else ()
-    coupled = [{"joint": c.joint, "follows": c.follows, "factor": c.factor} for c in given]
+    coupled = [c.model_dump(exclude_defaults=True) | {"factor": c.factor} for c in given]
     said = set()
     for c in changes:
         j = c.joint - 1
@@ -126,7 +126,8 @@ def keys(changes: tuple[Change, ...], cell: Cell) -> dict[str, str]:
             coupled.append({"joint": c.joint, "follows": c.follows, "factor": factor})
             said.add(COUPLING)
     entries = ", ".join(
-        "{ " + ", ".join(f"{k} = {v}" for k, v in entry.items()) + " }" for entry in coupled
+        "{ " + ", ".join(f"{k} = {json.dumps(v)}" for k, v in entry.items()) + " }"
+        for entry in coupled
     )
     out = {
         SIGN: json.dumps([int(s) for s in sign]),

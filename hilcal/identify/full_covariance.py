@@ -13,7 +13,7 @@ from hilcal.data.readings import Readings
 from hilcal.data.whitening import inverse_root
 from hilcal.errors import CannotAnswerError
 from hilcal.identify.registration import register
-from hilcal.robot.chain import command_jacobian, evaluate
+from hilcal.robot.chain import drive_jacobian, evaluate
 from hilcal.types import Floats
 
 CovarianceParts = Literal[
@@ -138,5 +138,5 @@ def joint_factors(cell: Cell, readings: Readings, joint_std: Floats) -> Floats:
     """
     chain = evaluate(cell.arm, readings.states.q)
     at = cell.target_of(readings.states.target)
-    jac = command_jacobian(cell.arm, chain, chain.point(at[..., :3, 3]))
+    jac = drive_jacobian(cell.arm, chain, chain.point(at[..., :3, 3]))
     return scatter_factor(jac, joint_std, cell.registration[:3, :3], readings.m)

@@ -29,14 +29,14 @@ def smooth_nuisance_columns(
     if s.approach is not None:
         functions.append(s.approach)
     functions += [np.cos(situation.angle), np.sin(situation.angle)]
-    joints = [moves.dq * f[:, None, :] for f in functions]
+    joints = [moves.drives * f[:, None, :] for f in functions]
     links, loads = [], []
     for slot in range(situation.wrench.shape[1]):
         moved = moves.by_slot(slot)
         links.append(moved)
         loads.append(moved[:, :, 3:5] * situation.wrench[:, slot, None, 3:5])
     drift = [] if s.time is None else [moves.by_station() * (s.time - s.time.mean())[:, None, None]]
-    harmonics = [moves.dq * f(2 * situation.angle)[:, None, :] for f in (np.cos, np.sin)]
+    harmonics = [moves.drives * f(2 * situation.angle)[:, None, :] for f in (np.cos, np.sin)]
     most = int(MOST_SHARE * w.rank)
     columns = np.concatenate([*joints, *drift, *loads, *harmonics, *links], axis=2)[:, :, :most]
     white = w.whiten(w.raw(columns)).reshape(w.m * len(w), -1)

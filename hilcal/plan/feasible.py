@@ -234,7 +234,8 @@ class Space:
         limit = _BELOW * self.config.limits.torque_share * np.asarray(arm.torque_max, dtype=float)
         pull = np.broadcast_to(self._pull(load), (len(q), 6))
         carried = Load(pull, cell.load_point, cell.tool_mass, cell.tool_com, cell.gravity)
-        torque = slot_wrenches(arm, evaluate(arm, q), carried)[:, : arm.n, 5]
+        about_axes = slot_wrenches(arm, evaluate(arm, q), carried)[:, : arm.n, 5]
+        torque = arm.drive_torques(about_axes)
         return np.asarray(np.all(np.abs(torque) <= limit, axis=1))
 
     def _payload(self, q: Floats, load: str) -> Bools:

@@ -12,7 +12,7 @@ from hilcal.data.covariance import (
 )
 from hilcal.model import Prediction
 from hilcal.plan.nominal_model import NominalModel
-from hilcal.robot.chain import command_jacobian
+from hilcal.robot.chain import drive_jacobian
 from hilcal.types import Floats
 
 
@@ -36,7 +36,7 @@ def arrival_covariance(nominal: NominalModel, config: CellConfig, predicted: Pre
         return single
     o = predicted.observation
     s = predicted.situation
-    jac = command_jacobian(s.cell.arm, s.chain, o.base_position)
+    jac = drive_jacobian(s.cell.arm, s.chain, o.base_position)
     joint_std = config.repeatability.per_joint(nominal.cell.arm.n)
     factor = scatter_factor(jac, joint_std, o.axes, m).reshape(-1, count * m, jac.shape[2])
     out = (factor @ np.swapaxes(factor, 1, 2)).reshape(-1, count, m, count, m)
@@ -67,7 +67,7 @@ def reading_covariance(nominal: NominalModel, config: CellConfig, predicted: Pre
     out = expected_share_of_mean(a.samples, a.systematic_share) * stated
     joint_std = config.repeatability.per_joint(nominal.cell.arm.n)
     if np.any(joint_std):
-        jac = command_jacobian(
+        jac = drive_jacobian(
             predicted.situation.cell.arm, predicted.situation.chain, o.base_position
         )
         out = out + joint_scatter(jac, joint_std, o.axes, m)

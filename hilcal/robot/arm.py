@@ -33,6 +33,10 @@ class Arm:
         source: where the figures come from.
         coupling: (n, n) C with θ = C q: the angles of the chain from the controller's values, where
             joints follow others (see `conventions`); None where each turns by itself.
+        drive: (n, n) D with dθ = D dδ: displacements of the chain's joints from those of the
+            drives, where drives turn several joints; None where each turns its own.
+        sign: (n,) −1 where the axis is the drawn one turned round (`with_conventions`), else 1;
+            None for 1 everywhere.
         notes: what its description lacks, and what that means, a sentence each.
         repeatability: pose repeatability RP of ISO 9283 as the maker states it, m; None if unknown.
     """
@@ -48,12 +52,36 @@ class Arm:
     joint_names: tuple[str, ...]
     source: str
     coupling: Floats | None = None
+    drive: Floats | None = None
+    sign: Floats | None = None
     notes: tuple[str, ...] = ()
     repeatability: float | None = None
 
     def chain_angles(self, q: Floats) -> Floats:
         """Angles (..., n) that the axes of the chain turn by, from the controller's values."""
         return q if self.coupling is None else q @ self.coupling.T
+
+    def drive_angles(self, q: Floats) -> Floats:
+        """Angles (..., n) that the drives have turned by, from the controller's values.
+
+        φ with D φ = C q; the controller's values themselves where all couplings are mechanical.
+        """
+        if self.drive is None:
+            return self.chain_angles(q)
+        if self.coupling is not None and np.array_equal(self.drive, self.coupling):
+            return q
+        return np.asarray(self.chain_angles(q) @ np.linalg.pinv(self.drive).T)
+
+    def driven(self, dq: Floats) -> Floats:
+        """Displacements (..., n) of the chain's joints by those of the drives."""
+        return dq if self.drive is None else np.asarray(dq @ self.drive.T)
+
+    def drive_torques(self, torque: Floats) -> Floats:
+        """Torques (..., n) that the drives carry, Dᵀ τ, from those about the joints' axes.
+
+        By virtual work: τ · D dδ = (Dᵀ τ) · dδ.
+        """
+        return torque if self.drive is None else np.asarray(torque @ self.drive)
 
     @property
     def n(self) -> int:

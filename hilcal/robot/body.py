@@ -4,12 +4,13 @@ Universal Robots' arms have figures of their own; any other arm gets a capsule p
 radius is a share of its reach. A capsule is all points within `radius` of a segment.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hilcal.robot.arm import Arm
 from hilcal.robot.chain import evaluate
+from hilcal.robot.conventions import as_drawn
 from hilcal.types import Floats
 
 BASE = "base"
@@ -17,6 +18,8 @@ _JOINTS = 6
 _RIM = 0.5  # of the radius: a housing's rounded end; so much shorter is the capsule's segment
 _THICK, _THIN = 0.047, 0.03  # radii of an unknown arm at base and flange, shares of its reach
 _SHORT = 1e-6  # m
+TURNED = np.array([1.0, -1.0, -1.0])
+"""Coordinates of a point in a frame that was turned round x by 180°."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,6 +84,8 @@ _FIGURES = {
 
 def is_known(arm: Arm) -> bool:
     """Whether the arm's sizes are known; else they are guessed from its reach."""
+    if arm.sign is not None:
+        return is_known(as_drawn(arm))
     parallel = arm.n == _JOINTS and min(abs(arm.links[k][2, 2]) for k in (2, 3)) > 0.99
     return arm.name in _FIGURES and bool(parallel)  # a file of the same name may be another arm
 
@@ -91,17 +96,24 @@ def capsules(arm: Arm) -> tuple[Capsule, ...]:
     Real housings are cylinders with rounded ends; the capsules hold them but for a rim of at
     most an eighth of the radius, which the margins of collision checks cover.
     """
-    return _of_ur(arm, _FIGURES[arm.name]) if is_known(arm) else _of_any(arm)
+    if arm.sign is None:
+        return _of_ur(arm, _FIGURES[arm.name]) if is_known(arm) else _of_any(arm)
+    # The shapes are those of the drawn arm; the bodies of turned axes have turned frames.
+    turned = np.append(False, arm.sign < 0)
+    return tuple(
+        replace(c, start=TURNED * c.start, end=TURNED * c.end) if turned[c.body] else c
+        for c in capsules(as_drawn(arm))
+    )
 
 
 def body_poses(arm: Arm, q: Floats) -> Floats:
     """Poses T_base_body of base and bodies, and of the flange.
 
-    T_base_body0 = 1, T_base_bodyi = L_0 Rz(q_1) ... L_{i-1} Rz(q_i).
+    T_base_body0 = 1, T_base_bodyi = L_0 Rz(θ_1) ... L_{i-1} Rz(θ_i).
 
     Args:
         arm: the arm.
-        q: (N, n) joint angles, rad.
+        q: (N, n) the controller's joint values, rad.
 
     Returns:
         (N, n + 2, 4, 4): base, the n bodies, flange.
@@ -111,8 +123,9 @@ def body_poses(arm: Arm, q: Floats) -> Floats:
     out[:, 1:, :3, :3] = np.swapaxes(chain.rotation, 0, 1)
     out[:, 1:, :3, 3] = np.swapaxes(chain.position, 0, 1)
     turn = np.tile(np.eye(3), (len(q), arm.n, 1, 1))
-    turn[..., 0, 0] = turn[..., 1, 1] = np.cos(q)
-    turn[..., 1, 0] = np.sin(q)
+    angle = arm.chain_angles(q)
+    turn[..., 0, 0] = turn[..., 1, 1] = np.cos(angle)
+    turn[..., 1, 0] = np.sin(angle)
     turn[..., 0, 1] = -turn[..., 1, 0]
     out[:, 1:-1, :3, :3] = out[:, 1:-1, :3, :3] @ turn
     return out

@@ -41,7 +41,7 @@ def evaluate(arm: Arm, q: Floats, deviation: Deviation | None = None) -> Chain:
     """Evaluate the deviated chain at the controller's values q (N, n); exact, batched."""
     deviation = deviation or Deviation()
     turned = arm.chain_angles(q)
-    angle = along_states(turned if deviation.dq is None else turned + deviation.dq)
+    angle = along_states(turned if deviation.dq is None else turned + arm.driven(deviation.dq))
     twist = deviation.twist
     if twist is not None:
         twist = np.swapaxes(along_states(twist), 0, 1)
@@ -73,7 +73,7 @@ def evaluate(arm: Arm, q: Floats, deviation: Deviation | None = None) -> Chain:
 def joint_jacobian(chain: Chain, x: Floats) -> Floats:
     """Geometric Jacobian (N, 6, n) of a flange-fixed point now at x (N, 3), base axes.
 
-    By the angles of the chain; `command_jacobian` is that by the controller's values.
+    By the angles of the chain; `drive_jacobian` is that by the drives.
 
     Column j is (z_j × (x − p_j), z_j); rows are m/rad and rad/rad.
     """
@@ -86,10 +86,10 @@ def joint_jacobian(chain: Chain, x: Floats) -> Floats:
     return out
 
 
-def command_jacobian(arm: Arm, chain: Chain, x: Floats) -> Floats:
-    """Geometric Jacobian (N, 6, n) by the controller's values, see `joint_jacobian`."""
+def drive_jacobian(arm: Arm, chain: Chain, x: Floats) -> Floats:
+    """Geometric Jacobian (N, 6, n) by displacements of the drives, see `joint_jacobian`."""
     out = joint_jacobian(chain, x)
-    return out if arm.coupling is None else np.asarray(out @ arm.coupling)
+    return out if arm.drive is None else np.asarray(out @ arm.drive)
 
 
 def slot_jacobian(chain: Chain, slot: int, x: Floats) -> Floats:

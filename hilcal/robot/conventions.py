@@ -6,6 +6,11 @@ The joint j of the chain turns by
 
 with q the controller's values, s = ±1, o the zero offset and k the couplings (a parallelogram: the
 forearm keeps its direction in space while joint 2 moves, k_32 = −1; bevel gears in a wrist).
+
+A coupling is mechanical where the motor of joint i turns joint j along: what the drives are off
+by, δ, turns the joints by D δ, and drive i carries the torque (Dᵀ τ)_i, with D = 1 + K of the
+mechanical couplings. One that only the controller counts (a forearm counted from the horizontal,
+with its drive in the elbow) is in θ alone: each drive carries the torque of its joint.
 """
 
 import math
@@ -42,13 +47,16 @@ def as_counted(arm: Arm, by: Conventions) -> Arm:
             )
     sign = np.array(by.joint_sign or (1,) * arm.n, dtype=float)
     offset = np.radians(by.joint_offset_deg or (0.0,) * arm.n)
-    coupling = np.zeros((arm.n, arm.n))
+    coupling, counted = np.zeros((2, arm.n, arm.n))
     for c in by.joint_coupling:
         coupling[c.joint - 1, c.follows - 1] += c.factor
-    return with_conventions(arm, sign, offset, coupling)
+        counted[c.joint - 1, c.follows - 1] += 0.0 if c.mechanical else c.factor
+    return with_conventions(arm, sign, offset, coupling, counted)
 
 
-def with_conventions(arm: Arm, sign: Floats, offset: Floats, coupling: Floats) -> Arm:
+def with_conventions(
+    arm: Arm, sign: Floats, offset: Floats, coupling: Floats, counted: Floats | float = 0.0
+) -> Arm:
     """Return the arm whose joint values are the controller's.
 
     Signs and zeros go into the constant links:
@@ -64,6 +72,7 @@ def with_conventions(arm: Arm, sign: Floats, offset: Floats, coupling: Floats) -
         sign: (n,) s.
         offset: (n,) o, rad.
         coupling: (n, n) k, zero on the diagonal.
+        counted: (n, n) the part of it that is not mechanical.
     """
     links, coms = arm.links.copy(), arm.coms.copy()
     own = np.eye(arm.n) if arm.coupling is None else arm.coupling
@@ -76,8 +85,29 @@ def with_conventions(arm: Arm, sign: Floats, offset: Floats, coupling: Floats) -
             coms[j] = _HALF_TURN[:3, :3] @ coms[j]
     # θ = C (S q + o + K q), and S θ is what turns the links.
     follows = sign[:, None] * (own @ (np.diag(sign) + coupling))
-    one = np.array_equal(follows, np.eye(arm.n))
-    return replace(arm, links=links, coms=coms, coupling=None if one else follows)
+    before = np.eye(arm.n) if arm.drive is None else arm.drive
+    drives = sign[:, None] * (before @ (np.diag(sign) + coupling - counted))
+    signs = sign if arm.sign is None else sign * arm.sign
+    return replace(
+        arm,
+        links=links,
+        coms=coms,
+        coupling=_unless_one(follows),
+        drive=_unless_one(drives),
+        sign=signs if np.any(signs < 0) else None,
+    )
+
+
+def as_drawn(arm: Arm) -> Arm:
+    """Return the arm with all axes as drawn, for what does not depend on the joint values."""
+    if arm.sign is None:
+        return arm
+    nothing = np.zeros((arm.n, arm.n))
+    return with_conventions(replace(arm, coupling=None, drive=None), arm.sign, nothing[0], nothing)
+
+
+def _unless_one(matrix: Floats) -> Floats | None:
+    return None if np.array_equal(matrix, np.eye(len(matrix))) else matrix
 
 
 def may_follow(n: int) -> tuple[tuple[int, int], ...]:

@@ -16,7 +16,7 @@ class Deviation:
     """Departure of N states from the nominal chain; None stands for zero.
 
     Attributes:
-        dq: (N, n) joint displacements, rad.
+        dq: (N, n) joint displacements, rad: of the drives where joints are coupled (`Arm.drive`).
         twist: (N, n + 1, 6) small rigid displacement of everything beyond slot k, in the axes
             of slot k, m and rad.
         base: (N, 6) twist of the base relative to its registration, base axes.

@@ -163,7 +163,7 @@ def _torques(arm: Arm, chain: Chain, wrench: Floats) -> Floats:
     """(N, n) static joint torques under weight and a wrench at the target, N·m."""
     wrenches = np.broadcast_to(wrench, (chain.position.shape[1], 6))
     load = Load(wrenches, TARGET, 0.0, np.zeros(3), np.array([0.0, 0.0, -9.80665]))
-    return slot_wrenches(arm, chain, load)[:, : arm.n, 5]
+    return arm.drive_torques(slot_wrenches(arm, chain, load)[:, : arm.n, 5])
 
 
 def _correlation(covariance: Floats) -> Floats:

@@ -48,7 +48,7 @@ def pose(place: Floats) -> Floats:
 
 
 class Kinematics:
-    """T_base_flange(q) = L_0 Rz(q_1) L_1 ... Rz(q_n) L_n of a nominal arm."""
+    """T_base_flange(q) = L_0 Rz(θ_1) L_1 ... Rz(θ_n) L_n of a nominal arm, θ = C q."""
 
     def __init__(self, arm: Arm) -> None:
         """Take the arm's constants."""
@@ -59,7 +59,8 @@ class Kinematics:
         arm = self.arm
         out = np.empty((arm.n + 1, 4, 4))
         place = arm.links[0]
-        cos, sin = np.cos(q), np.sin(q)
+        angle = arm.chain_angles(q)
+        cos, sin = np.cos(angle), np.sin(angle)
         for k in range(arm.n):
             turn = np.eye(4)
             turn[:2, :2] = [[cos[k], -sin[k]], [sin[k], cos[k]]]
@@ -76,12 +77,14 @@ class Kinematics:
         """Return (6, n): velocity of a point (3,), base axes, and turn, per joint speed."""
         frames = self.frames(q)[:-1]
         axes = frames[:, :3, 2]
-        return np.concatenate([np.cross(axes, point - frames[:, :3, 3]).T, axes.T])
+        by_angle = np.concatenate([np.cross(axes, point - frames[:, :3, 3]).T, axes.T])
+        return by_angle if self.arm.coupling is None else by_angle @ self.arm.coupling
 
     def weight_torque(self, q: Floats, mass: float, com: Floats) -> Floats:
-        """Return the (n,) torque that the arm's weight and a payload exert at its joints, N·m.
+        """Return the (n,) torque that the arm's weight and a payload exert at its drives, N·m.
 
-        tau_j = sum over bodies i >= j of z_j · ((c_i - p_j) x m_i g); `com` (3,) in flange axes.
+        tau_j = sum over bodies i >= j of z_j · ((c_i - p_j) x m_i g) about the axes; `com` (3,) in
+        flange axes.
         """
         frames, arm = self.frames(q), self.arm
         centres = np.einsum("kij,kj->ki", frames[:-1, :3, :3], arm.coms) + frames[:-1, :3, 3]
@@ -91,4 +94,4 @@ class Kinematics:
         for j in range(arm.n):
             moments = np.cross(centres[j:] - frames[j, :3, 3], forces[j:])
             torque[j] = frames[j, :3, 2] @ moments.sum(axis=0)
-        return torque
+        return self.arm.drive_torques(torque)

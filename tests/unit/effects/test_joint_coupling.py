@@ -59,10 +59,11 @@ def test_pairs_are_those_of_arms_with_couplings_or_those_that_are_named():
     assert some.options == {"pairs": "3:2/4:4"}
     assert [p.name for p in some.parameters] == ["j3.q2", "j4.q4"]
     assert some.parameters[1].meaning == "own ratio of joint 4"
-    dq = some.deviation(np.array([0.1, 0.01]), Model(ODD, ()).predict(states, []).situation).dq
-    expected = np.zeros_like(dq)
-    expected[:, 2], expected[:, 3] = 0.1 * states.q[:, 1], 0.01 * states.q[:, 3]
-    np.testing.assert_allclose(dq, expected, rtol=1e-15)
+    s = Model(ODD, ()).predict(states, np.zeros(0)).situation
+    twist = some.deviation(np.array([0.1, 0.01]), s).twist
+    expected = np.zeros_like(twist)
+    expected[:, 2, 5], expected[:, 3, 5] = 0.1 * states.q[:, 1], 0.01 * states.q[:, 3]
+    np.testing.assert_allclose(twist, expected, rtol=1e-15)
 
 
 @pytest.mark.parametrize("given", ["", "3", "3:2/3:2", "8:1", "0:1", "3-2", 3.2, None, ["3:2"]])

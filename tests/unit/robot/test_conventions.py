@@ -8,7 +8,7 @@ from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
 from hilcal.errors import InputError
 from hilcal.robot.catalogue import load_arm
-from hilcal.robot.chain import command_jacobian, evaluate
+from hilcal.robot.chain import drive_jacobian, evaluate
 from hilcal.robot.pinocchio_model import pinocchio_model
 from hilcal.robot.urdf import arm_from_urdf
 
@@ -42,7 +42,7 @@ def test_flange_and_masses_are_those_of_the_drawn_arm_at_the_turned_angles():
 def test_jacobian_by_the_controllers_values_agrees_with_differences():
     arm, q, step = described(**KEYS), np.random.default_rng(1).uniform(-2, 2, (3, 6)), 1e-6
     chain = evaluate(arm, q)
-    found = command_jacobian(arm, chain, chain.position[-1])[:, :3]
+    found = drive_jacobian(arm, chain, chain.position[-1])[:, :3]
     for j in range(6):
         ahead, back = (evaluate(arm, q + s * np.eye(6)[j]).position[-1] for s in (step, -step))
         np.testing.assert_allclose(found[:, :, j], (ahead - back) / (2 * step), atol=1e-8)
