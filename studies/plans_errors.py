@@ -9,11 +9,12 @@ import numpy as np
 from hilcal.data.plan import UNLOADED
 from hilcal.data.readings import Readings, States
 from hilcal.data.whitening import Mode
+from hilcal.effects.catalogue import installed
 from hilcal.errors import CannotAnswerError
 from hilcal.identify.baseline import with_effects
 from hilcal.identify.fit import fit
 from hilcal.plan.information import Problem, readings_of
-from hilcal.plan.nominal_model import nominal_states
+from hilcal.plan.nominal_model import nominal_states, planned_effects
 from hilcal.plan.predicted import rms
 from hilcal.types import Floats, Ints
 from studies.plans_kinds import Chosen, Scene
@@ -127,9 +128,9 @@ def run_campaign(of: Scene, chosen: Chosen, subject: Subject, rng: np.random.Gen
     Raises:
         CannotAnswerError: the readings do not determine the parameters.
     """
-    mode, names = of.config.planning.readings, of.config.planning.model
+    mode, names = of.config.planning.readings, planned_effects(of.config, installed())
     readings = subject.arm.measure(readings_asked(chosen), rng)
-    found = fit(with_effects(of.cell, readings, mode, names), readings, mode)
+    found = fit(with_effects(of.cell, readings, mode, names, names), readings, mode)
     at_test = found.model.predict(subject.test, found.theta).observation.position
     error = _of_interest(at_test, subject.unloaded) - subject.truth
     told, true = chosen.predicted, subject.arm.parameters

@@ -20,7 +20,12 @@ Output = Annotated[
     Path, typer.Option("-o", "--output", metavar="PLAN", help="The plan file to make.")
 ]
 Poses = Annotated[
-    int, typer.Option("--poses", help="As many readings as so many poses take under every load.")
+    int,
+    typer.Option(
+        "--poses",
+        help="As many readings as so many poses take under every load; "
+        "the plan may spread them over more or fewer poses.",
+    ),
 ]
 Seed = Annotated[int, typer.Option("--seed", help="Of the random candidates.")]
 Quick = Annotated[

@@ -20,7 +20,8 @@ class Planning(Section):
     model: tuple[_Name, ...] = Field(
         ("joint_compliance",),
         min_length=1,
-        description='the effects that are assumed, a list of names, e.g. ["joint_compliance"]',
+        description='the effects that are assumed, a list of names, e.g. ["joint_compliance"], '
+        'with options as in ["joint_compliance(joints=2-6)"]',
     )
     readings: Literal["deflection", "absolute"] = Field(
         "deflection", description='"deflection" or "absolute": what will be fitted'

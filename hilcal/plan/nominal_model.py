@@ -10,6 +10,7 @@ from hilcal.data.readings import States
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.effects.options import Options
 from hilcal.effects.protocol import Effect
+from hilcal.effects.written import read_effects_text
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit
 from hilcal.identify.priors import prior_of
@@ -90,10 +91,11 @@ def nominal_model(
         )
     registered, station = _registered(cell, config, place)
     frames = known.unknown_frames(cell)
-    names = tuple(dict.fromkeys((*frames, *checked(config.planning.model, "model", known))))
+    wanted = {name: dict[str, object]() for name in frames} | planned_effects(config, known)
     prior = FRAME_PRIOR if config.planning.readings == "deflection" else {}
     effects = tuple(
-        build(known, name, registered, m, prior if name in frames else {}) for name in names
+        build(known, name, registered, m, {**(prior if name in frames else {}), **options})
+        for name, options in wanted.items()
     )
     model = Model(registered, effects, known)
     parts = [(e.role == "baseline") * np.array([p.scale for p in e.parameters]) for e in effects]
@@ -160,6 +162,20 @@ def random_columns(effects: tuple[Effect, ...]) -> tuple[str, ...]:
         for e in effects
         if e.needs
     )
+
+
+def planned_effects(config: CellConfig, catalogue: Catalogue) -> dict[str, dict[str, object]]:
+    """Return the effects of `[planning] model`, by name, with the options written behind them.
+
+    Each is written as for `identify --effects`, e.g. "joint_compliance(joints=2-6)".
+
+    Raises:
+        InputError: an unknown effect (lists the valid ones), or options that cannot be read.
+    """
+    try:
+        return read_effects_text(", ".join(config.planning.model), "effects", catalogue)
+    except InputError as error:
+        raise InputError(f"[planning] model: {error}") from None
 
 
 def checked(names: tuple[str, ...], key: str, catalogue: Catalogue) -> tuple[str, ...]:

@@ -35,6 +35,7 @@ from hilcal.plan.predicted import Predicted, predicted
 from hilcal.plan.prediction_poses import PredictionPoses, prediction_poses
 from hilcal.plan.run_order import Chosen, Ordered, Ordering, order_plan
 from hilcal.plan.timing import pace
+from hilcal.plan.undetermined import Undetermined, without_undetermined
 from hilcal.types import Bools, Floats, Ints
 
 HOMES = 4
@@ -84,6 +85,8 @@ class Planned:
         budget: readings of the design.
         criterion: name of the criterion.
         predicted: standard uncertainties that a fit to the readings will have.
+        undetermined: parameters of the model that no reading of the cell determines.
+        asked_poses: poses that the budget was asked for by; None where readings were.
     """
 
     ordered: Ordered
@@ -97,6 +100,8 @@ class Planned:
     budget: float
     criterion: str
     predicted: Predicted
+    undetermined: tuple[Undetermined, ...]
+    asked_poses: int | None
 
     @property
     def counts(self) -> Floats:
@@ -129,8 +134,8 @@ def make(
 
     Raises:
         InputError: numbers or names that cannot be.
-        CannotAnswerError: the cell leaves too few states, or the readings are too few; names
-            the constraint or the parameter.
+        CannotAnswerError: the cell leaves too few states, its readings determine nothing of the
+            model, or they are too few; names the constraint or the parameter.
     """
     criterion = canonical(request.criterion or config.planning.criterion)
     say("drawing candidate poses")
@@ -140,8 +145,8 @@ def make(
     drawn = replace(drawn, q=drawn.q[poses], allowed=drawn.allowed[poses])
     say("computing the information of each pose")
     model = nominal_model(cell, config, 3, catalogue) if known is None else after(known, config)
-    of = problem(model, config, drawn.q, drawn.allowed)
-    work = prediction_poses(model, config, drawn.q, space.clear)
+    of, undetermined = without_undetermined(problem(model, config, drawn.q, drawn.allowed))
+    work = prediction_poses(of.nominal, config, drawn.q, space.clear)
     budget = _budget(request, of)
     asked = compound_objective(of, criterion, work, budget, rng)
     say("choosing loads")
@@ -178,8 +183,9 @@ def make(
     ordered = _ordered(space, of, home, counts, rng, request.unloaded)
     knows = predicted(of, counts.astype(float), work=work)
     return Planned(
-        ordered, design, loads, of, asked, usable, work, drawn, loads.budget, criterion, knows
-    )
+        ordered, design, loads, of, asked, usable, work, drawn, loads.budget, criterion, knows,
+        undetermined, None if request.readings is not None else request.poses,
+    )  # fmt: skip
 
 
 def _budget(request: Request, of: Problem) -> float:

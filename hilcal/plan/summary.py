@@ -34,6 +34,10 @@ LOOSE = 3e-3
 DRAWS = 5
 """Random directions of an effect whose median is its minimum detectable strength. A choice."""
 _SEED = 20240611
+_LEFT_OUT = {
+    "deflection": "geometry, registration, repeatability and effects outside of the model",
+    "position": "repeatability and effects outside of the model",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +46,7 @@ class PredictedParameter:
 
     Attributes:
         name: e.g. "joint_compliance.j2".
-        std: in `unit`, SI.
+        std: in `unit`, SI; infinite where the readings do not determine it.
         value: estimated or ordinary magnitude, SI; None where there is none.
         unit: SI.
     """
@@ -123,7 +127,8 @@ class PlanSummary:
         criterion: name of the criterion.
         efficiency: certified lower bound of the efficiency; None without a certificate.
         parameters: predicted precision by parameter.
-        position_std_m: RMS standard uncertainty at the prediction poses, m; None without.
+        position_std_m: RMS standard uncertainty of the prediction at the prediction poses, m; None
+            without. It is not the accuracy of the robot, see `position_note`.
         position: what is predicted there, e.g. "deflection under 5kg at 100 poses".
         criteria: criterion comparison, the plan's own among them.
         curve: sample-size curve, fewest poses first.
@@ -132,6 +137,8 @@ class PlanSummary:
         confounding: of the plan's order with a linear drift; None where it is not known.
         shortest: confounding of the shortest order.
         remarks: assumptions and omissions, one sentence each.
+        asked_poses: poses that were asked for: as many readings as these take under every load;
+            None where readings were.
     """
 
     poses: int
@@ -150,6 +157,17 @@ class PlanSummary:
     confounding: Confounding | None = None
     shortest: Confounding | None = None
     remarks: tuple[str, ...] = ()
+    asked_poses: int | None = None
+
+    @property
+    def quantity(self) -> str:
+        """What is predicted at the prediction poses: "deflection" or "position"."""
+        return self.position.split(" ")[0] or "position"
+
+    @property
+    def position_note(self) -> str:
+        """What `position_std_m` is, and what it leaves out, in a sentence."""
+        return position_note(self.quantity)
 
     @property
     def load_changes(self) -> int:
@@ -171,6 +189,9 @@ class PlanSummary:
         same = ("poses", "readings", "criterion", "efficiency", "position_std_m", "parameters")
         return {
             **{key: known[key] for key in same},
+            "asked_poses": self.asked_poses,
+            "position": self.position,
+            "position_note": self.position_note,
             "predicted_std": {p.name: p.std for p in self.parameters},
             "readings_by_load": self.loads,
             "criteria": known["criteria"],
@@ -208,14 +229,7 @@ def summarise(
         duration=planned.ordered.duration,
         criterion=planned.criterion,
         efficiency=planned.design.efficiency,
-        parameters=tuple(
-            PredictedParameter(name, float(std), float(value) or None, unit)
-            for name, std, value, unit in zip(
-                knows.names, knows.std, knows.values, knows.units, strict=True
-            )
-            # deflections do not determine where a frame is
-            if np.isfinite(std) or not name.startswith(_prefixes(planned.problem, *FRAME_ROLES))
-        ),
+        parameters=_parameters(planned),
         position_std_m=_finite(knows.position),
         position=planned.work.what,
         criteria=tuple(_criteria(planned, rng)) if compare else (),
@@ -225,7 +239,34 @@ def summarise(
         confounding=planned.ordered.confounding,
         shortest=planned.ordered.confounding_shortest,
         remarks=remarks(planned),
+        asked_poses=planned.asked_poses,
     )
+
+
+def position_note(quantity: str) -> str:
+    """Return what the uncertainty of a predicted "deflection" or "position" leaves out."""
+    return (
+        f"standard uncertainty (rms) of the {quantity} that the fitted model predicts; it is not "
+        f"the accuracy of the robot: {_LEFT_OUT[quantity]} are not in it"
+    )
+
+
+def _parameters(planned: Planned) -> tuple[PredictedParameter, ...]:
+    """Return the predicted precision of each parameter, in the order of the model."""
+    knows, frames = planned.predicted, _prefixes(planned.problem, *FRAME_ROLES)
+    known = {
+        name: PredictedParameter(name, float(std), float(value) or None, unit)
+        for name, std, value, unit in zip(
+            knows.names, knows.std, knows.values, knows.units, strict=True
+        )
+        # deflections do not determine where a frame is
+        if np.isfinite(std) or not name.startswith(frames)
+    }
+    for u in planned.undetermined:
+        known[u.name] = PredictedParameter(u.name, np.inf, u.value or None, u.unit)
+    effects = planned.problem.nominal.model.effects
+    names = (f"{e.name}.{p.name}" for e in effects for p in e.parameters)
+    return tuple(known[name] for name in names if name in known)
 
 
 def remarks(planned: Planned) -> tuple[str, ...]:
@@ -235,7 +276,9 @@ def remarks(planned: Planned) -> tuple[str, ...]:
         "the same time"
         for name, gain in planned.loads.left_out
     )
-    return tuple(dict.fromkeys((*planned.drawn.remarks, *planned.problem.notes, *omitted)))
+    without = tuple(u.remark for u in planned.undetermined)
+    notes = (*without, *planned.drawn.remarks, *planned.problem.notes, *omitted)
+    return tuple(dict.fromkeys(notes))
 
 
 def about(planned: Planned) -> dict[str, object]:
@@ -246,9 +289,11 @@ def about(planned: Planned) -> dict[str, object]:
         "made_by": "optimal design",
         "criterion": planned.criterion,
         "efficiency": round(planned.design.efficiency, 6),
-        "predicted_std": {n: _finite(s) for n, s in knows.by_name().items()},
+        "predicted_std": {n: _finite(s) for n, s in knows.by_name().items()}
+        | {u.name: None for u in planned.undetermined},
         "position_std_m": _finite(knows.position),
         "position": planned.work.what,
+        "position_note": position_note(planned.work.what.split(" ")[0]),
         "candidates": len(planned.drawn.q),
         "loads_left_out": [name for name, _ in planned.loads.left_out],
     }

@@ -30,13 +30,14 @@ A choice."""
 PARAMETER_COLUMNS = ("parameter", "±", "magnitude", "unit", "± in %")
 PARAMETER_NOTE = "magnitude: estimated so far, else the effect's ordinary magnitude."
 CRITERIA_COLUMNS = (
-    "criterion", "position ±", "open ±", "joint ±", "O1 (D)", "O2 (K)", "O3 (E)", "certified"
+    "criterion", "predicted ±", "open ±", "joint ±", "O1 (D)", "O2 (K)", "O3 (E)", "certified"
 )  # fmt: skip
 CRITERIA_NOTE = (
-    "position: at the prediction poses; open: the same with the effects outside of the model "
-    "estimated as well. joint: largest relative uncertainty of a joint compliance. O1 to O3: "
-    "observability indices, larger is better; O1 and O3 with these effects estimated as well. "
-    "certified: lower bound of the efficiency by its own criterion."
+    "predicted: standard uncertainty of the prediction at the prediction poses; open: the same "
+    "with the effects outside of the model estimated as well. joint: largest relative uncertainty "
+    "of a joint compliance. O1 to O3: observability indices, larger is better; O1 and O3 with "
+    "these effects estimated as well. certified: lower bound of the efficiency by its own "
+    "criterion."
 )
 
 
@@ -46,7 +47,6 @@ def plan_report(s: PlanSummary) -> Iterator[RenderableType]:
     rows = Table.grid(padding=(0, 2))
     rows.add_column(no_wrap=True)
     rows.add_column(overflow="fold")
-    rows.add_row("poses", f"{s.poses} and the reference")
     for name, value in cost_rows(s):
         rows.add_row(name, Text(value, style="bold" if name == "certified" else ""))
     yield Padding(rows, (0, 0, 1, 0))
@@ -90,6 +90,7 @@ def load_name(name: str) -> str:
 
 def cost_rows(s: PlanSummary) -> Iterator[tuple[str, str]]:
     """Yield names and values of what a plan costs and reaches."""
+    yield "poses", f"{s.poses} and the reference{_asked(s)}"
     loads = ", ".join(f"{load_name(name)} {count}" for name, count in s.loads.items())
     yield "readings", f"{s.readings}: {loads}"
     time = s.duration
@@ -105,7 +106,15 @@ def cost_rows(s: PlanSummary) -> Iterator[tuple[str, str]]:
     if s.efficiency is not None:
         yield "certified", certified(s.efficiency)
     if s.position_std_m is not None:
-        yield "position", f"± {numbers.length(s.position_std_m)}, predicted for the {s.position}"
+        yield s.quantity, f"± {numbers.length(s.position_std_m)}, predicted for the {s.position}"
+        yield "", s.position_note
+
+
+def _asked(s: PlanSummary) -> str:
+    """Say why there are other poses than were asked for; nothing where there are as many."""
+    if s.asked_poses is None or s.asked_poses == s.poses:
+        return ""
+    return f": as many readings as {s.asked_poses} poses take, which determine more at {s.poses}"
 
 
 def order_remark(s: PlanSummary) -> str:
@@ -146,6 +155,9 @@ def parameter_rows(parameters: Sequence[PredictedParameter]) -> Iterator[tuple[s
         sizes = [o.std if o.value is None else o.value for o in alike]
         unit, factor = numbers.unit_for(p.unit, sizes)
         magnitude = "" if p.value is None else numbers.digits(factor * p.value)
+        if not math.isfinite(p.std):
+            yield p.name, "not determined", magnitude, unit, ""
+            continue
         share = f"{numbers.digits(100 * p.std / abs(p.value), 2)} %" if p.value else ""
         yield p.name, numbers.digits(factor * p.std, 2), magnitude, unit, share
 
@@ -171,7 +183,7 @@ def criteria_rows(s: PlanSummary) -> Iterator[tuple[str, ...]]:
 
 def _curve(curve: Sequence[CurvePoint], poses: int) -> Iterator[RenderableType]:
     yield text.heading("Sample-size curve: how many poses are enough")
-    out = text.table("poses", "position ±", "", left=(2,))
+    out = text.table("poses", "predicted ±", "", left=(2,))
     top = max(point.position_std_m for point in curve)
     for point in curve:
         size = max(1, round(BAR * point.position_std_m / top)) if top > 0 else 1
@@ -188,10 +200,10 @@ def enough(curve: Sequence[CurvePoint]) -> str:
     last = curve[-1]
     first = next(p for p in curve if p.position_std_m <= LIKE * last.position_std_m)
     if first is last:
-        return f"More than {last.poses} poses still improve the position."
+        return f"More than {last.poses} poses still improve the prediction."
     gain = 1.0 - last.position_std_m / first.position_std_m
     return (
-        f"From {first.poses} to {last.poses} poses the position's uncertainty falls by "
+        f"From {first.poses} to {last.poses} poses the prediction's uncertainty falls by "
         f"{100 * gain:.0f} % only."
     )
 

@@ -83,7 +83,9 @@ def test_everything_is_told_and_fits(width: int) -> None:
         "37 min",
         "motion 14 min, readings 19 min, 4 load changes by hand 4 min",
         "at least 98.7 % of the best possible",
-        "± 11.4 µm, predicted for the deflection under mass-5kg at 100 poses",
+        "deflection ± 11.4 µm, predicted for the deflection under mass-5kg at 100 poses",
+        "it is not the accuracy of the robot: geometry, registration, repeatability and effects "
+        "outside of the model are not in it",
         "joint_compliance.j6 0.60 16.0 µrad/(N·m) 3.8 %",
         "base_frame.x 12 µm",
         "D (this) 11.4 µm 15.1 µm 3.8 % 132 0.021 4.10 98.7 %",
@@ -104,6 +106,23 @@ def test_what_is_absent_is_not_told() -> None:
         assert word not in shown
 
 
+def test_other_poses_than_asked_for_are_explained() -> None:
+    words = " ".join(_shown(replace(SUMMARY, asked_poses=14), 80).split())
+    assert (
+        "18 and the reference: as many readings as 14 poses take, which determine more at 18"
+        in words
+    )
+    assert "which determine more" not in _shown(replace(SUMMARY, asked_poses=18), 80)
+
+
+def test_a_parameter_without_uncertainty_is_named() -> None:
+    lost = PredictedParameter("joint_compliance.j1", np.inf, 4.2e-6, "rad/(N·m)")
+    words = " ".join(_shown(replace(SUMMARY, parameters=(lost,)), 80).split())
+    assert "joint_compliance.j1 not determined 4.20 µrad/(N·m)" in words
+    document = replace(SUMMARY, parameters=(lost,)).to_dict()
+    assert "accuracy of the robot" in str(document["position_note"])
+
+
 @pytest.mark.parametrize(
     ("efficiency", "words"),
     [(0.98768, "98.7 %"), (0.9999, "99.9 %"), (1.0, "100.0 %"), (1 + 1e-12, "100.0 %"), (0, "0.0")],
@@ -122,9 +141,9 @@ def test_bars_are_as_long_as_what_they_show_and_the_plan_is_marked() -> None:
 
 def test_enough_is_where_more_poses_change_little() -> None:
     assert enough(SUMMARY.curve) == (
-        "From 12 to 36 poses the position's uncertainty falls by 7 % only."
+        "From 12 to 36 poses the prediction's uncertainty falls by 7 % only."
     )
-    assert enough(SUMMARY.curve[:2]) == "More than 12 poses still improve the position."
+    assert enough(SUMMARY.curve[:2]) == "More than 12 poses still improve the prediction."
 
 
 def test_the_order_is_stated_with_its_cost_and_what_it_saves() -> None:
