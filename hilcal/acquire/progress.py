@@ -49,12 +49,13 @@ class GoalStatus:
     Attributes:
         text: the goal as it was given.
         met: whether it is met.
-        worst: the name of the parameter, or "position", whose uncertainty is worst.
-        std: its standard uncertainty, in `unit`; infinite where it is not identifiable.
+        worst: the name of the parameter, "position" or "deflection", whose uncertainty is worst.
+        std: its standard uncertainty, in `unit`; infinite where the readings do not determine it.
         ratio: std over what is asked for; at most 1 where the goal is met.
         unit: "%" or SI.
         model: names of the effects that were fitted.
         fitted: "deflection" or "absolute", the kind of readings that was fitted.
+        quantity: what `std` is, in full; empty while it is not known.
     """
 
     text: str
@@ -65,6 +66,7 @@ class GoalStatus:
     unit: str | None = None
     model: tuple[str, ...] | None = None
     fitted: str | None = None
+    quantity: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """Return it as JSON; a number that is not finite becomes null."""

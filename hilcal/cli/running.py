@@ -38,7 +38,7 @@ from hilcal.diagnose.live_model import LiveModel
 from hilcal.errors import CannotAnswerError, DeviceError, InputError
 from hilcal.plan.checked_plan import refuse
 from hilcal.plan.goal_rule import GoalRule
-from hilcal.report.goal_words import missed_words, status_words
+from hilcal.report.goal_words import full_words, missed_words
 from hilcal.report.live_run import watching
 from hilcal.report.progress import Say, working
 
@@ -65,7 +65,8 @@ def run(
         typer.Option(
             "--until",
             metavar="GOAL",
-            help='End as soon as a goal is met, e.g. "joint std < 2 %" or "position std < 20 um": '
+            help='End as soon as a goal is met, e.g. "joint std < 2 %" or '
+            '"deflection std < 20 um": '
             "the arm goes home, and the load is taken off. Exit 4 where all readings do not do; "
             "they are kept.",
         ),
@@ -120,7 +121,7 @@ def run(
     if goal is not None:
         document["goal"] = goal.status.to_dict()
         if goal.status.met:
-            t.show(f'The goal "{goal.goal.text}" is met: {status_words(goal.status)}.')
+            t.show(f'The goal "{goal.goal.text}" is met: {full_words(goal.status)}.')
     of = "" if measured == planned else f" of {planned}"
     t.show(f"{measured}{of} readings are in {output}. Go on with: hilcal refine {output}")
     t.document(document)

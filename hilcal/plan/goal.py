@@ -19,7 +19,10 @@ FORMS = (
     '"joint_compliance.j3 std < 1e-7 rad/(N·m)"',
     '"joint_tilt_compliance std < 10 %"',
     '"position std < 20 um"',
+    '"deflection std < 20 um"',
 )
+POSITIONS = ("position", "deflection")
+"""What is predicted where the robot will work: of deflections, both are the deflection."""
 _LENGTHS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6}
 _ANGLES = {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "µrad": 1e-6, "μrad": 1e-6}
 _SHAPE = re.compile(
@@ -34,7 +37,7 @@ class Goal:
 
     Attributes:
         text: as it was given.
-        what: "position", or a parameter or an effect by name.
+        what: "position" or "deflection", or a parameter or an effect by name.
         limit: largest standard uncertainty: a share of the value, or SI.
         relative: whether it is a share of the parameter's value.
         unit: SI unit that the limit was given in; "" for a share.
@@ -48,8 +51,8 @@ class Goal:
 
     @property
     def of_position(self) -> bool:
-        """Whether it is about positions where the robot will work, not about parameters."""
-        return self.what == "position"
+        """Whether it is about what is predicted where the robot will work, not about parameters."""
+        return self.what in POSITIONS
 
     def names(self, known: Mapping[str, float]) -> tuple[str, ...]:
         """Return the parameters that the goal is about, of those that are known.
@@ -90,6 +93,7 @@ class Goal:
         stds: Mapping[str, float],
         values: Mapping[str, float],
         position: float | None = None,
+        predicted: str = "",
     ) -> GoalStatus:
         """Judge standard uncertainties.
 
@@ -97,7 +101,9 @@ class Goal:
             stds: standard uncertainty of each parameter by name, SI; infinite where it is not
                 identifiable.
             values: the parameters, SI.
-            position: standard uncertainty of the position where the robot will work, m.
+            position: standard uncertainty of what is predicted where the robot will work, m;
+                infinite where the readings do not determine it.
+            predicted: what that is, e.g. "deflection under 5kg at 100 poses in the work box".
 
         Raises:
             InputError: a goal for positions without any, or for a parameter that is not there.
@@ -109,7 +115,8 @@ class Goal:
                     "work_min_m and work_max_m"
                 )
             ratio = _ratio(float(position), self.limit)
-            return self._status(ratio, "position", float(position), "m")
+            quantity = f"standard uncertainty (rms) of the predicted {predicted or self.what}"
+            return self._status(ratio, self.what, float(position), "m", quantity)
         status, worst = GoalStatus(self.text, True), -1.0
         for name in self.names(stds):
             std = float(stds[name])
@@ -119,11 +126,13 @@ class Goal:
             ratio = _ratio(std, self.limit)
             if ratio > worst:
                 shown = (100 * std, "%") if self.relative else (std, self.unit)
-                status, worst = self._status(ratio, name, *shown), ratio
+                quantity = f"standard uncertainty of {name}"
+                status, worst = self._status(ratio, name, *shown, quantity), ratio
         return status
 
-    def _status(self, ratio: float, worst: str, std: float, unit: str) -> GoalStatus:
-        return GoalStatus(self.text, bool(ratio <= 1.0), worst, std, ratio, unit)
+    def _status(self, ratio: float, worst: str, std: float, unit: str, quantity: str) -> GoalStatus:
+        met = bool(ratio <= 1.0)
+        return GoalStatus(self.text, met, worst, std, ratio, unit, quantity=quantity)
 
 
 def parse_goal(text: str) -> Goal:
@@ -144,9 +153,9 @@ def parse_goal(text: str) -> Goal:
     what, unit = match["what"], _plain(match["unit"] or "")
     if not unit:
         raise _wrong(text, "the unit is missing")
-    if what == "position":
+    if what in POSITIONS:
         if unit not in _LENGTHS:
-            raise _wrong(text, f"a position is in {', '.join(list(_LENGTHS)[:3])}, not {unit}")
+            raise _wrong(text, f"a {what} is in {', '.join(list(_LENGTHS)[:3])}, not {unit}")
         return Goal(text, what, number * _LENGTHS[unit], False, "m")
     if what == "joint":
         what = JOINTS

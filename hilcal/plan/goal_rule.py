@@ -12,14 +12,14 @@ from hilcal.config import CellConfig
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode, usual_mode
 from hilcal.effects.catalogue import Catalogue, installed
-from hilcal.errors import HilcalError
+from hilcal.errors import HilcalError, InputError
 from hilcal.identify.baseline import with_effects
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.full_covariance import with_joint_scatter
 from hilcal.identify.priors import scales_of
 from hilcal.plan.feasible import Space
 from hilcal.plan.goal import Goal, figures, parse_goal
-from hilcal.plan.nominal_model import after, nominal_model
+from hilcal.plan.nominal_model import after, nominal_model, planned_effects
 from hilcal.plan.predicted import positions_of, rms
 from hilcal.plan.prediction_poses import prediction_poses
 from hilcal.types import Floats
@@ -35,9 +35,10 @@ class GoalRule:
     every loaded reading has its unloaded one, else to the readings as they are; `[planning]
     readings = "absolute"` fits them so in any case.
 
-    The goal counts as met by a fit that converged. Where the residual is more than noise, the
-    stated uncertainty is itself an estimate, and a check after every reading will once find it
-    small by chance: then two fits in a row have to meet the goal, except at the plan's end.
+    The goal counts as met by a fit that converged, to readings that determine what the goal is
+    about: unloaded readings, for one, determine no deflection. Where the residual is more than
+    noise, the stated uncertainty is itself an estimate, and a check after every reading will once
+    find it small by chance: then two fits in a row have to meet the goal, except at the plan's end.
 
     Fits take at most a tenth of the time (`SHARE`), so that none delays the campaign.
 
@@ -75,7 +76,13 @@ class GoalRule:
         effects = model.model.effects
         self.goal.check({f"{e.name}.{p.name}": p.unit for e in effects for p in e.parameters})
         self._work_q: tuple[tuple[float, ...], ...] = ()
+        self._predicted = ""
         if self.goal.of_position:
+            if self.goal.what == "deflection" and config.planning.readings != "deflection":
+                raise InputError(
+                    f'goal "{text}": [planning] readings = "{config.planning.readings}", which '
+                    "predicts positions; valid: position"
+                )
             planning = config.planning
             if not planning.work_q_rad and planning.work_min_m is None:
                 self.goal.met({}, {})  # raises: names the missing keys
@@ -83,6 +90,7 @@ class GoalRule:
                 model, config, np.zeros((0, cell.arm.n)), Space(cell, config).clear
             )
             self._work_q = tuple(dict.fromkeys(tuple(q) for q in some.q.tolist()))
+            self._predicted = some.what
         self._good = False  # whether the fit before met the goal
         self._ended = self._took = -np.inf
 
@@ -118,26 +126,29 @@ class GoalRule:
         """Fit and judge; None where that cannot be done yet."""
         try:
             readings = with_joint_scatter(self._cell, readings, self._scatter)
-            mode, names = self._mode(readings), self._config.planning.model
-            if readings.unloaded.all():  # no load has been hung yet
-                elastic = {kind.name for kind in self._catalogue.with_role("baseline")}
-                names = tuple(name for name in names if name not in elastic)
-            model = with_effects(self._cell, readings, mode, names, None, self._catalogue)
+            mode = self._mode(readings)
+            wanted = planned_effects(self._config, self._catalogue)
+            model = with_effects(self._cell, readings, mode, wanted, wanted, self._catalogue)
             found = fit(model, readings, mode)
             std, value = figures(found)
             held = dict(zip(std, found.solution.prior == 0, strict=True))
             std = {name: s for name, s in std.items() if not held[name]}
             position = self._position(found) if self._work_q else None
-            status = self.goal.met(std, value, position)
+            status = self.goal.met(std, value, position, self._predicted)
             return replace(status, model=found.model.names, fitted=found.mode), found
         except (HilcalError, np.linalg.LinAlgError):
             return None
 
     def _position(self, found: Fit) -> float:
-        """RMS standard uncertainty of the position where the robot will work, m.
+        """RMS standard uncertainty of what is predicted where the robot will work, m.
 
         That of the fit's covariance T H⁻¹ Tᵀ, widened as `identify` widens the parameters'.
+        Infinite where directions that the readings do not determine move the prediction. A family
+        that the fit holds at zero may be so for want of readings, so that there have to be more
+        degrees of freedom than it has parameters, and more than one in any case.
         """
+        if found.dof <= max(int((found.solution.prior == 0).sum()), 1):
+            return float(np.inf)
         where = {"work_q_rad": self._work_q, "work_min_m": None, "work_max_m": None}
         planning = self._config.planning.model_copy(update=where)
         config = self._config.model_copy(update={"planning": planning})

@@ -20,7 +20,7 @@ from hilcal.identify.fit import fit
 from hilcal.plan import goal_rule as goal_rule
 from hilcal.plan.goal_rule import GoalRule
 from hilcal.plan.nominal_model import nominal_states
-from hilcal.report.goal_words import status_words
+from hilcal.report.goal_words import full_words, status_words
 from hilcal.robot import chain as chains
 from tests.support.campaigns import Campaign, campaign, configuration, noiseless, plan, with_noise
 from tests.support.cli_cases import ok, refused, run
@@ -88,19 +88,50 @@ def test_the_position_is_as_sure_as_it_says() -> None:
         seen.append(model.predict(states, found.theta).observation.position)
     scatter = np.sqrt(np.mean(np.sum(np.var(seen, axis=0, ddof=1), axis=1)))
     assert np.median(stated) == pytest.approx(scatter, rel=0.2)
-    assert status_words(told.status).startswith("position std ")
+    assert status_words(told.status).startswith("predicted position ± ")
+    where = "of the predicted position at 3 named poses"
+    assert full_words(told.status).startswith(f"standard uncertainty (rms) {where}: ")
 
 
-def test_what_cannot_be_fitted_yet_is_not_met() -> None:
+def test_what_is_not_determined_yet_is_not_met() -> None:
     c = campaign(mode="deflection", poses=8)
     free = c.readings[c.readings.unloaded]
     told = rule("joint std < 1000 %", c)
     for readings in (free[:1], free[:2], free, c.readings[:3]):
         status = told(readings, last=False)
         assert not status.met
-        assert (status.ratio, status.std) == (None, None)
-        assert status_words(status) == ""
+        assert status.std in (None, np.inf)
+        assert status_words(status) in ("", "joint std not determined yet (j1)")
     assert told(c.readings, last=False).met
+
+
+@pytest.mark.parametrize("what", ["deflection", "position"])
+def test_no_deflection_is_predicted_before_the_loads_are_read(what: str) -> None:
+    """Unloaded readings say nothing of it, and a load at one pose not enough."""
+    c = campaign(mode="deflection", poses=8)
+    work = plan(3, 7).states.q[::5].tolist()
+    told = rule(f"{what} std < 20 um", c, work_q_rad=work)
+    free = c.readings.unloaded
+    one = (c.readings.pose == 0) & (c.readings.load <= 1)
+    for some in (free, free | one, one):
+        status = told(c.readings[some], last=True)
+        assert not status.met
+        assert status.std in (None, np.inf)
+        assert status_words(status) in ("", "predicted deflection not determined yet")
+    status = told(c.readings, last=True)
+    assert status.met
+    assert status.std is not None
+    assert 0.1e-6 < status.std < 20e-6
+    assert status.quantity == (
+        "standard uncertainty (rms) of the predicted deflection under each load at 3 named poses"
+    )
+    assert "predicted deflection under each load" in full_words(status)
+
+
+def test_a_deflection_needs_a_plan_of_deflections() -> None:
+    c = campaign(mode="absolute", poses=6)
+    with pytest.raises(InputError, match="valid: position"):
+        rule("deflection std < 20 um", c, readings="absolute", work_q_rad=[[0.0] * 6])
 
 
 def test_an_estimated_uncertainty_must_do_twice() -> None:
@@ -231,7 +262,8 @@ def test_run_until(site: Site, capsys: pytest.CaptureFixture[str]) -> None:
     assert 9 < d["readings"] < total == d["planned"]
     assert (d["goal"]["met"], d["goal"]["text"]) == (True, "j2 std < 2 %")
     assert d["goal"]["std"] <= 2.0
-    assert "goal met: j2 std " in first.err
+    assert "goal met after " in first.err
+    assert "standard uncertainty of joint_compliance.j2: " in first.err
     assert site.bench.world.load == "none"
     stated = ok(capsys, "identify", path, "--json").document["parameters"]
     j2 = next(p for p in stated if p["name"] == "joint_compliance.j2")
@@ -251,8 +283,9 @@ def test_run_until(site: Site, capsys: pytest.CaptureFixture[str]) -> None:
     assert far.document["goal"]["ratio"] > 1
     line = [line for line in far.err.splitlines() if line.startswith("error: ")]
     assert len(line) == 1
-    said = f'goal "j2 std < 0.01 %" is not met after all {total} readings: j2 std '
+    said = f'goal "j2 std < 0.01 %" is not met after all {total} readings: standard uncertainty'
     assert said in line[0]
+    assert " % of its value, " in line[0]
     assert "times what is asked for" in line[0]
     assert "goal" not in ok(capsys, *site.command("--resume", "--json")).document
 

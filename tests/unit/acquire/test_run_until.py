@@ -68,7 +68,7 @@ def test_a_goal_that_is_met_under_a_load() -> None:
     assert (goal["met"], goal["readings"], goal["planned"]) == (True, 7, len(plan.steps))
     (event,) = b.notes.of(GoalMet)
     assert (event.status.std, event.readings, event.planned) == (7.0, 7, 15)
-    assert met_words(event) == "goal met: j2 std 7.0 % after 7 of 15 readings"
+    assert met_words(event) == "goal met after 7 of 15 readings: j2 std 7.0 %"
 
 
 def test_progress_tells_the_goal_and_what_is_left_of_the_way() -> None:
