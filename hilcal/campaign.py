@@ -173,14 +173,18 @@ class Campaign:
         check_sources(record, self.path, self.catalogue)
         return restore(record, self.cell, self.readings, self.catalogue)
 
+    def fitted_readings(self, record: RevisionRecord) -> Readings:
+        """Return the readings that a revision was fitted to; later ones come after them."""
+        return self.readings[: int(record.result_json["identify"]["n_readings"])]
+
     def restore_model(self, record: RevisionRecord) -> tuple[Model, Floats]:
         """Return model and parameters (P,) of a stored revision; raises as `fit` does."""
         check_sources(record, self.path, self.catalogue)
-        return restore_model(record, self.cell, self.readings, self.catalogue)
+        return restore_model(record, self.cell, self.fitted_readings(record), self.catalogue)
 
     def predictive(self, record: RevisionRecord, model: Model, theta: Floats) -> Predictive:
         """Return what a stored revision knows of readings that it has not seen."""
-        return restore_predictive(record, model, theta, self.readings)
+        return restore_predictive(record, model, theta, self.fitted_readings(record))
 
     def history(self, revision: int | None = None) -> History:
         """Return how the model of a revision was reached, which `diagnose` takes.

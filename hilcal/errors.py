@@ -25,6 +25,12 @@ class CannotAnswerError(HilcalError):
     exit_code = 4
 
 
+class LimitError(HilcalError):
+    """A limit that was given is not kept."""
+
+    exit_code = 5
+
+
 class StoppedError(HilcalError):
     """A person stopped it; says what is safe and how to go on."""
 

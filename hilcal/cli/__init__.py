@@ -15,7 +15,14 @@ import typer
 from hilcal import __version__
 from hilcal.cli.commands import COMMANDS, Command, load
 from hilcal.cli.help import EXIT_CODES, EXIT_CODES_OF_RUN, Group, InOrderOfWork
-from hilcal.errors import CannotAnswerError, DeviceError, HilcalError, InputError, StoppedError
+from hilcal.errors import (
+    CannotAnswerError,
+    DeviceError,
+    HilcalError,
+    InputError,
+    LimitError,
+    StoppedError,
+)
 
 DEBUG = "HILCAL_DEBUG"
 _COMPLETE = "_HILCAL_COMPLETE"
@@ -26,6 +33,7 @@ _KINDS = {
     InputError: "input",
     DeviceError: "device",
     CannotAnswerError: "cannot_answer",
+    LimitError: "limit",
     StoppedError: "interrupted",
 }
 
@@ -119,7 +127,8 @@ def _words_to_complete() -> list[str]:
 
 
 def execute(make: Callable[[], typer.Typer], name: str, arguments: Sequence[str]) -> None:
-    """Run a command and exit: 0 done, 2 wrong input, 3 a device failed, 4 cannot be answered.
+    """Run a command and exit: 0 done, 2 wrong input, 3 a device failed, 4 cannot be answered,
+    5 a limit is not kept.
 
     Wrong input and failures are one line on stderr; HILCAL_DEBUG=1 shows where they came from.
     With --json the error is a JSON document on stdout, too, unless the command has printed one.

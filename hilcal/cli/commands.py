@@ -74,7 +74,9 @@ COMMANDS = {
         "next:next_",
         "Plan the measurements that separate the leading suspects; exit 4 where none are in doubt.",
     ),
-    "validate": Command("fitting:validate", "Predict readings of another campaign with the model."),
+    "validate": Command(
+        "validating:validate", "Predict readings of another campaign with the model."
+    ),
     "accept": Command(
         "campaigns:accept",
         "Choose the revision that every command uses from now on, whatever is added later.",

@@ -1,7 +1,6 @@
-"""`identify`, `compare` and `validate`: fits, and how far they are from what was measured."""
+"""`identify` and `compare`: fits, and how far they are from what was measured."""
 
 from dataclasses import asdict
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -24,17 +23,14 @@ from hilcal.diagnose.misfit_breakdown import misfit_breakdown
 from hilcal.effects.written import write_effect
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline, with_effects
-from hilcal.identify.extrapolation import extrapolation
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.fit_document import to_json
 from hilcal.identify.full_prediction import full_prediction
 from hilcal.identify.linearisation import linearise
-from hilcal.identify.validation import validate as predict_other
-from hilcal.report import numbers, text, text_validate
+from hilcal.report import numbers, text
 from hilcal.report.covariance_words import covariance_words
 from hilcal.report.progress import working
 from hilcal.report.text_scalings import scalings_table
-from hilcal.revisions import mode_of
 
 Readings = Annotated[
     str | None,
@@ -139,68 +135,5 @@ def compare(
                 {"variable": p.variable, "share": p.share, "p_value": p.p_value} for p in places
             ],
             "worst": [asdict(w) for w in worst],
-        }
-    )
-
-
-def validate(
-    run: Run,
-    other: Annotated[
-        Path, typer.Argument(metavar="OTHER.hilcal", help="A campaign that was never fitted.")
-    ],
-    register: Annotated[
-        bool, typer.Option("--register", help="The tracker was set up anew: fit its place first.")
-    ] = False,
-    revision: Revision = None,
-    effects_from: EffectsFrom = None,
-    as_json: Json = False,
-) -> None:
-    """Predict readings of another campaign with the model."""
-    t, catalogue = terminal(as_json), catalogue_with(effects_from)
-    with (
-        Campaign.open(run, catalogue, read_only=True) as o,
-        Campaign.open(other, read_only=True) as unseen,
-        working(t.progress) as say,
-    ):
-        if o.cell.arm.name != unseen.cell.arm.name:
-            raise InputError(
-                f"{other}: robot {unseen.cell.arm.name}; the model of {run} is of {o.cell.arm.name}"
-            )
-        record = o.in_use(revision)
-        if record is None:
-            record = o.record(fit_of(t, o, say, revision)[1])
-        model, theta = o.restore_model(record)
-        say(f"predicting {len(unseen.readings)} readings")
-        found = predict_other(
-            model, theta, o.readings, unseen.readings, mode_of(record), registered=register
-        )
-        say("comparing with what was measured")
-        beyond = extrapolation(o.predictive(record, model, theta), o.readings, found)
-    name = text.model_name(titles(model, o.readings))
-    t.show(text.heading(f"{called(record.number or None)}: {name}"))
-    what = "deflections" if mode_of(record) == "deflection" else "positions"
-    e = found.error
-    t.show(
-        f"{len(found.raw)} {what} that were never fitted are predicted to "
-        f"{numbers.length(e.rms_m)} rms; noise alone would leave "
-        f"{numbers.length(found.noise_floor)}.\n"
-    )
-    t.show(text_validate.validation_report(found, beyond))
-    if e.rms_sigma > 5 and not register:
-        t.show(
-            "Was the tracker set up anew for these readings? Then --register fits its place first."
-        )
-    t.document(
-        {
-            "revision": record.number or None,
-            "model": list(model.names),
-            "readings": mode_of(record),
-            "registered": register,
-            "n_readings": len(found.readings),
-            "n_measurements": len(found.raw),
-            "error": e.to_json(),
-            "variance_factor": found.variance_factor,
-            "noise_floor_m": found.noise_floor,
-            **text_validate.to_json(beyond),
         }
     )

@@ -8,7 +8,7 @@ from hilcal.cli.commands import SECTIONS
 
 EXIT_CODES = (
     "Exit codes: 0 done; 2 wrong input; 3 a device failed; 4 the data cannot answer the question; "
-    "130 interrupted with Ctrl-C."
+    "5 a limit is not kept; 130 interrupted with Ctrl-C."
 )
 """Of every command."""
 

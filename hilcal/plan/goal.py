@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilcal.acquire.progress import GoalStatus
+from hilcal.data.lengths import LENGTHS
 from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit
@@ -23,7 +24,6 @@ FORMS = (
 )
 POSITIONS = ("position", "deflection")
 """What is predicted where the robot will work: of deflections, both are the deflection."""
-_LENGTHS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6}
 _ANGLES = {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "µrad": 1e-6, "μrad": 1e-6}
 _SHAPE = re.compile(
     r"\s*(?P<what>[\w.]+)\s+std\s*(?:<=|<|≤)\s*(?P<number>[-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*"
@@ -154,16 +154,16 @@ def parse_goal(text: str) -> Goal:
     if not unit:
         raise _wrong(text, "the unit is missing")
     if what in POSITIONS:
-        if unit not in _LENGTHS:
-            raise _wrong(text, f"a {what} is in {', '.join(list(_LENGTHS)[:3])}, not {unit}")
-        return Goal(text, what, number * _LENGTHS[unit], False, "m")
+        if unit not in LENGTHS:
+            raise _wrong(text, f"a {what} is in {', '.join(list(LENGTHS)[:3])}, not {unit}")
+        return Goal(text, what, number * LENGTHS[unit], False, "m")
     if what == "joint":
         what = JOINTS
     elif re.fullmatch(r"j\d+", what):
         what = f"{JOINTS}.{what}"
     if unit == "%":
         return Goal(text, what, number / 100, True, "")
-    for base, prefixes in (("m", _LENGTHS), ("rad", _ANGLES)):
+    for base, prefixes in (("m", LENGTHS), ("rad", _ANGLES)):
         if unit in prefixes:
             return Goal(text, what, number * prefixes[unit], False, base)
     return Goal(text, what, number, False, unit)

@@ -1,11 +1,14 @@
-"""What `validate` says of readings that were never fitted: inside and outside of what was."""
+"""What `validate` says: errors of readings that were never fitted, by load, by pose, by a limit."""
 
 from collections.abc import Iterator
+from dataclasses import asdict, dataclass
 
 import numpy as np
 from rich.console import RenderableType
 from rich.text import Text
 
+from hilcal.data.whitening import Mode
+from hilcal.identify.acceptance import BAND, Acceptance, Share
 from hilcal.identify.errors import ErrorBlock
 from hilcal.identify.extrapolation import Beyond, Extrapolation
 from hilcal.identify.validation import Validation
@@ -14,16 +17,72 @@ from hilcal.types import Floats
 
 MOST = 4
 """Variables that are listed."""
+WORST = 6
+"""Poses that are listed."""
 DOUBTED = 1.5
 """Error over the stated standard deviation from which the statement is called too small."""
 
 
-def validation_report(found: Validation, beyond: Extrapolation) -> Iterator[RenderableType]:
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """Which readings are judged.
+
+    Attributes:
+        number: of the revision; None for a baseline that is not kept.
+        mode: kind of measurements.
+        readings: all in the other campaign.
+        fitted: those of them that the revision was fitted to.
+        spoilt: further ones whose unloaded reading was fitted.
+        unseen: whether those that are judged were never fitted; False where all were.
+    """
+
+    number: int | None
+    mode: Mode
+    readings: int
+    fitted: int
+    spoilt: int
+    unseen: bool
+
+    @property
+    def model(self) -> str:
+        """The revision, in words."""
+        return "the baseline" if self.number is None else f"revision {self.number}"
+
+    @property
+    def what(self) -> str:
+        """The measurements, in words."""
+        return "deflections" if self.mode == "deflection" else "positions"
+
+
+def opening(judged: Judged, found: Validation) -> Iterator[str]:
+    """Yield how many of the readings were fitted, and how far the others are off."""
+    error = f"{numbers.length(found.error.rms_m)} rms"
+    noise = f"noise alone would leave {numbers.length(found.noise_floor)}.\n"
+    count = f"{len(found.raw)} {judged.what}"
+    if not judged.unseen:
+        all_ = "All" if judged.fitted == judged.readings else f"{judged.fitted} of the"
+        yield (
+            f"{all_} {judged.readings} readings were fitted by {judged.model}: these errors say "
+            f"how well it fits, not how well it predicts. {count} are off by {error}; {noise}"
+        )
+        return
+    if judged.fitted:
+        more = f", and {judged.spoilt} more share an unloaded reading" if judged.spoilt else ""
+        yield (
+            f"{judged.fitted} of the {judged.readings} readings were fitted by {judged.model}"
+            f"{more}; they are left out."
+        )
+    yield f"{count} that were never fitted are predicted to {error}; {noise}"
+
+
+def validation_report(
+    judged: Judged, found: Validation, beyond: Extrapolation
+) -> Iterator[RenderableType]:
     """Yield the errors, inside and outside of what was measured, and where outside is."""
     out = text.table("3-D position error", "rms", "mean", "largest", "rms in σ", "stated", "z")
     inside, outside = beyond.inside_error, beyond.outside_error
     everything = np.ones(len(beyond.z), dtype=np.bool_)
-    rows = [("never fitted", found.error, everything)]
+    rows = [("never fitted" if judged.unseen else "fitted", found.error, everything)]
     if inside is not None and outside is not None:
         rows += [
             ("inside", inside, ~beyond.outside),
@@ -72,6 +131,86 @@ def _beyond(v: Beyond) -> str:
     else:
         low, high, most = (f"{numbers.digits(x)} {v.unit}" for x in (v.low, v.high, v.most))
     return f"{v.variable}: {v.count}, by up to {most} (measured: {low} to {high})"
+
+
+def shares_report(found: Acceptance) -> Iterator[RenderableType]:
+    """Yield errors by load, the worst poses, and whether a limit is kept."""
+    limit = found.limit_m
+    heads = ("n", "rms", "largest", "at", "stated", "z", "in 95 %")
+    out = text.table("load", *heads, *(() if limit is None else ("limit",)), left=(0, 4))
+    for s in (*found.loads, *(() if len(found.loads) == 1 else (found.everything,))):
+        out.add_row(*_cells(s), *_verdict(s, limit))
+    yield out
+    yield Text(
+        f"in 95 %: share of the readings inside of their stated {100 * BAND:.0f} % region.\n",
+        style="dim",
+    )
+    heads = ("n", "rms", "largest", "load", "stated", "z", "in 95 %")
+    out = text.table("worst poses", *heads, *(() if limit is None else ("limit",)), left=(0, 4))
+    for s in found.poses[:WORST]:
+        out.add_row(*_cells(s), *_verdict(s, limit))
+    yield out
+    yield ""
+    if limit is not None:
+        yield _limit_words(found, limit)
+
+
+def _cells(s: Share) -> tuple[str, ...]:
+    lengths = [numbers.length(x) for x in (s.rms_m, s.max_m, s.stated_m)]
+    within = f"{100 * s.within:.0f} %"
+    return s.name, str(s.count), *lengths[:2], s.worst, lengths[2], f"{s.z:.2f}", within
+
+
+def _verdict(s: Share, limit: float | None) -> tuple[str, ...]:
+    return () if limit is None else ("kept" if s.passes(limit) else "over",)
+
+
+def _limit_words(found: Acceptance, limit: float) -> str:
+    size, a = numbers.length(limit), found.everything
+    worst = found.poses[0]
+    largest = f"the largest error is {numbers.length(a.max_m)}, at {worst.name} under {worst.worst}"
+    if found.passed:
+        return f"PASSED: no error is over the limit of {size}; {largest}.\n"
+    poses = sum(not s.passes(limit) for s in found.poses)
+    return (
+        f"FAILED: {found.over} of {a.count} errors are over the limit of {size}, at {poses} of "
+        f"{len(found.poses)} poses; {largest}.\n"
+    )
+
+
+def failure(found: Acceptance, judged: Judged) -> str:
+    """Return the one line on a limit that is not kept."""
+    limit, worst = found.limit_m or 0.0, found.poses[0]
+    head = (
+        f"the limit of {numbers.length(limit)} is not kept: {found.over} of "
+        f"{found.everything.count} {judged.what} are further off, {worst.name} under {worst.worst} "
+        f"by {numbers.length(worst.max_m)}"
+    )
+    if not found.undecided:
+        return head
+    return (
+        f"{head}; but noise alone leaves {numbers.length(found.noise_m)} rms, so that these "
+        "readings cannot tell: measure with less noise, or give a limit above it"
+    )
+
+
+def shares_json(found: Acceptance) -> dict[str, object]:
+    """Return the keys of `validate --json` on loads, poses and the limit."""
+    limit = found.limit_m
+
+    def document(s: Share, own: str, other: str) -> dict[str, object]:
+        d = {own if k == "name" else k: v for k, v in asdict(s).items()}
+        d[f"worst_{other}"] = d.pop("worst")
+        return d if limit is None else {**d, "passed": s.passes(limit)}
+
+    return {
+        "within_95": found.everything.within,
+        "loads": [document(s, "load", "pose") for s in found.loads],
+        "poses": [document(s, "pose", "load") for s in found.poses],
+        "limit": None
+        if limit is None
+        else {"limit_m": limit, "passed": found.passed, "n_over": found.over},
+    }
 
 
 def _rms(x: Floats) -> float:

@@ -211,12 +211,15 @@ def test_validate_predicts_what_was_never_fitted(
 ) -> None:
     ok(capsys, "refine", campaign)
     r = rehearsal("hysteresis")
-    half = r.readings.pose < 7  # the other readings: the same cell and tracker, half of the poses
+    seen, rng = r.readings, np.random.default_rng(3)
+    state = seen.states, seen.pose, seen.load, seen.cycle, seen.load_names
+    half = seen.pose < 7  # measured again: the same cell and tracker, half of the poses
     other = tmp_path / "other.hilcal"
     with CampaignFile.create(other, r.config.to_json(), str(tmp_path), "test") as file:
-        file.append_readings(r.readings[half])
+        file.append_readings(simulate(r.world, *state, rng)[half])
     d = ok(capsys, "validate", campaign, other, "--json").document
-    assert d["n_readings"] == int(half.sum())
+    assert (d["n_readings"], d["n_fitted"]) == (int(half.sum()), 0)
+    assert d["never_fitted"] is True
     assert set(d["error"]) == ERROR
     assert d["error"]["rms_sigma"] < 1.3
     assert d["registered"] is False
@@ -224,9 +227,8 @@ def test_validate_predicts_what_was_never_fitted(
     moved = np.eye(4)
     moved[:3, :3] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
     moved[:3, 3] = 2.0, 1.5, -0.4
-    seen, rng = r.readings, np.random.default_rng(3)
     there = replace(r.world, registration=moved)
-    readings = simulate(there, seen.states, seen.pose, seen.load, seen.cycle, seen.load_names, rng)
+    readings = simulate(there, *state, rng)
     far = tmp_path / "far.hilcal"
     with CampaignFile.create(far, r.config.to_json(), str(tmp_path), "test") as file:
         file.append_readings(readings)

@@ -1,0 +1,143 @@
+"""`validate`: what was fitted is told from what was not; a limit by load and by pose."""
+
+import csv
+from pathlib import Path
+
+import pytest
+
+from hilcal.data.covariance import WHOLE
+from hilcal.data.table import write_table
+from tests.support.cli_cases import CELL, ok, refused, rehearsal, run
+
+Capsys = pytest.CaptureFixture[str]
+FITTED, POSES = 10, 14
+
+
+@pytest.fixture(scope="module")
+def tables(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Tables of one campaign: the poses to fit, the others, all of them."""
+    folder, r = tmp_path_factory.mktemp("tables"), rehearsal("hysteresis", poses=POSES).readings
+    first = r.pose < FITTED
+    for name, rows in (("fit", first), ("rest", ~first), ("all", first | ~first)):
+        write_table(r[rows], folder / f"{name}.csv", WHOLE)
+    return folder
+
+
+@pytest.fixture
+def folder(tables: Path, tmp_path: Path, capsys: Capsys) -> Path:
+    """The same as campaigns; the first one has a revision with hysteresis."""
+    for name in ("fit", "rest", "all"):
+        source = tables / f"{name}.csv"
+        ok(capsys, "import", source, "--config", CELL, "-o", tmp_path / f"{name}.hilcal")
+    model = ("--effects", "joint_compliance,hysteresis")
+    ok(capsys, "identify", tmp_path / "fit.hilcal", *model)
+    return tmp_path
+
+
+def test_fitted_data_are_never_called_unseen(folder: Path, tables: Path, capsys: Capsys) -> None:
+    fit = folder / "fit.hilcal"
+    renamed = folder / "another name.hilcal"
+    with (tables / "fit.csv").open(encoding="utf-8", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    for row in rows:  # other names, other digits, and the rows the other way round
+        row["pose"] = "P" + row["pose"][1:]
+        for key in ("x_m", "y_m", "z_m"):
+            row[key] = f"{float(row[key]):.7f}"
+        for k in range(1, 7):
+            row[f"q{k}_rad"] = f"{float(row[f'q{k}_rad']):.5f}"
+    with (folder / "copy.csv").open("w", encoding="utf-8", newline="") as stream:
+        out = csv.DictWriter(stream, rows[0].keys())
+        out.writeheader()
+        out.writerows(reversed(rows))
+    ok(capsys, "import", folder / "copy.csv", "--config", CELL, "-o", renamed)
+    for other in (fit, renamed):
+        d = ok(capsys, "validate", fit, other, "--json").document
+        assert (d["n_readings"], d["n_fitted"], d["never_fitted"]) == (50, 50, False)
+        words = ok(capsys, "validate", fit, other).out
+        assert "All 50 readings were fitted by revision 1" in words
+        assert "not how well it predicts" in " ".join(words.split())
+        assert "never fitted" not in words
+        said = refused(capsys, 4, "validate", fit, other, "--limit", "1 mm")
+        assert "all its 50 readings were fitted by revision 1" in said
+
+
+def test_of_a_mixture_only_the_unseen_readings_are_judged(folder: Path, capsys: Capsys) -> None:
+    fit = folder / "fit.hilcal"
+    alone = ok(capsys, "validate", fit, folder / "rest.hilcal", "--json").document
+    mixed = ok(capsys, "validate", fit, folder / "all.hilcal", "--json").document
+    assert (alone["n_readings"], alone["n_fitted"], alone["n_measurements"]) == (20, 0, 16)
+    assert (mixed["n_readings"], mixed["n_fitted"], mixed["n_measurements"]) == (70, 50, 16)
+    assert mixed["error"] == pytest.approx(alone["error"], rel=1e-3)
+    words = ok(capsys, "validate", fit, folder / "all.hilcal").out
+    assert "50 of the 70 readings were fitted by revision 1; they are left out" in words
+    assert "16 deflections that were never fitted" in words
+
+
+def test_readings_that_came_after_a_revision_are_unseen_by_it(folder: Path, capsys: Capsys) -> None:
+    from hilcal.data.campaign_file import CampaignFile
+
+    fit = folder / "fit.hilcal"
+    with CampaignFile.open(folder / "rest.hilcal") as rest, CampaignFile.open(fit) as file:
+        file.append_readings(rest.readings())
+    d = ok(capsys, "validate", fit, fit, "--json").document
+    assert (d["n_readings"], d["n_fitted"], d["n_measurements"]) == (70, 50, 16)
+
+
+def test_errors_stand_by_load_and_by_pose_beside_what_is_stated(
+    folder: Path, capsys: Capsys
+) -> None:
+    arguments = ("validate", folder / "fit.hilcal", folder / "rest.hilcal")
+    d = ok(capsys, *arguments, "--json").document
+    assert [s["load"] for s in d["loads"]] == ["5kg", "10kg", "pull x", "pull y"]
+    assert sorted(s["pose"] for s in d["poses"]) == ["p11", "p12", "p13", "p14"]
+    assert sum(s["count"] for s in d["loads"]) == sum(s["count"] for s in d["poses"]) == 16
+    worst = d["poses"][0]
+    assert worst["max_m"] == pytest.approx(d["error"]["max_m"])
+    assert worst["max_m"] == max(s["max_m"] for s in d["loads"])
+    mean = sum(s["count"] * s["rms_m"] ** 2 for s in d["loads"]) / 16
+    assert mean == pytest.approx(d["error"]["rms_m"] ** 2)
+    inside = sum(s["count"] * s["within"] for s in d["loads"]) / 16
+    assert inside == pytest.approx(d["within_95"])
+    assert d["within_95"] > 0.7  # the model is right; 16 deflections
+    assert d["limit"] is None
+    assert "passed" not in worst
+    words = ok(capsys, *arguments).out
+    assert words.index("load ") < words.index("worst poses")
+    assert worst["pose"] in words
+
+
+def test_a_limit_is_kept_or_not_and_the_exit_code_says_so(folder: Path, capsys: Capsys) -> None:
+    arguments = ("validate", folder / "fit.hilcal", folder / "rest.hilcal")
+    kept = ok(capsys, *arguments, "--limit", "1 mm", "--json").document
+    assert kept["limit"] == {"limit_m": pytest.approx(1e-3), "passed": True, "n_over": 0}
+    assert all(s["passed"] for s in (*kept["loads"], *kept["poses"]))
+    assert (
+        "PASSED: no error is over the limit of 1.00 mm"
+        in ok(capsys, *arguments, "--limit", "1mm").out
+    )
+
+    ordered = sorted((s["max_m"] for s in kept["poses"]), reverse=True)
+    between = f"{(ordered[0] + ordered[1]) / 2 * 1e6:.3f} um"
+    assert (ordered[0] + ordered[1]) / 2 > kept["noise_floor_m"]
+    result = run(capsys, *arguments, "--limit", between, "--json")
+    assert result.code == 5
+    d = result.document
+    assert d["limit"]["passed"] is False
+    assert [s["pose"] for s in d["poses"] if not s["passed"]] == [d["poses"][0]["pose"]]
+    last = result.err.splitlines()[-1]
+    assert last.startswith("error: the limit of ")
+    assert f"{d['limit']['n_over']} of 16 deflections are further off" in last
+    words = run(capsys, *arguments, "--limit", between).out
+    assert "FAILED: " in words
+    assert "at 1 of 4 poses" in words
+
+    result = run(capsys, *arguments, "--limit", "1 µm")  # far below the noise: no answer
+    assert result.code == 4
+    assert "noise alone leaves" in result.err
+
+
+@pytest.mark.parametrize("limit", ["0.1", "0.1 in", "ten mm", "-1 mm", "0 mm", "1.2.3 mm", "inf m"])
+def test_a_limit_that_is_no_length_is_refused(limit: str, tmp_path: Path, capsys: Capsys) -> None:
+    said = refused(capsys, 2, "validate", tmp_path, tmp_path, "--limit", limit)
+    assert f'--limit "{limit}"' in said
+    assert 'valid: a length over 0 in m, mm, um, e.g. "0.1 mm"' in said
