@@ -127,8 +127,7 @@ def _words_to_complete() -> list[str]:
 
 
 def execute(make: Callable[[], typer.Typer], name: str, arguments: Sequence[str]) -> None:
-    """Run a command and exit: 0 done, 2 wrong input, 3 a device failed, 4 cannot be answered,
-    5 a limit is not kept.
+    """Run a command and exit; see `EXIT_CODES`.
 
     Wrong input and failures are one line on stderr; HILCAL_DEBUG=1 shows where they came from.
     With --json the error is a JSON document on stdout, too, unless the command has printed one.

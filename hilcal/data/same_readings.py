@@ -5,9 +5,9 @@ was read, and whether a load was on. Names of poses and loads, times, covariance
 the rows do not count, for a table may be imported again with other ones; nor does the wrench,
 which changes with the configured mass of a load.
 
-Numbers agree within `LENGTH_M`, `ANGLE_RAD` and `ATTITUDE_RAD`. A tracker's scatter is far larger: readings that
-were taken again at the same pose differ by more in some element, unless the instrument's last
-digit is coarser than its scatter. A digest of rounded numbers would not do: two copies on both
+Numbers agree within `LENGTH_M`, `ANGLE_RAD` and `ATTITUDE_RAD`. A tracker's scatter is far
+larger: readings that were taken again at the same pose differ by more in some element, unless the
+instrument's last digit is coarser than its scatter. A digest of rounded numbers would not do: two copies on both
 sides of a rounding boundary have different digests, however fine the rounding is.
 """
 
