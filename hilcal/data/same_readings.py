@@ -7,8 +7,8 @@ which changes with the configured mass of a load.
 
 Numbers agree within `LENGTH_M`, `ANGLE_RAD` and `ATTITUDE_RAD`. A tracker's scatter is far
 larger: readings that were taken again at the same pose differ by more in some element, unless the
-instrument's last digit is coarser than its scatter. A digest of rounded numbers would not do: two copies on both
-sides of a rounding boundary have different digests, however fine the rounding is.
+instrument's last digit is coarser than its scatter. A digest of rounded numbers would not do: two
+copies on both sides of a rounding boundary have different digests, however fine the rounding is.
 """
 
 import numpy as np
