@@ -1,7 +1,7 @@
 """Names of the exchange table's columns, and what to say about a wrong header."""
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from difflib import get_close_matches
 
 from hilcal.errors import InputError
@@ -72,8 +72,10 @@ def _closest(name: str, valid: Iterable[str]) -> str | None:
     return by_lower[found[0]] if found else None
 
 
-def check_header(path: str, header: Sequence[str], n: int, arm: str) -> None:
-    """Refuse a header that does not fit an arm of n joints.
+def check_header(
+    path: str, header: Sequence[str], n: int, arm: str, spare: Collection[str] = ()
+) -> None:
+    """Refuse a header that does not fit an arm of n joints; `spare` columns may be missing.
 
     Raises:
         InputError: a column is unnamed, duplicated, unknown or missing, or a group of columns
@@ -88,7 +90,7 @@ def check_header(path: str, header: Sequence[str], n: int, arm: str) -> None:
         if count > 1:
             raise InputError(f"{path}: column '{name}' appears {count} times; keep one")
     known = known_columns(n)
-    missing = [c for c in required_columns(n) if c not in header]
+    missing = [c for c in required_columns(n) if c not in header and c not in spare]
     for name in header:
         if name not in known and not name.startswith(OWN_PREFIX):
             raise InputError(f"{path}: unknown column '{name}'{_advice(name, known, header, n)}")
@@ -97,8 +99,8 @@ def check_header(path: str, header: Sequence[str], n: int, arm: str) -> None:
             f"{path}: column '{missing[0]}' is missing{_hint(missing, header, n, arm)}"
         )
     for group in groups(n):
-        lacking = [c for c in group if c not in header]
-        if 0 < len(lacking) < len(group):
+        lacking = [c for c in group if c not in header and c not in spare]
+        if lacking and any(c in header for c in group):
             raise InputError(
                 f"{path}: column '{lacking[0]}' is missing; give all of "
                 f"{', '.join(group)} or none of them"

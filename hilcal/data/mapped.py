@@ -11,6 +11,7 @@ from hilcal.data import mapping as units
 from hilcal.data.clock import seconds
 from hilcal.data.covariance import TrackerNoise
 from hilcal.data.csvfile import CsvTable
+from hilcal.data.following import own_columns
 from hilcal.data.grid import Grid
 from hilcal.data.imported import ImportResult
 from hilcal.data.mapping import Column, Mapping
@@ -108,13 +109,13 @@ def readings_of_grid(
     grid = grid.rows_with(keep)
     raw = {column: values[keep] for column, values in raw.items()}
     found = _Found()
-    angles, q = _motion(grid, mapping, raw, found)
+    angles, q = _motion(grid, mapping, raw, found, arm)
     _surroundings(grid, mapping, raw, found)
     wrench = _wrench(grid, mapping, np.asarray(gravity), found)
     text = {"load": _loads(grid, mapping, wrench)}
     text["pose"] = _poses(grid, mapping, q)
     if mapping.joints.reported:
-        _as_commanded(found, text["pose"], q)
+        _as_commanded(found, text["pose"], q, arm)
     if mapping.target is not None:
         text["target"] = grid.text(mapping.target.column)
     table = CsvTable(grid.path, grid.names, grid.rows, text, found.number, found.alias)
@@ -140,7 +141,8 @@ def _raw(grid: Grid, mapping: Mapping, arm: Arm) -> dict[str, Floats]:
         section = getattr(mapping, name)
         if section is None:
             continue
-        if name in per_joint and len(section.columns) != arm.n:
+        count = {arm.n, int(arm.own.sum())} if name in per_joint[:2] else {arm.n}
+        if name in per_joint and len(section.columns) not in count:
             raise InputError(
                 f"{grid.path}: the mapping has {len(section.columns)} columns of {name}; "
                 f"{arm.name} has {arm.n} joints"
@@ -201,7 +203,7 @@ def _block(raw: dict[str, Floats], grid: Grid, names: Sequence[Column]) -> Float
 
 
 def _motion(
-    grid: Grid, mapping: Mapping, raw: dict[str, Floats], found: _Found
+    grid: Grid, mapping: Mapping, raw: dict[str, Floats], found: _Found, arm: Arm
 ) -> tuple[Floats | None, Floats]:
     """Position, orientation and joints; returns the orientation's numbers and the joints, rad."""
     for name, column in zip(columns.POSITION, mapping.position.columns, strict=True):
@@ -228,12 +230,13 @@ def _motion(
         for k, name in enumerate(columns.ROTATION):
             found.add(grid, name, o.columns[k], vector[:, k])
     joints = mapping.joints
-    n = len(joints.columns)
     q = units.ANGLES[joints.unit] * _block(raw, grid, joints.columns)
-    for k, name in enumerate(columns.joint_columns(n)):
+    names = own_columns(columns.joint_columns(arm.n), len(joints.columns), arm)
+    for k, name in enumerate(names):
         found.add(grid, name, joints.columns[k], q[:, k])
     if (actual := mapping.actual_joints) is not None:
-        for name, column in zip(columns.actual_columns(n), actual.columns, strict=True):
+        names = own_columns(columns.actual_columns(arm.n), len(actual.columns), arm)
+        for name, column in zip(names, actual.columns, strict=True):
             found.add(grid, name, column, units.ANGLES[actual.unit] * raw[grid.name(column)])
     return angles, q
 
@@ -300,14 +303,15 @@ def _loads(grid: Grid, mapping: Mapping, wrench: Floats) -> list[str]:
     return ["load" if loaded else "none" for loaded in np.asarray(wrench.any(axis=1))]
 
 
-def _as_commanded(found: _Found, poses: Sequence[str], q: Floats) -> None:
+def _as_commanded(found: _Found, poses: Sequence[str], q: Floats, arm: Arm) -> None:
     """Take the angles of a pose's first row as commanded, those of each row as actual."""
     first: dict[str, int] = {}
     rows = [first.setdefault(name, k) for k, name in enumerate(poses)]
-    n = q.shape[1]
-    for k, (name, actual) in enumerate(
-        zip(columns.joint_columns(n), columns.actual_columns(n), strict=True)
-    ):
+    names, reported = (
+        own_columns(of(arm.n), q.shape[1], arm)
+        for of in (columns.joint_columns, columns.actual_columns)
+    )
+    for k, (name, actual) in enumerate(zip(names, reported, strict=True)):
         found.number[actual], found.alias[actual] = q[:, k], found.alias[name]
         found.number[name] = q[rows, k]
 

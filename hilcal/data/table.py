@@ -11,6 +11,7 @@ import numpy as np
 from hilcal.data import checks, columns
 from hilcal.data.covariance import INSTRUMENT, WHOLE, TrackerNoise, tracker_covariance
 from hilcal.data.csvfile import CsvTable, read_columns
+from hilcal.data.following import following_columns, with_following
 from hilcal.data.imported import ImportResult
 from hilcal.data.readings import Readings, States
 from hilcal.data.stated_noise import LEAST, floored, rounding_variance, with_rounding
@@ -145,7 +146,7 @@ def _choose(path: str, header: list[str], arm: Arm) -> tuple[Sequence[str], Sequ
             f"{path}: not an exchange table: row 1 has none of its columns "
             f"({', '.join(columns.required_columns(arm.n))}); for any other table: {PREVIEW}"
         )
-    columns.check_header(path, header, arm.n, arm.name)
+    columns.check_header(path, header, arm.n, arm.name, following_columns(arm))
     columns.covariance_size(path, header)
     optional = (columns.TARGET, columns.COVERS)
     text = (*columns.TEXT, *(name for name in header if name in optional))
@@ -216,6 +217,7 @@ def _covers(table: CsvTable) -> str:
 
 
 def _states(table: CsvTable, arm: Arm) -> States:
+    table = with_following(table, arm)
     number, n = table.number, arm.n
     q = table.matrix(columns.joint_columns(n))
     checks.check_joints(table, columns.joint_columns(n), q, arm)

@@ -88,7 +88,8 @@ def draw(
         drawn, have = len(also), len(found[-1])
     while have < count and drawn < (most if have else _VAIN):
         u = (sequence.random(_CHUNK) + shift) % 1.0
-        found.append(_kept(space, low + u * (high - low), left))
+        q = space.cell.arm.complete(low + u * (high - low))
+        found.append(_kept(space, q, left))
         drawn += _CHUNK
         have += len(found[-1])
     if have < least:

@@ -135,7 +135,8 @@ def _poses(
     for _ in range(_ROUNDS if may is not None else 0):
         if len(found) >= COUNT:
             break
-        drawn = _inside(nominal, rng.uniform(low, high, (_DRAWN, n)), *box)
+        drawn = cell.arm.complete(rng.uniform(low, high, (_DRAWN, n)))
+        drawn = _inside(nominal, drawn, *box)
         if may is not None and len(drawn):
             found = np.concatenate([found, drawn[may(drawn)]])
     if not len(found):

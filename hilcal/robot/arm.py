@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.types import Floats
+from hilcal.types import Bools, Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,6 +35,9 @@ class Arm:
             joints follow others (see `conventions`); None where each turns by itself.
         drive: (n, n) D with dθ = D dδ: displacements of the chain's joints from those of the
             drives, where drives turn several joints; None where each turns its own.
+        mimic: (n, n + 1) [F, f] with q = F q + f for the controller's values, where joints have no
+            value of their own (`<mimic>` of a URDF): their rows say what it would be, those of the
+            others are of the identity; None where every joint has one.
         sign: (n,) −1 where the axis is the drawn one turned round (`with_conventions`), else 1;
             None for 1 everywhere.
         notes: what its description lacks, and what that means, a sentence each.
@@ -53,6 +56,7 @@ class Arm:
     source: str
     coupling: Floats | None = None
     drive: Floats | None = None
+    mimic: Floats | None = None
     sign: Floats | None = None
     notes: tuple[str, ...] = ()
     repeatability: float | None = None
@@ -82,6 +86,23 @@ class Arm:
         By virtual work: τ · D dδ = (Dᵀ τ) · dδ.
         """
         return torque if self.drive is None else np.asarray(torque @ self.drive)
+
+    @property
+    def own(self) -> Bools:
+        """(n,) which joints have a value of their own."""
+        if self.mimic is None:
+            return np.ones(self.n, dtype=np.bool_)
+        return np.asarray(np.diag(self.mimic) != 0)
+
+    def complete(self, q: Floats) -> Floats:
+        """Return joint values (..., n) with those of mimic joints as they follow from the others.
+
+        What stands in their place is not used, it may be NaN.
+        """
+        if self.mimic is None:
+            return q
+        given = np.where(self.own, q, 0.0)
+        return np.asarray(given @ self.mimic[:, :-1].T + self.mimic[:, -1])
 
     @property
     def n(self) -> int:

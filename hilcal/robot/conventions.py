@@ -88,12 +88,19 @@ def with_conventions(
     before = np.eye(arm.n) if arm.drive is None else arm.drive
     drives = sign[:, None] * (before @ (np.diag(sign) + coupling - counted))
     signs = sign if arm.sign is None else sign * arm.sign
+    mimic = arm.mimic
+    if mimic is not None:  # v = F v + f for the drawn values v = S q + o + K q
+        by, rest = mimic[:, :-1], mimic[:, -1]
+        turned = sign[:, None] * (by @ (np.diag(sign) + coupling) - coupling)
+        moved = sign * (by @ offset + rest - offset)
+        mimic = np.where(arm.own[:, None], mimic, np.column_stack([turned, moved]))
     return replace(
         arm,
         links=links,
         coms=coms,
         coupling=_unless_one(follows),
         drive=_unless_one(drives),
+        mimic=mimic,
         sign=signs if np.any(signs < 0) else None,
     )
 

@@ -16,6 +16,7 @@ import pinocchio as pin
 
 from hilcal.errors import InputError
 from hilcal.robot.arm import Arm
+from hilcal.robot.mimic import mimics, with_mimics
 from hilcal.toml import suggest
 from hilcal.types import Floats
 
@@ -36,7 +37,9 @@ def arm_from_urdf(path: Path, base_link: str | None = None, tip_link: str | None
     are merged into it; joints outside the chain (fingers of a gripper) are held at zero.
     A continuous joint gets the range ±2π, also one whose limits are both 0; an effort of 0 means
     unknown (infinite); a URDF names no payload (infinite). What is missing is said in `Arm.notes`.
-    A joint outside of the chain that mimics another is held at zero as well.
+    A joint outside of the chain that mimics another is held at zero as well. One of the chain turns
+    by multiplier · q_i + offset of the joint i of the chain that it follows: that is a coupling of
+    the arm (`Arm.coupling`, `Arm.drive`), and the joint has no value of its own (`Arm.mimic`).
 
     Args:
         path: the file.
@@ -45,7 +48,8 @@ def arm_from_urdf(path: Path, base_link: str | None = None, tip_link: str | None
 
     Raises:
         InputError: no file, not a URDF, unknown link, a branching chain without `tip_link`
-            (lists the leaf links), or a joint that is not revolute.
+            (lists the leaf links), a joint that is not revolute, or one that mimics no joint with a
+            value of its own within the chain.
     """
     model = _read(path)
     names = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
@@ -59,7 +63,8 @@ def arm_from_urdf(path: Path, base_link: str | None = None, tip_link: str | None
     chain = _chain(model, base, tip, path)
     others = [joint for joint in range(1, model.njoints) if joint not in chain]
     reduced = pin.buildReducedModel(model, others, pin.neutral(model))
-    return _arm(reduced, _link(reduced, base).placement, _link(reduced, tip).placement, path)
+    arm = _arm(reduced, _link(reduced, base).placement, _link(reduced, tip).placement, path)
+    return with_mimics(arm, mimics(path), path.name)
 
 
 def _arm(model: pin.Model, base: pin.SE3, tip: pin.SE3, path: Path) -> Arm:
@@ -151,41 +156,7 @@ def _chain(model: pin.Model, base: str, tip: str, path: Path) -> list[int]:
                 "be revolute or continuous. A rail or column: set base_link to the link after "
                 f'"{name}", or give it type="fixed" with an <origin> where it stands'
             )
-        _refuse_mimic(str(model.names[joint]), path)
     return chain
-
-
-def _refuse_mimic(name: str, path: Path) -> None:
-    """Refuse a joint of the chain that has no value of its own."""
-    followed = _mimics(path).get(name)
-    if followed is not None:
-        raise InputError(
-            f'{path.name}: joint "{name}" of the arm mimics joint "{followed}"; every joint needs '
-            f'a value of its own. Take the <mimic> element out, and give "{name}" a column of its '
-            "own in the readings; where the controller counts a joint together with another, say "
-            "so by [robot] joint_coupling"
-        )
-
-
-def _mimics(path: Path) -> dict[str, str]:
-    """Return the joints with a `<mimic>` element, and which joint each follows."""
-    found: dict[str, str] = {}
-    within: list[str] = []
-
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        if tag == "joint":
-            within.append(attributes.get("name", ""))
-        elif tag == "mimic" and within:
-            found[within[-1]] = attributes.get("joint", "")
-
-    def end(tag: str) -> None:
-        if tag == "joint" and within:
-            within.pop()
-
-    parser = expat.ParserCreate()
-    parser.StartElementHandler, parser.EndElementHandler = start, end
-    parser.Parse(path.read_bytes(), True)
-    return found
 
 
 def _link(model: pin.Model, name: str) -> pin.Frame:

@@ -129,12 +129,12 @@ URDF = """<robot name="r"><link name="base"/><link name="a"/><link name="b"/>
 <joint name="j1" type="{kind}"><parent link="base"/><child link="a"/><axis xyz="0 0 1"/>
 <limit lower="0" upper="0" effort="1" velocity="1"/></joint>
 <joint name="j2" type="revolute"><parent link="a"/><child link="b"/><origin xyz="0.5 0 0"/>
-<axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="1" velocity="1"/>{mimic}</joint></robot>"""
+<axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>"""
 
 
-def urdf(tmp_path, kind="revolute", mimic=""):
+def urdf(tmp_path, kind="revolute"):
     path = tmp_path / "r.urdf"
-    path.write_text(URDF.format(kind=kind, mimic=mimic))
+    path.write_text(URDF.format(kind=kind))
     return path
 
 
@@ -146,8 +146,6 @@ def test_a_urdf_says_what_it_lacks(tmp_path):
     np.testing.assert_allclose(arm.q_max, [2 * np.pi, 1.0])
 
 
-def test_rails_and_mimics_are_refused_by_name(tmp_path):
+def test_rails_are_refused_by_name(tmp_path):
     with pytest.raises(InputError, match=r'"j1" is not revolute.*set base_link to the link after'):
         arm_from_urdf(urdf(tmp_path, "prismatic"))
-    with pytest.raises(InputError, match=r'"j2" of the arm mimics joint "j1".*joint_coupling'):
-        arm_from_urdf(urdf(tmp_path, mimic='<mimic joint="j1" multiplier="-1"/>'))
