@@ -32,9 +32,9 @@ from hilcal.diagnose.recorded import (
 )
 from hilcal.identify.folds import random_folds
 from hilcal.identify.linearisation import Linearisation
-from hilcal.regression.evidence import log_evidence, visible
-from hilcal.regression.projection import Projection, projection
-from hilcal.types import Bools, Floats
+from hilcal.regression.block_selection import BlockSelection, block_evidence
+from hilcal.regression.schur import positive_solve
+from hilcal.types import Bools, Floats, Ints
 
 FOLDS = 5
 MOST_ROWS = 3000
@@ -50,6 +50,8 @@ MOST_MEASUREMENTS = 4000
 LITTLE = 0.1
 """Share that smooth laws predict below which trees are fitted as well; a guess."""
 """Prior standard deviations that are tried: fewer than for effects, since laws are many."""
+AT_ONCE = 16
+"""Laws whose columns are worked on together; a choice by memory."""
 DETERMINED = 2.0
 """How many times its rms standard error a curve must be; a choice: of less, much is error."""
 LEAST_RIDGE, LAW_RIDGE = 1e-6, 1e-3
@@ -156,127 +158,117 @@ def _features(p: Linearisation) -> Floats:
     return np.concatenate(columns, axis=1)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class _Laws:
-    """All laws: columns (R, L, WIDTH) whitened, variable and motion (L,) of each."""
+    """All laws: variable and motion (L,) of each, and their whitened columns."""
 
-    x: Floats
-    variable: tuple[int, ...]
-    way: tuple[int, ...]
+    def __init__(self, p: Linearisation) -> None:
+        self.variables, self.ways = recorded(p), motions(p)
+        pairs = [(i, k) for i in range(len(self.variables)) for k in range(len(self.ways))]
+        self.variable, self.way = (tuple(x) for x in zip(*pairs, strict=True))
+        self._p = p
+        self._known: dict[int, Floats] = {}
+
+    def columns(self, law: int) -> Floats:
+        """(R, WIDTH) whitened columns of one law."""
+        return law_columns(self._p, self.variables[self.variable[law]], self.ways[self.way[law]])
+
+    def chosen(self, law: int) -> Floats:
+        """Return the same of one that was chosen; they are few, and kept."""
+        if law not in self._known:
+            self._known[law] = self.columns(law)
+        return self._known[law]
+
+    def at(self, rows: Bools) -> Floats:
+        """(R', L, WIDTH) columns of all laws in some of the rows."""
+        out = np.empty((int(rows.sum()), len(self.variable), WIDTH))
+        for law in range(len(self.variable)):
+            out[:, law] = self.columns(law)[rows]
+        return out
+
+    def exchanged(self, law: int, name: str, order: Ints, rows: Bools) -> Floats:
+        """(R', WIDTH) columns of a law in some rows, a variable's values from other readings."""
+        v, way = self.variables[self.variable[law]], self.ways[self.way[law]]
+        return law_columns(self._p, v.exchanged(name, order), way)[rows]
+
+
+class _Refits:
+    """The model, and laws beside it, refitted without each fold."""
+
+    def __init__(self, p: Linearisation, laws: _Laws, fold: Ints) -> None:
+        self._p, self._laws, self._fold = p, laws, fold
+        self._ridge = np.maximum(p.projection.ridge, LEAST_RIDGE)
+        parts = [(p.rows[fold == f], p.fit.white[fold == f]) for f in range(int(fold.max()) + 1)]
+        self._grams = [own.T @ own for own, _ in parts]
+        self._sides = [own.T @ white for own, white in parts]
+        self._gram, self._side = sum(self._grams), sum(self._sides)
+
+    def without(self, f: int, chosen: list[int]) -> tuple[Floats, list[Floats]]:
+        """Model step (K,) and coefficients of the chosen laws, without a fold."""
+        rows, size = self._fold != f, len(self._ridge)
+        width = WIDTH * len(chosen)
+        h = np.empty((size + width, size + width))
+        h[:size, :size] = self._gram - self._grams[f]
+        h[:size, :size] += np.diag(self._ridge)
+        b = np.concatenate([self._side - self._sides[f], np.zeros(width)])
+        if chosen:
+            x = np.hstack([self._laws.chosen(k)[rows] for k in chosen])
+            h[size:, :size] = x.T @ self._p.rows[rows]
+            h[:size, size:] = h[size:, :size].T
+            h[size:, size:] = x.T @ x + LAW_RIDGE * np.eye(width)
+            b[size:] = x.T @ self._p.fit.white[rows]
+        step = positive_solve(h, b)
+        return step[:size], list(step[size:].reshape(-1, WIDTH))
 
 
 def smooth_laws(p: Linearisation) -> ResidualRegression:
     """Find the laws that predict the misfit of poses left out, and what they depend on."""
-    variables, ways = recorded(p), motions(p)
-    laws = _laws(p, variables, ways)
+    laws = _Laws(p)
     white, w = p.fit.white, p.fit.whitening
     of_row = w.rows_of(random_folds(p.fit.pose, FOLDS))
+    count = int(of_row.max()) + 1
+    some = _thinned(len(white), w.m)
+    ridge = np.maximum(p.projection.ridge, LEAST_RIDGE)
+    selection = BlockSelection(p.rows[some], ridge, laws.at(some), white[some], of_row[some])
+    refits = _Refits(p, laws, of_row)
     rng = np.random.default_rng(20250302)
     without = with_ = 0.0
     lost: dict[str, float] = {}
-    for f in range(int(of_row.max()) + 1):
+    for f in range(count if count > 1 else 0):  # one pose: nothing to learn from
         mine = of_row == f
-        if mine.all():  # one pose: nothing to learn from
-            continue
-        chosen = _choose(p, laws, ~mine)
-        model, plain = _refit(p, laws, chosen, ~mine), _refit(p, laws, [], ~mine)
-        bare = white[mine] - p.rows[mine] @ plain[0]
-        base = white[mine] - p.rows[mine] @ model[0]
-        after = base - sum(
-            (laws.x[mine, k] @ c for k, c in zip(chosen, model[1], strict=True)), 0.0
-        )
+        chosen = selection.without(f, MOST_LAWS, LEAST_EVIDENCE, STRENGTHS)
+        plain, (step, coefficients) = refits.without(f, [])[0], refits.without(f, chosen)
+        bare = white[mine] - p.rows[mine] @ plain
+        base = white[mine] - p.rows[mine] @ step
+        curves = list(zip(chosen, coefficients, strict=True))
+        after = base - sum((laws.chosen(k)[mine] @ c for k, c in curves), 0.0)
         without += float(bare @ bare)
         with_ += float(after @ after)
-        for name in {n for k in chosen for n in variables[laws.variable[k]].names}:
+        names = [laws.variables[laws.variable[k]].names for k in chosen]
+        for name in dict.fromkeys(n for of_law in names for n in of_law):
             for _ in range(SHUFFLES):
-                order = rng.permutation(len(variables[0].values))
+                order = rng.permutation(len(laws.variables[0].values))
                 other = base.copy()
-                for k, c in zip(chosen, model[1], strict=True):
-                    v, x = variables[laws.variable[k]], laws.x[mine, k]
-                    if name in v.names:
-                        x = law_columns(p, v.exchanged(name, order), ways[laws.way[k]])[mine]
-                    other -= x @ c
+                for (k, c), of_law in zip(curves, names, strict=True):
+                    if name in of_law:
+                        other -= laws.exchanged(k, name, order, mine) @ c
+                    else:
+                        other -= laws.chosen(k)[mine] @ c
                 more = float(other @ other) - float(after @ after)
                 lost[name] = lost.get(name, 0.0) + more / SHUFFLES
     rank = w.rank
     misfit = max(without - rank, 3 * np.sqrt(2 * rank))
     share = float(np.clip((without - with_) / misfit, 0.0, 1.0))
-    return ResidualRegression(share, _dependences(p, variables, ways, laws, lost, share))
+    return ResidualRegression(share, _dependences(p, laws, lost, share))
 
 
-def _choose(p: Linearisation, laws: _Laws, rows: Bools) -> list[int]:
-    """Laws chosen one after the other by their evidence on some of the rows."""
-    rows = _thinned(rows, p.fit.whitening.m)
-    white, own = p.fit.white[rows], p.rows[rows]
-    x = laws.x[rows].reshape(len(white), -1)
-    model = _beside(p, own, np.zeros((len(white), 0)))
-    x, r = model.project_out(x), model.project_out(white)
-    dof = max(len(r) - own.shape[1], 1)
-    chosen: list[int] = []
-    for _ in range(MOST_LAWS):
-        blocks = x.reshape(len(r), -1, WIDTH).transpose(1, 2, 0)
-        evidence = _evidence(blocks @ blocks.transpose(0, 2, 1), blocks @ r, float(r @ r), dof)
-        best = int(np.argmax(evidence))
-        if evidence[best] < LEAST_EVIDENCE:
-            break
-        chosen.append(best)
-        u, s, _ = np.linalg.svd(blocks[best].T, full_matrices=False)
-        u = u[:, s > 1e-3 * s.max(initial=1e-300)]
-        x, r = x - u @ (u.T @ x), r - u @ (u.T @ r)
-        dof = max(dof - u.shape[1], 1)
-    return chosen
-
-
-def _thinned(rows: Bools, m: int) -> Bools:
-    """At most about `MOST_ROWS` of the rows, whole measurements, for speed."""
-    every = -(-int(rows.sum()) // MOST_ROWS)
-    return np.asarray(rows & (np.arange(len(rows)) // m % every == 0))
-
-
-def _evidence(gram: Floats, g: Floats, rss: float, dof: float) -> Floats:
-    """(L,) gain in log evidence of each of L laws, at its best prior strength."""
-    lam, u = np.linalg.eigh(gram)
-    seen = visible(lam)
-    c2 = np.einsum("lij,li->lj", u, g) ** 2
-    explained = np.where(seen, c2 / np.where(seen, lam, 1.0), 0.0)
-    found = log_evidence(np.where(seen, lam, 0.0), explained, rss, dof, STRENGTHS)
-    return np.asarray(found.max(axis=0))
-
-
-def _beside(p: Linearisation, own: Floats, x: Floats) -> Projection:
-    """Return the projection off the model's columns and laws X, from some rows."""
-    ridge = np.maximum(p.projection.ridge, LEAST_RIDGE)
-    return projection(np.hstack([own, x]), np.append(ridge, np.full(x.shape[1], LAW_RIDGE)))
-
-
-def _refit(
-    p: Linearisation, laws: _Laws, chosen: list[int], rows: Bools
-) -> tuple[Floats, list[Floats]]:
-    """Model step (K,) and coefficients of the chosen laws, from some rows."""
-    own, white = p.rows[rows], p.fit.white[rows]
-    x = np.hstack([np.zeros((len(white), 0)), *(laws.x[rows, k] for k in chosen)])
-    both = _beside(p, own, x)
-    step, size = both.solve(both.rows.T @ white), own.shape[1]
-    return step[:size], list(step[size:].reshape(-1, WIDTH))
-
-
-def _laws(p: Linearisation, variables: list[Variable], ways: list[Floats]) -> _Laws:
-    columns, of, by = [], [], []
-    for i, v in enumerate(variables):
-        for k, way in enumerate(ways):
-            columns.append(law_columns(p, v, way))
-            of.append(i)
-            by.append(k)
-    return _Laws(np.stack(columns, axis=1), tuple(of), tuple(by))
+def _thinned(count: int, m: int) -> Bools:
+    """At most about `MOST_ROWS` of the rows of all folds but one, whole measurements, for speed."""
+    every = max(-(-count * (FOLDS - 1) // (FOLDS * MOST_ROWS)), 1)
+    return np.asarray(np.arange(count) // m % every == 0)
 
 
 def _dependences(
-    p: Linearisation,
-    variables: list[Variable],
-    ways: list[Floats],
-    laws: _Laws,
-    lost: dict[str, float],
-    share: float,
+    p: Linearisation, laws: _Laws, lost: dict[str, float], share: float
 ) -> tuple[Dependence, ...]:
     """Variables that lose something when exchanged, with their curves."""
     names = {name: value for name, value in lost.items() if value > 0}
@@ -285,21 +277,29 @@ def _dependences(
         return ()
     out = []
     for name, value in sorted(names.items(), key=lambda item: -item[1]):
-        mine = [k for k, of in enumerate(laws.variable) if name in variables[of].names]
-        v = next((v for v in variables if v.names == (name,)), None)
+        mine = [k for k, of in enumerate(laws.variable) if name in laws.variables[of].names]
+        v = next((v for v in laws.variables if v.names == (name,)), None)
         if value < 0.02 * total or v is None:
             continue
         way = laws.way[_best(p, laws, mine)]
-        out.append(_curve(p, v, way, ways[way], share * value / total))
+        out.append(_curve(p, v, way, laws.ways[way], share * value / total))
     return tuple(out)
 
 
 def _best(p: Linearisation, laws: _Laws, mine: list[int]) -> int:
     """The law of one variable with the largest evidence on all rows."""
-    x = laws.x[:, mine].reshape(len(p.fit.white), -1)
-    blocks = p.project_out(x).reshape(len(x), -1, WIDTH).transpose(1, 2, 0)
-    plain = x.reshape(len(x), -1, WIDTH).transpose(1, 0, 2)
-    found = _evidence(blocks @ plain, blocks @ p.residual, p.rss, p.fit.dof)
+    grams, slopes = [], []
+    explained = p.projection.solve(p.rows.T @ p.residual)
+    for start in range(0, len(mine), AT_ONCE):
+        x = np.stack([laws.columns(law) for law in mine[start : start + AT_ONCE]], axis=1)
+        flat = x.reshape(len(x), -1)
+        seen = p.rows.T @ flat
+        lifted = (p.projection.inverse_root @ seen).reshape(-1, *x.shape[1:])
+        blocks, gone = x.transpose(1, 2, 0), lifted.transpose(1, 2, 0)
+        grams.append(blocks @ blocks.transpose(0, 2, 1) - gone @ gone.transpose(0, 2, 1))
+        slopes.append((flat.T @ p.residual - seen.T @ explained).reshape(-1, WIDTH))
+    gram, slope = np.concatenate(grams), np.concatenate(slopes)
+    found = block_evidence(gram, slope, p.rss, p.fit.dof, STRENGTHS)
     return mine[int(np.argmax(found))]
 
 

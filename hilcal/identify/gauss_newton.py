@@ -33,6 +33,8 @@ CONVERGED = 1e-5
 SETTLED = 0.02
 """Priors and rank are chosen at each step until the residual changes by less than this share from
 one step to the next, or is within the noise; then they are kept. A choice, no study set it."""
+DEPTH = 3
+"""Earlier steps that a step is combined with; a choice, there are as few weak directions."""
 HALVINGS = 8
 """Most step lengths of a line search; a choice, no study set it."""
 
@@ -179,6 +181,7 @@ def _minimise(
     point = problem.at(np.where(sigma > 0, theta, 0.0))
     by: Regularisation  # set in the first step
     square, settled, converged = np.inf, False, False
+    path = _Path()
     for iterations in range(1, MAX_ITERATIONS + 1):  # noqa: B007 - reported
         linear = _linearise(problem, point, sigma)
         if not settled:
@@ -187,7 +190,8 @@ def _minimise(
         linear = linear.restricted(sigma)
         by, aim = _step(linear, by, groups)
         moved = linear.a @ (aim - point.theta)[linear.live]
-        point = _line_search(problem, point, aim, by)
+        shortcut = path.accelerated(aim, moved) if settled else None
+        point = _line_search(problem, point, aim, by, shortcut)
         before, square = square, point.mean_square(len(by.basis.singular))
         noise = max(square, by.beta) * len(moved)
         converged = settled and float(moved @ moved) <= CONVERGED**2 * noise
@@ -230,12 +234,52 @@ def _step(linear: LinearProblem, by: Regularisation, groups: Ints) -> tuple[Regu
     return by, aim
 
 
-def _line_search(problem: _Problem, point: _Point, aim: Floats, by: Regularisation) -> _Point:
-    """Go towards `aim` (P,), half as far each time while the objective grows.
+class _Path:
+    """Anderson's acceleration of the steps that follow once priors and rank are settled.
 
-    The chain may be strongly nonlinear along a step in a weakly determined direction.
+    Where a residual remains, steps in a weakly determined direction shrink by a constant factor
+    only. With f_i the motion of the whitened readings by step i, and g_i where it leads to, the
+    combination Σ α_i f_i, Σ α_i = 1, of the last steps that is shortest leads to Σ α_i g_i.
+
+    Source: Walker and Ni, *Anderson acceleration for fixed-point iterations*, SIAM J. Numer. Anal.
+    49 (2011) 1715-1735.
+    """
+
+    def __init__(self) -> None:
+        self._aims: list[Floats] = []
+        self._moves: list[Floats] = []
+
+    def accelerated(self, aim: Floats, moved: Floats) -> Floats | None:
+        """Return where the steps so far lead to; None after the first.
+
+        Args:
+            aim: (P,) where the step leads to by itself.
+            moved: (R,) its motion of the whitened readings.
+        """
+        self._aims, self._moves = [*self._aims[-DEPTH:], aim], [*self._moves[-DEPTH:], moved]
+        if len(self._aims) == 1:
+            return None
+        differences = np.diff(self._moves, axis=0)
+        gamma = np.linalg.lstsq(differences.T, moved, rcond=None)[0]
+        return np.asarray(aim - gamma @ np.diff(self._aims, axis=0))
+
+
+def _line_search(
+    problem: _Problem, point: _Point, aim: Floats, by: Regularisation, shortcut: Floats | None
+) -> _Point:
+    """Go to the `shortcut` (P,), unless the objective grows; else towards `aim` (P,).
+
+    On the way to `aim` half as far each time while the objective grows: the chain may be strongly
+    nonlinear along a step in a weakly determined direction.
     """
     now = point.objective(by)
+    if shortcut is not None:
+        try:
+            trial = problem.at(shortcut)
+            if trial.objective(by) <= now:
+                return trial
+        except CannotAnswerError:
+            pass
     begin = np.where(by.prior > 0, point.theta, 0.0)
     for halving in range(HALVINGS):
         share = 0.5**halving

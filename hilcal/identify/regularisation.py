@@ -63,9 +63,8 @@ class LinearProblem:
         """Return the normal equations in the coordinates of a basis."""
         return normal_equations(self.a, self.target, basis, self.gram)
 
-    def rss(self, equations: NormalEquations, beta: float) -> float:
-        """Return ‖y − A (θ − θ_0)‖² at the solution of normal equations."""
-        z = equations.solve(beta)
+    def rss(self, equations: NormalEquations, z: Floats) -> float:
+        """Return ‖y − A (θ − θ_0)‖² at the coordinates z (K,) of normal equations."""
         yy = float(self.target @ self.target)
         return yy - 2 * float(equations.rhs @ z) + float(z @ equations.gram @ z)
 
@@ -110,7 +109,8 @@ def _attainable_spread(p: LinearProblem, scale: Floats, prior: Floats) -> float:
     It does not depend on where the linearisation started, as the residual itself does.
     """
     basis = p.basis(scale, prior, 1.0)
-    rss = p.rss(p.equations(basis), p.noise)
+    equations = p.equations(basis)
+    rss = p.rss(equations, equations.solve(p.noise))
     return float(np.sqrt(max(rss, 1e-30) / max(p.rank - len(basis.singular), 1)))
 
 
@@ -118,16 +118,24 @@ def noise_factor(p: LinearProblem, equations: NormalEquations) -> float:
     """Fixed point of β = max(1, RSS(β) / (R − effective parameters)), given the priors."""
     beta = 1.0
     for _ in range(NOISE_STEPS):
-        free = max(p.rank - effective_parameters(equations, beta), 1.0)
-        beta, before = max(1.0, p.rss(equations, beta) / free), beta
+        root = equations.inverse_root(beta)
+        z = root.T @ (root @ equations.rhs)
+        free = max(p.rank - effective_parameters(equations, beta, root), 1.0)
+        beta, before = max(1.0, p.rss(equations, z) / free), beta
         if abs(beta - before) < NOISE_TOLERANCE * beta:
             break
     return beta
 
 
-def effective_parameters(equations: NormalEquations, beta: float) -> float:
-    """Effective number of parameters: flat directions + Σ (1 − β Λ_kk H⁻¹_kk) over the others."""
-    return len(equations.basis.singular) + float(np.sum(_determined(equations, beta)))
+def effective_parameters(equations: NormalEquations, beta: float, root: Floats) -> float:
+    """Effective number of parameters: flat directions + Σ (1 − β Λ_kk H⁻¹_kk) over the others.
+
+    Args:
+        equations: normal equations.
+        beta: noise variance factor that the priors are weighed against.
+        root: (K, K) T with Tᵀ T = H⁻¹.
+    """
+    return len(equations.basis.singular) + float(np.sum(_determined(equations, beta, root)))
 
 
 def spent_parameters(equations: NormalEquations, beta: float, groups: Ints) -> float:
@@ -139,7 +147,7 @@ def spent_parameters(equations: NormalEquations, beta: float, groups: Ints) -> f
         groups: (P,) shrinkage group of each parameter, or −1.
     """
     held = equations.basis.held
-    determined = _determined(equations, beta)
+    determined = _determined(equations, beta, equations.inverse_root(beta))
     chosen = groups[held] >= 0
     own = float(np.sum(determined[~chosen])) + len(equations.basis.singular)
     if not chosen.any():
@@ -150,13 +158,11 @@ def spent_parameters(equations: NormalEquations, beta: float, groups: Ints) -> f
     return own + float(np.sum(spent_by_groups(share, size)))
 
 
-def _determined(equations: NormalEquations, beta: float) -> Floats:
+def _determined(equations: NormalEquations, beta: float, root: Floats) -> Floats:
     """Share (H,) of each parameter with a prior that the data determine: 1 − β Λ_kk H⁻¹_kk."""
     flat, precision = len(equations.basis.singular), equations.basis.prior_precision
-    if flat == len(precision):
-        return np.zeros(0)
-    covariance = np.diag(equations.inverse(beta))[flat:]
-    return np.asarray(1 - beta * precision[flat:] * covariance)
+    variance = np.sum(root[:, flat:] ** 2, axis=0)
+    return np.asarray(1 - beta * precision[flat:] * variance)
 
 
 def _family_priors(

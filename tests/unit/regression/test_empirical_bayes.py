@@ -114,7 +114,10 @@ def test_nothing_there_leaves_almost_nothing_and_costs_less_than_two_percent():
         worse.append(off[0].error.rms_sigma / off[1].error.rms_sigma)
         effective.append(found.solution.effective - plain.solution.effective)
         s = found.solution
-        determined.append(effective_parameters(s.equations, s.beta) - plain.solution.effective)
+        determined.append(
+            effective_parameters(s.equations, s.beta, s.equations.inverse_root(s.beta))
+            - plain.solution.effective
+        )
     assert np.mean(worse) < 1.02
     assert np.mean(determined) < 0.1 * 72
     # Of 36 groups of two, noise keeps those with χ² > 2, each of which spends 2 to 2.7.
