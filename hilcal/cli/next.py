@@ -66,7 +66,7 @@ def next_(
         summary = summarise(found.planned, config, rng, say, compare=not quick)
         say("checking every motion in a dry run")
         made = checked(numbers, config, plan_of(found, effects), summary)
-    write(t, numbers, config, made, output, csv, record)
+    write(t, numbers, config, made, output, csv, record, found.powers)
     t.show(f"In doubt: {words_of.names(effects, 'or')}.\n")
     t.show(next_report(found, made.summary.poses, made.summary.readings))
     t.show(plan_report(made.summary))

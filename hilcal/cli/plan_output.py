@@ -12,6 +12,7 @@ from hilcal.config import CellConfig
 from hilcal.data.plan_csv import plan_csv
 from hilcal.errors import InputError
 from hilcal.plan.checked_plan import CheckedPlan
+from hilcal.plan.next import PairPower
 from hilcal.report.progress import working
 
 POSES = 20
@@ -55,6 +56,7 @@ def write(
     output: Path,
     csv: Path | None,
     record: Path | None,
+    powers: tuple[PairPower, ...] = (),
 ) -> None:
     """Write a plan: as a file, and where asked as a table and as a recording."""
     made.save(output)
@@ -69,4 +71,4 @@ def write(
 
         with working(t.progress) as say:
             say(f"recording {record}")
-            record_plan(cell, config, made.plan, made.summary, record)
+            record_plan(cell, config, made.plan, made.summary, record, powers)

@@ -13,6 +13,8 @@ _STRETCHED = 1.15
 _MOST_LOADS = 2
 _LEAST_SHARE = 0.1
 
+POWER_COLUMNS = ("if this is there", "this is ruled out", "now", "then")
+
 
 def next_report(found: Next, poses: int, readings: int) -> Iterator[RenderableType]:
     """Yield the powers of all pairs, now and then, and what makes the difference.
@@ -23,10 +25,9 @@ def next_report(found: Next, poses: int, readings: int) -> Iterator[RenderableTy
         readings: of the plan.
     """
     yield text.heading("Telling the suspects apart")
-    out = text.table("if this is there", "this is ruled out", "now", "then", left=(0, 1))
-    for t in found.powers:
-        then = "never" if t.not_separable else numbers.percent(t.then)
-        out.add_row(t.effect, t.rival, numbers.percent(t.now), then)
+    out = text.table(*POWER_COLUMNS, left=(0, 1))
+    for row in power_rows(found.powers):
+        out.add_row(*row)
     yield out
     yield Text(
         "now, then: chance that the test at 1 % rules it out, with the readings so far and with "
@@ -36,6 +37,13 @@ def next_report(found: Next, poses: int, readings: int) -> Iterator[RenderableTy
     yield f"{summary(found.powers, poses, readings)} {_difference(found)}\n"
     for note in found.notes:
         yield f"note: {note}"
+
+
+def power_rows(powers: Sequence[PairPower]) -> Iterator[tuple[str, str, str, str]]:
+    """Yield the rows of `POWER_COLUMNS`."""
+    for t in powers:
+        then = "never" if t.not_separable else numbers.percent(t.then)
+        yield t.effect, t.rival, numbers.percent(t.now), then
 
 
 def summary(powers: Sequence[PairPower], poses: int, readings: int) -> str:

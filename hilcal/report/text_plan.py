@@ -48,7 +48,7 @@ def plan_report(s: PlanSummary) -> Iterator[RenderableType]:
     rows.add_column(no_wrap=True)
     rows.add_column(overflow="fold")
     for name, value in cost_rows(s):
-        rows.add_row(name, Text(value, style="bold" if name == "certified" else ""))
+        rows.add_row(name, Text(value, style="bold" if name == "efficiency" else ""))
     yield Padding(rows, (0, 0, 1, 0))
     if s.confounding is not None:
         yield f"{order_remark(s)}\n"
@@ -76,7 +76,7 @@ def plan_report(s: PlanSummary) -> Iterator[RenderableType]:
 
 def certified(efficiency: float) -> str:
     """Return a certified efficiency in words; rounded down, it is a bound."""
-    return f"at least {_floor(efficiency)} of the best possible"
+    return f"of the plan: at least {_floor(efficiency)} (certified lower bound); not accuracy"
 
 
 def _floor(efficiency: float) -> str:
@@ -104,7 +104,7 @@ def cost_rows(s: PlanSummary) -> Iterator[tuple[str, str]]:
     meaning = CRITERIA.get(s.criterion)
     yield "criterion", f"{s.criterion}: {meaning}" if meaning else s.criterion
     if s.efficiency is not None:
-        yield "certified", certified(s.efficiency)
+        yield "efficiency", certified(s.efficiency)
     if s.position_std_m is not None:
         yield s.quantity, f"± {numbers.length(s.position_std_m)}, predicted for the {s.position}"
         yield "", s.position_note

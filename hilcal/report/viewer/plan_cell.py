@@ -12,6 +12,7 @@ from hilcal.types import Floats, Ints
 BEAD, BEAD_GAP = 0.0075, 0.016
 """Radius of a bead and distance of two in a stack, shares of the reach."""
 _OBSTACLE = (122, 112, 104)
+_SOLID = 90  # of 255: what stands behind an obstacle shows through
 _BOX = (64, 82, 108)
 _TRACKER = (235, 235, 240)
 _HEAD = 0.07  # m, of the drawn tracker
@@ -39,7 +40,7 @@ def bead_places(d: PlanDigest, steps: Ints) -> Floats:
 def _obstacles(rec: rr.RecordingStream, things: tuple[Obstacle, ...]) -> None:
     boxes = [x for x in things if x.center_m is not None]
     if boxes:
-        for part, mode, alpha in (("body", "solid", 150), ("edge", "majorwireframe", 255)):
+        for part, mode, alpha in (("body", "solid", _SOLID), ("edge", "majorwireframe", 255)):
             rec.log(
                 f"world/obstacles/box/{part}",
                 rr.Boxes3D(
@@ -60,7 +61,7 @@ def _obstacles(rec: rr.RecordingStream, things: tuple[Obstacle, ...]) -> None:
                 centers=bottom + 0.5 * height[:, None] * [0.0, 0.0, 1.0],
                 lengths=height,
                 radii=[x.radius_m or 0.0 for x in stood],
-                colors=[(*_OBSTACLE, 170)],
+                colors=[(*_OBSTACLE, _SOLID)],
                 fill_mode="solid",
             ),
             static=True,

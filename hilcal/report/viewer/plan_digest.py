@@ -13,6 +13,7 @@ from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.data.plan import Plan
 from hilcal.errors import InputError
+from hilcal.plan.next import PairPower
 from hilcal.plan.summary import PlanSummary
 from hilcal.plan.timing import pace, timeline
 from hilcal.robot import chain as chains
@@ -47,6 +48,7 @@ class PlanDigest:
         rank: (S,) how many other loads are measured before in the same pose: its bead's place.
         ways: of each step, (K, 3) the target's way there from the step before.
         time: (S,) middle of each reading since the start, s.
+        powers: of the suspects that the plan separates, pair by pair; else empty.
     """
 
     cell: Cell
@@ -66,6 +68,7 @@ class PlanDigest:
     rank: Ints
     ways: tuple[Floats, ...]
     time: Floats
+    powers: tuple[PairPower, ...] = ()
 
     def __len__(self) -> int:
         """Return the number of steps."""
@@ -104,7 +107,13 @@ class PlanDigest:
         return tuple(pairwise(starts))
 
 
-def plan_digest(cell: Cell, config: CellConfig, plan: Plan, summary: PlanSummary) -> PlanDigest:
+def plan_digest(
+    cell: Cell,
+    config: CellConfig,
+    plan: Plan,
+    summary: PlanSummary,
+    powers: tuple[PairPower, ...] = (),
+) -> PlanDigest:
     """Derive what the views need.
 
     Raises:
@@ -143,6 +152,7 @@ def plan_digest(cell: Cell, config: CellConfig, plan: Plan, summary: PlanSummary
         rank=_rank(pose, load),
         ways=_ways(cell, route(plan, cell.arm, margin)),
         time=timeline(plan, cell.arm, margin, pace(config))[1],
+        powers=powers,
     )
 
 

@@ -4,11 +4,13 @@ import numpy as np
 import rerun.blueprint as rrb
 
 from hilcal.report import numbers
-from hilcal.report.viewer import plan_charts, plan_scene
+from hilcal.report.viewer import eye, plan_charts, plan_scene
 from hilcal.report.viewer.plan_digest import PlanDigest
 from hilcal.types import Floats
 
 _FPS = 2.0
+_LOOKED_AT = 20
+"""Steps whose arm is to be seen from the eye."""
 # Views that draw with light colours stay dark in the light theme too.
 _DARK = rrb.Background(color=(22, 24, 29), kind=rrb.BackgroundKind.SolidColor)
 STEPS = "Plan step by step: a bead per pose and load, beam green = seen"
@@ -17,7 +19,7 @@ SCHEDULE = "Schedule: minute of each reading by step, colour by load"
 
 
 def blueprint(d: PlanDigest) -> rrb.Blueprint:
-    """Left: 3-D over the schedule. Right: the plan in words over curve and tables."""
+    """Left: 3-D over the schedule. Right: the plan in words over the curve, with tables."""
     scenes = [_steps(d)]
     if d.tracker is not None:
         scenes.append(_from_tracker(d, d.tracker))
@@ -26,21 +28,14 @@ def blueprint(d: PlanDigest) -> rrb.Blueprint:
         rrb.Tabs(
             rrb.TextDocumentView(origin="words/plan", name="Plan"),
             rrb.TextDocumentView(origin="words/step", name="This step"),
+            rrb.TextDocumentView(origin="words/notes", name="Notes"),
             rrb.TextDocumentView(origin="words/guide", name="How to read this"),
         )
     ]
-    shares = [11.0]
-    if d.summary.curve:
-        right.append(
-            rrb.BarChartView(
-                origin="curve", name=curve_title(d), plot_legend=rrb.PlotLegend(visible=False)
-            )
-        )
-        shares.append(7.0)
     details = _details(d)
     if details:
         right.append(rrb.Tabs(*details))
-        shares.append(8.0)
+    shares = [5, 4][: len(right)]
     return rrb.Blueprint(
         rrb.Horizontal(left, rrb.Vertical(*right, row_shares=shares), column_shares=[3, 2]),
         rrb.TimePanel(timeline="step", state="collapsed", fps=_FPS, play_state="paused"),
@@ -59,6 +54,12 @@ def curve_title(d: PlanDigest) -> str:
 
 def _details(d: PlanDigest) -> list[rrb.View]:
     out: list[rrb.View] = []
+    if d.summary.curve:
+        out.append(
+            rrb.BarChartView(
+                origin="curve", name=curve_title(d), plot_legend=rrb.PlotLegend(visible=False)
+            )
+        )
     if d.summary.criteria:
         out.append(rrb.TextDocumentView(origin="words/criteria", name="Criteria"))
     if d.summary.parameters:
@@ -68,7 +69,7 @@ def _details(d: PlanDigest) -> list[rrb.View]:
 
 def _steps(d: PlanDigest) -> rrb.Spatial3DView:
     middle, size = plan_scene.framed(d)
-    return _view3d(STEPS, ["+ $origin/**"], middle + size * _eye(d, middle), middle)
+    return _view3d(STEPS, ["+ $origin/**"], middle + size * _eye(d, middle, size), middle)
 
 
 def _from_tracker(d: PlanDigest, place: Floats) -> rrb.Spatial3DView:
@@ -79,16 +80,18 @@ def _from_tracker(d: PlanDigest, place: Floats) -> rrb.Spatial3DView:
     return _view3d(f"{TRACKER}, {numbers.length(far)} away", contents, place, at)
 
 
-def _eye(d: PlanDigest, middle: Floats) -> Floats:
-    """Direction to the eye, in half sizes of the picture: across the beam where there is one."""
-    turn = np.deg2rad(-52.0)
+def _eye(d: PlanDigest, middle: Floats, size: float) -> Floats:
+    """Direction to the eye: across the beam where there is one, and where no obstacle hides."""
+    turn = float(np.deg2rad(-52.0))
     if d.tracker is not None:
         beam = d.tracker - middle
-        turn = np.arctan2(beam[1], beam[0]) - np.deg2rad(62.0)
-    return np.array([1.7 * np.cos(turn), 1.7 * np.sin(turn), 0.75])
+        turn = float(np.arctan2(beam[1], beam[0]) - np.deg2rad(62.0))
+    some = np.unique(np.linspace(0, len(d) - 1, _LOOKED_AT).round().astype(np.int64))
+    points = np.vstack([d.bodies[some, 1:, :3, 3].reshape(-1, 3), d.target[some]])
+    return eye.direction(turn, middle, size, points, d.config.obstacles)
 
 
-def _view3d(name: str, contents: list[str], eye: Floats, look: Floats) -> rrb.Spatial3DView:
+def _view3d(name: str, contents: list[str], place: Floats, look: Floats) -> rrb.Spatial3DView:
     return rrb.Spatial3DView(
         origin="world",
         contents=contents,
@@ -98,12 +101,12 @@ def _view3d(name: str, contents: list[str], eye: Floats, look: Floats) -> rrb.Sp
             visible=True, spacing=0.25, stroke_width=0.7, color=(120, 124, 132, 60)
         ),
         eye_controls=rrb.EyeControls3D(
-            kind=rrb.Eye3DKind.Orbital, position=eye, look_target=look, eye_up=(0.0, 0.0, 1.0)
+            kind=rrb.Eye3DKind.Orbital, position=place, look_target=look, eye_up=(0.0, 0.0, 1.0)
         ),
     )
 
 
 def _schedule() -> rrb.TimeSeriesView:
     return rrb.TimeSeriesView(
-        origin="schedule", name=SCHEDULE, plot_legend=rrb.PlotLegend(visible=True)
+        origin="schedule", name=SCHEDULE, plot_legend=rrb.PlotLegend(rrb.Corner2D.RightBottom)
     )

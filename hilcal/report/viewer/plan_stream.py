@@ -9,6 +9,7 @@ import rerun as rr
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.data.plan import Plan
+from hilcal.plan.next import PairPower
 from hilcal.plan.summary import PlanSummary
 from hilcal.report.viewer import (
     plan_cell,
@@ -23,7 +24,12 @@ from hilcal.report.viewer.stream import flush, opened, require_folder, write
 
 
 def record_plan(
-    cell: Cell, config: CellConfig, plan: Plan, summary: PlanSummary, path: Path
+    cell: Cell,
+    config: CellConfig,
+    plan: Plan,
+    summary: PlanSummary,
+    path: Path,
+    powers: tuple[PairPower, ...] = (),
 ) -> None:
     """Write a plan as a recording file, whole or not at all; an existing file is replaced.
 
@@ -37,6 +43,7 @@ def record_plan(
         plan: poses and steps.
         summary: cost, predicted precision and efficiency.
         path: of the recording, ".rrd".
+        powers: of the suspects that the plan separates; these are shown first.
 
     Raises:
         InputError: the folder is missing, or the plan's poses do not fit the arm.
@@ -44,8 +51,8 @@ def record_plan(
     """
     path = Path(path)
     require_folder(path)
-    d = plan_digest(cell, config, plan, summary)
-    rec = opened(_recording_id(config, plan, summary))
+    d = plan_digest(cell, config, plan, summary, powers)
+    rec = opened(_recording_id(d))
     write(rec, plan_layout.blueprint(d), lambda: _log(rec, d), path)
 
 
@@ -54,6 +61,7 @@ def _log(rec: rr.RecordingStream, d: PlanDigest) -> None:
     plan_cell.static_scene(rec, d)
     for name, text in (
         ("plan", plan_words.overview(d)),
+        ("notes", plan_words.notes(d)),
         ("guide", plan_words.GUIDE),
         ("parameters", plan_words.parameters(d.summary)),
         ("criteria", plan_words.criteria(d.summary)),
@@ -74,7 +82,7 @@ def _log(rec: rr.RecordingStream, d: PlanDigest) -> None:
     flush(rec)
 
 
-def _recording_id(config: CellConfig, plan: Plan, summary: PlanSummary) -> str:
+def _recording_id(d: PlanDigest) -> str:
     """Return an identifier that depends on the content of the recording alone."""
-    content = "\n".join((config.to_json(), plan.to_json(), repr(summary)))
+    content = "\n".join((d.config.to_json(), d.plan.to_json(), repr(d.summary), repr(d.powers)))
     return str(uuid.UUID(bytes=hashlib.sha256(content.encode()).digest()[:16]))

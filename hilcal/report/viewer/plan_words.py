@@ -7,7 +7,7 @@ import numpy as np
 from hilcal.acquire.sight import UNKNOWN as NO_TRACKER
 from hilcal.data.plan import UNLOADED
 from hilcal.plan.summary import PlanSummary
-from hilcal.report import text_plan
+from hilcal.report import numbers, text_next, text_plan
 from hilcal.report.text_run import spoken
 from hilcal.report.viewer.plan_digest import SEEN, PlanDigest
 from hilcal.report.viewer.style import escaped
@@ -17,14 +17,22 @@ _DETECTABLE = 6
 
 
 def overview(d: PlanDigest) -> str:
-    """Return cost, efficiency, remarks and order of a plan."""
+    """Return what a plan is for, its cost and efficiency; short, since a small window cuts it."""
     s = d.summary
-    lines = [f"# Plan: {s.poses} poses, {s.readings} readings, {spoken(s.duration.total)}"]
-    if s.efficiency is not None:
-        lines += [f"## {escaped(text_plan.certified(s.efficiency).capitalize())}"]
-    rows = [row for row in text_plan.cost_rows(s) if row[0] not in ("certified", "takes about")]
-    lines += [_table(("", ""), rows), f"| tracker | {sight(d)} |"]
-    lines += [line for remark in s.remarks for line in ("", f"⚠ {escaped(remark)}")]
+    title = f"Plan: {s.poses} poses, {s.readings} readings, {spoken(s.duration.total)}"
+    lines = [*_question(d), "", f"**{title}**"] if d.powers else [f"### {title}"]
+    rows = [row for row in text_plan.cost_rows(s) if row[0] not in ("", "takes about")]
+    lines += [f"- **{name}** {escaped(value)}" for name, value in rows]
+    return "\n".join([*lines, f"- **tracker** {sight(d)}"])
+
+
+def notes(d: PlanDigest) -> str:
+    """Return cost, remarks, what more poses would give, detectable effects and order of a plan."""
+    s = d.summary
+    lines = ["### Notes"]
+    for name, value in text_plan.cost_rows(s):
+        lines += [f"- **{name}** {escaped(value)}"] if name else [f"  ({escaped(value)})"]
+    lines += [line for remark in s.remarks for line in ("", escaped(numbers.sentence(remark)))]
     if s.curve:
         lines += ["", escaped(text_plan.enough(s.curve))]
     if s.detectable:
@@ -32,6 +40,15 @@ def overview(d: PlanDigest) -> str:
     if s.confounding is not None:
         lines += ["", escaped(text_plan.order_remark(s))]
     return "\n".join(lines)
+
+
+def _question(d: PlanDigest) -> list[str]:
+    """Return the suspects that the plan separates, and with which power."""
+    names = list(dict.fromkeys(t.effect for t in d.powers))
+    return [
+        f"### Which is it: {escaped(numbers.names(names, 'or'))}?",
+        _table(text_next.POWER_COLUMNS, text_next.power_rows(d.powers)),
+    ]
 
 
 def _table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -43,7 +60,7 @@ def _table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 def sight(d: PlanDigest) -> str:
     """Return how many of the readings the tracker sees."""
     if d.tracker is None:
-        return f"⚠ {escaped(NO_TRACKER)}"
+        return escaped(NO_TRACKER)
     lost = int(d.unseen.sum())
     if not lost:
         return f"✓ sees the target in all {len(d)} readings"
@@ -63,7 +80,7 @@ def step_card(d: PlanDigest, k: int) -> str:
     step = d.plan.steps[k]
     under = "unloaded" if step.load == UNLOADED else f"under {escaped(step.load)}"
     lines = [
-        f"# Step {k + 1} of {len(d)}: {escaped(step.pose)}, {under}",
+        f"### Step {k + 1} of {len(d)}: {escaped(step.pose)}, {under}",
         f"Minute {d.time[k] / 60.0:.0f} of {d.time[-1] / 60.0:.0f}.",
         "",
     ]
@@ -87,7 +104,7 @@ def _change(load: str) -> str:
 
 def _sight(d: PlanDigest, k: int) -> str:
     if d.tracker is None:
-        return f"⚠ {escaped(NO_TRACKER)}."
+        return f"{escaped(NO_TRACKER)[0].upper()}{escaped(NO_TRACKER)[1:]}."
     far = float(np.linalg.norm(d.tracker - d.target[k]))
     way = f"at {far:.2f} m"
     if d.incidence is not None:
@@ -100,7 +117,7 @@ def _sight(d: PlanDigest, k: int) -> str:
 def parameters(s: PlanSummary) -> str:
     """Return the table of predicted standard uncertainties."""
     rows = text_plan.parameter_rows(s.parameters)
-    return f"{_table(text_plan.PARAMETER_COLUMNS, rows)}\n\n{text_plan.PARAMETER_NOTE}"
+    return f"{text_plan.PARAMETER_NOTE}\n\n{_table(text_plan.PARAMETER_COLUMNS, rows)}"
 
 
 def criteria(s: PlanSummary) -> str:
@@ -109,7 +126,7 @@ def criteria(s: PlanSummary) -> str:
     return f"{_table(text_plan.CRITERIA_COLUMNS, rows)}\n\n{text_plan.CRITERIA_NOTE}"
 
 
-GUIDE = """# How to read this
+GUIDE = """### How to read this
 **Plan step by step** (3-D): the arm stands in the pose of the step, as the capsules that are kept
 clear of everything. *Step* (bottom left) goes through the readings in the order in which they are
 taken; the bright line is the target's last motion, the faint one its whole way under this load.

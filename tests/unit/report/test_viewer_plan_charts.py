@@ -79,17 +79,20 @@ def test_tables_have_the_numbers_of_the_summary(recording):
 
 
 def test_the_overview_has_cost_and_predicted_precision(recording):
-    text = rows(recording, "/words/plan", "TextDocument:text")[0][0].replace("\\", "")
+    text = "\n".join(
+        rows(recording, f"/words/{x}", "TextDocument:text")[0][0] for x in ("plan", "notes")
+    ).replace("\\", "")
+    assert "⚠" not in text  # remarks are no warnings
     for told in (
         "Plan: 3 poses, 10 readings",
-        "At least 98.7 % of the best possible",
+        "**efficiency** of the plan: at least 98.7 % (certified lower bound); not accuracy",
         "unloaded 6, 10kg 2, pull x 2",
         "3 load changes by hand 3 min",
         "± 12.0 µm",
         "does not see the target in 3 of 10 readings",
         "hysteresis from 6.00 µm",
         "cannot detect tracker_drift",
-        "only 3 candidates are left of load 10kg.",
+        "Only 3 candidates are left of load 10kg.",
     ):
         assert told in text
     cards = rows(recording, "/words/step", "TextDocument:text")
@@ -104,7 +107,7 @@ def test_what_a_summary_lacks_has_no_view(tmp_path):
     record_plan(cell, config, PLAN, BARE, tmp_path / "x.rrd")
     assert not {"/curve/plan", "/curve/other"} & entities(tmp_path / "x.rrd")
     text = rows(tmp_path / "x.rrd", "/words/plan", "TextDocument:text")[0][0]
-    for word in ("best possible", "±", "None", "nan", "drift"):
+    for word in ("efficiency", "±", "None", "nan", "drift"):
         assert word not in text
 
 

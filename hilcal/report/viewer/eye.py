@@ -1,0 +1,50 @@
+"""Where the eye of a 3-D view stands, so that nothing hides the arm."""
+
+import numpy as np
+
+from hilcal.config import Obstacle
+from hilcal.types import Bools, Floats
+
+_TURNS = np.deg2rad(np.array([0, 15, -15, 30, -30, 45, -45, 60, -60, 90, -90, 120, -120, 150, 180]))
+_HEIGHTS = (0.75, 1.2)
+_SAMPLES = np.linspace(0.0, 0.98, 80)  # of a line of sight
+_WORTH = 0.02  # share of points that must come into sight for the eye to go one place further
+
+
+def hidden(eye: Floats, points: Floats, things: tuple[Obstacle, ...]) -> Bools:
+    """Return (K,) which of the points (K, 3) an obstacle hides from an eye (3,), m."""
+    at = eye + _SAMPLES[:, None] * (points - eye)[:, None]
+    out = np.zeros(len(points), dtype=np.bool_)
+    for x in things:
+        if x.center_m is not None and x.size_m is not None:
+            off = np.abs(at - np.array(x.center_m)) <= 0.5 * np.array(x.size_m)
+            out |= off.all(axis=2).any(axis=1)
+        elif x.bottom_m is not None and x.radius_m is not None and x.height_m is not None:
+            off = at - np.array(x.bottom_m)
+            inside = np.hypot(off[..., 0], off[..., 1]) <= x.radius_m
+            out |= (inside & (off[..., 2] >= 0.0) & (off[..., 2] <= x.height_m)).any(axis=1)
+    return np.asarray(out)
+
+
+def direction(
+    turn: float, middle: Floats, size: float, points: Floats, things: tuple[Obstacle, ...]
+) -> Floats:
+    """Return the direction (3,) to the eye, in half sizes of the picture.
+
+    Args:
+        turn: about z, that is preferred, rad.
+        middle: (3,) of the picture, m.
+        size: half size of the picture, m.
+        points: (K, 3) what is to be seen, m.
+        things: what may hide it.
+    """
+    places = [
+        np.array([1.7 * np.cos(turn + a), 1.7 * np.sin(turn + a), z])
+        for z in _HEIGHTS
+        for a in _TURNS
+    ]
+    cost = [
+        hidden(middle + size * place, points, things).mean() + _WORTH * k
+        for k, place in enumerate(places)
+    ]
+    return places[int(np.argmin(cost))]
