@@ -1,4 +1,4 @@
-"""`accept`: which revision of a campaign is used."""
+"""`info` and `accept`: what a campaign holds, and which revision of it is used."""
 
 from typing import Annotated
 
@@ -6,9 +6,24 @@ import typer
 
 from hilcal.cli.terminal import Json, Run, terminal
 from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.covariance import COVERS
+from hilcal.data.overview import overview
 from hilcal.data.revision import RevisionRecord
 from hilcal.errors import InputError
+from hilcal.identify.full_covariance import covariance_parts
 from hilcal.report import text
+from hilcal.report.covariance_words import covariance_words
+from hilcal.report.text_info import info_report, to_json
+
+
+def info(run: Run, as_json: Json = False) -> None:
+    """Say what a campaign holds: readings, instruments, drift, events, revisions."""
+    t = terminal(as_json)
+    with CampaignFile.open(run, read_only=True) as file:
+        found = overview(file)
+        parts = covariance_parts(file.about(COVERS), found.config)
+    t.show(info_report(found, run.name, covariance_words(parts)))
+    t.document(to_json(found, str(run), parts))
 
 
 def accept(

@@ -60,6 +60,10 @@ COMMANDS = {
         "Measure a campaign: every step of the plan, each reading stored before the next motion.",
     ),
     "import": Command("tables:import_", "Make a campaign file from a table of readings."),
+    "info": Command(
+        "campaigns:info",
+        "Say what a campaign holds: readings, instruments, drift, events, revisions.",
+    ),
     "identify": Command(
         "fitting:identify", "Fit a model to the readings, and keep it as a revision."
     ),
