@@ -1,0 +1,138 @@
+"""The README's campaign: its blocks are one CELL.toml, and its commands run in their order.
+
+Here the readings are drawn in the simulated world; `test_readme_on_devices` drives the same
+commands over wires.
+"""
+
+import tomllib
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import openpyxl
+import pytest
+
+from drivers.simulated.on_the_wire import case_of_plan, read_plan
+from hilcal.acquire.connect import ConnectionResult
+from hilcal.cell import cell_from_config
+from hilcal.cli import planning
+from hilcal.cli.commands import COMMANDS
+from hilcal.config import CellConfig, load_config
+from hilcal.data.appended import with_new_names
+from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.covariance import WHOLE
+from hilcal.data.plan import Plan, load_plan
+from hilcal.data.readings import Readings
+from hilcal.data.run_log import RunLog, create_run
+from hilcal.data.table import write_table
+from hilcal.plan.planner import Request, make
+from tests.support import readme
+from tests.support.cli_cases import Outcome, run
+
+Capsys = pytest.CaptureFixture[str]
+FEW = "candidates = 60\nagainst = []\n"
+"""In [planning]: so that planning takes a second."""
+SEED = 3
+ELSEWHERE = {"simulate", "demo"}
+"""Commands of the section that other tests run."""
+
+
+def test_the_blocks_are_one_cell(tmp_path: Path) -> None:
+    path = tmp_path / "CELL.toml"
+    path.write_text(readme.cell(), encoding="utf-8")
+    config = load_config(path)
+    assert config.planning.work_min_m is not None
+    assert [load.name for load in config.loads] == ["5kg"]
+    assert tomllib.loads(readme.cell())["tracker"]["driver"] == "geocom"
+
+
+def test_every_command_is_one_of_the_program() -> None:
+    used = {words[0] for words in readme.commands()}
+    assert used <= set(COMMANDS)
+    assert {"check", "plan", "run", "import", "identify", "refine", "next", "validate"} <= used
+
+
+def test_every_command_in_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capsys
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    text = readme.cell().replace("[planning]\n", f"[planning]\n{FEW}")
+    Path("CELL.toml").write_text(text, encoding="utf-8")
+    monkeypatch.setattr(planning, "connect", nobody)
+    config = load_config(Path("CELL.toml"))
+    others(config, tmp_path)
+    shown = {}
+    for words in readme.commands():
+        if words[0] in ELSEWHERE:
+            continue
+        if words[0] == "run":
+            draw(config, words)
+            continue
+        quick = ["--quick"] if words[0] in ("plan", "next") else []
+        if "--plan" in words and words[words.index("--plan") + 1] == "next.json":
+            continue
+        result = run(capsys, *words, *quick)
+        if words[0] == "next" and result.code == 4:  # nothing is hidden, nothing is in doubt
+            assert "no suspects to separate" in result.err
+            continue
+        assert result.code == 0, (words, result.err)
+        shown[" ".join(words)] = result
+        if words[0] == "plan" and not Path("other.hilcal").exists():
+            draw(config, ["run", "CELL.toml", "--plan", words[3], "-o", "other.hilcal"], 7)
+    told = said(shown, "plan CELL.toml -o plan.json")
+    assert "joint_compliance.j1 not determined" in told
+    assert "joint 1 needs a side pull" in told
+    assert "it is not the accuracy of the robot" in told
+    assert "joint_compliance.j1" in said(shown, "identify run.hilcal")
+    assert "adequate" in said(shown, "refine run.hilcal")
+
+
+def said(shown: dict[str, Outcome], command: str) -> str:
+    """What the first command that begins so has printed, on one line."""
+    return " ".join(next(r for c, r in shown.items() if c.startswith(command)).out.split())
+
+
+def nobody(config: CellConfig) -> tuple[None, tuple[ConnectionResult, ...]]:
+    """No device is asked: their addresses are those of the README's author."""
+    return None, ()
+
+
+def draw(config: CellConfig, words: list[str], noise: int = 1) -> None:
+    """Stand in for `run`: draw the readings of a plan in a world where nothing is hidden."""
+    given = dict(pairwise(words))
+    path = Path(given["-o"])
+    if "--resume" in words or not Path(given["--plan"]).exists():
+        return  # nothing is missing; nothing was to be separated
+    made = load_plan(Path(given["--plan"]))
+    if "--append" in words:
+        with CampaignFile.open(path) as c:
+            first = RunLog(c).plans[0]
+            RunLog(c).append(RunLog(c).with_new_names(made))
+            further = with_new_names(made, first, 2)
+            secret = case_of_plan(config, first, "nothing", SEED)
+            c.append_readings(read_plan(secret, further, [SEED, 2], 3000.0).readings)
+        return
+    with create_run(path, config, path.absolute().parent, made) as c:
+        c.append_readings(readings(config, made, noise))
+
+
+def readings(config: CellConfig, plan: Plan, noise: int) -> Readings:
+    """Readings of a plan in the one world of this file."""
+    return read_plan(case_of_plan(config, plan, "nothing", SEED), plan, [SEED, noise]).readings
+
+
+def others(config: CellConfig, directory: Path) -> None:
+    """Somebody else's tables: one in the exchange format, one as a spreadsheet in their units."""
+
+    plan = make(cell_from_config(config), config, Request(8), np.random.default_rng(2)).ordered.plan
+    r = readings(config, plan, 5)
+    write_table(r, directory / "readings.csv", WHOLE)
+    book = openpyxl.Workbook()
+    sheet = book.active
+    assert sheet is not None
+    joints = [f"A{k} [deg]" for k in range(1, 7)]
+    sheet.append(["pose", "load", *joints, "X [mm]", "Y [mm]", "Z [mm]"])
+    for q, x, pose, load in zip(r.states.q, r.value, r.pose, r.load, strict=True):
+        row = [r.pose_names[pose], r.load_names[load], *np.rad2deg(q), *(1e3 * x)]
+        sheet.append([v if isinstance(v, str) else float(v) for v in row])
+    book.save(directory / "theirs.xlsx")
