@@ -4,7 +4,6 @@ import contextlib
 import math
 import sys
 import termios
-from functools import partial
 
 from rich.console import Console
 
@@ -18,11 +17,19 @@ _NO_TERMINAL = (
 )
 
 
+ANSWERS = "Enter = done, q = give up: "
+
+
 class TerminalOperator:
-    """Asks on standard error and listens to standard input."""
+    """Asks on standard error and listens to standard input.
+
+    Attributes:
+        at_terminal: true, see `hilcal.acquire.devices.TerminalPerson`.
+    """
 
     def __init__(self, config: CellConfig) -> None:
         """Remember where loads act and which way weights pull."""
+        self.at_terminal = True
         self._point = config.tool.load_point_m
         self._gravity = config.robot.gravity_m_s2
         self._console = Console(stderr=True, highlight=False)
@@ -45,28 +52,39 @@ class TerminalOperator:
         """
         if not _is_terminal():
             raise DeviceError(_NO_TERMINAL)
-        say = partial(self._console.print, markup=False, soft_wrap=True)
-        say()
+        self._say()
+        if self._console.is_terminal:
+            self._console.bell()
         if why:
-            say(why, style="bold red")
+            self._say(f"Not yet: {why}", style="bold red")
         for line in self._request(load):
-            say(line, style="bold")
+            self._say(line, style="bold")
         with contextlib.suppress(termios.error, OSError, ValueError):
             termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)
         while True:
-            say("Enter = done, q = give up: ", end="")
+            self._say(ANSWERS, end="")
             try:
                 answer = sys.stdin.readline()
             except (OSError, ValueError) as error:
                 raise DeviceError(f"operator: the terminal is gone ({error})") from None
             if not answer:
+                self._say()
                 raise DeviceError("operator: the terminal was closed before the load was hung")
             answer = answer.strip().lower()
             if answer == "":
+                self._say("Done: " + ("nothing hangs." if load is None else f"{load.name} hangs."))
                 return
             if answer in ("q", "quit"):
+                self._say("Given up.")
                 raise DeviceError("stopped by the operator")
-            say(f"{answer!r} is no answer.")
+            self._say(
+                f"{answer!r} is no answer. Press Enter when it is done, or q and Enter to give up."
+            )
+
+    def _say(self, words: str = "", *, style: str | None = None, end: str = "\n") -> None:
+        """Print above nothing: the live display is gone. A terminal's lines break between words."""
+        whole = not self._console.is_terminal
+        self._console.print(words, style=style, end=end, markup=False, soft_wrap=whole)
 
     def close(self) -> None:
         """Nothing to give back."""

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from drivers.simulated import admin
+from drivers.terminal_operator import TerminalOperator
 from hilcal.acquire.clock import Clock
 from hilcal.acquire.devices import Report
 from hilcal.config import CellConfig, Load
@@ -12,7 +13,7 @@ from hilcal.errors import DeviceError, InputError
 HAND_S = 20.0
 """Time that a person takes to change a load, s."""
 
-_OPTIONS = ("socket", "hand_s")
+_OPTIONS = ("socket", "hand_s", "person")
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,29 +24,44 @@ class SimulatedOperator:
         socket: the world's admin socket.
         hand: time that a change of the load takes, s of cell time.
         clock: cell time.
+        person: who is asked at the terminal, as in a real cell; None where nobody is.
     """
 
     socket: Path
     hand: float
     clock: Clock
+    person: TerminalOperator | None = None
+
+    @property
+    def at_terminal(self) -> bool:
+        """Whether somebody is asked at the terminal."""
+        return self.person is not None
 
     def report(self) -> Report:
         """Say who is asked, and whether the world is there to hang anything in."""
-        facts = (("takes", f"{self.hand:g} s for a load"),)
+        facts: tuple[tuple[str, str], ...] = (("takes", f"{self.hand:g} s for a load"),)
+        name = "simulated operator"
         problems: tuple[str, ...] = ()
+        if self.person is not None:
+            asked = self.person.report()
+            name, facts, problems = f"{asked.name}, who rehearses", asked.facts, asked.problems
         try:
             admin.ask(self.socket, "state")
         except DeviceError as error:
-            problems = (f"operator: {error}",)
-        return Report("operator", "simulated operator", facts, problems)
+            problems = (*problems, f"operator: {error}")
+        return Report("operator", name, facts, problems)
 
     def hang(self, load: Load | None, why: str) -> None:
-        """Hang a load in the simulated world, or take it off.
+        """Hang a load in the simulated world, or take it off; a person is asked first.
 
         Raises:
-            DeviceError: the simulated world is gone, or does not have this load.
+            DeviceError: the simulated world is gone or does not have this load, or the person
+                gives up.
         """
-        self.clock.sleep(self.hand)
+        if self.person is not None:
+            self.person.hang(load, why)
+        else:
+            self.clock.sleep(self.hand)
         admin.ask(self.socket, "hang", name=None if load is None else load.name)
 
     def close(self) -> None:
@@ -55,8 +71,9 @@ class SimulatedOperator:
 def open_operator(config: CellConfig) -> SimulatedOperator:
     """Return the simulated operator of a configuration.
 
-    Its [operator] options are `socket`, the admin socket of the simulated world, and
-    `hand_s`, how long a change of the load takes, s of cell time.
+    Its [operator] options are `socket`, the admin socket of the simulated world, `hand_s`, how long
+    a change of the load takes, s of cell time, and `person`: true where it is left to the person at
+    the terminal, whose every answer is then true in the simulated world.
 
     Raises:
         InputError: a missing or bad option.
@@ -76,4 +93,8 @@ def open_operator(config: CellConfig) -> SimulatedOperator:
         )
     if isinstance(hand, bool) or not isinstance(hand, int | float) or not 0 <= hand <= 3600:
         raise InputError(f"[operator] options hand_s = {hand!r}; valid: a time in s, 0 to 3600")
-    return SimulatedOperator(Path(socket), float(hand), Clock(config.simulation.clock))
+    person = options.get("person", False)
+    if not isinstance(person, bool):
+        raise InputError(f"[operator] options person = {person!r}; valid: true or false")
+    asked = TerminalOperator(config) if person else None
+    return SimulatedOperator(Path(socket), float(hand), Clock(config.simulation.clock), asked)

@@ -306,3 +306,14 @@ class OperatorDevice(Protocol):
     def close(self) -> None:
         """Give the terminal back. Never raises, may be called twice."""
         ...
+
+
+@runtime_checkable
+class TerminalPerson(OperatorDevice, Protocol):
+    """An operator who is asked at the terminal on which the campaign is shown.
+
+    Attributes:
+        at_terminal: whether that is so now; the live display gives way to the question then.
+    """
+
+    at_terminal: bool

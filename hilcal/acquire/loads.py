@@ -5,10 +5,10 @@ from collections.abc import Callable
 import numpy as np
 
 from hilcal.acquire.clock import Clock
-from hilcal.acquire.devices import ArmDevice, OperatorDevice, WrongLoadError
+from hilcal.acquire.devices import ArmDevice, OperatorDevice, TerminalPerson, WrongLoadError
 from hilcal.acquire.force import ForceMeter
 from hilcal.acquire.motion import Mover
-from hilcal.acquire.progress import Phase, Remark, Watcher
+from hilcal.acquire.progress import Answered, Phase, Question, Remark, Watcher
 from hilcal.cell import Cell
 from hilcal.config import CellConfig, Load
 from hilcal.data.plan import UNLOADED
@@ -89,15 +89,22 @@ class Hook:
     def _ask(self, load: Load | None, wrong: Wrong) -> None:
         """Ask until nothing is wrong, `TRIES` times."""
         what = "take everything off" if load is None else f"hang {load.name}"
+        person = isinstance(self._operator, TerminalPerson) and self._operator.at_terminal
         why = ""
         for _ in range(TRIES):
             self._watcher.notify(Phase(f"waiting for the operator to {what}"))
+            if person:
+                self._watcher.notify(Question())
             self._operator.hang(load, why)
+            if person:
+                self._watcher.notify(Answered())
+            self._watcher.notify(Phase("checking what hangs"))
             self._mover.look()
             why = wrong()
             if not why:
                 return
-            self._watcher.notify(Remark(f"asked to {what}: {why}"))
+            if not person:  # a person is told with the next question
+                self._watcher.notify(Remark(f"asked to {what}: {why}"))
         raise WrongLoadError(f"operator: asked {TRIES} times to {what}; {why}")
 
     def _differs(self, load: Load | None) -> str:

@@ -111,9 +111,19 @@ class ReadingStored:
     goal: GoalStatus | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class Question:
+    """Somebody is about to be asked at the terminal: the display gives way until `Answered`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Answered:
+    """The question has been answered: the terminal is the display's again."""
+
+
 class Watcher(Protocol):
     """Receives the events of a campaign."""
 
     def notify(self, event: object) -> None:
-        """Receive a `Phase`, a `Remark`, a `ReadingStored` or a `GoalMet`; returns soon."""
+        """Receive any event of this module; returns soon."""
         ...

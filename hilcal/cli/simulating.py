@@ -34,6 +34,13 @@ def simulate(
         str | None, typer.Option("--hide", metavar="EFFECT", help="An effect, random or nothing.")
     ] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Of everything random.")] = None,
+    person: Annotated[
+        bool,
+        typer.Option(
+            "--person",
+            help="`run` asks you for each load, as in a real cell; without it nobody is asked.",
+        ),
+    ] = False,
     effects_from: EffectsFrom = None,
 ) -> None:
     """Run simulated devices for a cell until Ctrl-C, for `check` and `run` to talk to."""
@@ -42,20 +49,34 @@ def simulate(
     number = config.simulation.seed if seed is None else seed
     if number < 0:
         raise InputError(f"--seed {number}; valid: a whole number, 0 or more")
-    made = make_plan(numbers, config, POSES, number, catalogue) if plan is None else load_plan(plan)
     base_dir = cell.absolute().parent
-    secret = case_of_plan(config, made, hide or config.simulation.hide or NOTHING, number)
+    with working(t.progress) as say:
+        if plan is None:
+            say("planning a campaign, to know how strong an effect has to be")
+            made = make_plan(numbers, config, POSES, number, catalogue, say)
+        else:
+            made = load_plan(plan)
+        say("preparing the simulated cell")
+        secret = case_of_plan(config, made, hide or config.simulation.hide or NOTHING, number)
     with told_to_end(signal.SIGTERM, signal.SIGINT, signal.SIGHUP) as wait, ExitStack() as stack:
         with working(t.progress) as say:
             say("starting the devices")
             there = stack.enter_context(simulated_cell(secret, number, base_dir, output))
         target = output / "cell.toml"
-        target.write_text(to_toml(_placed(there.config, base_dir)), encoding="utf-8")
+        told = with_person(there.config) if person else there.config
+        target.write_text(to_toml(_placed(told, base_dir)), encoding="utf-8")
         t.show(f"The devices run. Their cell is {target}; go on in another terminal with:")
         t.show(f"  hilcal check {target}\n  hilcal run {target} -o run.hilcal")
         t.show("Ctrl-C ends them.")
         wait()
     t.show("The devices have ended.")
+
+
+def with_person(config: CellConfig) -> CellConfig:
+    """Return the configuration of a simulated cell whose loads are left to a person."""
+    options = {**config.operator.options, "person": True}
+    operator = config.operator.model_copy(update={"options": options})
+    return config.model_copy(update={"operator": operator})
 
 
 def _placed(config: CellConfig, base_dir: Path) -> CellConfig:

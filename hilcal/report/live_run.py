@@ -4,12 +4,20 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import Any
 
 from rich.console import Console, RenderableType
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    TaskID,
+    TextColumn,
+)
 from rich.text import Text
 
-from hilcal.acquire.progress import GoalMet, Phase, ReadingStored, Remark
+from hilcal.acquire.progress import Answered, GoalMet, Phase, Question, ReadingStored, Remark
 from hilcal.report import numbers
 from hilcal.report.goal_words import met_words, status_words
 from hilcal.report.text_run import spoken
@@ -39,24 +47,57 @@ class _Lines:
         self.console.print(f"{seconds} {words}", markup=False, highlight=False, soft_wrap=True)
 
 
-@dataclass(slots=True)
 class _Bar:
-    """Keeps two lines up to date; remarks scroll by above them."""
+    """Keeps two lines up to date; remarks scroll by above them.
 
-    progress: Progress
-    task: TaskID
+    While somebody is asked a question they are gone, for their refresh would wipe it away.
+    """
+
+    def __init__(self, console: Console, total: int) -> None:
+        """Show nothing before `begin`."""
+        self._console = console
+        self._total, self._done = total, 0
+        self._fields: dict[str, Any] = {"left": "", "last": "", "phase": ""}
+        self._shown: tuple[_TwoLines, TaskID] | None = None
+
+    def begin(self) -> None:
+        """Show the lines."""
+        progress = _TwoLines(*_columns(), console=self._console, transient=True)
+        task = progress.add_task("", total=self._total, completed=self._done, **self._fields)
+        progress.start()
+        self._shown = (progress, task)
+
+    def end(self) -> None:
+        """Take the lines away."""
+        if self._shown is not None:
+            self._shown[0].stop()
+            self._shown = None
 
     def notify(self, event: object) -> None:
         """Take note."""
         if isinstance(event, Phase):
-            self.progress.update(self.task, phase=event.text)
+            self._update(phase=event.text)
+        elif isinstance(event, Question):
+            self.end()
+            if self._done:
+                words = f"{self._done} of {self._total} readings are stored"
+                left = f", {self._fields['left']}" if self._fields["left"] else ""
+                self._console.print(f"\n{words}{left}.", style="dim", markup=False)
+        elif isinstance(event, Answered):
+            self.begin()
         elif isinstance(event, Remark | GoalMet):
             text = event.text if isinstance(event, Remark) else met_words(event)
-            self.progress.console.print(f"note: {text}", markup=False, highlight=False)
+            self._console.print(f"note: {text}", markup=False, highlight=False)
         elif isinstance(event, ReadingStored):
+            self._done = event.done
             left = f"{spoken(event.left_real)} left" if event.left_real > 0 else ""
-            last = f"{event.step}{figures(event)}"
-            self.progress.update(self.task, completed=event.done, left=left, last=last)
+            self._update(left=left, last=f"{event.step}{figures(event)}")
+
+    def _update(self, **fields: str) -> None:
+        self._fields |= fields
+        if self._shown is not None:
+            progress, task = self._shown
+            progress.update(task, completed=self._done, **self._fields)
 
 
 class _TwoLines(Progress):
@@ -75,15 +116,21 @@ def watching(console: Console, total: int) -> Iterator[_Lines | _Bar]:
     if not console.is_terminal:
         yield _Lines(console)
         return
-    columns = (
+    bar = _Bar(console, total)
+    bar.begin()
+    try:
+        yield bar
+    finally:
+        bar.end()
+
+
+def _columns() -> tuple[ProgressColumn, ...]:
+    return (
         BarColumn(bar_width=20),
         MofNCompleteColumn(),
         TextColumn("{task.fields[left]}", style="bold", markup=False),
         TextColumn("{task.fields[phase]}", style="dim", markup=False),
     )
-    with _TwoLines(*columns, console=console, transient=True) as progress:
-        task = progress.add_task("", total=total, left="", last="", phase="")
-        yield _Bar(progress, task)
 
 
 def figures(event: ReadingStored) -> str:

@@ -1,0 +1,161 @@
+"""A program at a terminal of a given size, as a person sits there: types, and reads the screen."""
+
+import fcntl
+import os
+import pty
+import select
+import signal
+import struct
+import subprocess
+import sys
+import termios
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import pyte
+
+ROOT = Path(__file__).resolve().parents[2]
+HISTORY = 2000
+"""Lines that have scrolled off the top and can still be read."""
+DEADLINE = 120.0
+"""Nothing that is waited for may take longer, s; far above what it takes."""
+STANDING_S = 0.5
+"""A question that stands so long is not wiped away; a live bar refreshes ten times a second."""
+
+
+class AtTerminal:
+    """One command of hilcal in a pseudo-terminal of its own, and what stands on its screen.
+
+    Attributes:
+        gaps: (seconds, line that stood last) of every silence so far, longest first.
+    """
+
+    def __init__(
+        self, *arguments: str | Path, columns: int = 80, lines: int = 30, home: Path | None = None
+    ) -> None:
+        """Start it, in the directory `home`."""
+        self.columns = columns
+        self._screen = pyte.HistoryScreen(columns, lines, history=HISTORY, ratio=1.0)
+        self._stream = pyte.ByteStream(self._screen)
+        self._silences: list[tuple[float, str]] = []
+        self._heard = time.monotonic()
+        self._open = True
+        self._master, slave = pty.openpty()
+        fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", lines, columns, 0, 0))
+        hidden = ("COLUMNS", "LINES", "HILCAL_DEBUG")
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "hilcal", *map(str, arguments)],
+            stdin=slave,
+            stdout=slave,
+            stderr=slave,
+            cwd=home,
+            env={
+                **{name: value for name, value in os.environ.items() if name not in hidden},
+                "PYTHONPATH": str(ROOT),
+                "OMP_NUM_THREADS": "1",
+                "TERM": "xterm-256color",
+            },
+            start_new_session=True,
+            preexec_fn=lambda: fcntl.ioctl(slave, termios.TIOCSCTTY, 0),
+        )
+        os.close(slave)
+
+    # what stands there
+
+    @property
+    def page(self) -> list[str]:
+        """The lines of the screen as it is now, without blanks at their ends."""
+        return [line.rstrip() for line in self._screen.display]
+
+    @property
+    def lines(self) -> list[str]:
+        """Everything that still stands, from the first line: scrolled off, and on the screen."""
+        above = [
+            "".join(row[k].data for k in range(self.columns)).rstrip()
+            for row in self._screen.history.top
+        ]
+        below = self.page
+        while below and not below[-1]:
+            below.pop()
+        return above + below
+
+    @property
+    def text(self) -> str:
+        """All lines as one text; words that a line's end divides are joined by a blank."""
+        return " ".join(" ".join(self.lines).split())
+
+    @property
+    def gaps(self) -> list[tuple[float, str]]:
+        """Silences, the longest first."""
+        return sorted(self._silences, reverse=True)
+
+    # what happens
+
+    def look(self, seconds: float = 0.05) -> bool:
+        """Let the screen change for a while; False where the program's end has been read."""
+        end = time.monotonic() + seconds
+        while self._open and (left := end - time.monotonic()) > 0:
+            if not select.select([self._master], [], [], left)[0]:
+                break
+            try:
+                found = os.read(self._master, 65536)
+            except OSError:  # the program has closed its terminal
+                found = b""
+            if not found:
+                self._open = False
+                break
+            now = time.monotonic()
+            self._silences.append((now - self._heard, (self.lines or [""])[-1]))
+            self._heard = now
+            self._stream.feed(found)
+        return self._open
+
+    def sees(self, words: str, times: int = 1) -> None:
+        """Wait until words stand there, so many times; line ends count as blanks."""
+        self.wait(lambda: self.text.count(words) >= times, f"{words!r} for the {times}. time")
+
+    def keeps(self, words: str, times: int = 1) -> None:
+        """Wait for words, and see that they still stand after a while."""
+        self.sees(words, times)
+        end = time.monotonic() + STANDING_S
+        while time.monotonic() < end:
+            self.look()
+        assert self.text.count(words) >= times, f"wiped away: {words!r}\n" + "\n".join(self.lines)
+
+    def wait(self, holds: Callable[[], bool], what: str) -> None:
+        """Wait until something holds."""
+        end = time.monotonic() + DEADLINE
+        while not holds():
+            there = self.look()
+            if holds():
+                return
+            assert there, f"ended before {what}:\n" + "\n".join(self.lines)
+            assert time.monotonic() < end, f"never {what}:\n" + "\n".join(self.lines)
+
+    def types(self, keys: str) -> None:
+        """Press keys."""
+        os.write(self._master, keys.encode())
+
+    def ends(self) -> int:
+        """Wait for the end; returns the exit code."""
+        end = time.monotonic() + DEADLINE
+        while self.look(0.2):
+            assert time.monotonic() < end, "it does not end:\n" + "\n".join(self.lines)
+        return self.process.wait(10.0)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self.process.poll() is None:
+            os.killpg(self.process.pid, signal.SIGKILL)
+            self.process.wait()
+        os.close(self._master)
