@@ -2,8 +2,11 @@
 
 import json
 import os
+import re
 import shlex
+import shutil
 import sys
+import textwrap
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -29,6 +32,7 @@ _COMPLETE = "_HILCAL_COMPLETE"
 _BROKEN_PIPE = 141
 _INTERRUPTED = StoppedError.exit_code
 _USAGE = 2
+_COMMAND = re.compile(r"(.*:) (hilcal [^,;()]*)$")
 _KINDS = {
     InputError: "input",
     DeviceError: "device",
@@ -77,9 +81,25 @@ def _hilcal(arguments: Sequence[str]) -> typer.Typer:
             app.add_typer(_group(command), name=name)
         else:
             epilog = EXIT_CODES_OF_RUN if name == "run" else EXIT_CODES
-            app.command(name, epilog=epilog)(load(command.place))
+            with _loading(name):
+                function = load(command.place)
+            app.command(name, epilog=epilog)(function)
     app.callback()(_top)
     return app
+
+
+@contextmanager
+def _loading(name: str) -> Iterator[None]:
+    """Show on a terminal that the program is there while a command's libraries are loaded."""
+    if not sys.stderr.isatty() or os.environ.get(_COMPLETE):
+        yield
+        return
+    words = f"hilcal {name} ..."
+    print(words, end="", file=sys.stderr, flush=True)
+    try:
+        yield
+    finally:
+        print("\r" + " " * len(words), end="\r", file=sys.stderr, flush=True)
 
 
 def _group(command: Command) -> typer.Typer:
@@ -181,7 +201,7 @@ class Failures:
         if self._debug and error is not None:
             traceback.print_exception(error)
         line = " ".join(message.split())
-        print(f"error: {line}", file=sys.stderr)
+        print(_laid_out(f"error: {line}"), file=sys.stderr)
         if self._json and not self.out.written:
             kinds = {kind.exit_code: name for kind, name in _KINDS.items()}
             kind = kinds.get(code, "unexpected")
@@ -201,6 +221,27 @@ def _one_thread() -> Iterator[None]:
 
     with threadpool_limits(limits=1, user_api="blas"):
         yield
+
+
+def _laid_out(line: str) -> str:
+    """Return a line as people read it: on a terminal broken between words.
+
+    A command at its end has a line of its own there, to be copied as it stands.
+    """
+    if not sys.stderr.isatty():
+        return line
+    words, command = line, ""
+    if found := _COMMAND.match(line):
+        words, command = found.groups()
+    width = shutil.get_terminal_size().columns
+    told = textwrap.wrap(
+        words,
+        width,
+        subsequent_indent="  ",
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+    return "\n".join((*told, *([f"  {command}"] if command else ())))
 
 
 def _run(

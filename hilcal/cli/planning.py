@@ -19,9 +19,9 @@ from hilcal.data.plan import Plan, load_plan
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import DeviceError, InputError
 from hilcal.identify.fit import Fit
-from hilcal.plan.checked_plan import checked, refuse
+from hilcal.plan.checked_plan import CheckedPlan, checked, refuse
 from hilcal.plan.choice import CRITERIA, canonical
-from hilcal.plan.planner import Request, make
+from hilcal.plan.planner import Planned, Request, make
 from hilcal.plan.summary import about, remarks, summarise
 from hilcal.report import text_run
 from hilcal.report.progress import Say, working
@@ -144,7 +144,22 @@ def make_plan(
     say: Say = lambda words: None,
 ) -> Plan:
     """Return a plan of as many readings as so many poses take under every load of the cell."""
-    chosen = make(cell, config, Request(poses), generator(seed), None, say, catalogue)
+    return _with_origin(make(cell, config, Request(poses), generator(seed), None, say, catalogue))
+
+
+def make_checked(
+    cell: Cell, config: CellConfig, poses: int, seed: int, catalogue: Catalogue, say: Say
+) -> CheckedPlan:
+    """Return the same plan with its dry run and its summary, without comparisons."""
+    rng = generator(seed)
+    chosen = make(cell, config, Request(poses), rng, None, say, catalogue)
+    summary = summarise(chosen, config, rng, say, compare=False)
+    say("checking every motion in a dry run")
+    return checked(cell, config, _with_origin(chosen), summary)
+
+
+def _with_origin(chosen: Planned) -> Plan:
+    """Return a plan that says where it is from."""
     return replace(chosen.ordered.plan, about={**about(chosen), "remarks": list(remarks(chosen))})
 
 

@@ -1,5 +1,6 @@
 """`run`: measure a campaign; `--resume` goes on after any stop."""
 
+import shlex
 import signal
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -17,15 +18,17 @@ from hilcal.acquire.connect import ConnectionResult, connect
 from hilcal.acquire.dry_run import dry_run
 from hilcal.acquire.progress import Watcher
 from hilcal.acquire.rig import Rig
+from hilcal.acquire.run import HOW_ON
 from hilcal.acquire.run import run as run_plan
 from hilcal.cell import Cell
+from hilcal.cli.asking import agreed, somebody_there
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.plan_output import POSES
 from hilcal.cli.planning import (
     CellFile,
     PlanFile,
     answer_json,
-    make_plan,
+    make_checked,
     read_cell,
     refuse_unready,
 )
@@ -35,12 +38,14 @@ from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.plan import Plan, load_plan
 from hilcal.data.run_log import RunLog, check_same_cell, create_run
 from hilcal.diagnose.live_model import LiveModel
-from hilcal.errors import CannotAnswerError, DeviceError, InputError
+from hilcal.effects.catalogue import Catalogue
+from hilcal.errors import CannotAnswerError, DeviceError, HilcalError, InputError, StoppedError
 from hilcal.plan.checked_plan import refuse
 from hilcal.plan.goal_rule import GoalRule
 from hilcal.report.goal_words import full_words, missed_words
 from hilcal.report.live_run import watching
 from hilcal.report.progress import Say, working
+from hilcal.report.text_plan import plan_facts
 
 
 def run(
@@ -71,6 +76,12 @@ def run(
             "they are kept.",
         ),
     ] = None,
+    yes: Annotated[
+        bool,
+        typer.Option(
+            "--yes", "-y", help="Without --plan: do not ask whether to measure what was planned."
+        ),
+    ] = False,
     effects_from: EffectsFrom = None,
     as_json: Json = False,
 ) -> None:
@@ -97,11 +108,7 @@ def run(
                     f"{output}: the file exists; go on with it by --resume, add a plan by "
                     "--append, or choose another name"
                 )
-            made = (
-                make_plan(numbers, config, POSES, config.simulation.seed, catalogue)
-                if plan is None
-                else load_plan(plan)
-            )
+            made = load_plan(plan) if plan else _own_plan(t, cell, config, numbers, catalogue, yes)
             refuse(dry_run(numbers, config, made), str(plan or "the plan"))
         if rehearse:
             with working(t.progress) as say:
@@ -114,8 +121,13 @@ def run(
             RunLog(campaign).append(further)
         elif not resume:
             campaign = stack.enter_context(create_run(output, config, base_dir, made))
-        measured = measure(t, config, numbers, campaign, goal)
         planned = len(RunLog(campaign).plan.steps) * len(numbers.all_targets)
+        more = (*_given("--rehearse", rehearse), *_given("--until", until))
+        for path in effects_from or ():
+            more = (*more, "--effects-from", str(path))
+        on = shlex.join(("hilcal", "run", str(cell), "-o", str(output), "--resume", *more))
+        with _says_how_to_resume(campaign, planned, on):
+            measured = measure(t, config, numbers, campaign, goal)
     document: dict[str, object] = {"campaign": str(output), "readings": measured}
     document["planned"] = planned
     if goal is not None:
@@ -128,6 +140,58 @@ def run(
     if goal is not None and not goal.status.met:
         on = f"hilcal plan {cell} --after {output}"
         raise CannotAnswerError(f"{missed_words(goal.status, measured)}; plan on with: {on}")
+
+
+def _own_plan(
+    t: Terminal, path: Path, config: CellConfig, cell: Cell, catalogue: Catalogue, yes: bool
+) -> Plan:
+    """Make a plan, show it, and ask whether to measure it, where somebody can be asked.
+
+    Raises:
+        StoppedError: the person does not want it; nothing has moved.
+    """
+    with working(t.progress) as say:
+        made = make_checked(cell, config, POSES, config.simulation.seed, catalogue, say)
+    t.show(plan_facts(made.summary))
+    seed = config.simulation.seed
+    whole = ("hilcal", "plan", str(path), "-o", "plan.json", *(("--seed", str(seed)) * bool(seed)))
+    if notes := len(made.summary.remarks):
+        t.show(f"What it assumes and leaves out ({notes} note{'s' * (notes > 1)}):")
+        t.command(shlex.join(whole))
+    if yes or not somebody_there(t):
+        return made.plan
+    t.notice("")
+    if not agreed(t, "Measure this plan now? The arm will move."):
+        raise StoppedError(
+            "not measured, nothing has moved. To see, keep or change the whole plan: "
+            + shlex.join(whole)
+        )
+    return made.plan
+
+
+def _given(option: str, value: str | bool | None) -> tuple[str, ...]:
+    """Return an option as it stands in a command line, nothing where it was not given."""
+    if value is None or isinstance(value, bool):
+        return (option,) if value else ()
+    return option, value
+
+
+@contextmanager
+def _says_how_to_resume(campaign: CampaignFile, planned: int, on: str) -> Iterator[None]:
+    """Let whatever ends a run early say what is safe, and the line that goes on."""
+
+    def safe() -> str:
+        return f"{campaign.n_readings} of {planned} readings are safe; go on with: {on}"
+
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise StoppedError(f"interrupted: the arm stands, {safe()}") from None
+    except HilcalError as error:
+        words = str(error)
+        if not words.endswith(HOW_ON):
+            raise
+        raise type(error)(words.removesuffix(HOW_ON) + safe()) from error
 
 
 def _append(

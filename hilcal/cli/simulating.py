@@ -1,5 +1,6 @@
 """`simulate`: the devices of a simulated cell, on real wires, until they are stopped."""
 
+import shlex
 import signal
 from contextlib import ExitStack
 from pathlib import Path
@@ -66,7 +67,8 @@ def simulate(
         told = with_person(there.config) if person else there.config
         target.write_text(to_toml(_placed(told, base_dir)), encoding="utf-8")
         t.show(f"The devices run. Their cell is {target}; go on in another terminal with:")
-        t.show(f"  hilcal check {target}\n  hilcal run {target} -o run.hilcal")
+        t.command(shlex.join(("hilcal", "check", str(target))))
+        t.command(shlex.join(("hilcal", "run", str(target), "-o", "run.hilcal")))
         t.show("Ctrl-C ends them.")
         wait()
     t.show("The devices have ended.")

@@ -53,8 +53,13 @@ class Terminal:
             self.people.print(part, markup=False, highlight=False)
 
     def notice(self, words: str) -> None:
-        """Say what people should know but did not ask for."""
-        self.progress.print(words, markup=False, highlight=False, soft_wrap=True)
+        """Say what people should know but did not ask for; broken between words on a terminal."""
+        whole = not self.progress.is_terminal
+        self.progress.print(words, markup=False, highlight=False, soft_wrap=whole)
+
+    def command(self, line: str) -> None:
+        """Print a command on a line of its own, which no line's end divides, to be copied."""
+        self.people.print(f"  {line}", markup=False, highlight=False, soft_wrap=True)
 
     def document(self, content: object) -> None:
         """Print the JSON document, where it is asked for."""

@@ -41,8 +41,8 @@ CRITERIA_NOTE = (
 )
 
 
-def plan_report(s: PlanSummary) -> Iterator[RenderableType]:
-    """Yield the tables and remarks of a plan."""
+def plan_facts(s: PlanSummary) -> Iterator[RenderableType]:
+    """Yield what a plan costs and reaches."""
     yield text.heading("Plan")
     rows = Table.grid(padding=(0, 2))
     rows.add_column(no_wrap=True)
@@ -50,6 +50,11 @@ def plan_report(s: PlanSummary) -> Iterator[RenderableType]:
     for name, value in cost_rows(s):
         rows.add_row(name, Text(value, style="bold" if name == "efficiency" else ""))
     yield Padding(rows, (0, 0, 1, 0))
+
+
+def plan_report(s: PlanSummary) -> Iterator[RenderableType]:
+    """Yield the tables and remarks of a plan."""
+    yield from plan_facts(s)
     if s.confounding is not None:
         yield f"{order_remark(s)}\n"
     if s.parameters:

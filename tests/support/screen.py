@@ -87,6 +87,10 @@ class AtTerminal:
         """All lines as one text; words that a line's end divides are joined by a blank."""
         return " ".join(" ".join(self.lines).split())
 
+    def page_with(self, words: str) -> str:
+        """The first line of the screen that has some words; empty where there is none."""
+        return next((line for line in self.page if words in line), "")
+
     @property
     def gaps(self) -> list[tuple[float, str]]:
         """Silences, the longest first."""

@@ -89,6 +89,7 @@ def test_a_simulated_person_without_a_world_reports_it(world, tmp_path):
         ({"socket": "x", "hand_s": -1}, "hand_s = -1; valid"),
         ({"socket": "x", "hand_s": True}, "hand_s = True; valid"),
         ({"socket": "x", "hands": 2}, "no key 'hands'"),
+        ({"socket": "x", "person": "me"}, "person = 'me'; valid: true or false"),
     ],
 )
 def test_wrong_options_of_the_simulated_person_are_refused(options, message):

@@ -1,0 +1,72 @@
+"""A campaign at a real terminal: the operator's questions, Ctrl-C, and how it goes on."""
+
+from pathlib import Path
+
+import pytest
+
+from hilcal.cli.simulating import with_person
+from hilcal.config.write import to_toml
+from hilcal.data.campaign_file import CampaignFile
+from tests.support.campaign_cases import STARVED, cell, nothing_goes_on
+from tests.support.campaign_site import Site
+from tests.support.screen import AtTerminal
+
+__all__ = ["cell", "nothing_goes_on"]  # fixtures
+
+TRIES = 3
+"""The devices' deadlines are real time; on a computer that is too busy a run is begun again."""
+ASKED = "Enter = done, q = give up:"
+
+
+@pytest.fixture
+def toml(cell: Site, tmp_path: Path) -> Path:
+    """The simulated cell, its loads left to a person."""
+    path = tmp_path / "cell.toml"
+    path.write_text(to_toml(with_person(cell.config)), encoding="utf-8")
+    return path
+
+
+def test_questions_stay_answers_are_understood_and_ctrl_c_says_how_to_go_on(
+    cell: Site, toml: Path, tmp_path: Path
+) -> None:
+    for left in reversed(range(TRIES)):
+        path = tmp_path / f"run{left}.hilcal"
+        command = ("run", toml.name, "--plan", cell.plan_file, "-o", path.name)
+        with AtTerminal(*command, home=tmp_path) as person:
+            try:
+                at_the_first_question(person)
+                person.wait(lambda: bool(person.page_with("2/")), "two readings")
+            except AssertionError:
+                if not left or not STARVED.search(person.text):
+                    raise
+                continue
+            person.types("\x03")
+            assert person.ends() == 130
+            with CampaignFile.open(path) as campaign:
+                safe = campaign.n_readings
+            assert safe >= 2
+            planned = len(cell.plan.steps)
+            told = f"the arm stands, {safe} of {planned} readings are safe; go on with:"
+            assert told in person.text
+            # the line to copy stands alone, and what was asked stands above it
+            assert person.lines[-1] == f"  hilcal run cell.toml -o {path.name} --resume"
+            assert person.text.count("Take every load off the tool") == 1
+            assert "banana" in person.text
+        break
+    with AtTerminal("run", toml.name, "-o", path.name, "--resume", home=tmp_path) as person:
+        person.keeps(ASKED)
+        person.types("q\n")
+        assert person.ends() == 3
+        assert "error: stopped by the operator" in person.text
+        assert f"{safe} of {planned} readings are safe" in person.text
+        assert "Traceback" not in person.text
+
+
+def at_the_first_question(person: AtTerminal) -> None:
+    """Give a wrong answer, and then the right one."""
+    person.keeps(f"Take every load off the tool, and do not touch the arm. {ASKED}")
+    person.types("banana\n")
+    person.keeps(f"{ASKED} banana 'banana' is no answer. Press Enter when it is done")
+    person.keeps(ASKED, 2)
+    person.types("\n")
+    person.keeps("Done: nothing hangs.")
