@@ -8,7 +8,7 @@ from hilcal.data.campaign_file import CampaignFile
 from tests.support.cli_cases import run
 from tests.support.screen import AtTerminal
 
-FACTS = ("poses", "readings", "takes about", "load changes by hand", "certified at least")
+FACTS = ("poses", "readings", "load changes", "of the plan: at least")
 
 
 TOML = """
