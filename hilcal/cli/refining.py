@@ -39,6 +39,7 @@ from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline, with_effects
 from hilcal.identify.fit import Fit
 from hilcal.identify.frames_document import fit_to_json
+from hilcal.identify.weight import weight_note
 from hilcal.refine import add as add_effect
 from hilcal.refine import predicts_better
 from hilcal.refine import refine as refine_model
@@ -255,6 +256,9 @@ def refine(
         t.show(options_line(rows[-1].fit))
         t.show(text_refine.verdict_line(found.diagnosis))
         t.show([*fitted_lines(found.fit)])
+        weight = weight_note(found.fit)
+        if weight is not None:
+            t.show(numbers.sentence(weight))
         if found.rejected:
             t.show(
                 f"Tried and left out, since the error on poses left out did not fall: "

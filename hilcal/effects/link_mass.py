@@ -16,6 +16,7 @@ class LinkMass(Effect):
 
     name = "link_mass"
     summary = "moment (R_k δ_k) × g at joint k: links are heavier or balanced otherwise"
+    for_missing_weight = True
     plausible = 20.0
     """1 kg·m: a fifth of the first moment of an upper arm of 20 kg. A choice."""
 

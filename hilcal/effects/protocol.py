@@ -161,6 +161,8 @@ class Effect(ABC):
             "effect": none; it is added by name, or where a diagnosis finds it missing.
             An effect that is not of the last role is never removed by a diagnosis. Those of the
             first two take the options `prior_m` and `prior_rad`.
+        for_missing_weight: whether a starting model has the effect where the arm is described
+            without masses and the readings tell what its weight does.
         plausible: standard deviation of the parameters over arms and cells as they are, in their
             ordinary magnitudes: the range that a suspect of this name must stay in. An effect
             that states none is plausible at any size. See `most`.
@@ -173,6 +175,7 @@ class Effect(ABC):
     needs: ClassVar[tuple[str, ...]] = ()
     option_help: ClassVar[Mapping[str, str]] = {}
     role: ClassVar[Role] = "effect"
+    for_missing_weight: ClassVar[bool] = False
     plausible: ClassVar[float] = np.inf
 
     def __init__(self, cell: Cell, states: States, options: Options | None = None) -> None:

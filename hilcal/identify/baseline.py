@@ -13,6 +13,7 @@ from hilcal.effects.spec import EffectSpec
 from hilcal.identify.description_words import refuse_misdescribed
 from hilcal.identify.registration import register
 from hilcal.identify.rigid_frames import TARGET_M, TELL
+from hilcal.identify.weight import loads_differ, weight_missing
 from hilcal.model import Model
 
 ARM = 0.5
@@ -25,7 +26,8 @@ def baseline(
 ) -> Model:
     """Return the starting model: unknown frames, and joint compliance where a load acts.
 
-    They are found by the `role` of the catalogue's effects.
+    They are found by the `role` of the catalogue's effects. In absolute readings of an arm without
+    masses, what its weight does is estimated as well where poses were read under several loads.
 
     Args:
         cell: the cell.
@@ -39,6 +41,8 @@ def baseline(
     known = catalogue or installed()
     loaded = bool(np.any(readings.states.wrench != 0))
     names = [kind.name for kind in known.with_role("baseline") if loaded]
+    if loaded and weight_missing(cell, mode) and loads_differ(readings):
+        names += [kind.name for kind in known.effects if kind.for_missing_weight]
     return with_effects(cell, readings, mode, names, catalogue=known)
 
 

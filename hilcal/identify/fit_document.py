@@ -8,6 +8,7 @@ from hilcal.identify.fit import Fit
 from hilcal.identify.frames_document import fit_to_json, frames_of_fit
 from hilcal.identify.full_prediction import full_prediction
 from hilcal.identify.gross_errors import gross_errors
+from hilcal.identify.weight import weight_note
 
 
 def to_json(fit: Fit) -> dict[str, object]:
@@ -72,13 +73,9 @@ def notes(fit: Fit) -> tuple[str, ...]:
             f"deflections do not see where the base is, only how it is turned: {registered[0]} "
             "is determined by the closed-form registration and by how deflections turn"
         )
-    weightless = not np.any(fit.model.cell.arm.masses)
-    if fit.mode == "absolute" and weightless and any(e.elastic for e in fit.model.effects):
-        out.append(
-            "the arm's description has no masses: compliance from absolute readings can come out "
-            "many times too soft, since the sag under the arm's own weight is taken for a load's; "
-            "fit deflections, or give the masses"
-        )
+    weight = weight_note(fit)
+    if weight is not None:
+        out.append(weight)
     return tuple(out)
 
 

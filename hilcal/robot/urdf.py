@@ -23,8 +23,9 @@ from hilcal.types import Floats
 _WHOLE_TURN = 2.0 * math.pi
 NO_MASSES = (
     "the URDF has no masses: the arm's own weight makes no torque in the model. Compliance is "
-    "right where loads are hung and deflections (loaded minus unloaded) are fitted; absolute "
-    "readings can give it many times too soft, since the weight's sag is taken for a load's"
+    "right from deflections (loaded minus unloaded), and from absolute readings of poses under "
+    "several loads, where the weight is estimated; under one load it comes out too soft by "
+    "(weight + load)/load"
 )
 
 
@@ -102,6 +103,16 @@ def _missing(model: pin.Model, masses: Floats) -> Iterator[str]:
     open_ended = [str(model.names[j]) for j in range(1, model.njoints) if _no_limits(model, j)]
     if open_ended:
         yield f"no limits in the URDF for {', '.join(open_ended)}: ±360° is assumed"
+    weak = [
+        str(model.names[j])
+        for j in range(1, model.njoints)
+        if not model.upperEffortLimit[model.joints[j].idx_v]
+    ]
+    if weak:
+        yield (
+            f"no effort in the URDF for {', '.join(weak)}: plans have no torque limit there, and "
+            "what compliance counts as ordinary is taken from 150 N·m"
+        )
 
 
 def _no_limits(model: pin.Model, joint: int) -> bool:
