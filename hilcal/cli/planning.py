@@ -21,6 +21,7 @@ from hilcal.errors import DeviceError, InputError
 from hilcal.identify.fit import Fit
 from hilcal.plan.checked_plan import CheckedPlan, checked, refuse
 from hilcal.plan.choice import CRITERIA, canonical
+from hilcal.plan.nominal_model import check_effects
 from hilcal.plan.planner import Planned, Request, make
 from hilcal.plan.summary import about, remarks, summarise
 from hilcal.report import text_run
@@ -102,10 +103,19 @@ def _known(t: Terminal, path: Path, revision: int | None, catalogue: Catalogue, 
         return fit_of(t, run, say, revision)[1]
 
 
-def check(cell: CellFile, plan: PlanFile = None, as_json: Json = False) -> None:
+def check(
+    cell: CellFile,
+    plan: PlanFile = None,
+    effects_from: EffectsFrom = None,
+    as_json: Json = False,
+) -> None:
     """Connect to every device and report its state; nothing moves."""
-    t = terminal(as_json)
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
     config, numbers = read_cell(cell)
+    try:
+        check_effects(numbers, config, catalogue)
+    except InputError as error:
+        raise InputError(f"{cell.name}: {error}") from None
     dry = None
     if plan is not None:
         dry = dry_run(numbers, config, load_plan(plan))
