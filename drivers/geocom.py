@@ -38,7 +38,7 @@ _LOW_BATTERY, _INTERNAL = 10, 2  # %, power source
 
 
 class Options(Section):
-    """[tracker.options] of the driver "geocom"."""
+    """[tracker.options]: keys of the driver "geocom"."""
 
     search_rad: Positive = Field(
         0.1, description="width and height of the window searched for the target in rad, over 0"

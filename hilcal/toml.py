@@ -136,7 +136,7 @@ def _locate(root: type[Section], loc: tuple[int | str, ...], *, inside: bool) ->
             place = replace(place, words=f"[{place.words}] number {part + 1}")
             continue
         field = place.section.model_fields.get(part)
-        inner = _section_of(field)
+        inner = section_of(field)
         if inner is None:
             numbers = [p + 1 for p in loc[i + 1 :] if isinstance(p, int)]
             return replace(place, key=part, field=field, element=next(iter(numbers), None))
@@ -146,7 +146,7 @@ def _locate(root: type[Section], loc: tuple[int | str, ...], *, inside: bool) ->
     return place
 
 
-def _section_of(field: FieldInfo | None) -> type[Section] | None:
+def section_of(field: FieldInfo | None) -> type[Section] | None:
     """Return the section class inside a field's annotation, if any."""
     pending: list[Any] = [] if field is None else [field.annotation]
     while pending:

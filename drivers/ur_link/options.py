@@ -8,7 +8,7 @@ from hilcal.toml import Section
 
 
 class UrOptions(Section):
-    """Keys of [robot.options]; every one may be left out."""
+    """[robot.options]: keys of the driver "ur"."""
 
     receive_hz: Annotated[float, Strict(), Field(ge=10, le=500)] = Field(
         125.0, description="packets of state per second, 10 to 500"

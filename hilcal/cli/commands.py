@@ -48,6 +48,9 @@ COMMANDS = {
         "simulating:simulate",
         "Run simulated devices for a cell until Ctrl-C, for `check` and `run` to talk to.",
     ),
+    "config": Command(
+        "configuring:config", "Explain the sections and keys of CELL.toml: unit, default, example."
+    ),
     "check": Command(
         "planning:check", "Connect to every device and report its state; nothing moves."
     ),

@@ -43,21 +43,30 @@ class Robot(Conventions):
     """[robot]: which arm, how its controller counts the joints, and how it stands in gravity."""
 
     model: str = Field(
-        min_length=1, description='a catalogue name, e.g. "ur10e", or the path of a .urdf file'
+        min_length=1,
+        description='a catalogue name, e.g. "ur10e", or the path of a .urdf file',
+        examples=["ur10e"],
     )
     gravity_m_s2: Vector3 = Field(
         (0.0, 0.0, -STANDARD_GRAVITY_M_S2),
         description="gravity in base axes: three finite numbers in m/s², e.g. [0.0, 0.0, -9.80665]",
     )
     driver: str | None = Field(
-        None, min_length=1, description='the name of an arm\'s driver, e.g. "ur"'
+        None, min_length=1, description='the name of an arm\'s driver, e.g. "ur"', examples=["ur"]
     )
     host: str | None = Field(
-        None, min_length=1, description='the controller\'s address, e.g. "192.168.56.101"'
+        None,
+        min_length=1,
+        description='the controller\'s address, e.g. "192.168.56.101"',
+        examples=["192.168.56.101"],
     )
-    options: dict[str, Any] = Field(default_factory=dict, description=OPTIONS)
-    base_link: str | None = Field(None, description="the name of a link of the URDF")
-    tip_link: str | None = Field(None, description="the name of a link of the URDF")
+    options: dict[str, Any] = Field(default_factory=dict, description=OPTIONS, examples=[{}])
+    base_link: str | None = Field(
+        None, description="the name of a link of the URDF", examples=["base_link"]
+    )
+    tip_link: str | None = Field(
+        None, description="the name of a link of the URDF", examples=["tool0"]
+    )
 
     @model_validator(mode="after")
     def _plausible_gravity(self) -> "Robot":
@@ -72,13 +81,17 @@ class Robot(Conventions):
 class Target(Section):
     """[[tool.targets]]: one of several targets that the tool carries (flange axes)."""
 
-    name: str = Field(min_length=1, description='the name of a target, e.g. "R1"')
+    name: str = Field(min_length=1, description='the name of a target, e.g. "R1"', examples=["R1"])
     target_m: Vector3 | None = Field(
-        None, description=VECTOR_M + "; leave it out to have it estimated"
+        None,
+        description=VECTOR_M + "; leave it out to have it estimated",
+        examples=[[0.06, 0.02, 0.12]],
     )
-    target_rotvec_rad: Vector3 | None = Field(None, description=ROTVEC)
+    target_rotvec_rad: Vector3 | None = Field(None, description=ROTVEC, examples=[[0.0, 0.0, 1.57]])
     estimate: bool = Field(
-        False, description="true or false: whether target_m is rough, and the offset estimated"
+        False,
+        description="true or false: whether target_m is rough, and the offset estimated",
+        examples=[True],
     )
 
     @model_validator(mode="after")
@@ -100,15 +113,21 @@ class Tool(Section):
     """[tool]: what the flange carries, where the target sits and the load acts (flange axes)."""
 
     target_m: Vector3 | None = Field(
-        None, description=VECTOR_M + "; leave it out to have it estimated"
+        None,
+        description=VECTOR_M + "; leave it out to have it estimated",
+        examples=[[0.06, 0.02, 0.12]],
     )
-    target_rotvec_rad: Vector3 | None = Field(None, description=ROTVEC)
+    target_rotvec_rad: Vector3 | None = Field(None, description=ROTVEC, examples=[[0.0, 0.0, 1.57]])
     targets: tuple[Target, ...] = Field(
-        (), description="sections [[tool.targets]], one per target, in the order of measurement"
+        (),
+        description="sections [[tool.targets]], one per target, in the order of measurement",
+        examples=[[{"name": "R1", "target_m": [0.06, 0.02, 0.12]}]],
     )
-    load_point_m: Vector3 = Field((0.0, 0.0, 0.0), description=VECTOR_M)
-    mass_kg: NonNegative = Field(0.0, description="a mass in kg, 0 or more")
-    com_m: Vector3 = Field((0.0, 0.0, 0.0), description=VECTOR_M)
+    load_point_m: Vector3 = Field(
+        (0.0, 0.0, 0.0), description=VECTOR_M, examples=[[0.1, 0.0, 0.15]]
+    )
+    mass_kg: NonNegative = Field(0.0, description="a mass in kg, 0 or more", examples=[0.8])
+    com_m: Vector3 = Field((0.0, 0.0, 0.0), description=VECTOR_M, examples=[[0.01, 0.0, 0.06]])
 
     @model_validator(mode="after")
     def _metres(self) -> "Tool":
@@ -143,22 +162,31 @@ class Tracker(Section):
     """
 
     driver: str | None = Field(
-        None, min_length=1, description='the name of a tracker\'s driver, e.g. "geocom"'
+        None,
+        min_length=1,
+        description='the name of a tracker\'s driver, e.g. "geocom"',
+        examples=["geocom"],
     )
-    port: str | None = Field(None, min_length=1, description=PORT)
+    port: str | None = Field(
+        None, min_length=1, description=PORT, examples=["/dev/serial/by-id/usb-FTDI_..."]
+    )
     baud: Whole | None = Field(
-        None, description="the line's rate in Bd; the driver's own if absent"
+        None, description="the line's rate in Bd; the driver's own if absent", examples=[115200]
     )
-    options: dict[str, Any] = Field(default_factory=dict, description=OPTIONS)
+    options: dict[str, Any] = Field(default_factory=dict, description=OPTIONS, examples=[{}])
     frame: Literal["tracker", "base"] = Field(
         "tracker", description='"tracker" or "base": the axes in which positions are given'
     )
     base_xyz_m: Vector3 | None = Field(
-        None, description=VECTOR_M + ": the arm's base in the tracker frame"
+        None,
+        description=VECTOR_M + ": the arm's base in the tracker frame",
+        examples=[[3.0, 0.5, -0.9]],
     )
-    base_rotvec_rad: Vector3 | None = Field(None, description=ROTVEC)
+    base_rotvec_rad: Vector3 | None = Field(None, description=ROTVEC, examples=[[0.0, 0.0, 1.57]])
     station_m: Vector3 | None = Field(
-        None, description=VECTOR_M + ": the tracker's position in base axes"
+        None,
+        description=VECTOR_M + ": the tracker's position in base axes",
+        examples=[[3.0, 0.5, 0.9]],
     )
     range_std_m: Positive = Field(
         5e-6, description=_std("along the beam in m, more than 0, e.g. 5e-6")
@@ -204,11 +232,14 @@ class Repeatability(Section):
     """[repeatability]: scatter of the joints from one arrival to the next."""
 
     joint_std_rad: NonNegative | Annotated[tuple[NonNegative, ...], Field(min_length=1)] = Field(
-        0.0, description="one standard deviation in rad, 0 or more, or one per joint"
+        0.0,
+        description="one standard deviation in rad, 0 or more, or one per joint",
+        examples=[1e-5],
     )
     in_tables: bool = Field(
         False,
         description="true where the covariances of imported tables include the arm's scatter",
+        examples=[True],
     )
 
     def per_joint(self, n: int) -> Floats:
@@ -230,14 +261,18 @@ class Simulation(Section):
     """[simulation]: what a simulated cell hides."""
 
     seed: Annotated[int, Strict(), Field(ge=0)] = Field(
-        0, description="the seed of the random numbers, a whole number, 0 or more"
+        0, description="the seed of the random numbers, a whole number, 0 or more", examples=[4]
     )
-    hide: str | None = Field(None, description='the name of an effect to hide, or "random"')
+    hide: str | None = Field(
+        None, description='the name of an effect to hide, or "random"', examples=["creep"]
+    )
     strength_sigma: Positive = Field(
         3.0, description="the RMS strength of the hidden effect in sigmas of a reading, more than 0"
     )
     clock: Annotated[float, Strict(), Field(ge=1, le=200)] = Field(
-        1.0, description="how much faster than real time the simulated world goes, 1 to 200"
+        1.0,
+        description="how much faster than real time the simulated world goes, 1 to 200",
+        examples=[20.0],
     )
 
 
@@ -268,6 +303,7 @@ class CellConfig(Section):
         default_factory=dict,
         description="a section [plausible]: how many times as large as stated an effect may be, "
         "by its name, e.g. link_geometry = 4.0",
+        examples=[{"link_geometry": 4.0}],
     )
 
     @model_validator(mode="after")

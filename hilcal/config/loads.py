@@ -16,18 +16,23 @@ HANG_M = 0.3
 class Load(Section):
     """[[loads]]: a load at hand: a dead weight, a pull in base axes, or both."""
 
-    name: str = Field(min_length=1, description='a name other than "none"')
-    mass_kg: NonNegative = Field(0.0, description="a mass in kg, 0 or more")
+    name: str = Field(min_length=1, description='a name other than "none"', examples=["5kg"])
+    mass_kg: NonNegative = Field(0.0, description="a mass in kg, 0 or more", examples=[5.0])
     force_N: Vector3 = Field(
-        (0.0, 0.0, 0.0), description="three finite numbers in N, base axes, e.g. [50.0, 0.0, 0.0]"
+        (0.0, 0.0, 0.0),
+        description="three finite numbers in N, base axes, e.g. [50.0, 0.0, 0.0]",
+        examples=[[80.0, 0.0, 0.0]],
     )
     moment_Nm: Vector3 = Field(
-        (0.0, 0.0, 0.0), description="three finite numbers in N·m, base axes"
+        (0.0, 0.0, 0.0),
+        description="three finite numbers in N·m, base axes",
+        examples=[[0.0, 6.0, 6.0]],
     )
     hang_m: NonNegative | None = Field(
         None,
         description="the length in m of what hangs below the load point, 0 or more; if absent "
         f"{HANG_M:g} for a load with a mass, else 0",
+        examples=[0.3],
     )
     radius_m: Positive = Field(
         0.06, description="the radius in m of what hangs below the load point, over 0"
@@ -35,6 +40,7 @@ class Load(Section):
     cable_m: NonNegative = Field(
         0.0,
         description="the length in m of the cable of a pull, kept clear along force_N, 0 or more",
+        examples=[2.0],
     )
 
     @model_validator(mode="after")
@@ -79,10 +85,14 @@ class Limits(Section):
         0.9, description="the usable share of the joint torques, more than 0, at most 1"
     )
     workspace_min_m: Vector3 | None = Field(
-        None, description=VECTOR_M + ": a corner that flange, target and load point stay above"
+        None,
+        description=VECTOR_M + ": a corner that flange, target and load point stay above",
+        examples=[[-1.2, -1.2, 0.05]],
     )
     workspace_max_m: Vector3 | None = Field(
-        None, description=VECTOR_M + ": a corner that flange, target and load point stay below"
+        None,
+        description=VECTOR_M + ": a corner that flange, target and load point stay below",
+        examples=[[1.2, 1.2, 1.5]],
     )
     joint_speed_rad_s: Positive = Field(
         2.0, description="a measured joint speed in rad/s that stops the arm, over 0"

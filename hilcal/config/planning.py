@@ -22,6 +22,7 @@ class Planning(Section):
         min_length=1,
         description='the effects that are assumed, a list of names, e.g. ["joint_compliance"], '
         'with options as in ["joint_compliance(joints=2-6)"]',
+        examples=[["joint_compliance", "creep(joints=each)"]],
     )
     readings: Literal["deflection", "absolute"] = Field(
         "deflection", description='"deflection" or "absolute": what will be fitted'
@@ -30,25 +31,36 @@ class Planning(Section):
         "catalogue",
         description='"catalogue", or a list of effects (may be empty), which the plan could still '
         "find although the model lacks them",
+        examples=[["creep", "hysteresis"]],
     )
     criterion: Annotated[
         Literal["D", "A", "E", "K", "I", "separate"],
         BeforeValidator(lambda name: "I" if name == "test" else name),  # its name before 1.0
-    ] = Field("D", description='"D", "A", "E", "K", "I" or "separate"')
+    ] = Field("D", description='"D", "A", "E", "K", "I" or "separate"', examples=["I"])
     work_q_rad: tuple[_Joints, ...] = Field(
-        (), description="a list of joint vectors in rad where the robot will work"
+        (),
+        description="a list of joint vectors in rad where the robot will work",
+        examples=[[[0.0, -1.57, 1.57, 0.0, 1.57, 0.0]]],
     )
     work_min_m: Vector3 | None = Field(
-        None, description=VECTOR_M + ": the lowest corner of the target's work, base axes"
+        None,
+        description=VECTOR_M + ": the lowest corner of the target's work, base axes",
+        examples=[[0.3, -0.4, 0.2]],
     )
     work_max_m: Vector3 | None = Field(
-        None, description=VECTOR_M + ": the highest corner of the target's work, base axes"
+        None,
+        description=VECTOR_M + ": the highest corner of the target's work, base axes",
+        examples=[[0.9, 0.4, 0.8]],
     )
     work_load: _Name = Field(
-        "none", description='the name of one of [[loads]], or "none", under which it will work'
+        "none",
+        description='the name of one of [[loads]], or "none", under which it will work',
+        examples=["5kg"],
     )
     reading_s: Positive | None = Field(
-        None, description="how long a reading takes in s, over 0; from [acquire] if absent"
+        None,
+        description="how long a reading takes in s, over 0; from [acquire] if absent",
+        examples=[8.0],
     )
     load_change_s: Positive = Field(
         60.0, description="how long a person needs for a change of the load in s, over 0"
@@ -86,16 +98,26 @@ class Planning(Section):
 class Obstacle(Section):
     """[[obstacles]]: a box along the base axes, or a cylinder that stands along base z."""
 
-    name: str = Field(min_length=1, description='a name, e.g. "tripod"')
-    center_m: Vector3 | None = Field(None, description=VECTOR_M + ": the box's centre, base axes")
+    name: str = Field(min_length=1, description='a name, e.g. "tripod"', examples=["tripod"])
+    center_m: Vector3 | None = Field(
+        None, description=VECTOR_M + ": the box's centre, base axes", examples=[[0.0, 0.9, 0.4]]
+    )
     size_m: tuple[Positive, Positive, Positive] | None = Field(
-        None, description="three lengths in m, over 0: the box along x, y and z of the base"
+        None,
+        description="three lengths in m, over 0: the box along x, y and z of the base",
+        examples=[[1.2, 0.6, 0.8]],
     )
     bottom_m: Vector3 | None = Field(
-        None, description=VECTOR_M + ": the centre of the cylinder's lower face, base axes"
+        None,
+        description=VECTOR_M + ": the centre of the cylinder's lower face, base axes",
+        examples=[[0.9, -0.9, 0.0]],
     )
-    radius_m: Positive | None = Field(None, description="the cylinder's radius in m, over 0")
-    height_m: Positive | None = Field(None, description="the cylinder's height in m, over 0")
+    radius_m: Positive | None = Field(
+        None, description="the cylinder's radius in m, over 0", examples=[0.3]
+    )
+    height_m: Positive | None = Field(
+        None, description="the cylinder's height in m, over 0", examples=[1.2]
+    )
 
     @model_validator(mode="after")
     def _one_shape(self) -> "Obstacle":
@@ -118,10 +140,14 @@ class Sight(Section):
     """[sight]: what the tracker sees of the target."""
 
     tracker_m: Vector3 | None = Field(
-        None, description=VECTOR_M + ": the tracker's approximate position in base axes"
+        None,
+        description=VECTOR_M + ": the tracker's approximate position in base axes",
+        examples=[[3.0, 0.5, 0.9]],
     )
     target_normal: Vector3 | None = Field(
-        None, description="three numbers, not all 0: where the reflector looks, flange axes"
+        None,
+        description="three numbers, not all 0: where the reflector looks, flange axes",
+        examples=[[0.0, 0.0, 1.0]],
     )
     incidence_max_rad: Annotated[float, Strict(), Field(gt=0, le=np.pi / 2)] = Field(
         0.5,

@@ -36,16 +36,24 @@ class Motion(Section):
 class ForceSensor(Section):
     """[force_sensor]: the wrench sensor between flange and tool."""
 
-    driver: str = Field(min_length=1, description='the name of a driver, e.g. "ft300" or "bota"')
-    port: str = Field(min_length=1, description=PORT)
+    driver: str = Field(
+        min_length=1, description='the name of a driver, e.g. "ft300" or "bota"', examples=["ft300"]
+    )
+    port: str = Field(
+        min_length=1, description=PORT, examples=["/dev/serial/by-id/usb-Silicon_Labs_..."]
+    )
     baud: Whole | None = Field(
-        None, description="the line's rate in Bd; the driver's own if absent"
+        None, description="the line's rate in Bd; the driver's own if absent", examples=[19200]
     )
     origin_m: Vector3 = Field(
-        (0.0, 0.0, 0.0), description=VECTOR_M + ": the sensor's origin, flange axes"
+        (0.0, 0.0, 0.0),
+        description=VECTOR_M + ": the sensor's origin, flange axes",
+        examples=[[0.0, 0.0, 0.02]],
     )
     rotvec_rad: Vector3 = Field(
-        (0.0, 0.0, 0.0), description=ROTVEC + ": the sensor's axes in flange axes"
+        (0.0, 0.0, 0.0),
+        description=ROTVEC + ": the sensor's axes in flange axes",
+        examples=[[0.0, 0.0, 1.57]],
     )
     max_force_N: Positive = Field(250.0, description="a force in N that stops the arm, over 0")
     max_moment_Nm: Positive = Field(25.0, description="a moment in N·m that stops the arm, over 0")
@@ -53,8 +61,9 @@ class ForceSensor(Section):
         "pulls",
         description='"pulls" (measured wrench for loads with force_N or moment_Nm, mass times '
         'gravity for dead weights), "all" (always the measured one) or "verify" (never)',
+        examples=["all"],
     )
-    options: dict[str, Any] = Field(default_factory=dict, description=OPTIONS)
+    options: dict[str, Any] = Field(default_factory=dict, description=OPTIONS, examples=[{}])
 
 
 class Operator(Section):
@@ -69,7 +78,7 @@ class Operator(Section):
     tolerance_share: NonNegative = Field(
         0.05, description="the same as a share of the load, 0 or more"
     )
-    options: dict[str, Any] = Field(default_factory=dict, description=OPTIONS)
+    options: dict[str, Any] = Field(default_factory=dict, description=OPTIONS, examples=[{}])
 
 
 class Acquire(Section):
@@ -90,6 +99,7 @@ class Acquire(Section):
     systematic_share: Annotated[float, Strict(), Field(ge=0, le=1)] = Field(
         0.0,
         description="the share of the tracker's variance that averaging does not reduce, 0 to 1",
+        examples=[0.1],
     )
     drift_limit_sigma: Positive = Field(
         6.0, description="a reference pose that moved more than so many sigma is reported, over 0"

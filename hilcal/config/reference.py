@@ -1,0 +1,170 @@
+"""Every key of CELL.toml with unit, default and example, read off the sections themselves."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import tomli_w
+from pydantic.fields import FieldInfo
+
+from hilcal.config.cell import CellConfig
+from hilcal.errors import InputError
+from hilcal.toml import Section, section_of, suggest
+
+_UNITS = (
+    ("_m_s2", "m/s²"),
+    ("_rad_s2", "rad/s²"),
+    ("_rad_s", "rad/s"),
+    ("_std_per_m", "m/m"),
+    ("_std_m", "m"),
+    ("_m", "m"),
+    ("_rad", "rad"),
+    ("_deg", "deg"),
+    ("_kg", "kg"),
+    ("_Nm", "N·m"),
+    ("_N", "N"),
+    ("_s", "s"),
+    ("_hz", "Hz"),
+    ("_sigma", "σ"),
+    ("_share", "1"),
+    ("baud", "Bd"),
+    ("samples", "readings"),
+    ("candidates", "poses"),
+    ("clock", "times real time"),
+    ("singularity", "1"),
+    ("factor", "1"),
+)
+"""Units by the end of a key's name."""
+REQUIRED = "required"
+NOT_SET = "not set"
+
+
+@dataclass(frozen=True, slots=True)
+class Key:
+    """One key.
+
+    Attributes:
+        name: of the key.
+        unit: of its value; "" for texts, choices and tables.
+        default: as it is written in TOML, `REQUIRED` or `NOT_SET`.
+        valid: what its value must be.
+        example: a line of TOML.
+    """
+
+    name: str
+    unit: str
+    default: str
+    valid: str
+    example: str
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """One section of CELL.toml.
+
+    Attributes:
+        name: e.g. "tracker".
+        header: as it is written, e.g. "[tracker]" or "[[loads]]".
+        about: what it is for, one line.
+        keys: its keys, in order.
+    """
+
+    name: str
+    header: str
+    about: str
+    keys: tuple[Key, ...]
+
+
+def tables(options: Mapping[str, type[Section]] | None = None) -> tuple[Table, ...]:
+    """Return all sections, in the order of the configuration.
+
+    Args:
+        options: sections of drivers' own keys, by name, e.g. "tracker.options".
+    """
+    found: list[Table] = []
+    for name, field in CellConfig.model_fields.items():
+        inner = section_of(field)
+        if inner is None:
+            found.append(_by_name(name, field))
+            continue
+        found += _tables(name, inner, _is_list(field))
+        for place, section in (options or {}).items():
+            if place.split(".")[0] == name:
+                found.append(_table(place, section, False))
+    return tuple(found)
+
+
+def table(name: str, known: tuple[Table, ...]) -> Table:
+    """Return a section by name, with or without its brackets.
+
+    Raises:
+        InputError: no such section (lists the valid ones).
+    """
+    plain, names = name.strip().strip("[]").strip(), [t.name for t in known]
+    for t in known:
+        if t.name == plain:
+            return t
+    raise InputError(
+        f'no section "{plain}" in CELL.toml{suggest(plain, names)}; valid: {", ".join(names)}'
+    )
+
+
+def _tables(name: str, section: type[Section], several: bool) -> Iterator[Table]:
+    """Yield a section and those inside of it."""
+    yield _table(name, section, several)
+    for key, field in section.model_fields.items():
+        inner = section_of(field)
+        if inner is not None:
+            yield from _tables(f"{name}.{key}", inner, _is_list(field))
+
+
+def _table(name: str, section: type[Section], several: bool) -> Table:
+    about = (section.__doc__ or "").split("\n")[0].split(": ", 1)[-1]
+    keys = tuple(_key(key, field) for key, field in section.model_fields.items())
+    header = f"[[{name}]]" if several else f"[{name}]"
+    return Table(name, header, about[:1].upper() + about[1:], keys)
+
+
+def _by_name(name: str, field: FieldInfo) -> Table:
+    """Return a section whose keys are names of the user's."""
+    ((key, value),) = example(field).items()
+    valid = f"a number over 0; the key is a name, as {key}"
+    one = Key("NAME", "1", "1.0", valid, f"{key} = {inline(value)}")
+    about = (field.description or "").split(": ", 1)[-1]
+    return Table(name, f"[{name}]", f"{about[:1].upper()}{about[1:]}.", (one,))
+
+
+def _key(name: str, field: FieldInfo) -> Key:
+    unit = next((unit for end, unit in _UNITS if name.endswith(end)), "")
+    default, value = _default(field), example(field)
+    return Key(name, unit, default, field.description or "", f"{name} = {inline(value)}")
+
+
+def example(field: FieldInfo) -> Any:
+    """Return the example of a field: the one that is given, else its default."""
+    return field.examples[0] if field.examples else _default_value(field)
+
+
+def _default_value(field: FieldInfo) -> Any:
+    return None if field.is_required() else field.get_default(call_default_factory=True)
+
+
+def _default(field: FieldInfo) -> str:
+    if field.is_required():
+        return REQUIRED
+    value = _default_value(field)
+    return NOT_SET if value in (None, (), {}) else inline(value)
+
+
+def inline(value: Any) -> str:
+    """Return a value on one line of TOML."""
+    if isinstance(value, dict):
+        pairs = ", ".join(f"{k} = {inline(v)}" for k, v in value.items())
+        return f"{{ {pairs} }}" if pairs else "{}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(inline, value))}]"
+    return tomli_w.dumps({"x": value}).strip().removeprefix("x = ")
+
+
+def _is_list(field: FieldInfo) -> bool:
+    return getattr(field.annotation, "__origin__", None) is tuple
