@@ -15,7 +15,7 @@ from hilcal.identify.baseline import with_effects
 from hilcal.identify.fit import mahalanobis2
 from hilcal.identify.folds import distinct_poses
 from hilcal.identify.full_covariance import with_joint_scatter
-from hilcal.identify.gauss_newton import Solution, solve
+from hilcal.identify.gauss_newton import Solution, solve, whitened_jacobian
 from hilcal.identify.priors import scales_of
 from hilcal.identify.residual import residual
 from hilcal.model import Model
@@ -89,8 +89,8 @@ class LiveModel:
             names = [kind.name for kind in installed().with_role("baseline")]
             model = with_effects(self._cell, readings, "absolute", names)
             w = whitening(readings, "absolute", "gc")
-            found, jacobian = solve(model, readings, w)
-            rows = w.whiten(jacobian).reshape(-1, len(found.live))
+            found = solve(model, readings, w)
+            rows = whitened_jacobian(model, found.prediction, found.theta, w, found.live)
             rms = float(np.sqrt(np.mean(np.sum(found.raw[:, :3] ** 2, axis=1))))
             covariance = _covariance(model, found, rows)
             self._known = _Known(model, found.theta, covariance, rms, count, loaded)

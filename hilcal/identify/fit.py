@@ -1,6 +1,7 @@
 """A fit: parameters, their uncertainties, residuals and errors."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -30,11 +31,10 @@ OUTLIER_ROUNDS = 6
 MAX_OUTLIER_SHARE = 0.05
 """Most readings that are set aside, as a share; a choice: more is a misfit."""
 
-_Solved = tuple[Whitening, Solution, Floats]
-"""Scaling, solution, and the Jacobian (D, m, L) of the measurements by the live parameters."""
+_Solved = tuple[Whitening, Solution]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Fit:
     """A model fitted to readings.
 
@@ -47,17 +47,18 @@ class Fit:
         mode: "deflection" or "absolute".
         scaling: "none", "gu" or "gc".
         whitening: gc-scaling of the readings that were fitted.
+        fitted: their scaling in the fit.
         solution: the minimum that Gauss-Newton reached.
-        uncertainty: standard uncertainties and identifiable parameters.
         pose: (D,) distinct pose of each fitted measurement.
         raw: (D, m) residual.
         white: (R,) gc-whitened residual.
-        left_out: (D, m) residual of each measurement, predicted without its pose.
         outlier: (N,) readings that were set aside as gross errors.
         chi2: whitened sum of squares.
         dof: degrees of freedom.
         error: error block of the fit.
-        holdout: error block of whole poses left out.
+
+    What takes long, and is of no use for a fit that is only tried, is computed when it is asked
+    for: `left_out`, `holdout`, `uncertainty`.
     """
 
     model: Model
@@ -65,17 +66,42 @@ class Fit:
     mode: Mode
     scaling: Scaling
     whitening: Whitening
+    fitted: Whitening
     solution: Solution
-    uncertainty: Uncertainty
     pose: Ints
     raw: Floats
     white: Floats
-    left_out: Floats
     outlier: Bools
     chi2: float
     dof: float
     error: ErrorBlock
-    holdout: ErrorBlock
+
+    @cached_property
+    def left_out(self) -> Floats:
+        """(D, m) residual of each measurement, predicted without its pose."""
+        return leave_out(self.model, self.solution, random_folds(self.pose), self.fitted)
+
+    @cached_property
+    def holdout(self) -> ErrorBlock:
+        """Error block of whole poses left out."""
+        raw, w = _with_outliers(self)
+        if w is self.whitening:
+            return error_block(self.left_out, w)
+        place = {
+            int(r): i for i, r in enumerate(np.flatnonzero(~self.outlier)[self.whitening.reading])
+        }
+        for i, r in enumerate(w.reading):
+            if int(r) in place:
+                raw[i] = self.left_out[place[int(r)]]
+        return error_block(raw, w)
+
+    @cached_property
+    def uncertainty(self) -> Uncertainty:
+        """Standard uncertainties and identifiable parameters."""
+        kept = self.readings[~self.outlier]
+        return uncertainty(
+            self.model, kept, self.fitted, self.solution, self.pose, self.chi2, self.dof
+        )
 
     @property
     def theta(self) -> Floats:
@@ -206,7 +232,7 @@ def _set_aside(
     solved = _solve(model, readings, mode, "gc", start, prior)
     left = int(MAX_OUTLIER_SHARE * len(readings))
     for _ in range(OUTLIER_ROUNDS):
-        w, solution, _jacobian = solved
+        w, solution = solved
         distance2 = mahalanobis2(solution.raw, w.covariance)
         if distance2.max() <= limit(w.m, len(distance2)):
             break
@@ -228,14 +254,14 @@ def _solve(
     prior: Floats | None,
 ) -> _Solved:
     w = whitening(readings, mode, scaling)
-    solution, jacobian = solve(model, readings, w, start, prior)
+    solution = solve(model, readings, w, start, prior)
     free = solution.equations.basis.structural
     if w.rank <= free:
         raise CannotAnswerError(
             f"{w.rank} measured elements for {free} parameters: nothing is left to judge the model "
             f"by; measure at least {free // w.m + 2} {_what(mode)}, better {3 * free // w.m + 1}"
         )
-    return w, solution, jacobian
+    return w, solution
 
 
 def _what(mode: Mode) -> str:
@@ -250,41 +276,37 @@ def _assemble(
     scaling: Scaling,
     fitted: Whitening,
     solution: Solution,
-    jacobian: Floats,
 ) -> Fit:
     kept, raw = readings[~outlier], solution.raw
     w = fitted if scaling == "gc" else whitening(kept, mode, "gc")
     white = w.whiten(raw).reshape(-1)
-    pose = distinct_poses(kept)[w.reading]
-    left_out = leave_out(model, solution, jacobian, random_folds(pose), fitted)
     total = float(white @ white)
-    dof = max(w.rank - solution.effective, 1.0)
-    # Readings that were set aside count in the errors: they are data, and took no part in the fit.
-    whole, all_raw, all_left_out = w, raw, left_out
-    if outlier.any():
-        whole = whitening(readings, mode, "gc")
-        prediction = model.predict(readings.states, solution.theta)
-        all_raw = residual(readings, prediction, whole)
-        all_left_out = all_raw.copy()
-        place = {int(r): i for i, r in enumerate(np.flatnonzero(~outlier)[w.reading])}
-        for i, r in enumerate(whole.reading):
-            if int(r) in place:
-                all_left_out[i] = left_out[place[int(r)]]
-    return Fit(
+    found = Fit(
         model=model,
         readings=readings,
         mode=mode,
         scaling=scaling,
         whitening=w,
+        fitted=fitted,
         solution=solution,
-        uncertainty=uncertainty(model, kept, fitted, solution, pose, total, dof),
-        pose=pose,
+        pose=distinct_poses(kept)[w.reading],
         raw=raw,
         white=white,
-        left_out=left_out,
         outlier=outlier,
         chi2=total,
-        dof=dof,
-        error=error_block(all_raw, whole),
-        holdout=error_block(all_left_out, whole),
+        dof=max(w.rank - solution.effective, 1.0),
+        error=error_block(raw, w),
     )
+    return replace(found, error=error_block(*_with_outliers(found))) if outlier.any() else found
+
+
+def _with_outliers(of: Fit) -> tuple[Floats, Whitening]:
+    """Residual of all readings, and their gc-scaling; of the fitted ones where they are all.
+
+    Readings that were set aside count in the errors: they are data, and took no part in the fit.
+    """
+    if not of.outlier.any():
+        return of.raw, of.whitening
+    w = whitening(of.readings, of.mode, "gc")
+    prediction = of.model.predict(of.readings.states, of.theta)
+    return residual(of.readings, prediction, w), w

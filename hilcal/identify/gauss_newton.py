@@ -127,7 +127,7 @@ def solve(
     w: Whitening,
     start: Floats | None = None,
     prior: Floats | None = None,
-) -> tuple[Solution, Floats]:
+) -> Solution:
     """Fit all parameters of the model to the readings.
 
     Args:
@@ -137,22 +137,17 @@ def solve(
         start: (P,) starting parameters, zero unless given.
         prior: (P,) prior standard deviations to keep as they are; otherwise those of
             shrunk families are chosen by the evidence.
-
-    Returns:
-        The solution, and the Jacobian (D, m, L) there of the measurements, not whitened, by the
-        live parameters; by far the largest array of a fit, which a solution does not keep.
     """
     problem = _Problem(model, readings, w)
     point, by, iterations, converged = _minimise(problem, start, prior)
     live = np.flatnonzero(by.prior > 0)
-    jacobian = w.raw(model.jacobian(point.prediction, point.theta, w.m, live))
-    rows = by.basis.rows(w.whiten(jacobian).reshape(point.white.size, len(live)))
+    rows = by.basis.rows(whitened_jacobian(model, point.prediction, point.theta, w, live))
     beta = point.mean_square(len(by.basis.singular)) if w.scaling == "none" else by.beta
     # Formed anew at the solution, so that folds can be taken out of them exactly.
     basis = _all_parameters(by.basis, live, model.size)
     target = point.white + rows @ _coordinates(basis, point.theta, by.prior)
     equations = NormalEquations(basis, rows.T @ rows, rows.T @ target)
-    solution = Solution(
+    return Solution(
         theta=point.theta,
         prior=by.prior,
         beta=beta,
@@ -166,7 +161,6 @@ def solve(
         iterations=iterations,
         converged=converged,
     )
-    return solution, jacobian
 
 
 def _minimise(

@@ -13,7 +13,7 @@ fit where that is more.
 import numpy as np
 
 from hilcal.data.whitening import Whitening
-from hilcal.identify.gauss_newton import Solution
+from hilcal.identify.gauss_newton import Solution, whitened_jacobian
 from hilcal.identify.priors import FIRST_GUESS, prior_of, scales_of
 from hilcal.model import Model
 from hilcal.regression.fold_evidence import FamilyProblem, solutions
@@ -66,43 +66,47 @@ def changes(model: Model, solution: Solution, fold: Ints, w: Whitening) -> Float
     return np.asarray(np.array(steps) @ solution.equations.basis.transform.T)
 
 
-def leave_out(
-    model: Model, solution: Solution, jacobian: Floats, fold: Ints, w: Whitening
-) -> Floats:
+def leave_out(model: Model, solution: Solution, fold: Ints, w: Whitening) -> Floats:
     """Return the residual (D, m) of each measurement, predicted without its fold.
 
     Args:
         model: the model.
         solution: the full fit.
-        jacobian: (D, m, L) of the measurements by its live parameters.
         fold: (D,) fold of each measurement.
         w: the scaling of the fit.
     """
-    predicted = solution.raw.copy()
     groups = prior_of(model)[1]
     if w.scaling != "none" and bool((groups >= 0).any()):
-        return _with_families(model, solution, jacobian, fold, w, groups)
-    for f, change in enumerate(changes(model, solution, fold, w)):
-        predicted[fold == f] -= jacobian[fold == f] @ change[solution.live]
+        change = _with_families(model, solution, fold, w, groups)
+    else:
+        change = changes(model, solution, fold, w)
+    moved = np.flatnonzero(np.any(change != 0, axis=0))
+    jacobian = w.raw(model.jacobian(solution.prediction, solution.theta, w.m, moved))
+    predicted = solution.raw.copy()
+    for f, by in enumerate(change[:, moved]):
+        predicted[fold == f] -= jacobian[fold == f] @ by
     return predicted
 
 
 def _with_families(
-    model: Model, solution: Solution, jacobian: Floats, fold: Ints, w: Whitening, groups: Ints
+    model: Model, solution: Solution, fold: Ints, w: Whitening, groups: Ints
 ) -> Floats:
-    """`leave_out` for a model with shrunk families, whose strengths each fold chooses."""
-    basis, predicted = solution.equations.basis, solution.raw.copy()
+    """`changes` for a model with shrunk families, whose strengths each fold chooses."""
+    basis = solution.equations.basis
     flat, count = len(basis.singular), len(basis.prior_precision)
     dropped = np.flatnonzero((groups >= 0) & (solution.prior == 0))
-    if len(dropped) * predicted.size > MOST_ELEMENTS:
+    if len(dropped) * solution.raw.size > MOST_ELEMENTS:
         dropped = dropped[:0]
     guess = FIRST_GUESS * scales_of(model)[dropped]
-    more = w.raw(model.jacobian(solution.prediction, solution.theta, w.m, dropped)) * guess
+    more = whitened_jacobian(model, solution.prediction, solution.theta, w, dropped)
+    more *= guess
     shrunk = groups[basis.held] >= 0
     others = np.concatenate([np.arange(flat), flat + np.flatnonzero(~shrunk)])
     kept = flat + np.flatnonzero(shrunk)
     family = np.concatenate([groups[basis.held[shrunk]], groups[dropped]])
-    coordinates, rows = solution.coordinates(), solution.rows
+    coordinates, order = solution.coordinates(), np.concatenate([others, kept])
+    in_order = np.array_equal(order, np.arange(count))
+    rows = solution.rows if in_order else solution.rows[:, order]
     # Flat parameters have the prior about zero of `folds_of`, unshrunk ones their own.
     per = basis.transform[:, :flat] / ordinary(model, solution.theta)[:, None]
     own = np.where(basis.flat, solution.theta / ordinary(model, solution.theta), 0.0)
@@ -111,8 +115,8 @@ def _with_families(
     ridge[np.arange(flat, len(others)), np.arange(flat, len(others))] = solution.beta
     found = solutions(
         FamilyProblem(
-            rows=_beside(rows, np.concatenate([others, kept]), w.whiten(more)),
-            target=solution.white + rows @ coordinates,
+            rows=(rows, more),
+            target=solution.white + solution.rows @ coordinates,
             ridge=ridge,
             pull=np.concatenate([-solution.beta * per.T @ own, np.zeros(len(others) - flat)]),
             groups=np.unique(family, return_inverse=True)[1],
@@ -121,17 +125,8 @@ def _with_families(
         ),
         w.rows_of(fold),
     )
-    for f, u in enumerate(found):
-        mine, z = fold == f, np.zeros(count)
-        z[others], z[kept] = u[: len(others)], u[len(others) : count]
-        change = basis.transform[solution.live] @ (z - coordinates)
-        predicted[mine] -= jacobian[mine] @ change + more[mine] @ u[count:]
-    return predicted
-
-
-def _beside(rows: Floats, order: Ints, more: Floats) -> Floats:
-    """Return columns (R, K) in another order, and more (D·m, ..., Q); `rows` where that is all."""
-    moved = rows if np.array_equal(order, np.arange(len(order))) else rows[:, order]
-    if not more.size:
-        return moved
-    return np.hstack([moved, more.reshape(len(rows), -1)])
+    z = np.empty((len(found), count))
+    z[:, order] = found[:, :count]
+    change = (z - coordinates) @ basis.transform.T
+    change[:, dropped] = found[:, count:] * guess
+    return np.asarray(change)

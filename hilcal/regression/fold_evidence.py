@@ -13,12 +13,13 @@ d the columns of the group, M the projection off the others.
 """
 
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 import scipy.linalg as sl
 
 from hilcal.regression.empirical_bayes import maximise_evidence
-from hilcal.types import Floats, Ints
+from hilcal.types import Bools, Floats, Ints
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,7 +27,7 @@ class FamilyProblem:
     """The linear problem y = A u: unshrunk columns first, then those of groups that share a prior.
 
     Attributes:
-        rows: (R, F + P) A.
+        rows: (R, F + P) A, its columns in one or more parts.
         target: (R,) y.
         ridge: (F, F) prior precision of the unshrunk columns, times β.
         pull: (F,) right-hand side that this prior adds.
@@ -35,7 +36,7 @@ class FamilyProblem:
         beta: noise variance factor by all rows.
     """
 
-    rows: Floats
+    rows: tuple[Floats, ...]
     target: Floats
     ridge: Floats
     pull: Floats
@@ -51,22 +52,27 @@ def solutions(p: FamilyProblem, fold: Ints) -> Floats:
         p: the problem.
         fold: (R,) fold of each row, from 0.
     """
-    flat = len(p.pull)
-    gram, rhs = p.rows.T @ p.rows, p.rows.T @ p.target
+    flat, count_of = len(p.pull), np.bincount(fold)
+    parts = [_products(p, fold == f) for f in range(len(count_of))]
+    gram, rhs = (reduce(np.add, of) for of in zip(*parts, strict=True))
     gram[:flat, :flat] += p.ridge
     rhs[:flat] += p.pull
-    total = float(p.target @ p.target)
+    square = np.bincount(fold, weights=p.target**2)
     out = []
-    for f in range(int(fold.max()) + 1):
-        mine = fold == f
-        own, y = p.rows[mine], p.target[mine]
-        g, b, yy = gram - own.T @ own, rhs - own.T @ y, total - float(y @ y)
-        count = int(np.sum(~mine))
+    for f, (own, side) in enumerate(parts):
+        g, b, yy = gram - own, rhs - side, float(square.sum() - square[f])
+        count = len(fold) - int(count_of[f])
         first = maximise_evidence(g, b, yy, count, flat, p.groups, p.std, p.beta)
         start = _with_dropped(g, b, p.groups, first.std, first.beta)
         last = maximise_evidence(g, b, yy, count, flat, p.groups, start, first.beta)
         out.append(_solve(g, b, flat, last.std, last.beta)[0])
     return np.array(out)
+
+
+def _products(p: FamilyProblem, rows: Bools) -> tuple[Floats, Floats]:
+    """AᵀA and Aᵀy of some rows."""
+    own = np.hstack([part[rows] for part in p.rows])
+    return own.T @ own, own.T @ p.target[rows]
 
 
 def _solve(
