@@ -1,5 +1,6 @@
 """The command line: one file per group of commands, imported where it is used."""
 
+import itertools
 import json
 import os
 import re
@@ -7,6 +8,7 @@ import shlex
 import shutil
 import sys
 import textwrap
+import threading
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -32,6 +34,8 @@ _COMPLETE = "_HILCAL_COMPLETE"
 _BROKEN_PIPE = 141
 _INTERRUPTED = StoppedError.exit_code
 _USAGE = 2
+_FRAMES = "⠋⠙⠹⠸⠼⠴⠦⠧⠇⠏"
+_FRAME_S = 0.2
 _COMMAND = re.compile(r"(.*:) (hilcal [^,;()]*)$")
 _KINDS = {
     InputError: "input",
@@ -78,7 +82,9 @@ def _hilcal(arguments: Sequence[str]) -> typer.Typer:
         if words[:1] != [name]:
             app.command(name, help=command.summary)(_placeholder)
         elif command.subcommands:
-            app.add_typer(_group(command), name=name)
+            with _loading(name):
+                group = _group(command)
+            app.add_typer(group, name=name)
         else:
             epilog = EXIT_CODES_OF_RUN if name == "run" else EXIT_CODES
             with _loading(name):
@@ -94,12 +100,22 @@ def _loading(name: str) -> Iterator[None]:
     if not sys.stderr.isatty() or os.environ.get(_COMPLETE):
         yield
         return
-    words = f"hilcal {name} ..."
-    print(words, end="", file=sys.stderr, flush=True)
+    ended = threading.Event()
+
+    def show() -> None:
+        for frame in itertools.cycle(_FRAMES):
+            print(f"\r{frame} hilcal {name}", end="", file=sys.stderr, flush=True)
+            if ended.wait(_FRAME_S):
+                break
+
+    shown = threading.Thread(target=show, daemon=True)
+    shown.start()
     try:
         yield
     finally:
-        print("\r" + " " * len(words), end="\r", file=sys.stderr, flush=True)
+        ended.set()
+        shown.join()
+        print("\r" + " " * (len(name) + 9), end="\r", file=sys.stderr, flush=True)
 
 
 def _group(command: Command) -> typer.Typer:

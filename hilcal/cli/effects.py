@@ -41,11 +41,13 @@ def effects(
     states = example_states(cell)
     made = [kind(cell, states) for kind in catalogue.effects]
     defaults = {e.name: option_defaults(type(e), cell, states) for e in made}
-    out = text.table("effect", "parameters", "unit", "needs", "law", left=(0, 2, 3, 4))
-    out.columns[0].no_wrap = True
+    out = text.table("effect", "law", left=(0, 1))
     for e in made:
-        units = list(dict.fromkeys(p.unit for p in e.parameters))
-        out.add_row(e.name, str(len(e.parameters)), ", ".join(units), ", ".join(e.needs), e.summary)
+        units = ", ".join(dict.fromkeys(p.unit for p in e.parameters))
+        needs = f"; needs {', '.join(e.needs)}" if e.needs else ""
+        count = len(e.parameters)
+        facts = f"{count} parameter{'s' if count != 1 else ''}, {units}{needs}"
+        out.add_row(e.name, Text.assemble(e.summary, "\n", (facts, "dim")))
     t.show(out)
     notes = [
         f"parameters: of a {ROBOT} with 30 poses; needs: columns that the readings must have.",
@@ -62,15 +64,15 @@ def effects(
 
 def _options_table(made: list[Effect], defaults: dict[str, dict[str, object]]) -> Table:
     """Return the options of effects; an option that others have too is explained once."""
-    out = text.table("effect", "option", "default", "what it chooses", left=(0, 1, 2, 3))
-    out.columns[0].no_wrap = out.columns[1].no_wrap = True
+    out = text.table("effect", "option", "what it chooses", left=(0, 1, 2))
     explained: dict[tuple[str, str], str] = {}
     for e in made:
         for option, meaning in e.option_help.items():
             first = explained.setdefault((option, meaning), e.name)
             words = meaning if first == e.name else f"as for {first}"
             default = written(defaults[e.name][option])
-            out.add_row(e.name, option, Text(default), Text(words))
+            given = ("\ndefault: " + default, "dim") if default else ("", "")
+            out.add_row(e.name, option, Text.assemble(words, given))
     return out
 
 

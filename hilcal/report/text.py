@@ -4,9 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from rich import box
 from rich.console import RenderableType
-from rich.table import Table
 from rich.text import Text
 
 from hilcal.diagnose.effect_ranking import LEAST_SHARE
@@ -19,6 +17,7 @@ from hilcal.identify.gross_errors import gross_errors
 from hilcal.report import numbers
 from hilcal.report.scatter_words import sigmas
 from hilcal.report.text_registration import fitted_lines
+from hilcal.report.word_table import WordTable
 from hilcal.types import Ints
 
 ALL_ROWS = 60
@@ -42,12 +41,9 @@ def heading(words: str) -> Text:
     return Text(words, style="bold")
 
 
-def table(*columns: str, left: Sequence[int] = (0,)) -> Table:
+def table(*columns: str, left: Sequence[int] = (0,)) -> WordTable:
     """Return an empty table; numbers stand to the right, the columns of `left` to the left."""
-    out = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
-    for k, name in enumerate(columns):
-        out.add_column(name, justify="left" if k in left else "right", overflow="fold")
-    return out
+    return WordTable(*columns, left=left)
 
 
 def model_name(names: Sequence[str]) -> str:
@@ -100,7 +96,7 @@ def _which(names: Sequence[str], count: int) -> str:
     return " ".join(names) if len(names) <= 6 else f"({len(names)} of {count})"
 
 
-def _parameter_rows(rows: Table, fit: Fit, effect: Effect, index: Ints) -> None:
+def _parameter_rows(rows: WordTable, fit: Fit, effect: Effect, index: Ints) -> None:
     seen = fit.uncertainty.identifiable
     for k, p in zip(index, effect.parameters, strict=True):
         alike = [

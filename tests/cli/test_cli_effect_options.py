@@ -137,5 +137,11 @@ def test_effects_shows_options_and_defaults(capsys: Capsys) -> None:
     assert d["link_geometry"]["options"] == []
     assert d["link_geometry"]["defaults"] == {}
     words = " ".join(ok(capsys, "effects").out.split())
-    for part in ("periodic_joint_compliance orders [2]", "creep joints common", "(joints=1-3)"):
+    for part in (
+        "periodic_joint_compliance orders periods k per turn",
+        "given, [2]: the two-lobed wave generator of a strain wave gear. default: [2]",
+        "creep joints which joints share a k",
+        "default: common",
+        "(joints=1-3)",
+    ):
         assert part in words

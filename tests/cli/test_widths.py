@@ -1,0 +1,79 @@
+"""What the commands print keeps its words whole at 60, 80 and 120 columns."""
+
+import io
+from collections.abc import Iterable
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from hilcal.cli.terminal import Terminal
+from tests.cli.test_asking import TOML
+from tests.support.cli_cases import CELL, ok, table
+
+Capsys = pytest.CaptureFixture[str]
+WIDTHS = (60, 80, 120)
+ROOM = 1000
+"""Columns with which no line is broken."""
+
+
+@pytest.fixture(scope="module")
+def readings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return table(tmp_path_factory.mktemp("t") / "r.csv", "periodic_joint_compliance", poses=8)
+
+
+@pytest.fixture
+def pages(monkeypatch: pytest.MonkeyPatch) -> dict[int, io.StringIO]:
+    """What a command prints, at every width at once."""
+    streams = {width: io.StringIO() for width in (*WIDTHS, ROOM)}
+    consoles = [Console(file=stream, width=width) for width, stream in streams.items()]
+
+    def show(self: Terminal, parts: object) -> None:
+        shown = (parts,) if isinstance(parts, str) or not isinstance(parts, Iterable) else parts
+        for part in shown:
+            for console in consoles:
+                console.print(part, markup=False, highlight=False)
+
+    monkeypatch.setattr(Terminal, "show", show)
+    return streams
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An operator's directory; a path that is longer than a line has to be broken."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def whole(pages: dict[int, io.StringIO]) -> None:
+    """Check that no line is too long, and that every word is one of the lines with much room."""
+    known = set(pages[ROOM].getvalue().split())
+    assert len(known) > 5
+    for width in WIDTHS:
+        text = pages[width].getvalue()
+        assert max(map(len, text.splitlines())) <= width
+        new = {word for word in text.split() if set(word) != {"─"}} - known
+        lists = {word for word in new if word.endswith(":") and word[:-1] in known}
+        assert new == lists, width
+
+
+def test_the_words_of_a_campaign_stay_whole(
+    readings: Path, home: Path, capsys: Capsys, pages: dict[int, io.StringIO]
+) -> None:
+    run = "run.hilcal"
+    ok(capsys, "import", readings, "--config", CELL, "-o", run)
+    ok(capsys, "identify", run, "--scaling", "all")
+    ok(capsys, "compare", run)
+    ok(capsys, "add", run, "periodic_joint_compliance(joints=common)")
+    ok(capsys, "diagnose", run)
+    ok(capsys, "info", run)
+    whole(pages)
+
+
+def test_the_words_of_lists_and_plans_stay_whole(
+    home: Path, capsys: Capsys, pages: dict[int, io.StringIO]
+) -> None:
+    Path("cell.toml").write_text(TOML, encoding="utf-8")
+    ok(capsys, "effects")
+    ok(capsys, "plan", "cell.toml", "-o", "plan.json")
+    whole(pages)
