@@ -16,6 +16,7 @@ from hilcal.data.plan import REFERENCE, Plan, read_plan
 from hilcal.data.run_log import PLAN
 from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.diagnose.doubt import MOST, in_doubt
+from hilcal.diagnose.effect_ranking import Suspect
 from hilcal.diagnose.stepwise import remove
 from hilcal.diagnose.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue
@@ -122,6 +123,9 @@ def _without_suspects(
         suspects = in_doubt(d)
         if not suspects:
             raise CannotAnswerError(_settled(o, d))
+        finer = [s for s in d.suspects if s.coarse and s.effect in suspects]
+        if finer:
+            raise CannotAnswerError(f"not two effects, but one in doubt: {differ(o, finer[0])}")
     for name in suspects:
         if name in newest.model.names:
             say(f"fitting without {name}")
@@ -143,8 +147,12 @@ def _settled(o: Campaign, d: Diagnosis) -> str:
             "or state the covariance anew"
         )
     if d.verdict == "missing_effect":
-        lead = d.suspects[0].effect
-        return f"{head} {lead} alone is missing; add it with: hilcal add {o.path} {lead}"
+        lead = d.suspects[0]
+        if lead.coarse:
+            return f"{head} {differ(o, lead)}"
+        return (
+            f"{head} {lead.effect} alone is missing; add it with: hilcal add {o.path} {lead.effect}"
+        )
     why = "no effect of the catalogue explains the misfit"
     if d.reason == "insufficient_catalogue":
         why = (
@@ -154,6 +162,14 @@ def _settled(o: Campaign, d: Diagnosis) -> str:
     return (
         f"{head} {why}; see hilcal diagnose {o.path}, or give an effect of your own by "
         "--effects-from"
+    )
+
+
+def differ(o: Campaign, s: Suspect) -> str:
+    """Say how to let joints differ, where the readings ask for it."""
+    return (
+        f"the model has one {s.coarse} for several joints; let them differ, and diagnose again: "
+        f'hilcal add {o.path} "{s.effect}"'
     )
 
 

@@ -146,7 +146,8 @@ def _change(
             say(f"{'adding' if adds else 'removing'} {named}")
             after = make(before, effect)
             say("diagnosing")
-            added, removed = (effect, None) if adds else (None, effect)
+            finer = effect in before.model.names
+            added, removed = (named if finer else effect, None) if adds else (None, effect)
             before_it = o.history(before_number)
             how = History(
                 added=tuple(n for n in after.model.names if n in (added, *before_it.added)),

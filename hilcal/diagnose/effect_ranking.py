@@ -11,6 +11,7 @@ effect is implausible, and the size that it would need is stated.
 """
 
 from collections.abc import Callable, Collection, Iterable, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -60,6 +61,8 @@ class Suspect:
         kept: share of what the linearisation promised that the exact model keeps; 1 where that
             was not looked at, since the suspect fails other tests.
         same_as: other suspects that these readings do not separate from it.
+        coarse: name of the effect of the model that it is finer than; empty for one that the model
+            does not have.
     """
 
     effect: str
@@ -72,6 +75,7 @@ class Suspect:
     needs: tuple[tuple[str, float, float], ...] = ()
     kept: float = 1.0
     same_as: tuple[str, ...] = ()
+    coarse: str = ""
 
     @property
     def passes(self) -> bool:
@@ -90,7 +94,7 @@ class Suspect:
 
 
 def candidates(fit: Fit) -> tuple[Effect, ...]:
-    """Effects that are not in the model and can be computed from these readings.
+    """Effects that are not in the model, or are finer than one of it, and can be computed.
 
     Raises:
         InputError: `[plausible]` of the cell names an effect that the catalogue does not hold.
@@ -105,7 +109,8 @@ def candidates(fit: Fit) -> tuple[Effect, ...]:
         if kind.name not in model.names and kind.computable(states):
             effect = model.catalogue.make(kind.name, model.cell, states, m=fit.whitening.m)
             out.append(effect.for_scoring(states))
-    return tuple(out)
+    finer = (e.refined(states) for e in model.effects)
+    return (*out, *(e for e in finer if e is not None))
 
 
 def catalogue_columns(fit: Fit) -> tuple[Floats, dict[str, slice], dict[str, float]]:
@@ -161,6 +166,9 @@ def addition(before: Fit, after: Fit) -> Suspect:
         after: the fit with one more effect.
     """
     p, effect = linearise(before), after.model.effects[-1]
+    if effect.name in before.model.names:  # a finer form took its place
+        effect = copy(effect)
+        effect.name, effect.coarse = f"{effect.name}, finer", effect.name
     (s,) = rank_suspects(p, [effect], refit=lambda fit, name: after)
     return replace(s, kept=kept_by_refit(before, after, s.score))
 
@@ -213,6 +221,7 @@ def _suspect(p: Linearisation, of: EffectColumns, bare: Unloaded | None, level: 
         least = least_of_family(p, of, s, least, level, LEAST_SHARE, largest)
     return Suspect(
         effect=of.effect.name,
+        coarse=of.effect.coarse,
         score=result,
         share=p.share(result.gain),
         holdout_share=held.share,

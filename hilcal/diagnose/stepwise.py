@@ -6,6 +6,7 @@ import numpy as np
 
 from hilcal.data.readings import Readings
 from hilcal.effects.options import Options
+from hilcal.effects.written import read_effects_text
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.linearisation import left_out_by_pose
@@ -17,23 +18,20 @@ from hilcal.types import Floats
 def add(before: Fit, effect: str, options: Options | None = None) -> Fit:
     """Refit with one more effect, from where the fit stands.
 
+    One that is finer than an effect of the model, as joint_compliance(joints=each) where the model
+    has one for all joints, takes its place.
+
     Args:
         before: the fit.
-        effect: its name.
+        effect: its name; with options as `read_effects_text` reads them.
         options: of the effect, where they are not the usual ones.
 
     Raises:
         InputError: unknown effect, one that is there already, or one that these readings
             cannot show; an unknown option, or a bad value.
     """
-    readings = before.readings
-    if effect in before.model.names:
-        raise InputError(
-            f"effect {effect} is in the model already: {', '.join(before.model.names)}"
-        )
-    model = _with(before.model, effect, readings, options)
-    start = np.concatenate([before.theta, np.zeros(model.size - before.model.size)])
-    return fit(model, readings, before.mode, before.scaling, start)
+    model, start = _grown(before.model, before.theta, effect, before.readings, options)
+    return fit(model, before.readings, before.mode, before.scaling, start)
 
 
 class Refits:
@@ -56,23 +54,35 @@ def remove(before: Fit, effect: str) -> Fit:
     Raises:
         InputError: an effect that is not there.
     """
-    model, start = _rest(before, effect)
+    model, start = _rest(before.model, before.theta, effect)
     return fit(model, before.readings, before.mode, before.scaling, start)
 
 
-def _rest(before: Fit, effect: str) -> tuple[Model, Floats]:
-    """Return the model without an effect, and its parameters in the fit."""
-    model = before.model
+def _rest(model: Model, theta: Floats, effect: str) -> tuple[Model, Floats]:
+    """Return the model without an effect, and its parameters."""
     if effect not in model.names:
         raise InputError(f"effect {effect} is not in the model: {', '.join(model.names)}")
     place = model.names.index(effect)
     rest = tuple(e for e in model.effects if e.name != effect)
-    return replace(model, effects=rest), np.delete(before.theta, model.slices()[place])
+    return replace(model, effects=rest), np.delete(theta, model.slices()[place])
 
 
-def _with(model: Model, effect: str, readings: Readings, options: Options | None = None) -> Model:
-    """Return the model with one more effect, set up for the readings of a fit."""
-    return model + model.catalogue.make(effect, model.cell, readings.states, options, readings.m)
+def _grown(
+    model: Model, theta: Floats, effect: str, readings: Readings, options: Options | None = None
+) -> tuple[Model, Floats]:
+    """Return the model with one more effect, or a finer one, and parameters to start from."""
+    ((name, given),) = read_effects_text(effect, "effect", model.catalogue).items()
+    given = {**given, **(options or {})}
+    if name in model.names:
+        present = model.effects[model.names.index(name)]
+        made = present.with_options(readings.states, **given)
+        if not made.refines(present):
+            raise InputError(f"effect {name} is in the model already: {', '.join(model.names)}")
+        model, theta = _rest(model, theta, name)
+    else:
+        made = model.catalogue.make(name, model.cell, readings.states, given, readings.m)
+    grown = model + made
+    return grown, np.concatenate([theta, np.zeros(grown.size - model.size)])
 
 
 def exchange(before: Fit, effect: str, other: str) -> Fit:
@@ -81,13 +91,11 @@ def exchange(before: Fit, effect: str, other: str) -> Fit:
     Raises:
         InputError: an effect that is not there, or another that is.
     """
-    rest, start = _rest(before, effect)
+    rest, start = _rest(before.model, before.theta, effect)
     if other in before.model.names:
         raise InputError(f"effect {other} is in the model already: {', '.join(before.model.names)}")
-    readings = before.readings
-    model = _with(rest, other, readings)
-    start = np.concatenate([start, np.zeros(model.size - rest.size)])
-    return fit(model, readings, before.mode, before.scaling, start)
+    model, start = _grown(rest, start, other, before.readings)
+    return fit(model, before.readings, before.mode, before.scaling, start)
 
 
 def predicts_better(before: Fit, after: Fit) -> bool:

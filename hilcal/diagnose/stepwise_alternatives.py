@@ -81,10 +81,12 @@ class StepwiseAlternatives:
             self._most,
             self._gram,
         )
+        # What an effect does, a finer form of it does as well: no alternative.
+        barred = {*excluded, *(name for name in self._columns if name.startswith(f"{effect}("))}
         same: tuple[str, ...] = ()
         others: list[str] = []
         total = 0.0
-        for step in forward_selection(families.without(excluded), MOST_TOGETHER):
+        for step in forward_selection(families.without(barred), MOST_TOGETHER):
             if not others:
                 same = tuple(n for n, s in step.scores.items() if _same(s.log_evidence, own))
             if step.score.log_evidence <= SAME_EVIDENCE:

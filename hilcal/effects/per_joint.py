@@ -130,6 +130,24 @@ class PerJoint(Effect):
         self.shared = joint_groups(self.name, self.options, self.cell.arm.n)
         self.options["joints"] = self.shared.text
 
+    def refined(self, states: States) -> "PerJoint | None":
+        """Return the effect with a parameter of its own for each joint that has one."""
+        g = self.shared
+        if len(g.labels) == len(g.joint):
+            return None
+        finer = self.with_options(states, joints="/".join(str(j + 1) for j in g.joint))
+        finer.name, finer.coarse = f"{self.name}(joints={finer.shared.text})", self.name
+        return finer
+
+    def refines(self, other: Effect) -> bool:
+        """Whether no joints that `other` sets apart share a parameter here, and fewer do."""
+        if type(other) is not type(self) or not isinstance(other, PerJoint):
+            return False
+        own, theirs = self.shared, dict(zip(other.shared.joint, other.shared.group, strict=True))
+        apart = {(k, theirs.get(j)) for j, k in zip(own.joint, own.group, strict=True)}
+        whole = set(theirs) <= set(own.joint.tolist())
+        return whole and len(apart) == len(own.labels) > len(other.shared.labels)
+
     def group_parameters(
         self, unit: str, ordinary: Floats, meaning: str, kinds: Mapping[str, str] | None = None
     ) -> tuple[Parameter, ...]:

@@ -166,9 +166,14 @@ class Effect(ABC):
         plausible: standard deviation of the parameters over arms and cells as they are, in their
             ordinary magnitudes: the range that a suspect of this name must stay in. An effect
             that states none is plausible at any size. See `most`.
+
+    Attributes:
+        coarse: of an effect from `refined`, the name of the one that it is finer than; else empty.
+            Its own name has the options that make it finer, as "creep(joints=each)".
     """
 
-    name: ClassVar[str]
+    name: str
+    coarse: str = ""
     summary: ClassVar[str]
     elastic: ClassVar[bool] = False
     local_response: ClassVar[bool] = False
@@ -291,7 +296,9 @@ class Effect(ABC):
         `plausible`, times the factor that `[plausible]` of the cell has for the effect.
         """
         config = self.cell.config
-        return self.plausible * (1.0 if config is None else config.plausible.get(self.name, 1.0))
+        return self.plausible * (
+            1.0 if config is None else config.plausible.get(type(self).name, 1.0)
+        )
 
     @classmethod
     def usual_options(cls, m: int) -> Options:
@@ -314,6 +321,18 @@ class Effect(ABC):
         resolve may be there all the same.
         """
         return None
+
+    def refined(self, states: States) -> "Effect | None":
+        """Return the effect with a parameter of its own for each that shares one; None if none.
+
+        A fit with this one is diagnosed with that as a suspect: where the readings ask for it, the
+        effect is there, and its model is too coarse.
+        """
+        return None
+
+    def refines(self, other: "Effect") -> bool:
+        """Whether this is the same effect, and its parameters can be as `other` has them."""
+        return False
 
     def with_options(self, states: States, **options: object) -> Self:
         """Return the same effect with some options changed."""

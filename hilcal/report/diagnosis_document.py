@@ -63,6 +63,7 @@ def suspect_json(s: Suspect) -> dict[str, object]:
     """Return what is said of one suspect."""
     return {
         "effect": s.effect,
+        "finer_than": s.coarse or None,
         "p_value": s.score.p_value,
         "share": s.share,
         "holdout_share": s.holdout_share,

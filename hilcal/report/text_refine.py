@@ -83,6 +83,7 @@ def diagnosis_report(d: Diagnosis) -> Iterator[RenderableType]:
             style="dim",
         )
     if d.verdict != "adequate":
+        yield from finer(d)
         yield from doubtful(d)
         yield from (*text.where_table(d.misfit_breakdown), "")
     if d.verdict in ("unknown_effect", "noise_misjudged"):
@@ -103,6 +104,16 @@ def diagnosis_report(d: Diagnosis) -> Iterator[RenderableType]:
         yield from repeats(d.pure_error)
     yield from redundant_line(d)
     yield from could_have_been_seen(d)
+
+
+def finer(d: Diagnosis) -> Iterator[str]:
+    """Yield how to let joints differ, where the readings ask for it."""
+    for s in d.suspects:
+        if s.passes and s.coarse:
+            yield (
+                f"Let joints differ: {s.coarse} has one parameter for several joints; to give each "
+                f'its own: hilcal add RUN "{s.effect}".'
+            )
 
 
 def revisions_table(rows: Sequence[tuple[int, str, Fit, str]]) -> RenderableType:

@@ -14,7 +14,7 @@ from hilcal.report.scatter_words import left_to_the_arm, no_repeatability
 def message(d: Diagnosis) -> str:
     """Return the verdict in a sentence; the effect that it names is the first suspect."""
     if d.reason == "one_suspect":
-        return f"{d.suspects[0].effect} is missing: it {_explains(d.suspects[0])}"
+        return _missing(d.suspects[0])
     if d.reason == "inseparable_suspects":
         return _inseparable(d)
     if d.reason == "insufficient_catalogue":
@@ -37,6 +37,15 @@ def message(d: Diagnosis) -> str:
         return adequate
     doubts = "; ".join(_alternative(a) for a in d.alternatives if a.inseparable)
     return f"{adequate}; but {doubts}: measure what separates them"
+
+
+def _missing(s: Suspect) -> str:
+    if not s.coarse:
+        return f"{s.effect} is missing: it {_explains(s)}"
+    return (
+        f"let joints differ: {s.effect} {_explains(s)}; the model has one {s.coarse} for several "
+        "joints"
+    )
 
 
 def _explains(s: Suspect) -> str:

@@ -145,3 +145,21 @@ def test_effects_shows_options_and_defaults(capsys: Capsys) -> None:
         "(joints=1-3)",
     ):
         assert part in words
+
+
+def test_joints_that_differ_are_let_differ(campaign: Path, tmp_path: Path, capsys: Capsys) -> None:
+    finer = "joint_compliance(joints=each)"
+    ok(capsys, "identify", campaign, "--effects", "joint_compliance(joints=common)")
+    found = ok(capsys, "diagnose", campaign, "--json").document
+    assert found["suspects"][0]["effect"] == finer
+    assert found["suspects"][0]["finer_than"] == "joint_compliance"
+    assert found["message"].startswith(f"let joints differ: {finer} explains")
+    assert found["tests"]["each"] == found["tests"]["level"] / found["tests"]["count"]
+    refused_ = refused(capsys, 4, "next", campaign, "-o", tmp_path / "next.json")
+    assert f'hilcal add {campaign} "{finer}"' in refused_
+    result = ok(capsys, "add", campaign, finer)
+    assert f"+ {finer}" in result.out
+    (_, last) = revisions(campaign)
+    assert last[0] == ("base_frame", "joint_compliance")
+    assert last[1] == finer
+    assert last[2]["joint_compliance"] == {"joints": "each"}
