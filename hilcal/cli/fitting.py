@@ -27,9 +27,11 @@ from hilcal.identify.fit import Fit, fit
 from hilcal.identify.fit_document import to_json
 from hilcal.identify.full_prediction import full_prediction
 from hilcal.identify.linearisation import linearise
+from hilcal.identify.other_arm import other_arm_of
 from hilcal.report import numbers, text
 from hilcal.report.covariance_words import covariance_words
 from hilcal.report.progress import working
+from hilcal.report.text_registration import other_arm_line
 from hilcal.report.text_scalings import scalings_table
 
 Readings = Annotated[
@@ -76,8 +78,12 @@ def identify(
     t.show(text.fit_report(kept))
     t.show(numbers.sentence(covariance_words(o.covariance_parts)))
     t.show(options_line(kept))
+    other = other_arm_of(o.cell, o.readings)
+    if other is not None:
+        t.show(other_arm_line(other))
     document = {"revision": number, **to_json(kept), "options": options_json(kept)}
     document["covariance"] = o.covariance_parts
+    document["other_arm"] = None if other is None else other.to_json()
     if len(fits) > 1:
         t.show(["", *scalings_table(fits)])
         document["scalings"] = {s: to_json(found) for s, found in fits.items()}

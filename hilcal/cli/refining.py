@@ -39,6 +39,7 @@ from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline, with_effects
 from hilcal.identify.fit import Fit
 from hilcal.identify.frames_document import fit_to_json
+from hilcal.identify.other_arm import other_arm_of
 from hilcal.identify.weight import weight_note
 from hilcal.refine import add as add_effect
 from hilcal.refine import predicts_better
@@ -48,7 +49,7 @@ from hilcal.report import numbers, text, text_refine
 from hilcal.report.build_story import Chapter, build_story
 from hilcal.report.diagnosis_document import suspect_json, to_json
 from hilcal.report.progress import working
-from hilcal.report.text_registration import fitted_lines
+from hilcal.report.text_registration import fitted_lines, other_arm_line
 from hilcal.report.text_unknown import curves
 from hilcal.report.verdict_words import message
 
@@ -257,6 +258,9 @@ def refine(
         t.show(options_line(rows[-1].fit))
         t.show(text_refine.verdict_line(found.diagnosis))
         t.show([*fitted_lines(found.fit)])
+        other = other_arm_of(o.cell, o.readings) if latest is None else None
+        if other is not None:
+            t.show(other_arm_line(other))
         weight = weight_note(found.fit)
         if weight is not None:
             t.show(numbers.sentence(weight))
@@ -279,6 +283,7 @@ def refine(
             "message": message(last),
             "rejected": list(found.rejected),
             "frames": fit_to_json(found.fit),
+            "other_arm": None if other is None else other.to_json(),
             "diagnosis": to_json(last),
         }
     )

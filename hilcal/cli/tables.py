@@ -23,11 +23,12 @@ from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify import description_words, frames_document
 from hilcal.identify.full_covariance import covariance_parts
 from hilcal.identify.gate import examine
+from hilcal.identify.other_arm import other_arm
 from hilcal.identify.registration import Registration, register
 from hilcal.report import text
 from hilcal.report.covariance_words import covariance_words
 from hilcal.report.progress import working
-from hilcal.report.text_registration import registration_lines
+from hilcal.report.text_registration import other_arm_line, registration_lines
 
 
 def import_(
@@ -109,6 +110,10 @@ def import_(
     wrong = None if registered is None else examine(registered, readings)
     if registered is not None and not (wrong is not None and wrong.refused):
         t.show(Padding(line, (0, 0, 0, 2)) for line in registration_lines(registered))
+    refused = wrong is not None and wrong.refused
+    other = None if registered is None or refused else other_arm(registered, readings)
+    if other is not None:
+        t.show(Padding(f"Note: {other_arm_line(other)}", (0, 0, 0, 2)))
     if wrong is not None:
         said = description_words.words(wrong, cell, readings)
         begin = "Nothing can be fitted yet" if wrong.refused else "Note"
@@ -127,6 +132,7 @@ def import_(
             "description": None
             if wrong is None
             else description_words.document(wrong, cell, readings),
+            "other_arm": None if other is None else other.to_json(),
             "frames": None if registered is None else frames_document.document(registered),
         }
     )

@@ -7,6 +7,7 @@ import numpy as np
 from hilcal.cell import Cell
 from hilcal.identify.fit import Fit
 from hilcal.identify.frames_document import frames_of_fit
+from hilcal.identify.other_arm import OtherArm
 from hilcal.identify.registration import Registration, Undetermined, register
 from hilcal.report import numbers
 from hilcal.robot import se3
@@ -25,6 +26,15 @@ def registration_lines(found: Registration) -> Iterator[str]:
             f"The nominal arm leaves {numbers.length(found.rms)}{turn} rms."
         )
     yield from undetermined_lines(found)
+
+
+def other_arm_line(found: OtherArm) -> str:
+    """Return what to write where the readings are those of another arm of the catalogue."""
+    return (
+        f"These data fit the {found.name} better: {numbers.length(found.rms)} → "
+        f"{numbers.length(found.rms_with)} rms after registration; in CELL.toml: "
+        f'[robot] model = "{found.name}".'
+    )
 
 
 def fitted_lines(fit: Fit) -> Iterator[str]:
