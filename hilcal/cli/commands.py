@@ -48,6 +48,9 @@ COMMANDS = {
         "simulating:simulate",
         "Run simulated devices for a cell until Ctrl-C, for `check` and `run` to talk to.",
     ),
+    "init": Command(
+        "beginning:init", "Write a commented CELL.toml: asks at a terminal, else takes the options."
+    ),
     "config": Command(
         "configuring:config", "Explain the sections and keys of CELL.toml: unit, default, example."
     ),

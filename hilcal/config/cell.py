@@ -84,10 +84,12 @@ class Target(Section):
     name: str = Field(min_length=1, description='the name of a target, e.g. "R1"', examples=["R1"])
     target_m: Vector3 | None = Field(
         None,
-        description=VECTOR_M + "; leave it out to have it estimated",
+        description=VECTOR_M + ": the target, flange axes; leave it out to have it estimated",
         examples=[[0.06, 0.02, 0.12]],
     )
-    target_rotvec_rad: Vector3 | None = Field(None, description=ROTVEC, examples=[[0.0, 0.0, 1.57]])
+    target_rotvec_rad: Vector3 | None = Field(
+        None, description=ROTVEC + ": the target's axes in flange axes", examples=[[0.0, 0.0, 1.57]]
+    )
     estimate: bool = Field(
         False,
         description="true or false: whether target_m is rough, and the offset estimated",
@@ -114,20 +116,28 @@ class Tool(Section):
 
     target_m: Vector3 | None = Field(
         None,
-        description=VECTOR_M + "; leave it out to have it estimated",
+        description=VECTOR_M + ": the target, flange axes; leave it out to have it estimated",
         examples=[[0.06, 0.02, 0.12]],
     )
-    target_rotvec_rad: Vector3 | None = Field(None, description=ROTVEC, examples=[[0.0, 0.0, 1.57]])
+    target_rotvec_rad: Vector3 | None = Field(
+        None, description=ROTVEC + ": the target's axes in flange axes", examples=[[0.0, 0.0, 1.57]]
+    )
     targets: tuple[Target, ...] = Field(
         (),
         description="sections [[tool.targets]], one per target, in the order of measurement",
         examples=[[{"name": "R1", "target_m": [0.06, 0.02, 0.12]}]],
     )
     load_point_m: Vector3 = Field(
-        (0.0, 0.0, 0.0), description=VECTOR_M, examples=[[0.1, 0.0, 0.15]]
+        (0.0, 0.0, 0.0),
+        description=VECTOR_M + ": where loads act, flange axes",
+        examples=[[0.1, 0.0, 0.15]],
     )
     mass_kg: NonNegative = Field(0.0, description="a mass in kg, 0 or more", examples=[0.8])
-    com_m: Vector3 = Field((0.0, 0.0, 0.0), description=VECTOR_M, examples=[[0.01, 0.0, 0.06]])
+    com_m: Vector3 = Field(
+        (0.0, 0.0, 0.0),
+        description=VECTOR_M + ": the tool's centre of mass, flange axes",
+        examples=[[0.01, 0.0, 0.06]],
+    )
 
     @model_validator(mode="after")
     def _metres(self) -> "Tool":

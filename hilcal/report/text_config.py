@@ -15,7 +15,8 @@ _HEAD = """\
 # Keys of CELL.toml
 
 Written by the program (`hilcal config SECTION` shows the same in the terminal); a test holds this
-page to the code. Every key that is not "required" may be left out.
+page to the code. Every key that is not "required" may be left out. `hilcal init` writes a file to
+begin with.
 """
 
 
@@ -29,7 +30,7 @@ def overview(tables: Sequence[Table]) -> Iterator[RenderableType]:
     yield text.heading("Sections of CELL.toml")
     yield out
     yield ""
-    yield "hilcal config SECTION explains the keys of one."
+    yield "hilcal config SECTION explains the keys of one; hilcal init writes a file."
 
 
 def section(t: Table) -> Iterator[RenderableType]:

@@ -1,0 +1,390 @@
+"""`init`: a CELL.toml to begin with, from questions or from options."""
+
+import re
+import sys
+from collections.abc import Callable
+from copy import deepcopy
+from dataclasses import dataclass, field
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from hilcal.acquire import devices
+from hilcal.acquire.connect import driver
+from hilcal.cell import cell_from_config
+from hilcal.cli.asking import agreed, somebody_there
+from hilcal.cli.terminal import Json, Terminal, terminal
+from hilcal.config import CellConfig
+from hilcal.config.template import cell_text
+from hilcal.effects.catalogue import installed
+from hilcal.errors import InputError, StoppedError
+from hilcal.plan.nominal_model import check_effects
+from hilcal.report import text
+from hilcal.robot.catalogue import load_arm, robot_names
+from hilcal.toml import check_section
+
+SIMULATED = "simulated"
+"""Port of a force sensor that exists in the rehearsal only."""
+CLOCK = 20.0
+"""How much faster than real time a rehearsal goes, as in the demo's cell."""
+_LOAD = re.compile(r"(?:(?P<name>[^=]+)=)?(?P<values>[^=]+?)\s*(?P<unit>kg|N)\s*")
+LOADS = 'e.g. "5 kg", or a pull in base axes: "pull x = 80, 0, 0 N"'
+
+
+@dataclass(slots=True)
+class Draft:
+    """A cell in the making; every answer is checked as it comes.
+
+    Attributes:
+        base_dir: to which paths in it refer.
+        data: the sections so far, as TOML has them.
+    """
+
+    base_dir: Path
+    data: dict[str, Any] = field(default_factory=dict)
+
+    def set(self, section: str, **values: object) -> None:
+        """Set keys of a section.
+
+        Raises:
+            InputError: a value that is not valid; nothing is set then.
+        """
+        data = deepcopy(self.data)
+        data.setdefault(section, {}).update(values)
+        self._take(data)
+
+    def add_load(self, words: str) -> None:
+        """Add a load from words, see `LOADS`; raises as `set` does."""
+        match = _LOAD.fullmatch(words)
+        if match is None:
+            raise InputError(f"{words!r} is no load; valid: {LOADS}")
+        one: dict[str, object] = {"name": (match["name"] or words.replace(" ", "")).strip()}
+        if match["unit"] == "kg":
+            one["mass_kg"] = number(match["values"], "kg")
+        else:
+            one["force_N"] = vector(match["values"], "N")
+        data = deepcopy(self.data)
+        data.setdefault("loads", []).append(one)
+        self._take(data)
+
+    def _take(self, data: dict[str, Any]) -> None:
+        check_section(data, CellConfig, "the answer")
+        self.data = data
+
+    def robot(self, words: str) -> None:
+        """Set the arm."""
+        load_arm(words, self.base_dir)
+        self.set("robot", model=words)
+
+    def host(self, words: str) -> None:
+        """Set the address of the arm's controller, and its driver."""
+        if not re.fullmatch(r"[\w.:-]+", words):
+            raise InputError(f'{words!r} is no address; valid: e.g. "192.168.56.101"')
+        self.set("robot", driver=drivers(devices.ARMS)[0], host=words)
+
+    def tracker(self, words: str) -> None:
+        """Set the tracker's driver."""
+        driver(devices.TRACKERS, words, "[tracker] driver")
+        self.set("tracker", driver=words)
+
+    def force_sensor(self, words: str) -> None:
+        """Set the force sensor's driver."""
+        driver(devices.FORCE_SENSORS, words, "[force_sensor] driver")
+        self.set("force_sensor", driver=words, port=SIMULATED)
+
+    def floor(self, words: str) -> None:
+        """Set the height that the arm stays above."""
+        height = number(words, "m")
+        reach = load_arm(self.data["robot"]["model"], self.base_dir).reach
+        side = round(2.0 * reach, 1)
+        self.set("limits", workspace_min_m=[-side, -side, height])
+
+
+def number(words: str, unit: str) -> float:
+    """Read a number.
+
+    Raises:
+        InputError: it is none.
+    """
+    try:
+        return float(words)
+    except ValueError:
+        raise InputError(f"{words.strip()!r} is no number; valid: one in {unit}") from None
+
+
+def vector(words: str, unit: str) -> list[float]:
+    """Read three numbers.
+
+    Raises:
+        InputError: they are not three.
+    """
+    parts = words.replace(",", " ").replace("[", " ").replace("]", " ").split()
+    if len(parts) != 3:
+        raise InputError(f"{words.strip()!r} are {len(parts)} numbers; valid: three in {unit}")
+    return [number(part, unit) for part in parts]
+
+
+def drivers(group: str) -> list[str]:
+    """Names of the drivers that are installed for one kind of device."""
+    return sorted({point.name for point in entry_points(group=group)})
+
+
+def ports() -> list[str]:
+    """Serial ports of this computer, by names that stay the same where there are such."""
+    from serial.tools import list_ports  # takes a while
+
+    there = [p.device for p in list_ports.comports()]
+    folder = Path("/dev/serial/by-id")
+    steady = sorted(folder.iterdir()) if folder.is_dir() else []
+    named = {str(p.resolve()): str(p) for p in steady}
+    return [named.get(device, device) for device in there]
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """One thing that is asked for.
+
+    Attributes:
+        option: that gives it without a question.
+        question: in words.
+        take: puts the answer into a draft.
+        needs: section that must be there for it to be asked.
+        again: whether there may be several.
+        without: what an empty answer means.
+    """
+
+    option: str
+    question: str
+    take: Callable[[Draft, str], None]
+    needs: str = ""
+    again: bool = False
+    without: str = ""
+
+
+def _set(section: str, key: str, read: Callable[[str], object]) -> Callable[[Draft, str], None]:
+    return lambda draft, words: draft.set(section, **{key: read(words)})
+
+
+def _metres(words: str) -> list[float]:
+    return vector(words, "m")
+
+
+def items() -> tuple[Item, ...]:
+    """Return all that is asked for, in order."""
+    trackers, sensors = drivers(devices.TRACKERS), drivers(devices.FORCE_SENSORS)
+    return (
+        Item(
+            "--robot",
+            f"Which arm? One of {', '.join(robot_names())}, or the path of a .urdf file",
+            Draft.robot,
+        ),
+        Item("--host", "Address of its controller", Draft.host, without="not connected yet"),
+        Item(
+            "--tracker",
+            f"Which tracker? {' or '.join(trackers)}",
+            Draft.tracker,
+            without="not connected yet",
+        ),
+        Item(
+            "--tracker-port",
+            "Its serial port",
+            _set("tracker", "port", str),
+            needs="tracker",
+            without="not connected yet",
+        ),
+        Item(
+            "--force-sensor",
+            f"Which force sensor between flange and tool? {' or '.join(sensors)}",
+            Draft.force_sensor,
+            without="none",
+        ),
+        Item(
+            "--force-port",
+            "Its serial port",
+            _set("force_sensor", "port", str),
+            needs="force_sensor",
+            without="the simulated one, for a rehearsal",
+        ),
+        Item(
+            "--target",
+            "Where does the target sit? x, y, z in m, flange axes",
+            _set("tool", "target_m", _metres),
+            without="not known: it is estimated",
+        ),
+        Item(
+            "--load-point",
+            "Where do loads act? x, y, z in m, flange axes",
+            _set("tool", "load_point_m", _metres),
+            without="the flange's centre",
+        ),
+        Item(
+            "--tool-mass",
+            "Mass of the tool in kg",
+            _set("tool", "mass_kg", lambda words: number(words, "kg")),
+            without="0",
+        ),
+        Item(
+            "--tool-com",
+            "Its centre of mass, x, y, z in m, flange axes",
+            _set("tool", "com_m", _metres),
+            needs="tool",
+            without="the flange's centre",
+        ),
+        Item(
+            "--load",
+            f"Which loads are at hand? One at a time, {LOADS}",
+            Draft.add_load,
+            again=True,
+            without="no more",
+        ),
+        Item(
+            "--floor",
+            "What height must arm and load stay above? In m, base axes",
+            Draft.floor,
+            without="no limit",
+        ),
+        Item(
+            "--tracker-place",
+            "Where does the tracker stand, roughly? x, y, z in m, base axes",
+            _set("sight", "tracker_m", _metres),
+            without="not known: sight is not checked",
+        ),
+    )
+
+
+def init(
+    cell: Annotated[Path, typer.Argument(metavar="CELL.toml", help="The file to write.")] = Path(
+        "CELL.toml"
+    ),
+    robot: Annotated[str | None, typer.Option(help="The arm, e.g. ur10e, or a .urdf.")] = None,
+    host: Annotated[str | None, typer.Option(help="Address of its controller.")] = None,
+    tracker: Annotated[str | None, typer.Option(help="The tracker's driver.")] = None,
+    tracker_port: Annotated[str | None, typer.Option(help="Its serial port.")] = None,
+    force_sensor: Annotated[str | None, typer.Option(help="The force sensor's driver.")] = None,
+    force_port: Annotated[str | None, typer.Option(help="Its serial port.")] = None,
+    target: Annotated[
+        str | None, typer.Option(metavar="X,Y,Z", help="The target in flange axes, m.")
+    ] = None,
+    load_point: Annotated[
+        str | None, typer.Option(metavar="X,Y,Z", help="Where loads act, flange axes, m.")
+    ] = None,
+    tool_mass: Annotated[str | None, typer.Option(metavar="KG", help="Of the tool.")] = None,
+    tool_com: Annotated[
+        str | None, typer.Option(metavar="X,Y,Z", help="The tool's centre of mass, m.")
+    ] = None,
+    load: Annotated[
+        list[str] | None, typer.Option(metavar="LOAD", help=f"A load, {LOADS}; repeatable.")
+    ] = None,
+    floor: Annotated[
+        str | None, typer.Option(metavar="Z", help="Height that the arm stays above, m.")
+    ] = None,
+    tracker_place: Annotated[
+        str | None, typer.Option(metavar="X,Y,Z", help="Of the tracker in base axes, m.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Write a commented CELL.toml: asks at a terminal, else takes the options."""
+    t = terminal(as_json)
+    given: dict[str, list[str]] = {
+        f"--{name.replace('_', '-')}": value if isinstance(value, list) else [value]
+        for name, value in locals().items()
+        if name in _OPTIONS and value is not None
+    }
+    there = somebody_there(t) and not as_json
+    if not cell.absolute().parent.is_dir():
+        raise InputError(f"{cell}: no folder {cell.absolute().parent}; make it first")
+    if cell.exists() and not force and not (there and agreed(t, f"{cell} exists. Replace it?")):
+        raise InputError(f"{cell}: the file exists; choose another name or give --force")
+    draft = Draft(cell.absolute().parent)
+    for item in items():
+        if item.option in given:
+            for words in given[item.option]:
+                _from_option(draft, item, words)
+        elif there:
+            _ask(t, draft, item)
+        elif item.option == "--robot":
+            raise InputError(
+                f"--robot is missing, and nobody can be asked; valid: {', '.join(robot_names())}, "
+                "or the path of a .urdf file"
+            )
+    _complete(draft)
+    written = cell_text(draft.data, f"The cell of a {draft.data['robot']['model']}")
+    try:
+        cell.write_text(written, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{cell}: cannot be written ({error.strerror})") from None
+    t.show(text.heading(f"Written: {cell}"))
+    t.show(
+        "Look it over: what was not answered stands there as an example. Then, without any "
+        f"device:\n  hilcal plan {cell} -o plan.json\n"
+        f"  hilcal run {cell} --plan plan.json --rehearse -o rehearsal.hilcal\n"
+        f"and with the devices{_lacking(draft)}:\n  hilcal check {cell} --plan plan.json"
+    )
+    t.document({"cell": str(cell), "config": draft.data})
+
+
+_OPTIONS = frozenset(
+    {
+        *("robot", "host", "tracker", "tracker_port", "force_sensor", "force_port", "target"),
+        *("load_point", "tool_mass", "tool_com", "load", "floor", "tracker_place"),
+    }
+)
+
+
+def _lacking(draft: Draft) -> str:
+    """Say which devices have to be named before the cell can be measured."""
+    keys = {"host": "robot", "driver": "tracker"}
+    wanted = [f"[{s}] {key}" for key, s in keys.items() if key not in draft.data.get(s, {})]
+    return f", once {' and '.join(wanted)} are there" if wanted else ""
+
+
+def _from_option(draft: Draft, item: Item, words: str) -> None:
+    if item.needs and item.needs not in draft.data:
+        raise InputError(f"{item.option} without --{item.needs.replace('_', '-')}; give both")
+    try:
+        item.take(draft, words.strip())
+    except InputError as error:
+        raise InputError(f'{item.option} "{words}": {_shortly(error)}') from None
+
+
+def _ask(t: Terminal, draft: Draft, item: Item) -> None:
+    """Ask until the answer is valid, or empty where that means something."""
+    if item.needs and item.needs not in draft.data:
+        return
+    if item.option.endswith("-port"):
+        found = ports()
+        t.notice("Serial ports here: " + (", ".join(found) if found else "none") + ".")
+    hint = f" (Enter: {item.without})" if item.without else ""
+    question = f"{item.question}{hint}: "
+    while True:
+        t.progress.print(question, end="", markup=False, highlight=False, style="bold")
+        answer = sys.stdin.readline()
+        if not answer:
+            raise StoppedError("nothing is written: the input ended")
+        answer = answer.strip()
+        if not answer and item.without:
+            return
+        try:
+            item.take(draft, answer)
+        except InputError as error:
+            t.notice(f"  Not so: {_shortly(error)}")
+            continue
+        if not item.again:
+            return
+        question = "Another one (Enter: no more): "
+
+
+def _shortly(error: InputError) -> str:
+    return str(error).removeprefix("the answer: ")
+
+
+def _complete(draft: Draft) -> None:
+    """Add what a plan and a rehearsal need, and check the whole."""
+    if not draft.data.get("loads"):
+        draft.set("planning", readings="absolute", model=["encoder_offset"])
+    draft.set("simulation", clock=CLOCK)
+    config = check_section(draft.data, CellConfig, "the cell")
+    check_effects(cell_from_config(config, draft.base_dir), config, installed())

@@ -1,0 +1,163 @@
+"""`init`: a CELL.toml from questions at a terminal, or from options."""
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from hilcal.config import CellConfig, load_config
+from hilcal.config.reference import tables
+from hilcal.config.template import SHOWN
+from tests.support.cli_cases import ok, refused
+from tests.support.screen import AtTerminal
+
+Capsys = pytest.CaptureFixture[str]
+OPTIONS = (
+    *("--robot", "ur10e", "--host", "192.168.56.101", "--tracker", "geocom"),
+    *("--tracker-port", "/dev/ttyUSB0", "--force-sensor", "ft300"),
+    *("--target", "0.06,0.02,0.12", "--load-point", "0.1, 0, 0.15", "--tool-mass", "0.8"),
+    *("--tool-com", "0.01 0 0.06", "--load", "5 kg", "--load", "pull x = 80,0,0 N"),
+    *("--floor", "0.05", "--tracker-place", "3,0.5,0.9"),
+)
+
+
+def test_options_make_a_whole_cell(tmp_path: Path, capsys: Capsys) -> None:
+    path = tmp_path / "CELL.toml"
+    d = ok(capsys, "init", path, *OPTIONS, "--json").document
+    c = load_config(path)
+    assert d["config"]["robot"]["model"] == c.robot.model == "ur10e"
+    assert (c.robot.driver, c.robot.host) == ("ur", "192.168.56.101")
+    assert (c.tracker.driver, c.tracker.port) == ("geocom", "/dev/ttyUSB0")
+    assert c.force_sensor is not None
+    assert (c.force_sensor.driver, c.force_sensor.port) == ("ft300", "simulated")
+    assert (c.tool.target_m, c.tool.load_point_m) == ((0.06, 0.02, 0.12), (0.1, 0.0, 0.15))
+    assert (c.tool.mass_kg, c.tool.com_m) == (0.8, (0.01, 0.0, 0.06))
+    assert [(x.name, x.mass_kg, x.force_N) for x in c.loads] == [
+        ("5kg", 5.0, (0.0, 0.0, 0.0)),
+        ("pull x", 0.0, (80.0, 0.0, 0.0)),
+    ]
+    assert c.limits.workspace_min_m is not None
+    assert c.limits.workspace_min_m[2] == 0.05
+    assert c.sight.tracker_m == (3.0, 0.5, 0.9)
+
+
+@pytest.mark.parametrize("options", [OPTIONS, ("--robot", "ur5e")], ids=["whole", "least"])
+def test_comments_and_examples_are_those_of_the_configuration(
+    options: tuple[str, ...], tmp_path: Path, capsys: Capsys
+) -> None:
+    path = tmp_path / "CELL.toml"
+    ok(capsys, "init", path, *options)
+    text = path.read_text(encoding="utf-8")
+    for t in tables():
+        for key in t.keys if t.name in SHOWN else ():
+            if key.name in SHOWN[t.name] and (t.name != "loads" or "--load" not in options):
+                assert re.search(rf"^#?{key.name} = ", text, re.MULTILINE), key.name
+    used = re.sub(r"^#(?=[\[\w])", "", text, flags=re.MULTILINE)  # every example taken
+    assert used != text
+    CellConfig.model_validate(tomllib.loads(used))
+
+
+@pytest.mark.parametrize(
+    ("options", "poses"),
+    [(OPTIONS, 1), pytest.param(("--robot", "ur5e"), 6, marks=pytest.mark.slow)],
+    ids=["whole", "least"],
+)
+def test_the_file_is_planned_without_an_edit(
+    options: tuple[str, ...], poses: int, tmp_path: Path, capsys: Capsys
+) -> None:
+    path = tmp_path / "CELL.toml"
+    ok(capsys, "init", path, *options)
+    arguments = ("--poses", str(poses), "--quick", "--json")
+    d = ok(capsys, "plan", path, "-o", tmp_path / "plan.json", *arguments).document
+    assert d["efficiency"] > 0
+    assert (tmp_path / "plan.json").is_file()
+
+
+def test_nothing_is_overwritten_unasked(tmp_path: Path, capsys: Capsys) -> None:
+    path = tmp_path / "CELL.toml"
+    path.write_text("mine", encoding="utf-8")
+    assert "the file exists" in refused(capsys, 2, "init", path, "--robot", "ur3")
+    assert path.read_text(encoding="utf-8") == "mine"
+    ok(capsys, "init", path, "--robot", "ur3", "--force")
+    assert load_config(path).robot.model == "ur3"
+    away = tmp_path / "no" / "CELL.toml"
+    assert "make it first" in refused(capsys, 2, "init", away, "--robot", "ur3")
+
+
+WRONG = {
+    "no robot": ((), "--robot is missing, and nobody can be asked; valid: ur10, "),
+    "robot": (("--robot", "ur10f"), '--robot "ur10f": unknown robot "ur10f" (did you mean'),
+    "driver": (("--robot", "ur3", "--tracker", "geocam"), 'is unknown (did you mean "geocom"?)'),
+    "port alone": (("--robot", "ur3", "--force-port", "x"), "--force-port without --force-sensor"),
+    "vector": (("--robot", "ur3", "--target", "1,2"), "--target \"1,2\": '1,2' are 2 numbers"),
+    "number": (("--robot", "ur3", "--floor", "low"), "'low' is no number; valid: one in m"),
+    "mm": (("--robot", "ur3", "--target", "60,20,120"), "is it in m?"),
+    "load": (("--robot", "ur3", "--load", "five"), "'five' is no load; valid: e.g. \"5 kg\""),
+    "load twice": (("--robot", "ur3", "--load", "5 kg", "--load", "5kg"), "names must differ"),
+    "zero": (("--robot", "ur3", "--load", "0 kg"), "is zero"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_wrong_option_is_one_line_and_writes_nothing(
+    case: str, tmp_path: Path, capsys: Capsys
+) -> None:
+    options, said = WRONG[case]
+    assert said in refused(capsys, 2, "init", tmp_path / "CELL.toml", *options)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_person_is_asked_and_wrong_answers_are_explained(tmp_path: Path) -> None:
+    with AtTerminal("init", home=tmp_path) as t:
+        for question, answer, reply in (
+            ("Which arm?", "ur10f", 'did you mean "ur10"?'),
+            ("Which arm?", "ur10e", "Address of its controller"),
+            ("Address of its controller", "", "Which tracker?"),
+            ("Which tracker?", "laser", 'Not so: [tracker] driver = "laser" is unknown'),
+            ("Which tracker?", "geocom", "Serial ports here: "),
+            ("Its serial port", "", "Which force sensor"),
+            ("Which force sensor", "", "Where does the target sit?"),
+            ("Where does the target sit?", "60, 20, 120", "is it in m?"),
+            ("Where does the target sit?", "0.06, 0.02, 0.12", "Where do loads act?"),
+            ("Where do loads act?", "", "Mass of the tool"),
+            ("Mass of the tool", "0.8", "Its centre of mass"),
+            ("Its centre of mass", "", "Which loads are at hand?"),
+            ("Which loads are at hand?", "banana", "'banana' is no load"),
+            ("Which loads are at hand?", "5 kg", "Another one"),
+            ("Another one", "pull y = 0, 60, 0 N", "Another one"),
+            ("Another one", "", "What height"),
+            ("What height", "0.05", "Where does the tracker stand"),
+            ("Where does the tracker stand", "", "Written: CELL.toml"),
+        ):
+            t.sees(question)
+            before = t.text.count(reply)
+            t.types(f"{answer}\n")
+            t.sees(reply, before + 1)
+        assert t.ends() == 0
+        assert max(len(line) for line in t.lines) <= 80
+    c = load_config(tmp_path / "CELL.toml")
+    assert (c.robot.model, c.tracker.driver, c.tool.target_m) == (
+        "ur10e",
+        "geocom",
+        (0.06, 0.02, 0.12),
+    )
+    assert [load.name for load in c.loads] == ["5kg", "pull y"]
+    assert c.force_sensor is None
+
+
+def test_a_person_decides_whether_a_file_is_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "CELL.toml"
+    path.write_text("mine", encoding="utf-8")
+    with AtTerminal("init", home=tmp_path) as t:
+        t.sees("CELL.toml exists. Replace it?")
+        t.types("n\n")
+        assert t.ends() == 2
+    assert path.read_text(encoding="utf-8") == "mine"
+    with AtTerminal("init", "--robot", "ur3", home=tmp_path) as t:
+        t.sees("Replace it?")
+        t.types("y\n")
+        t.sees("Address of its controller")
+        t.types("\x03")  # Ctrl-C: nothing is written
+        assert t.ends() == 130
+    assert path.read_text(encoding="utf-8") == "mine"
