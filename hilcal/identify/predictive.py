@@ -13,9 +13,9 @@ precision,
 
     C = (AᵀA/σ² + Λ)⁻¹,    Cov(prediction) = κ (σ² V + J C Jᵀ)
 
-where κ, at least 1, makes the mean leave-one-out variance σ² tr (1 − H)⁻¹/m, H (m, m) the leverage
-of a measurement, equal to the mean square
-that was found on poses left out: a misfit is no noise, and repeats itself in new poses.
+where κ, at least 1, makes the mean variance on a pose left out, σ² tr (1 − H)⁻¹/R, H (R, R) the
+leverage of its R rows, equal to the mean square that was found on poses left out: a misfit is no
+noise, and repeats itself in new poses.
 """
 
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ from hilcal.identify.holdout import ordinary
 from hilcal.identify.priors import prior_of
 from hilcal.identify.residual import residual
 from hilcal.model import Model, Prediction
-from hilcal.types import Floats
+from hilcal.types import Floats, Ints
 
 ITERATIONS = 20
 """Fixed-point iterations of the noise factor; it converges within a few."""
@@ -51,6 +51,7 @@ class Predictive:
         factor: κ.
         leverage: (D,) largest eigenvalue of a fitted measurement's leverage: variance of the
             prediction over that of the noise.
+        left_out: mean variance of the predictions of poses left out by C, in units of the noise.
     """
 
     model: Model
@@ -59,6 +60,7 @@ class Predictive:
     noise: float
     factor: float
     leverage: Floats
+    left_out: float
 
     def of_prediction(self, prediction: Prediction, w: Whitening) -> Floats:
         """Return κ J C Jᵀ (D, m, m) of predicted measurements."""
@@ -102,10 +104,23 @@ def predictive(
     for k in range(0, len(a), CHUNK * w.m):
         part = (a[k : k + CHUNK * w.m] @ root).reshape(-1, w.m, len(root))
         shares.append(np.linalg.eigvalsh(part @ np.swapaxes(part, 1, 2)) / noise)
-    leverage = np.clip(np.concatenate(shares), 0.0, MOST_LEVERAGE)
+    leverage = np.clip(np.concatenate(shares), 0.0, MOST_LEVERAGE).max(axis=1)
+    left_out = _left_out(a, root, w.rows_of(fitted.pose[w.reading]), noise)
     root *= std[:, None]
-    factor = max(1.0, left_out_sigma**2 / float(np.mean(noise / (1 - leverage))))
-    return Predictive(model, theta, root @ root.T, noise, factor, leverage.max(axis=1))
+    factor = max(1.0, left_out_sigma**2 / (noise + left_out))
+    return Predictive(model, theta, root @ root.T, noise, factor, leverage, left_out)
+
+
+def _left_out(a: Floats, root: Floats, pose: Ints, noise: float) -> float:
+    """Mean variance of the rows (R, P) of each pose, predicted without it, beside the noise."""
+    order = np.argsort(pose, kind="stable")
+    total = 0.0
+    for mine in np.split(order, np.flatnonzero(np.diff(pose[order])) + 1):
+        part = a[mine] @ root
+        small = part @ part.T if len(part) < len(root) else part.T @ part
+        h = np.clip(np.linalg.eigvalsh(small) / noise, 0.0, MOST_LEVERAGE)
+        total += noise * float(np.sum(h / (1 - h)))
+    return total / max(len(a), 1)
 
 
 def open_prior(model: Model, theta: Floats, prior: Floats) -> Floats:
