@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 __version__ = "0.1.0"
 
 _PLACES = {
+    "Calibration": "hilcal.calibration.calibration",
     "Campaign": "hilcal.campaign",
     "CannotAnswerError": "hilcal.errors",
     "Catalogue": "hilcal.effects.catalogue",
@@ -49,6 +50,7 @@ _PLACES = {
 __all__ = ["__version__", *_PLACES]
 
 if TYPE_CHECKING:
+    from hilcal.calibration.calibration import Calibration
     from hilcal.campaign import Campaign
     from hilcal.cell import Cell
     from hilcal.data.readings import Readings, States

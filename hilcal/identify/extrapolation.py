@@ -85,13 +85,17 @@ def extrapolation(p: Predictive, fitted: Readings, found: Validation) -> Extrapo
     root = inverse_root(noise)
     leverage = np.linalg.eigvalsh(root @ spread @ np.swapaxes(root, 1, 2))[:, -1]
     outside = np.zeros(len(w.reading), dtype=np.bool_)
-    variables = []
-    for name, unit, before, after in _variables(fitted, other):
+    beyond_any = []
+    known = {name: values for name, _, values in variables(fitted.states)}
+    for name, unit, after in variables(other.states):
+        before = known.get(name)
+        if before is None:
+            continue
         low, high = float(before.min()), float(before.max())
         beyond = np.maximum(after - high, low - after)[w.reading]
         far = beyond > MARGIN * (high - low) + 1e-9 * max(abs(low), abs(high), 1.0)
         if far.any():
-            variables.append(
+            beyond_any.append(
                 Beyond(name, unit, low, high, int(far.sum()), float(beyond[far].max()))
             )
         outside |= far
@@ -99,12 +103,12 @@ def extrapolation(p: Predictive, fitted: Readings, found: Validation) -> Extrapo
     far = leverage > max(limit, 1e-12)
     if far.any():
         most = float(leverage.max() - limit)
-        variables.append(Beyond("leverage", "1", 0.0, limit, int(far.sum()), most))
+        beyond_any.append(Beyond("leverage", "1", 0.0, limit, int(far.sum()), most))
     outside |= far
     white = np.einsum("dij,dj->di", inverse_root(total), found.raw)
     return Extrapolation(
         outside=outside,
-        variables=tuple(sorted(variables, key=lambda v: -v.count)),
+        variables=tuple(sorted(beyond_any, key=lambda v: -v.count)),
         stated_m=np.sqrt(np.trace(total[:, :3, :3], axis1=1, axis2=2)),
         z=np.sqrt(np.mean(white**2, axis=1)),
         inside_error=_error(found.raw, w, ~outside),
@@ -112,24 +116,17 @@ def extrapolation(p: Predictive, fitted: Readings, found: Validation) -> Extrapo
     )
 
 
-def _variables(fitted: Readings, other: Readings) -> Iterator[tuple[str, str, Floats, Floats]]:
-    """Yield name, unit, and the values (N,) at the fitted and at the other readings."""
-    a, b = fitted.states, other.states
-    for j in range(a.q.shape[1]):
-        yield f"joint {j + 1} angle", "rad", a.q[:, j], b.q[:, j]
+def variables(s: States) -> Iterator[tuple[str, str, Floats]]:
+    """Yield name, unit, and the values (N,) of what a prediction may extrapolate in."""
+    for j in range(s.q.shape[1]):
+        yield f"joint {j + 1} angle", "rad", s.q[:, j]
     for name, unit, part in (("force", "N", slice(0, 3)), ("moment", "N·m", slice(3, 6))):
-        size = [np.linalg.norm(s.wrench[:, part], axis=1) for s in (a, b)]
-        yield name, unit, size[0], size[1]
-    yield from _temperatures(a, b)
-
-
-def _temperatures(a: States, b: States) -> Iterator[tuple[str, str, Floats, Floats]]:
-    if a.air_temperature is not None and b.air_temperature is not None:
-        yield "air temperature", "K", a.air_temperature, b.air_temperature
-    if a.joint_temperature is not None and b.joint_temperature is not None:
-        for j in range(a.joint_temperature.shape[1]):
-            before, after = a.joint_temperature[:, j], b.joint_temperature[:, j]
-            yield f"joint {j + 1} temperature", "K", before, after
+        yield name, unit, np.linalg.norm(s.wrench[:, part], axis=1)
+    if s.air_temperature is not None:
+        yield "air temperature", "K", s.air_temperature
+    if s.joint_temperature is not None:
+        for j in range(s.joint_temperature.shape[1]):
+            yield f"joint {j + 1} temperature", "K", s.joint_temperature[:, j]
 
 
 def _error(raw: Floats, w: Whitening, mine: Bools) -> ErrorBlock | None:

@@ -1,0 +1,283 @@
+"""An identified arm, ready for use: `predict` and `compensate`, without campaign or devices.
+
+The true position of the tool differs from the prediction by
+
+    Σ = κ J C Jᵀ + s² 1 + J_q Σ_q J_qᵀ
+
+C the covariance of the parameters, what a family does at places that nobody measured included (see
+`identify.predictive`); κ ≥ 1 what poses left out were farther off than by C; s² the misfit of the
+fit, where χ² is larger than chance allows; Σ_q the arm's scatter from one arrival to the next.
+
+Of a fit to deflections only what the load does is known: errors are then counted from the unloaded
+arm.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from hilcal.calibration.compensation import Pose, invert
+from hilcal.calibration.measured import Measured
+from hilcal.calibration.poses import Compensation, ToolPoses
+from hilcal.calibration.scatter import Scatter, scatter_of
+from hilcal.calibration.tool import Tool, one_of_each, tool_of, tool_poses
+from hilcal.data.readings import States
+from hilcal.data.whitening import Mode
+from hilcal.diagnose.noise_verdict import MISFIT_ALARM
+from hilcal.effects.catalogue import Catalogue
+from hilcal.errors import InputError
+from hilcal.identify.fit import Fit
+from hilcal.identify.predictive import predictive
+from hilcal.model import Model, Prediction
+from hilcal.robot import se3
+from hilcal.robot.chain import evaluate
+from hilcal.types import Floats, Ints
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """A fitted model with what is known of it.
+
+    >>> with hc.Campaign.open(RUN) as run:
+    ...     found = hc.fit(hc.baseline(run.cell, run.readings), run.readings)
+    >>> calibration = hc.Calibration.of(found)
+    >>> q = run.readings.states.q[:3]
+    >>> found = calibration.compensate(q, [0, 0, -50, 0, 0, 0])
+    >>> bool(found.after.error_m.max() < 1e-9), found.q.shape
+    (True, (3, 6))
+
+    Attributes:
+        model: the fitted model.
+        theta: (P,) its parameters.
+        mode: kind of readings that it was fitted to.
+        root: (P, K) R with κ C = R Rᵀ.
+        misfit: s², m².
+        scatter: the arm's scatter.
+        measured: where the fitted readings lie.
+        loads: (6,) wrench at the load point, base axes, by the name of a load of the cell.
+        source: what it is from, for people.
+    """
+
+    model: Model
+    theta: Floats
+    mode: Mode
+    root: Floats
+    misfit: float
+    scatter: Scatter
+    measured: Measured
+    loads: Mapping[str, Floats]
+    source: Mapping[str, Any]
+    _tracked: Tool = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        """Keep the tracked target as the usual tool."""
+        object.__setattr__(self, "_tracked", tool_of(self.model, self.theta, None))
+
+    @classmethod
+    def of(cls, found: Fit, source: Mapping[str, Any] | None = None) -> "Calibration":
+        """Make a calibration of a fit.
+
+        Args:
+            found: the fit.
+            source: what it is from, for people.
+
+        Raises:
+            InputError: a fit of another scaling than gc.
+        """
+        if found.scaling != "gc":
+            raise InputError(f"a calibration needs scaling gc, this fit has {found.scaling}")
+        used, model = found.readings[~found.outlier], found.model
+        left_out = found.holdout.rms_sigma
+        p = predictive(model, found.theta, found.solution.prior, used, found.mode, left_out)
+        values, vectors = np.linalg.eigh(p.covariance)
+        noise = np.trace(found.whitening.covariance[:, :3, :3], axis1=1, axis2=2)
+        misfits = float(chi2.sf(found.chi2, found.dof)) < MISFIT_ALARM
+        noisy = max(p.noise, 1.0)
+        kappa = max(1.0, (left_out**2 - noisy) / max(p.left_out, 1e-12))
+        # A deflection is the difference of two readings.
+        readings = 2 if found.mode == "deflection" else 1
+        loads = () if model.cell.config is None else model.cell.config.loads
+        return cls(
+            model=replace(model, readings=None),
+            theta=found.theta,
+            mode=found.mode,
+            root=vectors * np.sqrt(kappa * np.maximum(values, 0.0)),
+            misfit=(noisy - 1.0) * misfits * float(noise.mean()) / 3 / readings,
+            scatter=scatter_of(found.readings, model.cell),
+            measured=Measured.of(used.states, p, noise),
+            loads={load.name: load.wrench(model.cell.gravity) for load in loads},
+            source=dict(source or {}),
+        )
+
+    @classmethod
+    def load(cls, path: str | Path, catalogue: Catalogue | None = None) -> "Calibration":
+        """Read a calibration file.
+
+        Args:
+            path: the file.
+            catalogue: has its effects; the installed ones unless given.
+
+        Raises:
+            InputError: no calibration, or one with effects that are not at hand.
+        """
+        from hilcal.calibration.storage import read
+
+        return read(Path(path), catalogue)
+
+    def save(self, path: str | Path) -> None:
+        """Write it as one JSON file, which needs nothing else to be loaded."""
+        from hilcal.calibration.storage import write
+
+        write(self, Path(path))
+
+    def predict(
+        self,
+        q: Floats,
+        wrench: Floats | None = None,
+        *,
+        tool: Floats | None = None,
+        std: bool = True,
+        recorded: Mapping[str, Floats] | None = None,
+    ) -> ToolPoses:
+        """Say where the tool is.
+
+        Args:
+            q: (n,) or (N, n) joint values, rad.
+            wrench: (6,) or (N, 6) force and moment of the load at the load point, base axes; none
+                where None.
+            tool: (4, 4) T_flange_tool; the tracked target where None.
+            std: also state the uncertainty, and whether points lie far from what was measured.
+            recorded: other columns of `States` by name: `air_temperature`, `load_time`, ...
+
+        Raises:
+            InputError: another shape, or a column is missing that the model needs.
+        """
+        states, of = self._states(q, wrench, recorded), self._tool(tool)
+        return self._poses(of, states, self._nominal(of, states), std)
+
+    def compensate(
+        self,
+        q: Floats,
+        wrench: Floats | None = None,
+        *,
+        tool: Floats | None = None,
+        wanted: Floats | None = None,
+        std: bool = True,
+        recorded: Mapping[str, Floats] | None = None,
+    ) -> Compensation:
+        """Find the joint values that put the tool where it is asked to be.
+
+        Args:
+            q: (n,) or (N, n) joint values, rad; the nominal arm has the tool there. Those found
+                are on their branch.
+            wrench: as for `predict`.
+            tool: as for `predict`.
+            wanted: (4, 4) or (N, 4, 4) T_base_tool to go to instead.
+            std: as for `predict`.
+            recorded: as for `predict`.
+
+        Raises:
+            InputError: as for `predict`.
+        """
+        states, of = self._states(q, wrench, recorded), self._tool(tool)
+        rotation, position = self._nominal(of, states)
+        if wanted is not None:
+            given = np.broadcast_to(np.asarray(wanted, dtype=float), (len(states), 4, 4))
+            rotation, position = given[:, :3, :3], given[:, :3, 3]
+
+        def poses(at: Floats, points: Ints) -> Pose:
+            prediction = of.model.predict(replace(states[points], q=at), of.theta)
+            return (*tool_poses(of, prediction), prediction.situation.chain)
+
+        arm = self.model.cell.arm
+        found = invert(arm, poses, states.q, rotation, position)
+        return Compensation(
+            inverse=found,
+            before=self._poses(of, states, (rotation, position), std=False),
+            after=self._poses(of, replace(states, q=found.q), (rotation, position), std),
+            limits=(found.q < arm.q_min) | (found.q > arm.q_max),
+        )
+
+    def tool_pose(self, tool: Floats | None = None) -> Floats:
+        """(4, 4) T_flange_tool: as given, or the tracked target as fitted."""
+        return self._tool(tool).pose
+
+    def _tool(self, pose: Floats | None) -> Tool:
+        """Return the tool with a pose on the flange; raises as `predict` does."""
+        if pose is None:
+            return self._tracked
+        pose = np.asarray(pose, dtype=float)
+        turn = pose[:3, :3] if pose.shape == (4, 4) else np.zeros((3, 3))
+        if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-6) or np.linalg.det(turn) < 0:
+            raise InputError("tool is no (4, 4) pose on the flange: a rotation and a position")
+        return tool_of(self.model, self.theta, pose)
+
+    def _states(
+        self, q: Floats, wrench: Floats | None, recorded: Mapping[str, Floats] | None
+    ) -> States:
+        """Return the points as states; raises as `predict` does."""
+        n, every = self.model.cell.arm.n, one_of_each(self.model.cell)
+        q = np.atleast_2d(np.asarray(q, dtype=float))
+        if q.shape[1:] != (n,) or not len(q):
+            raise InputError(f"q has shape {q.shape}; valid: ({n},) or (N, {n})")
+        given = {"wrench": np.zeros(6) if wrench is None else wrench, **(recorded or {})}
+        columns = {}
+        for name, value in given.items():
+            kind = None if name == "q" else getattr(every, name, None)
+            if kind is None:
+                raise InputError(f"{name}: no column of hilcal.States that a prediction takes")
+            shape, values = (len(q), *kind.shape[1:]), np.asarray(value, dtype=float)
+            if values.shape not in (shape, shape[1:]):
+                raise InputError(f"{name} has shape {values.shape}; valid: {shape} or {shape[1:]}")
+            columns[name] = np.array(np.broadcast_to(values, shape))
+        for name, column in {"q": q, **columns}.items():
+            if not np.isfinite(column).all():
+                raise InputError(f"{name} has values that are not finite")
+        states = States(q, **columns)
+        for e in self.model.effects:
+            if not e.computable(states):
+                raise InputError(
+                    f"the model has {e.name}, which needs {', '.join(e.needs)}; give it"
+                )
+        return states
+
+    def _nominal(self, of: Tool, states: States) -> tuple[Floats, Floats]:
+        """Orientation and position of the tool that errors are counted from."""
+        if self.mode == "deflection":
+            unloaded = replace(states, wrench=np.zeros((len(states), 6)))
+            return tool_poses(of, of.model.predict(unloaded, of.theta))
+        chain = evaluate(of.model.cell.arm, states.q)
+        rotation = se3.product(chain.rotation[-1], of.pose[:3, :3])
+        return rotation, chain.point(of.pose[:3, 3])
+
+    def _poses(
+        self, of: Tool, states: States, nominal: tuple[Floats, Floats], std: bool
+    ) -> ToolPoses:
+        prediction = of.model.predict(states, of.theta)
+        rotation, position = tool_poses(of, prediction)
+        known = covariance = None
+        if std:
+            known = self._by_parameters(of, states, prediction)
+            scatter = self.scatter.covariance(of.model.cell, prediction.situation.chain, position)
+            covariance = known + scatter + self.misfit * np.eye(3)
+            known = np.sqrt(np.trace(known, axis1=1, axis2=2))
+        outside = tuple(self.measured.outside(states, known))
+        return ToolPoses(position, rotation, nominal[1], nominal[0], covariance, outside)
+
+    def _by_parameters(self, of: Tool, states: States, prediction: Prediction) -> Floats:
+        """(N, 3, 3) κ J C Jᵀ of the position, base axes, m²."""
+        spread = self._spread(of, prediction)
+        if self.mode == "deflection":
+            unloaded = replace(states, wrench=np.zeros((len(states), 6)))
+            spread = spread - self._spread(of, of.model.predict(unloaded, of.theta))
+        return spread @ np.swapaxes(spread, 1, 2)
+
+    def _spread(self, of: Tool, prediction: Prediction) -> Floats:
+        """(N, 3, K) J R of the position, base axes."""
+        jacobian = of.model.jacobian(prediction, of.theta, 3)
+        jacobian = np.swapaxes(prediction.observation.axes, 1, 2) @ jacobian
+        return np.asarray(jacobian @ self.root[of.kept])

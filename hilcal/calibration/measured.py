@@ -1,0 +1,99 @@
+"""What a calibration was measured at, and which points lie outside of it."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from hilcal.data.readings import States
+from hilcal.identify.extrapolation import FAR, MARGIN, variables
+from hilcal.identify.predictive import Predictive
+from hilcal.types import Bools, Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Range:
+    """Values of one variable in the fitted readings; SI."""
+
+    variable: str
+    unit: str
+    low: float
+    high: float
+
+    def beyond(self, values: Floats) -> Bools:
+        """Which values are outside, by more than `MARGIN` of the range."""
+        allowed = MARGIN * (self.high - self.low) + 1e-9 * max(abs(self.low), abs(self.high), 1.0)
+        return np.asarray(np.maximum(values - self.high, self.low - values) > allowed)
+
+
+@dataclass(frozen=True, slots=True)
+class Outside:
+    """Points outside of what was measured.
+
+    Attributes:
+        of: the range that they leave; for the uncertainty, its limit, m.
+        points: (N,) which points.
+        values: (N,) their values.
+    """
+
+    of: Range
+    points: Bools
+    values: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """Where the fitted readings lie.
+
+    Attributes:
+        ranges: of joint angles, force, moment, temperatures.
+        most_std_m: standard deviation of a prediction, by the parameters alone, from which on a
+            point is far from all fitted ones; see `identify.extrapolation`. For the tracked target.
+    """
+
+    ranges: tuple[Range, ...]
+    most_std_m: float
+
+    @classmethod
+    def of(cls, states: States, p: Predictive, noise: Floats) -> "Measured":
+        """Return where fitted states lie.
+
+        Args:
+            states: of the fitted readings.
+            p: what the fit knows of others.
+            noise: (D,) trace of the position's noise covariance of each measurement, m².
+        """
+        ranges = (
+            Range(name, unit, float(v.min()), float(v.max())) for name, unit, v in variables(states)
+        )
+        spread = p.factor * p.noise * noise * p.leverage / (1 - p.leverage)
+        return cls(tuple(ranges), float(np.sqrt(FAR * np.quantile(spread, 0.99))))
+
+    def outside(self, states: States, std_m: Floats | None) -> list[Outside]:
+        """Return what points leave, by variable.
+
+        Args:
+            states: N points.
+            std_m: (N,) standard deviation of the predictions; None where it is not known.
+        """
+        known = {r.variable: r for r in self.ranges}
+        found = [
+            Outside(known[name], known[name].beyond(values), values)
+            for name, _, values in variables(states)
+            if name in known
+        ]
+        if std_m is not None:
+            limit = Range("standard deviation of the position", "m", 0.0, self.most_std_m)
+            found.append(Outside(limit, std_m > self.most_std_m, std_m))
+        return [o for o in found if o.points.any()]
+
+    def to_json(self) -> dict[str, object]:
+        """Return it as JSON, SI."""
+        return asdict(self)
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> "Measured":
+        """Return what `to_json` wrote."""
+        ranges = tuple(Range(**r) for r in content["ranges"])
+        return cls(ranges, float(content["most_std_m"]))

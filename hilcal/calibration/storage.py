@@ -1,0 +1,182 @@
+"""A calibration as one JSON file: everything that predicting and compensating needs.
+
+The covariance factor is stored as 32-bit floats, each row scaled by its parameter's standard
+deviation; everything else as decimal numbers, exactly.
+"""
+
+import base64
+import json
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hilcal import __version__
+from hilcal.calibration.calibration import Calibration
+from hilcal.calibration.measured import Measured
+from hilcal.calibration.scatter import Scatter
+from hilcal.calibration.tool import one_of_each
+from hilcal.cell import Cell
+from hilcal.data.whitening import MODES
+from hilcal.effects.catalogue import Catalogue, installed
+from hilcal.errors import InputError
+from hilcal.model import Model
+from hilcal.robot.arm import Arm
+from hilcal.types import Floats
+
+FORMAT, VERSION = "hilcal-calibration", 1
+_CELL = ("target", "load_point", "tool_mass", "tool_com", "gravity", "registration", "targets")
+
+
+def write(c: Calibration, path: Path) -> None:
+    """Write a calibration to a file.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    content = json.dumps(to_json(c), indent=1, allow_nan=False)
+    try:
+        path.write_text(content + "\n", encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+
+
+def read(path: Path, catalogue: Catalogue | None = None) -> Calibration:
+    """Read a calibration from a file.
+
+    Raises:
+        InputError: see `from_json`; or the file cannot be read.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: no calibration: {error}") from None
+    try:
+        return from_json(content, catalogue)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{path}: a damaged calibration: {error!r}") from None
+
+
+def to_json(c: Calibration) -> dict[str, object]:
+    """Return a calibration as JSON, SI."""
+    cell = c.model.cell
+    std = np.sqrt(np.einsum("pk,pk->p", c.root, c.root))
+    scaled = c.root / np.where(std > 0, std, 1.0)[:, None]
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "hilcal": __version__,
+        "source": dict(c.source),
+        "readings": c.mode,
+        "arm": {f.name: _plain(getattr(cell.arm, f.name)) for f in fields(cell.arm)},
+        "cell": {
+            **{name: _plain(getattr(cell, name)) for name in _CELL},
+            "target_names": list(cell.target_names),
+            "known_targets": list(cell.known_targets),
+            "registration_known": cell.registration_known,
+        },
+        "effects": [{"name": e.name, "options": _plain(dict(e.options))} for e in c.model.effects],
+        "parameters": [f"{e.name}.{p.name}" for e in c.model.effects for p in e.parameters],
+        "theta": c.theta.tolist(),
+        "std": std.tolist(),
+        "covariance_root": base64.b64encode(scaled.astype("<f4").tobytes()).decode("ascii"),
+        "misfit_m2": c.misfit,
+        "scatter": c.scatter.to_json(),
+        "measured": c.measured.to_json(),
+        "loads": {name: wrench.tolist() for name, wrench in c.loads.items()},
+    }
+
+
+def from_json(content: Mapping[str, Any], catalogue: Catalogue | None = None) -> Calibration:
+    """Return the calibration that `to_json` wrote.
+
+    Raises:
+        InputError: another kind of document, a newer version, or an effect that is not at hand.
+    """
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise InputError(f'no calibration; valid: a JSON document with "format": "{FORMAT}"')
+    if content["version"] != VERSION:
+        raise InputError(
+            f"a calibration of version {content['version']}, written by hilcal "
+            f"{content['hilcal']}; this program reads version {VERSION}"
+        )
+    known = catalogue or installed()
+    cell = _cell(content["cell"], _arm(content["arm"]))
+    effects = []
+    for e in content["effects"]:
+        if e["name"] not in known.names:
+            raise InputError(
+                f"it has the effect {e['name']}, which is not in the catalogue; give the file "
+                "that defines it: --effects-from FILE.py"
+            )
+        effects.append(known.make(e["name"], cell, one_of_each(cell), e["options"]))
+    model = Model(cell, tuple(effects), known)
+    names = [f"{e.name}.{p.name}" for e in effects for p in e.parameters]
+    if names != content["parameters"]:
+        raise InputError(
+            f"written by hilcal {content['hilcal']}, whose effects have other parameters"
+        )
+    theta, std = (np.array(content[k], dtype=float) for k in ("theta", "std"))
+    root = np.frombuffer(base64.b64decode(content["covariance_root"]), dtype="<f4")
+    return Calibration(
+        model=model,
+        theta=theta,
+        mode=MODES[MODES.index(content["readings"])],
+        root=root.reshape(len(std), -1).astype(float) * std[:, None],
+        misfit=float(content["misfit_m2"]),
+        scatter=Scatter.from_json(content["scatter"]),
+        measured=Measured.from_json(content["measured"]),
+        loads={name: _array(wrench) for name, wrench in content["loads"].items()},
+        source=content["source"],
+    )
+
+
+def _arm(content: Mapping[str, Any]) -> Arm:
+    """Return an arm as it was stored."""
+    given = {f.name: content[f.name] for f in fields(Arm)}
+    for name, value in given.items():
+        if isinstance(value, list):
+            words = name in ("joint_names", "notes")
+            given[name] = tuple(value) if words else _array(value)
+    return Arm(**given)
+
+
+def _cell(content: Mapping[str, Any], arm: Arm) -> Cell:
+    """Return a cell as it was stored."""
+    cell = Cell(
+        arm=arm,
+        target=_array(content["target"]),
+        load_point=_array(content["load_point"]),
+        tool_mass=float(content["tool_mass"]),
+        tool_com=_array(content["tool_com"]),
+        gravity=_array(content["gravity"]),
+        registration=_array(content["registration"]),
+        registration_known=bool(content["registration_known"]),
+        target_known=all(content["known_targets"]),
+    )
+    if content["targets"] is None:
+        return cell
+    several = replace(
+        cell, targets=_array(content["targets"]), target_names=tuple(content["target_names"])
+    )
+    return several.with_targets(_array(content["targets"]), content["known_targets"])
+
+
+def _array(value: object) -> Floats:
+    """Return numbers as an array; "inf" and "-inf" are among them."""
+    return np.array(value, dtype=float)
+
+
+def _plain(value: Any) -> Any:
+    """Return arrays and tuples as lists, infinite numbers, which JSON lacks, as text."""
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, float) and np.isinf(value):
+        return str(value)
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items()}
+    return [_plain(v) for v in value] if isinstance(value, tuple | list) else value

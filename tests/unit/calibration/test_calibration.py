@@ -1,0 +1,234 @@
+"""A calibration: predicted and compensated poses against the world's own mechanics."""
+
+import json
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import hilcal as hc
+from hilcal.calibration.calibration import Calibration
+from hilcal.calibration.poses import band
+from hilcal.calibration.scatter import Scatter
+from hilcal.calibration.storage import from_json, to_json
+from hilcal.calibration.tool import tool_poses
+from hilcal.data.readings import States
+from hilcal.data.whitening import Mode
+from hilcal.errors import InputError
+from hilcal.identify.baseline import baseline
+from hilcal.identify.fit import fit
+from hilcal.robot import se3
+from hilcal.robot.chain import evaluate, joint_jacobian
+from hilcal.types import Floats
+from tests.support.campaigns import campaign, plan
+
+POSES = 24
+
+
+@cache
+def calibrated(effect: str, mode: Mode = "absolute", seed: int = 0) -> Calibration:
+    c = campaign(effect, mode, seed, poses=POSES)
+    model = baseline(c.cell, c.readings, mode)
+    if effect != "none":
+        model = model + model.catalogue.make(effect, c.cell, c.readings.states)
+    return Calibration.of(fit(model, c.readings, mode), {"campaign": "made"})
+
+
+def fresh(seed: int = 0, load: int = 1) -> States:
+    """Poses that were never fitted, under one load."""
+    p = plan(40, 5000 + seed)
+    return p.states[np.flatnonzero(p.load == load)]
+
+
+def achieved(c: Calibration, effect: str, seed: int, states: States, goal: Floats) -> Floats:
+    """(N, 3) by how much the world's tool misses a goal (N, 3) in base axes of the fit."""
+    world = campaign(effect, c.mode, seed, poses=POSES).world
+    rng = np.random.default_rng(seed)
+    scattered = states.q + rng.standard_normal(states.q.shape) * world.joint_std
+    read = world.sight(replace(states, q=scattered)).value(3)
+    prediction = c.model.predict(states, c.theta)
+    axes = prediction.observation.axes
+    position = tool_poses(c._tracked, prediction)[1]
+    wanted = prediction.observation.position + np.einsum("nij,nj->ni", axes, goal - position)
+    return np.asarray(read - wanted)
+
+
+@pytest.mark.parametrize("effect", ["joint_tilt_compliance", "link_geometry", "transmission_error"])
+def test_the_world_is_where_it_was_asked_to_be(effect: str) -> None:
+    c, states = calibrated(effect), fresh()
+    k = c.compensate(states.q, states.wrench)
+    good = k.usable
+    assert good.mean() > 0.6
+    before = achieved(c, effect, 0, states, k.before.nominal_position)[good]
+    after = achieved(c, effect, 0, replace(states, q=k.q), k.after.nominal_position)[good]
+    scatter = c.scatter.covariance(c.model.cell, evaluate(c.model.cell.arm, k.q), k.after.position)
+    floor = np.mean(np.trace(scatter[good], axis1=1, axis2=2))
+    left = max(np.mean(np.sum(after**2, axis=1)) - floor, 0.0)
+    assert left < 0.05**2 * (np.mean(np.sum(before**2, axis=1)) - floor)
+    assert np.mean(np.linalg.norm(after, axis=1) <= k.after.band_m[good]) > 0.85
+    assert np.sqrt(np.mean(np.sum(after**2, axis=1) / k.after.std_m[good] ** 2)) < 1.2
+
+
+def test_deflections_are_compensated_to_the_unloaded_arm() -> None:
+    c, states = calibrated("joint_tilt_compliance", "deflection"), fresh()
+    k = c.compensate(states.q, states.wrench)
+    still = replace(states, wrench=0 * states.wrench)
+    world = campaign("joint_tilt_compliance", "deflection", 0, poses=POSES).world
+    unloaded = world.sight(still).value(3)
+    before, after = (
+        np.linalg.norm(world.sight(replace(states, q=q)).value(3) - unloaded, axis=1)
+        for q in (states.q, k.q)
+    )
+    assert before.mean() > 2e-4
+    assert after.mean() < 0.05 * before.mean()
+    np.testing.assert_allclose(k.before.error_m, before, atol=1e-4)
+    nothing = c.compensate(states.q)
+    np.testing.assert_allclose(nothing.q, states.q, atol=1e-9)
+    assert nothing.before.error_m.max() < 1e-12
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.lists(st.floats(-2.5, 2.5), min_size=6, max_size=6),
+    st.lists(st.floats(-100, 100), min_size=3, max_size=3),
+    st.lists(st.floats(-0.3, 0.3), min_size=6, max_size=6),
+)
+def test_predicting_what_was_inverted_returns_the_wanted_pose(
+    q: list[float], force: list[float], tool: list[float]
+) -> None:
+    c = calibrated("joint_tilt_compliance")
+    pose = se3.matrix(se3.rotation(np.array(tool[3:])), np.array(tool[:3]))
+    wrench = np.array([*force, 0.0, 0.0, 0.0])
+    k = c.compensate(np.array(q), wrench, tool=pose, std=False)
+    chain = evaluate(c.model.cell.arm, np.array([q]))
+    jacobian = joint_jacobian(chain, chain.position[-1])[0]
+    if np.linalg.svd(jacobian)[1][-1] < 0.03:  # near the limit of its reach
+        return
+    assert k.inverse.solved.all()
+    again = c.predict(k.q, wrench, tool=pose, std=False)
+    np.testing.assert_allclose(again.position, chain.point(pose[:3, 3]), atol=1e-9)
+    turn = chain.rotation[-1] @ pose[:3, :3]
+    np.testing.assert_allclose(again.rotation, turn, atol=1e-9)
+
+
+def test_a_wanted_pose_is_reached_from_joint_values_nearby() -> None:
+    c, q = calibrated("none"), fresh().q[:5]
+    wanted = se3.matrix(*(x[:5] for x in nominal(c, q)))
+    k = c.compensate(q + 0.05, wanted=wanted, std=False)
+    np.testing.assert_allclose(k.q, c.compensate(q, std=False).q, atol=1e-8)
+
+
+def nominal(c: Calibration, q: Floats) -> tuple[Floats, Floats]:
+    chain = evaluate(c.model.cell.arm, q)
+    pose = c.tool_pose()
+    return se3.product(chain.rotation[-1], pose[:3, :3]), chain.point(pose[:3, 3])
+
+
+@pytest.mark.parametrize("effect", [e.name for e in hc.installed().effects])
+def test_a_calibration_comes_back_from_its_file(effect: str, tmp_path: Path) -> None:
+    c = campaign("joint_tilt_compliance", "absolute", 0, poses=POSES)
+    states = replace(
+        c.readings.states,
+        **{
+            name: np.broadcast_to(20.0, np.shape(value)).copy()
+            for name, value in {
+                "air_temperature": c.readings.states.time,
+                "joint_temperature": c.readings.states.q,
+            }.items()
+        },
+    )
+    readings = replace(c.readings, states=states)
+    cell = replace(c.cell, target_known=False) if effect == "target_offset" else c.cell
+    model = baseline(cell, readings, "absolute")
+    if effect not in model.names:
+        model = model + model.catalogue.make(effect, c.cell, states)
+    calibration = Calibration.of(fit(model, readings, "absolute"))
+    path = tmp_path / "c.json"
+    calibration.save(path)
+    again = Calibration.load(path)
+    of = {k: getattr(states, k)[:4] for k in ("time", "load_time", "approach")}
+    of["air_temperature"], of["joint_temperature"] = np.full(4, 24.0), np.full((4, 6), 28.0)
+    a, b = (
+        x.compensate(states.q[:4], states.wrench[:4], recorded=of) for x in (calibration, again)
+    )
+    np.testing.assert_array_equal(a.q, b.q)
+    np.testing.assert_allclose(a.after.std_m, b.after.std_m, rtol=1e-5)
+    assert again.source == calibration.source
+    assert [(o.of, o.points.tolist()) for o in a.after.outside] == [
+        (o.of, o.points.tolist()) for o in b.after.outside
+    ]
+
+
+def test_a_file_of_another_kind_is_refused_in_words(tmp_path: Path) -> None:
+    good = to_json(calibrated("none"))
+    path = tmp_path / "c.json"
+    for content, words in [
+        ("{", "no calibration"),
+        ("[]", '"format": "hilcal-calibration"'),
+        (json.dumps({**good, "version": 2}), "reads version 1"),
+        (json.dumps({**good, "theta": [1.0]}), "damaged"),
+        (json.dumps({**good, "parameters": []}), "other parameters"),
+        (json.dumps({**good, "effects": [{"name": "mine", "options": {}}]}), "--effects-from"),
+        (json.dumps({k: v for k, v in good.items() if k != "arm"}), "damaged"),
+    ]:
+        path.write_text(content)
+        with pytest.raises(InputError, match=r"c\.json") as error:
+            Calibration.load(path)
+        assert words in str(error.value)
+    with pytest.raises(InputError, match=r"none\.json"):
+        Calibration.load(tmp_path / "none.json")
+
+
+def test_points_outside_of_what_was_measured_are_named() -> None:
+    c, q = calibrated("none"), fresh().q[:2].copy()
+    ranges = {r.variable: r for r in c.measured.ranges}
+    q[1, 2] = ranges["joint 3 angle"].high + 0.5
+    heavy = np.array([0.0, 0.0, -3 * ranges["force"].high, 0.0, 0.0, 0.0])
+    p = c.predict(q, np.stack([heavy, 0 * heavy]))
+    found = {o.of.variable: o.points.tolist() for o in p.outside}
+    assert found["joint 3 angle"] == [False, True]
+    assert found["force"] == [True, False]
+
+
+def test_wrong_input_is_refused_in_words() -> None:
+    c = calibrated("none")
+    for call, words in [
+        (lambda: c.predict(np.zeros(5)), r"q has shape \(1, 5\)"),
+        (lambda: c.predict(np.full(6, np.nan)), "not finite"),
+        (lambda: c.predict(np.zeros(6), np.zeros(3)), "wrench has shape"),
+        (lambda: c.predict(np.zeros(6), recorded={"humidity": np.zeros(1)}), "no column"),
+        (lambda: c.predict(np.zeros(6), tool=np.zeros((4, 4))), "tool is no"),
+        (lambda: c.predict(np.zeros(6), std=False).std_m, "std=True"),
+    ]:
+        with pytest.raises(InputError, match=words):
+            call()
+
+
+def test_the_band_holds_its_share() -> None:
+    rng = np.random.default_rng(1)
+    for scale in ([1.0, 1.0, 1.0], [1.0, 0.1, 0.01], [1.0, 1.0, 0.1]):
+        root = np.diag(scale) @ np.linalg.qr(rng.standard_normal((3, 3)))[0]
+        c = (root.T @ root)[None]
+        drawn = np.linalg.norm(rng.standard_normal((20000, 3)) @ root, axis=1)
+        assert np.mean(drawn <= band(c)[0]) == pytest.approx(0.95, abs=0.012)
+
+
+def test_the_scatter_of_the_joints_is_that_of_drawn_ones() -> None:
+    c, q = calibrated("none"), fresh().q[:1]
+    std = np.array([1.0, 2.0, 0.5, 3.0, 1.0, 2.0]) * 1e-4
+    chain = evaluate(c.model.cell.arm, q)
+    offset = np.array([0.1, 0.0, 0.2])
+    stated = Scatter(std, 0.0, known=True).covariance(c.model.cell, chain, chain.point(offset))[0]
+    rng = np.random.default_rng(0)
+    many = evaluate(c.model.cell.arm, q + std * rng.standard_normal((20000, 6))).point(offset)
+    np.testing.assert_allclose(np.cov(many.T), stated, atol=0.05 * np.trace(stated))
+
+
+def test_the_document_is_plain_json() -> None:
+    document = json.loads(json.dumps(to_json(calibrated("none")), allow_nan=False))
+    again = from_json(document)
+    np.testing.assert_array_equal(again.theta, calibrated("none").theta)

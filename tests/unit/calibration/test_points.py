@@ -1,0 +1,147 @@
+"""Points of tables and of UR programs, and the branch that poses are put on."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilcal.calibration.points import on_branch, read_points
+from hilcal.calibration.urscript import movej_program, program_points, waypoints, with_joints
+from hilcal.errors import InputError
+from hilcal.robot import se3
+from hilcal.robot.catalogue import load_arm
+from hilcal.robot.chain import evaluate
+
+ARM = load_arm("ur10e")
+LOADS = {"10kg": np.array([0.0, 0.0, -98.0665, 0.0, 0.0, 0.0])}
+Q = np.array([[0.1, -1.2, 1.5, -1.0, -1.4, 0.3], [0.3, -1.1, 1.4, -0.9, -1.5, 0.4]])
+TOOL = se3.matrix(se3.rotation(np.array([0.1, 0.2, -0.3])), np.array([0.05, 0.0, 0.12]))
+JOINTS = "q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad"
+PROGRAM = """def prog():
+  set_tcp(p[0,0,0.1,0,0,0])
+  global A_p=p[.1,-.5,.3,0,3.14,0]
+  global A_q=[-1.6, -1.7, -2.0, -.8, 1.6, 0]
+  movej([0,-1.57,1.57,0,1.57,0], a=1.4, v=1.05) # movej([1,2,3,4,5,6])
+  movej(get_inverse_kin(A_p, qnear=A_q), a=1.3)
+  textmsg("movel(p[1,2,3,4,5,6])")
+  movel(A_p, a=1.2, v=0.25, r=0.01)
+end
+"""
+
+
+def written(tmp_path: Path, text: str, name: str = "p.csv") -> Path:
+    path = tmp_path / name
+    path.write_text(text)
+    return path
+
+
+def poses(q):
+    chain = evaluate(ARM, q)
+    rotation = se3.product(chain.rotation[-1], TOOL[:3, :3])
+    return se3.matrix(rotation, chain.point(TOOL[:3, 3]))
+
+
+@pytest.mark.parametrize("unit", ["rad", "deg"])
+def test_joint_values_loads_and_records_are_read(tmp_path: Path, unit: str) -> None:
+    factor = np.degrees(1) if unit == "deg" else 1.0
+    rows = [",".join(f"{factor * v:.12f}" for v in q) for q in Q]
+    header = JOINTS.replace("rad", unit)
+    text = f"pose,{header},load,air_degC\na,{rows[0]},10kg,21\nb,{rows[1]},none,22\n"
+    p = read_points(written(tmp_path, text), ARM, LOADS)
+    assert p.names == ("a", "b")
+    np.testing.assert_allclose(p.q, Q, atol=1e-11)
+    assert p.wanted is None
+    assert p.wrench is not None
+    np.testing.assert_array_equal(p.wrench[:, 2], [-98.0665, 0.0])
+    np.testing.assert_array_equal(p.recorded["air_temperature"], [21, 22])
+
+
+@pytest.mark.parametrize("metric", [True, False])
+def test_poses_follow_the_branch_of_the_point_before(tmp_path: Path, metric: bool) -> None:
+    goal = poses(Q)
+    r = se3.rotation_vector(goal[:, :3, :3])
+    rows = np.hstack([goal[:, :3, 3], r] if metric else [1e3 * goal[:, :3, 3], np.degrees(r)])
+    header = "x_m,y_m,z_m,rx_rad,ry_rad,rz_rad" if metric else "x_mm,y_mm,z_mm,rx_deg,ry_deg,rz_deg"
+    text = "\n".join([header, *(",".join(f"{v:.12f}" for v in row) for row in rows)])
+    p = read_points(written(tmp_path, text + "\n"), ARM, LOADS)
+    q = on_branch(p, ARM, TOOL, Q[0] + 0.1)
+    np.testing.assert_allclose(q, Q, atol=1e-8)
+    assert p.names == ("1", "2")
+    with pytest.raises(InputError, match=r"point 1 is a pose without joint values.*--near"):
+        on_branch(p, ARM, TOOL, None)
+
+
+def test_a_pose_out_of_reach_is_named(tmp_path: Path) -> None:
+    text = f"pose,x_m,y_m,z_m,rx_rad,ry_rad,rz_rad,{JOINTS}\nfar,3,0,0,0,0,0,0,-1,1,0,1,0\n"
+    with pytest.raises(InputError, match=r"point far: the nominal arm does not reach it .* mm"):
+        on_branch(read_points(written(tmp_path, text), ARM, LOADS), ARM, TOOL, None)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("pose\na\n", "neither joint values nor poses"),
+        (f"{JOINTS},speed\n1,1,1,1,1,1,1\n", "unknown column 'speed'"),
+        ("q1_rad,q2_rad\n1,1\n", "column 'q3_rad' is missing"),
+        ("x_m,y_m,z_m\n1,1,1\n", "one half is missing"),
+        (f"{JOINTS},load\n1,1,1,1,1,1,5kg\n", "row 2, column 'load': unknown load '5kg'; valid: "),
+        (f"{JOINTS},load,fx_N,fy_N,fz_N,mx_Nm,my_Nm,mz_Nm\n" + "1," * 12 + "1\n", "both load"),
+        (f"{JOINTS},{JOINTS.replace('rad', 'deg')}\n" + "1," * 11 + "1\n", "both q1_rad and q1_d"),
+        (f"{JOINTS},q1_rad\n" + "1," * 6 + "1\n", "twice"),
+        (f"{JOINTS}\n1,1,1,x,1,1\n", "row 2, column 'q4_rad'"),
+        (f"{JOINTS}\n", "no readings"),
+    ],
+)
+def test_tables_that_cannot_be_used_are_refused(tmp_path: Path, text: str, words: str) -> None:
+    with pytest.raises(InputError) as error:
+        read_points(written(tmp_path, text), ARM, LOADS)
+    assert words in str(error.value)
+
+
+def test_waypoints_of_a_program_are_found_and_replaced(tmp_path: Path) -> None:
+    text, found, p, tool = program_points(written(tmp_path, PROGRAM, "p.script"))
+    assert [w.line for w in found] == [5, 6, 8]
+    assert tool is not None
+    np.testing.assert_allclose(tool[:3, 3], [0, 0, 0.1])
+    np.testing.assert_allclose(p.q[0], [0, -1.57, 1.57, 0, 1.57, 0])
+    np.testing.assert_allclose(p.q[1], [-1.6, -1.7, -2.0, -0.8, 1.6, 0])
+    assert np.isnan(p.q[2]).all()
+    assert p.wanted is not None
+    assert np.isnan(p.wanted[0]).all()
+    np.testing.assert_allclose(p.wanted[2, :3, 3], [0.1, -0.5, 0.3])
+    new = np.arange(18.0).reshape(3, 6)
+    again = with_joints(text, found, new)
+    assert "  movej([6.000000000, 7.000000000" in again
+    assert "11.000000000], a=1.3)" in again
+    assert "17.000000000], a=1.2, v=0.25, r=0.01)" in again
+    assert again.count("textmsg") == again.count("# movej([1,2,3,4,5,6])") == 1
+    np.testing.assert_allclose([w.q for w in waypoints(again)], new)
+
+
+def test_a_program_of_moves_has_them_as_waypoints() -> None:
+    np.testing.assert_allclose([w.q for w in waypoints(movej_program(["a", "b"], Q))], Q, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("x = 1\n", "no waypoints"),
+        ("\nmovel(pose_trans(a, b))\n", "line 2: the waypoint 'pose_trans(a, b)' is computed"),
+        ("movej(q)\n", "is computed"),
+        ("a=[1,2,3,4,5,6]\na=[1,2,3,4,5,7]\nmovej(a)\n", "is computed"),
+        ("movej([1,2,3])\n", "is computed"),
+        ("movej(", "is computed"),
+        ("set_tcp(x)\nmovej([1,2,3,4,5,6])\n", "is computed"),
+        ("set_tcp([1,2,3,4,5,6])\nmovej([1,2,3,4,5,6])\n", "set_tcp without a pose"),
+        (
+            "set_tcp(p[0,0,0,0,0,0])\nmovej([1,2,3,4,5,6])\nset_tcp(p[0,0,1,0,0,0])\n"
+            "movej([1,2,3,4,5,6])\n",
+            "line 4: another tool centre point",
+        ),
+    ],
+)
+def test_programs_that_cannot_be_used_are_refused(tmp_path: Path, text: str, words: str) -> None:
+    with pytest.raises(InputError) as error:
+        program_points(written(tmp_path, text, "p.script"))
+    assert words in str(error.value)
+    assert "p.script" in str(error.value)
