@@ -1,11 +1,12 @@
 """A campaign: its readings with their full covariance, and the fits that were stored in it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
+from hilcal.calibration.calibration import Calibration
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
 from hilcal.data.campaign_file import CampaignFile
@@ -185,6 +186,30 @@ class Campaign:
     def predictive(self, record: RevisionRecord, model: Model, theta: Floats) -> Predictive:
         """Return what a stored revision knows of readings that it has not seen."""
         return restore_predictive(record, model, theta, self.fitted_readings(record))
+
+    def calibration(self, revision: int | None = None) -> Calibration:
+        """Return a stored fit ready for use, see `Calibration`.
+
+        Args:
+            revision: its number; the one in use where None, see `in_use`.
+
+        Raises:
+            InputError: no such revision, or see `fit`.
+        """
+        record = self.in_use(revision)
+        if record is None:
+            raise InputError(f"{self.path}: no revision yet; run hilcal identify or refine first")
+        judged: Mapping[str, Any] = record.result_json.get("diagnose", {})
+        return Calibration.of(
+            self.restore(record),
+            {
+                "campaign": self.path.name,
+                "revision": record.number,
+                "effects": list(record.effects),
+                "verdict": judged.get("verdict"),
+                "readings_sha256": record.data_hash,
+            },
+        )
 
     def history(self, revision: int | None = None) -> History:
         """Return how the model of a revision was reached, which `diagnose` takes.

@@ -35,7 +35,7 @@ SECTIONS = {
     "Fit, and find what is missing": (
         *("identify", "compare", "diagnose", "add", "remove", "refine", "next"),
     ),
-    "Use the result": ("validate", "accept", "view", "export"),
+    "Use the result": ("validate", "compensate", "accept", "view", "export"),
     "Look up": ("effects", "study"),
 }
 """The commands in the order of the work, as `hilcal --help` lists them."""
@@ -87,12 +87,18 @@ COMMANDS = {
     "validate": Command(
         "validating:validate", "Predict readings of another campaign with the model."
     ),
+    "compensate": Command(
+        "compensating:compensate",
+        "Find the joint values that put the tool where it was asked to be, under a load.",
+    ),
     "accept": Command(
         "campaigns:accept",
         "Choose the revision that every command uses from now on, whatever is added later.",
     ),
     "view": Command("refining:view", "Tell the story of the revisions in rerun."),
-    "export": Command("tables:export", "Write readings and parameters as CSV."),
+    "export": Command(
+        "tables:export", "Write readings and parameters as CSV, the calibration as JSON."
+    ),
     "effects": Command(
         "effects:effects",
         "List the effects that a model can have; `new` begins one of your own.",

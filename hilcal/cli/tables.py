@@ -11,6 +11,7 @@ from rich.padding import Padding
 
 from hilcal.campaign import Campaign
 from hilcal.cell import Cell, cell_from_config
+from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.previewing import show_preview
 from hilcal.cli.terminal import Json, Revision, Run, terminal
 from hilcal.config import load_config
@@ -167,21 +168,32 @@ def export(
         Path | None,
         typer.Option("--parameters", metavar="F.csv", help="Parameters of the model."),
     ] = None,
+    calibration: Annotated[
+        Path | None,
+        typer.Option(
+            "--calibration",
+            metavar="F.json",
+            help="The identified arm, ready for compensate on any machine.",
+        ),
+    ] = None,
     revision: Revision = None,
     force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
+    effects_from: EffectsFrom = None,
     as_json: Json = False,
 ) -> None:
-    """Write readings and parameters as CSV."""
+    """Write readings and parameters as CSV, the calibration as JSON."""
     t = terminal(as_json)
-    wanted = [path for path in (table, parameters) if path is not None]
+    wanted = [path for path in (table, parameters, calibration) if path is not None]
     if not wanted:
-        raise InputError("nothing to export; give --table F.csv, --parameters F.csv or both")
+        raise InputError(
+            "nothing to export; give --table F.csv, --parameters F.csv or --calibration F.json"
+        )
     for path in wanted:
         if path.exists() and not force:
             raise InputError(f"{path}: the file exists; choose another name or give --force")
-    if revision is not None and parameters is None:
-        raise InputError("--revision is about the parameters; give --parameters F.csv, too")
-    with Campaign.open(run, read_only=True) as opened_run:
+    if revision is not None and parameters is None and calibration is None:
+        raise InputError("--revision is about the model; give --parameters or --calibration, too")
+    with Campaign.open(run, catalogue_with(effects_from), read_only=True) as opened_run:
         record = opened_run.in_use(revision)
         if parameters is not None and record is None:
             raise InputError(f"{run}: no revision yet, so no parameters; run hilcal identify first")
@@ -192,6 +204,10 @@ def export(
             rows = record.result_json["identify"]["parameters"]
             _write_parameters(parameters, rows)
             t.show(f"{parameters}: {len(rows)} parameters of revision {record.number}")
+        if calibration is not None:
+            found = opened_run.calibration(revision)
+            found.save(calibration)
+            t.show(f"{calibration}: the calibration of revision {found.source['revision']}")
     t.document({"written": [str(path) for path in wanted]})
 
 

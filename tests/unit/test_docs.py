@@ -70,6 +70,27 @@ def test_the_guide_to_the_library_runs_as_it_stands(
         assert "creep" in run.fit().model.names
 
 
+def test_the_guide_to_compensation_runs_as_it_stands(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    guide = ROOT / "docs" / "how-to" / "compensate.md"
+    cell = configs_dir() / "cells" / "demo_ur10e.toml"
+    config = load_config(cell)
+    monkeypatch.chdir(tmp_path)
+    with CampaignFile.create("run.hilcal", config.to_json(), str(cell.parent), "test") as file:
+        file.append_readings(rehearse(config, "nothing", 3, 20).readings)
+    ok(capsys, "identify", "run.hilcal", "--readings", "absolute")
+    (table,) = blocks(guide, "csv")
+    Path("points.csv").write_text(table)
+    for line in "".join(blocks(guide, "sh")).splitlines():
+        ok(capsys, *line.split()[1:])
+    for name in ("corrected.csv", "corrected.script", "corrected.json"):
+        assert Path(name).stat().st_size > 100
+    (code,) = blocks(guide)
+    exec(code, {})
+    assert "e-0" in capsys.readouterr().out
+
+
 def test_the_guide_to_imports_is_what_the_commands_do(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,0 +1,276 @@
+"""`compensate`: joint values that put the tool where it was asked to be."""
+
+import csv
+import io
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from hilcal.calibration.calibration import Calibration
+from hilcal.calibration.points import Points, on_branch, read_points
+from hilcal.calibration.poses import Compensation
+from hilcal.calibration.urscript import JOINTS, movej_program, program_points, with_joints
+from hilcal.campaign import Campaign
+from hilcal.cli.effects_from import EffectsFrom, catalogue_with
+from hilcal.cli.terminal import Json, Revision, Terminal, terminal
+from hilcal.data.columns import joint_columns
+from hilcal.effects.catalogue import Catalogue
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.identify.fit_document import plain
+from hilcal.report import text_compensate
+from hilcal.report.progress import working
+from hilcal.robot import se3
+from hilcal.types import Floats
+
+PROGRAMS = (".script", ".urscript")
+WRITTEN = (".csv", ".json", *PROGRAMS)
+NAMED = 5
+"""Refused points that an error names."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Task:
+    """What is to be compensated.
+
+    Attributes:
+        points: the points.
+        tool: (4, 4) T_flange_tool; the tracked target where None.
+        rewrite: makes the program with other joint values, where the points are of a program.
+    """
+
+    points: Points
+    tool: Floats | None
+    rewrite: Callable[[Floats], str] | None
+
+
+def compensate(
+    model: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RUN.hilcal", help="A campaign with a revision, or a calibration (JSON)."
+        ),
+    ],
+    points: Annotated[
+        Path,
+        typer.Argument(
+            metavar="POINTS", help="Where to go: a table (CSV) or a UR program (.script)."
+        ),
+    ],
+    output: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "-o", "--output", metavar="F", help="Write CSV, JSON or a UR program; repeatable."
+        ),
+    ] = None,
+    load: Annotated[
+        str | None,
+        typer.Option("--load", metavar="NAME", help="The load at every point, of [[loads]]."),
+    ] = None,
+    wrench: Annotated[
+        str | None,
+        typer.Option(
+            "--wrench",
+            metavar='"FX FY FZ MX MY MZ"',
+            help="Force and moment at the load point, base axes, N and N·m.",
+        ),
+    ] = None,
+    tool: Annotated[
+        str | None,
+        typer.Option(
+            "--tool",
+            metavar='"X Y Z RX RY RZ"',
+            help="The tool on the flange, m and rad; the tracked target unless given.",
+        ),
+    ] = None,
+    near: Annotated[
+        str | None,
+        typer.Option(
+            "--near", metavar='"Q1 Q2 .. QN"', help="Joint values near the first pose, degrees."
+        ),
+    ] = None,
+    outside: Annotated[
+        bool,
+        typer.Option("--allow-outside", help="Also points outside of what was measured."),
+    ] = False,
+    revision: Revision = None,
+    effects_from: EffectsFrom = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Find the joint values that put the tool where it was asked to be, under a load."""
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
+    for path in output or ():
+        _check_output(path, force)
+    with working(t.progress) as say:
+        say(f"reading {model}")
+        calibration = _calibration(model, catalogue, revision)
+        arm = calibration.model.cell.arm
+        task = _task(points, calibration, tool)
+        acting = _wrench(task.points, calibration, load, wrench)
+        start = None if near is None else np.radians(_numbers(near, arm.n, "--near"))
+        say(f"compensating {len(task.points.names)} points")
+        q = on_branch(task.points, arm, calibration.tool_pose(task.tool), start)
+        found = calibration.compensate(q, acting, tool=task.tool, recorded=task.points.recorded)
+    refused = text_compensate.refusals(found, outside)
+    _refuse(points, task.points.names, refused, found)
+    document = text_compensate.document(calibration, task.points.names, found, refused)
+    for path in output or ():
+        _write(path, task, found, document)
+    t.show(text_compensate.report(calibration, task.points.names, q, found))
+    _say_written(t, output or [])
+    t.document({**document, "written": [str(path) for path in output or ()]})
+
+
+def _say_written(t: Terminal, paths: list[Path]) -> None:
+    if paths:
+        t.show(f"\nWritten: {', '.join(str(path) for path in paths)}.")
+    else:
+        t.show("\nNothing is written; -o F.csv, F.json or F.script keeps the joint values.")
+
+
+def _calibration(path: Path, catalogue: Catalogue, revision: int | None) -> Calibration:
+    """Return the calibration of a campaign, or of a file.
+
+    Raises:
+        InputError: the campaign has no revision; or the file is none of both.
+    """
+    if path.suffix == ".json":
+        if revision is not None:
+            raise InputError(f"{path}: a calibration has no revisions; leave out --revision")
+        return Calibration.load(path, catalogue)
+    with Campaign.open(path, catalogue, read_only=True) as run:
+        return run.calibration(revision)
+
+
+def _task(path: Path, calibration: Calibration, tool: str | None) -> _Task:
+    """Read what is to be compensated.
+
+    Raises:
+        InputError: an unknown kind of file, or one that cannot be used.
+    """
+    arm = calibration.model.cell.arm
+    given = None
+    if tool is not None:
+        six = _numbers(tool, 6, "--tool")
+        given = se3.matrix(se3.rotation(six[3:]), six[:3])
+    if path.suffix in PROGRAMS:
+        if arm.n != JOINTS:
+            raise InputError(f"{path}: a UR program, and {arm.name} has {arm.n} joints")
+        program, found, points, own = program_points(path)
+        if own is None and given is None and points.wanted is not None:
+            poses = np.isfinite(points.wanted[:, 0, 0])
+            if poses.any():
+                name = points.names[int(np.argmax(poses))]
+                raise InputError(
+                    f"{path}: {name} is a pose of a tool centre point that the program does not "
+                    'set; give --tool "X Y Z RX RY RZ" as the installation has it'
+                )
+        return _Task(
+            points, given if own is None else own, lambda q: with_joints(program, found, q)
+        )
+    if path.suffix != ".csv":
+        raise InputError(f"{path}: valid: a table .csv or a UR program {' or '.join(PROGRAMS)}")
+    return _Task(read_points(path, arm, calibration.loads), given, None)
+
+
+def _wrench(
+    points: Points, calibration: Calibration, load: str | None, wrench: str | None
+) -> Floats | None:
+    """(6,) or (N, 6) wrench at the points.
+
+    Raises:
+        InputError: it is given twice, or the load is not known.
+    """
+    given = [x for x in (load, wrench, points.wrench) if x is not None]
+    if len(given) > 1:
+        raise InputError("the load is given twice; valid: one of --load, --wrench, columns")
+    if wrench is not None:
+        return _numbers(wrench, 6, "--wrench")
+    if load is not None and load != "none":
+        if load not in calibration.loads:
+            valid = ", ".join(("none", *calibration.loads))
+            raise InputError(f"--load {load}: no such load; valid: {valid}")
+        return calibration.loads[load]
+    return points.wrench
+
+
+def _numbers(written: str, count: int, option: str) -> Floats:
+    """Return the numbers of an option.
+
+    Raises:
+        InputError: another count, or no numbers.
+    """
+    try:
+        values = np.array([float(word) for word in written.replace(",", " ").split()])
+    except ValueError:
+        values = np.empty(0)
+    if len(values) != count or not np.isfinite(values).all():
+        raise InputError(f"{option} {written!r}; valid: {count} numbers")
+    return values
+
+
+def _refuse(path: Path, names: tuple[str, ...], refused: list[str], found: Compensation) -> None:
+    """Refuse the whole table where points are refused.
+
+    Raises:
+        CannotAnswerError: points lie outside of what was measured.
+        InputError: points cannot be reached.
+    """
+    bad = [k for k, why in enumerate(refused) if why]
+    if not bad:
+        return
+    named = "; ".join(f"{names[k]}: {refused[k]}" for k in bad[:NAMED])
+    more = f"; and {len(bad) - NAMED} more" if len(bad) > NAMED else ""
+    words = f"{path}: {len(bad)} of {len(names)} points are refused: {named}{more}"
+    lost = ~found.inverse.solved | found.inverse.singular | found.limits.any(axis=1)
+    if lost[bad].any():
+        raise InputError(words)
+    raise CannotAnswerError(f"{words}; measure there, or give --allow-outside")
+
+
+def _check_output(path: Path, force: bool) -> None:
+    if path.suffix not in WRITTEN:
+        raise InputError(f"{path}: unknown kind of file; valid: {', '.join(WRITTEN)}")
+    if path.exists() and not force:
+        raise InputError(f"{path}: the file exists; choose another name or give --force")
+
+
+def _write(path: Path, task: _Task, found: Compensation, document: dict[str, object]) -> None:
+    """Write the joint values as the file's name asks.
+
+    Raises:
+        InputError: it cannot be written, or the arm is none of UR's.
+    """
+    names, n = task.points.names, found.q.shape[1]
+    if path.suffix == ".json":
+        content = json.dumps(plain(document), allow_nan=False, indent=2) + "\n"
+    elif path.suffix == ".csv":
+        content = _csv(names, found)
+    elif n != JOINTS:
+        raise InputError(f"{path}: a UR program has {JOINTS} joints, this arm has {n}")
+    elif task.rewrite is None:
+        content = movej_program(names, found.q)
+    else:
+        content = task.rewrite(found.q)
+    try:
+        path.write_text(content, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+
+
+def _csv(names: tuple[str, ...], found: Compensation) -> str:
+    """Return the table of points, with what is expected of them."""
+    out = io.StringIO()
+    rows = csv.writer(out, lineterminator="\n")
+    n = found.q.shape[1]
+    rows.writerow(["pose", *joint_columns(n), "before_m", "std_m", "band_m"])
+    for k, name in enumerate(names):
+        numbers = (found.before.error_m[k], found.after.std_m[k], found.after.band_m[k])
+        values = [f"{v:.9f}" for v in found.q[k]]
+        rows.writerow([name, *values, *(f"{x:.4g}" for x in numbers)])
+    return out.getvalue()

@@ -1,0 +1,140 @@
+"""What `compensate` says: error before and after at each point, and why points are refused."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from rich.console import RenderableType
+
+from hilcal.calibration.calibration import Calibration
+from hilcal.calibration.measured import Outside
+from hilcal.calibration.poses import BAND, Compensation
+from hilcal.report import numbers, text
+from hilcal.types import Floats
+
+MOST = 12
+"""Points that are listed."""
+
+
+def refusals(c: Compensation, allowed_outside: bool) -> list[str]:
+    """Return why each point is refused, of N points; empty where it is not."""
+    out = []
+    for k in range(len(c.q)):
+        why = []
+        if not c.inverse.solved[k]:
+            left = numbers.length(float(c.inverse.residual_m[k]))
+            why.append(f"cannot be reached on its branch, {left} are left")
+        if c.inverse.singular[k]:
+            why.append("the pose is singular")
+        for j in np.flatnonzero(c.limits[k]):
+            why.append(f"joint {j + 1} would be beyond its limit ({_degrees(c.q[k, j])})")
+        if not allowed_outside:
+            why += [_outside(o, k) for o in c.after.outside if o.points[k]]
+        out.append("; ".join(why))
+    return out
+
+
+def _outside(o: Outside, k: int) -> str:
+    """Say what a point leaves of that which was measured."""
+    value, r = float(o.values[k]), o.of
+    if r.unit == "rad":
+        return f"{r.variable} {_degrees(value)}, measured {_degrees(r.low)} to {_degrees(r.high)}"
+    if r.unit == "m":
+        return (
+            f"far from all that was measured (± {numbers.length(value)} by the parameters alone, "
+            f"{numbers.length(r.high)} there)"
+        )
+    low, high = numbers.digits(r.low), numbers.digits(r.high)
+    return f"{r.variable} {numbers.digits(value)} {r.unit}, measured {low} to {high}"
+
+
+def _degrees(value: float) -> str:
+    return f"{np.degrees(value):.1f}°"
+
+
+def report(
+    calibration: Calibration, names: Sequence[str], before: Floats, c: Compensation
+) -> Iterator[RenderableType]:
+    """Yield the summary and the points with the largest corrections.
+
+    Args:
+        calibration: the calibration.
+        names: of the N points.
+        before: (N, n) joint values that were given.
+        c: the compensation.
+    """
+    now, later = c.before.error_m, c.after.band_m
+    asked = "the unloaded arm" if calibration.mode == "deflection" else "the nominal arm"
+    yield text.heading(f"{len(names)} points compensated")
+    yield (
+        f"  error before   {numbers.length(float(now.mean()))} mean, "
+        f"{numbers.length(float(now.max()))} largest, from where {asked} has the tool\n"
+        f"  error after    {BAND:.0%} of the points within {numbers.length(float(later.max()))}; "
+        f"expected {numbers.length(float(_rms(c.after.std_m)))} rms"
+    )
+    yield f"  the latter has {', '.join(_parts(calibration))}"
+    out = text.table("point", "before", "after, 95 %", "largest correction")
+    order = np.argsort(-now, kind="stable")[:MOST]
+    for k in sorted(order):
+        turn = np.abs(c.q[k] - before[k])
+        joint = int(np.argmax(turn))
+        out.add_row(
+            names[k],
+            numbers.length(float(now[k])),
+            f"± {numbers.length(float(later[k]))}",
+            f"joint {joint + 1}: {np.degrees(turn[joint]):.3f}°",
+        )
+    yield ""
+    yield out
+    if len(names) > MOST:
+        yield f"The {MOST} of {len(names)} points with the largest error before are listed."
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _parts(calibration: Calibration) -> list[str]:
+    """What the stated error after compensation consists of."""
+    parts = ["the parameters"]
+    if calibration.misfit > 0:
+        left = numbers.length(float(np.sqrt(3 * calibration.misfit)))
+        parts.append(f"what the model leaves ({left} rms)")
+    scatter = calibration.scatter
+    parts.append(
+        "the arm's repeatability" if scatter.known else "no repeatability, which is not known"
+    )
+    return parts
+
+
+def document(
+    calibration: Calibration, names: Sequence[str], c: Compensation, refused: Sequence[str]
+) -> dict[str, object]:
+    """Return the JSON document, SI."""
+    return {
+        "calibration": dict(calibration.source),
+        "readings": calibration.mode,
+        "n_points": len(names),
+        "error_before": _block(c.before.error_m),
+        "error_after": {
+            "std_m": _rms(c.after.std_m),
+            "band_m": float(c.after.band_m.max()),
+            "band_share": BAND,
+        },
+        "points": [
+            {
+                "name": name,
+                "q_rad": c.q[k].tolist(),
+                "before_m": float(c.before.error_m[k]),
+                "before_rad": float(c.before.error_rad[k]),
+                "residual_m": float(c.inverse.residual_m[k]),
+                "std_m": float(c.after.std_m[k]),
+                "band_m": float(c.after.band_m[k]),
+                "refused": refused[k] or None,
+            }
+            for k, name in enumerate(names)
+        ],
+    }
+
+
+def _block(values: Floats) -> dict[str, float]:
+    return {"mean_m": float(values.mean()), "rms_m": _rms(values), "max_m": float(values.max())}

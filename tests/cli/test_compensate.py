@@ -1,0 +1,134 @@
+"""`compensate` through the command line."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hilcal as hc
+from hilcal.calibration.urscript import waypoints
+from hilcal.config import load_config
+from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.covariance import COVERS, WHOLE
+from tests.support.cli_cases import CELL, ok, refused, rehearsal
+
+JOINTS = "q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg"
+
+
+def made(path: Path) -> None:
+    """Write a campaign without any revision."""
+    config = load_config(CELL).to_json()
+    path.unlink(missing_ok=True)
+    with CampaignFile.create(path, config, str(CELL.parent), "made", more={COVERS: WHOLE}) as file:
+        file.append_readings(rehearsal("nothing").readings)
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A campaign with one revision."""
+    path = tmp_path_factory.mktemp("compensate") / "run.hilcal"
+    made(path)
+    with hc.Campaign.open(path) as run:
+        model = hc.baseline(run.cell, run.readings, "absolute")
+        run.append(hc.fit(model, run.readings, "absolute"))
+    return path
+
+
+def table(tmp_path: Path, run: Path, count: int = 3, **more: str) -> Path:
+    """Points at poses between those that were fitted."""
+    with hc.Campaign.open(run, read_only=True) as opened:
+        q = np.unique(opened.readings.states.q, axis=0)
+    rows = np.degrees(q[:count] + 0.2 * (q[1 : count + 1] - q[:count]))
+    path = tmp_path / "points.csv"
+    lines = [",".join(["pose", JOINTS, *more])]
+    lines += [
+        ",".join([f"w{k}", *(f"{v:.9f}" for v in row), *more.values()])
+        for k, row in enumerate(rows)
+    ]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_a_table_becomes_joint_values_that_the_model_confirms(capsys, fitted, tmp_path) -> None:
+    points, out, script = table(tmp_path, fitted), tmp_path / "o.csv", tmp_path / "o.script"
+    before = fitted.read_bytes()
+    shown = ok(capsys, "compensate", fitted, points, "--load", "10kg", "-o", out, "-o", script)
+    assert "3 points compensated" in shown.out
+    assert "the arm's repeatability" in shown.out
+    assert fitted.read_bytes() == before
+    with out.open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert [r["pose"] for r in rows] == ["w0", "w1", "w2"]
+    q = np.array([[float(r[f"q{j}_rad"]) for j in range(1, 7)] for r in rows])
+    with hc.Campaign.open(fitted, read_only=True) as run:
+        c = run.calibration()
+        with points.open() as stream:
+            asked = np.radians([[float(v) for v in r[1:7]] for r in list(csv.reader(stream))[1:]])
+        nominal = c.predict(asked, std=False).nominal_position
+        reached = c.predict(q, c.loads["10kg"], std=False).position
+    assert np.abs(reached - nominal).max() < 1e-8
+    np.testing.assert_allclose([w.q for w in waypoints(script.read_text())], q, atol=2e-9)
+
+
+def test_a_program_is_rewritten_and_a_calibration_file_will_do(capsys, fitted, tmp_path) -> None:
+    ok(capsys, "export", fitted, "--calibration", tmp_path / "arm.json")
+    with hc.Campaign.open(fitted, read_only=True) as run:
+        q = run.readings.states.q[:1] + 0.01
+        first = ", ".join(f"{v:.9f}" for v in q[0])
+    program = tmp_path / "p.script"
+    program.write_text(f"set_tcp(p[0.06,0.02,0.12,0,0,0])\nmovel([{first}], a=1)\n")
+    out = tmp_path / "new.script"
+    document = ok(
+        capsys, "compensate", tmp_path / "arm.json", program, "-o", out, "--json"
+    ).document
+    (point,) = document["points"]
+    assert point["name"] == "line 2"
+    assert point["residual_m"] < 1e-9
+    assert 0 < point["std_m"] < point["band_m"] < 1e-3
+    (waypoint,) = waypoints(out.read_text())
+    np.testing.assert_allclose(waypoint.q, point["q_rad"], atol=1e-9)
+    assert document["calibration"]["revision"] == 1
+    assert document["written"] == [str(out)]
+
+
+def test_points_outside_are_refused_by_name_unless_told_otherwise(capsys, fitted, tmp_path) -> None:
+    points = table(
+        tmp_path, fitted, fx_N="0", fy_N="0", fz_N="-400", mx_Nm="0", my_Nm="0", mz_Nm="0"
+    )
+    out = tmp_path / "o.csv"
+    said = refused(capsys, 4, "compensate", fitted, points, "-o", out)
+    assert "3 of 3 points are refused: w0: force 400 N, measured 0 to " in said
+    assert "--allow-outside" in said
+    assert not out.exists()
+    ok(capsys, "compensate", fitted, points, "-o", out, "--allow-outside")
+    assert out.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--load", "2t"), "--load 2t: no such load; valid: none, 5kg, 10kg"),
+        (("--load", "10kg", "--wrench", "0 0 1 0 0 0"), "the load is given twice"),
+        (("--wrench", "0 0"), "--wrench '0 0'; valid: 6 numbers"),
+        (("--tool", "a b c d e f"), "--tool 'a b c d e f'; valid: 6 numbers"),
+        (("-o", "x.pdf"), "x.pdf: unknown kind of file; valid: .csv, .json, .script"),
+        (("--revision", "7"), "revision"),
+    ],
+)
+def test_wrong_options_are_refused(capsys, fitted, tmp_path, arguments, words) -> None:
+    assert words in refused(capsys, 2, "compensate", fitted, table(tmp_path, fitted), *arguments)
+
+
+def test_what_is_no_campaign_or_no_table_is_refused(capsys, fitted, tmp_path) -> None:
+    points = table(tmp_path, fitted)
+    assert "no such campaign" in refused(capsys, 2, "compensate", tmp_path / "a.hilcal", points)
+    (tmp_path / "a.json").write_text("{}")
+    assert "no calibration" in refused(capsys, 2, "compensate", tmp_path / "a.json", points)
+    assert "valid: a table .csv" in refused(capsys, 2, "compensate", fitted, CELL)
+    existing = tmp_path / "o.csv"
+    existing.write_text("mine")
+    assert "--force" in refused(capsys, 2, "compensate", fitted, points, "-o", existing)
+    bare = tmp_path / "bare.hilcal"
+    made(bare)
+    assert "no revision yet" in refused(capsys, 2, "compensate", bare, points)
