@@ -42,7 +42,14 @@ class StreamingSensor:
     def report(self) -> Report:
         """Say who answered, rate, temperature, counters, and every problem."""
         facts = (*self._facts, *self._stream.facts())
-        return Report(DEVICE, self._name, facts, tuple(self._stream.problems()))
+        fields = (*((what.replace(" ", "_"), value) for what, value in self._facts),)
+        return Report(
+            DEVICE,
+            self._name,
+            facts,
+            tuple(self._stream.problems()),
+            (*fields, *self._stream.fields()),
+        )
 
     def latest(self) -> WrenchSample:
         """Return the newest frame, younger than 0.2 s.

@@ -159,6 +159,18 @@ class ForceStream:
         facts.append(("frames", f"{count.frames}, lost {count.lost}, corrupt {count.corrupt}"))
         return facts
 
+    def fields(self) -> list[tuple[str, object]]:
+        """The same for scripts."""
+        count = self.losses()
+        return [
+            ("port", self._path),
+            ("rate_Hz", self.rate or None),
+            ("temperature_degC", self._temperature),
+            ("frames", count.frames),
+            ("lost", count.lost),
+            ("corrupt", count.corrupt),
+        ]
+
     def problems(self) -> list[str]:
         """What has to be put right, one line each."""
         try:

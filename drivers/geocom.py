@@ -146,29 +146,41 @@ class GeoComTracker:
         name = self._told(until, geo.NAME, _text) or ("GeoCOM instrument",)
         serial = self._told(until, geo.SERIAL_NUMBER, int)
         facts: list[tuple[str, str]] = []
+        fields: list[tuple[str, object]] = [("name", name[0])]
+        if serial:
+            fields.append(("serial_number", str(serial[0])))
         for what, request in (("firmware", geo.FIRMWARE), ("GeoCOM", geo.GEOCOM_VERSION)):
             version = self._told(until, request, int, int, int)
             if version:
                 facts.append((what, ".".join(map(str, version))))
+                fields.append((what.lower(), facts[-1][1]))
         face = self._told(until, geo.FACE, int)
         if face:
             facts.append(("face", "second" if face[0] else "first"))
+            fields.append(("face", 2 if face[0] else 1))
         problems: list[str] = []
         power = self._told(until, geo.POWER, int, int, int)
         if power:
             facts.append(("battery", f"{power[0]} %"))
+            fields.append(("battery_percent", power[0]))
             if power[0] < _LOW_BATTERY and power[1] == _INTERNAL:
                 problems.append(f"its battery is at {power[0]} %; change it or connect power")
         air = self._told(until, geo.GET_ATMOSPHERE, float, float, float, float)
         if air:
             facts.append(("atmosphere set", f"{air[1]:.1f} hPa, {air[2]:.1f} °C"))
+            fields += [("pressure_hPa", air[1]), ("temperature_degC", air[2])]
         locked = self._locked(until)
         if locked is not None:
             facts.append(("lock", "on the target" if locked else "none"))
+            fields.append(("locked", locked))
             if self._options.lock and not locked:
                 problems.append("it is not locked on its target")
         try:
-            facts += self._sight(self._measure())
+            polar = self._measure()
+            facts += self._sight(polar)
+            along, across = self._spread(polar)
+            fields += [("distance_m", polar.distance), ("tilt_rad", polar.tilt)]
+            fields += [("std_along_m", along), ("std_across_m", across)]
         except TargetLostError as error:
             problems.append(str(error).removeprefix(f"{DEVICE}: "))
         except DeviceError as error:
@@ -176,7 +188,7 @@ class GeoComTracker:
                 raise
             problems.append(str(error).removeprefix(f"{DEVICE}: "))
         full_name = f"{name[0]}, serial {serial[0]}" if serial else str(name[0])
-        return Report(DEVICE, full_name, tuple(facts), tuple(problems))
+        return Report(DEVICE, full_name, tuple(facts), tuple(problems), tuple(fields))
 
     def close(self) -> None:
         """Give the port back. Never raises, may be called twice."""

@@ -9,6 +9,7 @@ controller's watchdog stops it 0.1 s after the control process has ended.
 
 import contextlib
 import time
+from dataclasses import replace
 from typing import NoReturn
 
 import numpy as np
@@ -79,7 +80,7 @@ class UrArm:
                 report = self._survey()
             return report
         ours = tuple(p for p in report.problems if not _is_foreign(p))
-        return Report(report.device, report.name, report.facts, ours)
+        return replace(report, problems=ours)
 
     def _survey(self) -> Report:
         return survey(

@@ -49,7 +49,8 @@ class SimulatedOperator:
             admin.ask(self.socket, "state")
         except DeviceError as error:
             problems = (*problems, f"operator: {error}")
-        return Report("operator", name, facts, problems)
+        fields = (("hand_s", self.hand), ("person", self.person is not None))
+        return Report("operator", name, facts, problems, fields)
 
     def hang(self, load: Load | None, why: str) -> None:
         """Hang a load in the simulated world, or take it off; a person is asked first.

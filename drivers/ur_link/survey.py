@@ -31,10 +31,9 @@ def survey(
         receiver: its state.
         no_dashboard: why there is no dashboard server; empty where there is one.
     """
-    facts = [
-        ("address", host),
-        ("controller version", states.version_word(controller.version)),
-    ]
+    version = states.version_word(controller.version)
+    facts = [("address", host), ("controller version", version)]
+    fields: list[tuple[str, object]] = [("address", host), ("controller_version", version)]
     problems: list[str] = []
     name = "Universal Robots arm"
     if no_dashboard:
@@ -49,6 +48,13 @@ def survey(
             serial = f", serial number {robot.serial}" if robot.serial else ""
             name = f"Universal Robots {robot.model or 'arm'}{serial}"
             facts += _facts(robot)
+            fields += [
+                ("model", robot.model),
+                ("serial_number", robot.serial),
+                ("software_version", robot.version),
+                ("remote_control", robot.remote),
+                ("program", robot.program),
+            ]
             problems += _problems(robot, model)
     try:
         reading = receiver.read()
@@ -57,10 +63,11 @@ def survey(
         problems.append(str(error))
     else:
         facts += [*_state(reading), ("RTDE rate", f"{rate:.0f} Hz of {hz:g} Hz")]
+        fields += [*_state_fields(reading), ("rtde_rate_Hz", rate), ("rtde_rate_asked_Hz", hz)]
         problems += _hindrances(reading)
         if rate < 0.5 * hz:
             problems.append(f"RTDE comes at {rate:.0f} Hz instead of {hz:g} Hz; check the network")
-    return Report("arm", name, tuple(facts), tuple(problems))
+    return Report("arm", name, tuple(facts), tuple(problems), tuple(fields))
 
 
 def _facts(robot: dashboard.RobotFacts) -> list[tuple[str, str]]:
@@ -95,6 +102,17 @@ def _state(reading: Reading) -> list[tuple[str, str]]:
         ("safety", sample.safety),
         ("payload", payload),
         ("joint temperatures", f"{_list(sample.joint_temperature, 1)} °C"),
+    ]
+
+
+def _state_fields(reading: Reading) -> list[tuple[str, object]]:
+    sample = reading.sample
+    return [
+        ("robot_mode", states.mode_word(reading.mode)),
+        ("safety", sample.safety),
+        ("payload_kg", None if math.isnan(sample.payload) else sample.payload),
+        ("payload_com_m", None if sample.payload_com is None else sample.payload_com.tolist()),
+        ("joint_temperature_degC", sample.joint_temperature.tolist()),
     ]
 
 

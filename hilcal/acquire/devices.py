@@ -35,12 +35,14 @@ class Report:
         name: the maker's name for it, with its serial number where known.
         facts: (what, value) for people: versions, modes, rates, temperatures.
         problems: what has to be put right before a run, one clear line each.
+        fields: (name, value) of the facts for scripts: numbers with their unit in the name.
     """
 
     device: str
     name: str
     facts: tuple[tuple[str, str], ...] = ()
     problems: tuple[str, ...] = ()
+    fields: tuple[tuple[str, object], ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

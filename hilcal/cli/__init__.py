@@ -1,33 +1,22 @@
 """The command line: one file per group of commands, imported where it is used."""
 
 import itertools
-import json
 import os
-import re
 import shlex
-import shutil
 import sys
-import textwrap
 import threading
-import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
-from typing import Annotated, Any, TextIO
+from typing import Annotated
 
 import typer
 
 from hilcal import __version__
 from hilcal.cli.commands import COMMANDS, Command, load
+from hilcal.cli.failing import Failures, Watched
 from hilcal.cli.help import EXIT_CODES, EXIT_CODES_OF_RUN, Group, InOrderOfWork
-from hilcal.errors import (
-    CannotAnswerError,
-    DeviceError,
-    HilcalError,
-    InputError,
-    LimitError,
-    StoppedError,
-)
+from hilcal.errors import HilcalError, StoppedError
 
 DEBUG = "HILCAL_DEBUG"
 _COMPLETE = "_HILCAL_COMPLETE"
@@ -36,14 +25,6 @@ _INTERRUPTED = StoppedError.exit_code
 _USAGE = 2
 _FRAMES = "⠋⠙⠹⠸⠼⠴⠦⠧⠇⠏"
 _FRAME_S = 0.2
-_COMMAND = re.compile(r"(.*:) (hilcal [^,;()]*)$")
-_KINDS = {
-    InputError: "input",
-    DeviceError: "device",
-    CannotAnswerError: "cannot_answer",
-    LimitError: "limit",
-    StoppedError: "interrupted",
-}
 
 
 def application(
@@ -186,47 +167,6 @@ def execute(make: Callable[[], typer.Typer], name: str, arguments: Sequence[str]
         sys.exit(_run(make, name, given, failed))
 
 
-class Watched:
-    """A stream that knows whether anything was written to it."""
-
-    def __init__(self, stream: TextIO) -> None:
-        """Stand before a stream; everything but `write` is the stream's own."""
-        self.written = False
-        self._stream = stream
-
-    def write(self, text: str) -> int:
-        """Write, and take note."""
-        self.written = self.written or bool(text)
-        return self._stream.write(text)
-
-    def __getattr__(self, name: str) -> Any:
-        """Return what the stream has."""
-        return getattr(self._stream, name)
-
-
-class Failures:
-    """Tells people, and with --json scripts, why a command failed."""
-
-    def __init__(self, as_json: bool, out: Watched, debug: bool) -> None:
-        """Remember where the document goes, and whether people want to know more."""
-        self.out = out
-        self._json, self._debug = as_json, debug
-
-    def tell(self, error: BaseException | None, message: str, code: int) -> int:
-        """Say what failed in one line, and in one document; returns the exit code."""
-        if self._debug and error is not None:
-            traceback.print_exception(error)
-        line = " ".join(message.split())
-        print(_laid_out(f"error: {line}"), file=sys.stderr)
-        if self._json and not self.out.written:
-            kinds = {kind.exit_code: name for kind, name in _KINDS.items()}
-            kind = kinds.get(code, "unexpected")
-            found = {"error": {"message": line, "kind": kind, "exit_code": code}}
-            self.out.write(json.dumps(found, indent=2) + "\n")
-            self.out.flush()
-        return code
-
-
 @contextmanager
 def _one_thread() -> Iterator[None]:
     """Limit BLAS to one thread: more gain nothing on small matrices, and cost on a busy machine."""
@@ -237,27 +177,6 @@ def _one_thread() -> Iterator[None]:
 
     with threadpool_limits(limits=1, user_api="blas"):
         yield
-
-
-def _laid_out(line: str) -> str:
-    """Return a line as people read it: on a terminal broken between words.
-
-    A command at its end has a line of its own there, to be copied as it stands.
-    """
-    if not sys.stderr.isatty():
-        return line
-    words, command = line, ""
-    if found := _COMMAND.match(line):
-        words, command = found.groups()
-    width = shutil.get_terminal_size().columns
-    told = textwrap.wrap(
-        words,
-        width,
-        subsequent_indent="  ",
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
-    return "\n".join((*told, *([f"  {command}"] if command else ())))
 
 
 def _run(

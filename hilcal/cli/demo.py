@@ -10,7 +10,7 @@ import typer
 from drivers.simulated.rehearsal import NOTHING, RANDOM, Rehearsal, check_choice
 from hilcal.cli.doubting import FIRST, STRENGTH, Doubted, doubted, in_doubt
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
-from hilcal.cli.files import check_record, record_story
+from hilcal.cli.files import check_record, finish, record_story
 from hilcal.cli.plan_output import POSES
 from hilcal.cli.refining import Row, revisions_json
 from hilcal.cli.rehearsing import RehearsalSettings, first_plan, in_process, on_devices
@@ -92,6 +92,8 @@ def demo(
     with working(t.progress) as say:
         model = baseline(r.cell, r.readings, r.mode, catalogue)
         found = refine_model(model, r.readings, r.mode, say)
+        for step in found.steps:
+            finish(step.fit, say)
     with CampaignFile.open(output) as campaign:
         if doubt is not None and doubt.plan is not None:
             first = to_json(doubt.diagnosis)

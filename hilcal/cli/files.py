@@ -50,6 +50,14 @@ def _tell_accepted(t: Terminal, run: Campaign, revision: int | None) -> None:
         t.notice(f"using revision {accepted}, which is accepted; the latest is {latest.number}")
 
 
+def finish(found: Fit, say: Say) -> None:
+    """Compute what a fit's report and its document hold, while it is said what is done."""
+    say("predicting the poses left out")
+    _ = found.holdout
+    say("computing standard uncertainties")
+    _ = found.uncertainty
+
+
 def called(number: int | None) -> str:
     """Return how a revision is called in a heading; None is the baseline that is not kept."""
     return "Baseline, not kept" if number is None else f"Revision {number}"

@@ -11,6 +11,7 @@ from hilcal.cli.files import (
     called,
     check_options,
     chosen,
+    finish,
     fit_of,
     mode_of_option,
     scalings,
@@ -73,8 +74,9 @@ def identify(
             for s in wanted:
                 say(f"fitting {text.model_name(titles(model, o.readings))}, scaling {s}")
                 fits[s] = fit(model, o.readings, mode, s)
-        kept = fits[wanted[-1]]
-        number = o.store(kept, None, None)
+                finish(fits[s], say)
+            kept = fits[wanted[-1]]
+            number = o.store(kept, None, None)
     t.show(text.fit_report(kept))
     t.show(numbers.sentence(covariance_words(o.covariance_parts)))
     t.show(options_line(kept))
@@ -121,8 +123,9 @@ def compare(
             )
         say("looking where it fails")
         places = misfit_breakdown(linearise(found))
-    e = full_prediction(found)
-    worst = text.worst_poses(e)
+        finish(found, say)
+        e = full_prediction(found)
+        worst = text.worst_poses(e)
     name = text.model_name(titles(found.model, found.readings))
     t.show(text.heading(f"{called(number)}: {name}"))
     t.show([text.misses(found), text.follows(places), "", text.errors(found), ""])

@@ -17,9 +17,10 @@ from hilcal.cli.terminal import Json, Record, Revision, Terminal, terminal
 from hilcal.config import CellConfig, load_config
 from hilcal.data.plan import Plan, load_plan
 from hilcal.effects.catalogue import Catalogue
-from hilcal.errors import DeviceError, InputError
+from hilcal.errors import DeviceError, HilcalError, InputError
 from hilcal.identify.fit import Fit
-from hilcal.plan.checked_plan import CheckedPlan, checked, refuse
+from hilcal.identify.fit_document import plain
+from hilcal.plan.checked_plan import CheckedPlan, checked, refusal
 from hilcal.plan.choice import CRITERIA, canonical
 from hilcal.plan.nominal_model import check_effects
 from hilcal.plan.planner import Planned, Request, make
@@ -125,18 +126,19 @@ def check(
         if rig is not None:
             rig.close()
     t.show(text_run.check_report(answers, dry))
+    failed: HilcalError | None = None
+    if names := ", ".join(a.device for a in answers if a.problems):
+        failed = DeviceError(f"not ready: {names}; see above")
+    elif dry is not None:
+        failed = refusal(dry, str(plan))
     t.document(
         {
             "ok": not any(a.problems for a in answers) and not (dry and dry.problems),
             "devices": [answer_json(a) for a in answers],
             "plan": None if dry is None else asdict(dry),
-        }
+        },
+        failed,
     )
-    if failed := [a for a in answers if a.problems]:
-        names = ", ".join(a.device for a in failed)
-        raise DeviceError(f"not ready: {names}; see above")
-    if dry is not None:
-        refuse(dry, str(plan))
 
 
 def read_cell(path: Path) -> tuple[CellConfig, Cell]:
@@ -182,6 +184,7 @@ def answer_json(answer: ConnectionResult) -> dict[str, object]:
         "answers": report is not None,
         "name": "" if report is None else report.name,
         "facts": {} if report is None else dict(report.facts),
+        "fields": {} if report is None else plain(dict(report.fields)),
         "problems": list(answer.problems),
     }
 

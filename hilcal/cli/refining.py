@@ -19,6 +19,7 @@ from hilcal.cli.ending import told_to_end
 from hilcal.cli.files import (
     check_options,
     check_record,
+    finish,
     fit_of,
     mode_of_option,
     record_story,
@@ -85,6 +86,7 @@ def diagnose(
         number, found = fit_of(t, o, say, revision)
         say("diagnosing" if number is None else f"diagnosing revision {number}")
         d = judge(found, o.history(number), say)
+        finish(found, say)
     t.show(text_refine.diagnosis_report(d))
     t.document({"revision": number, **to_json(d)})
 
@@ -155,7 +157,10 @@ def _change(
                 removed=(*before_it.removed, *([] if removed is None else [removed])),
             )
             d = judge(after, how, say)
+            finish(before, say)
+            finish(after, say)
             number = o.store(after, d, added, removed, before_number)
+            expected = addition(before, after) if adds and before.scaling == "gc" else None
         stored = o.file.revision(before_number)
         verdict = str(stored.result_json.get("diagnose", {}).get("verdict", ""))
         rows: list[Row] = [
@@ -164,7 +169,6 @@ def _change(
         ]
         t.show([text_refine.revisions_table([r.shown for r in rows]), text_refine.key()])
         t.show(_fell(before, after, named) if adds else _rose(before, after, effect))
-        expected = addition(before, after) if adds and before.scaling == "gc" else None
         t.show([] if expected is None else text_refine.addition_lines(expected))
         t.show(["", text_refine.verdict_line(d)])
         if record is not None:
@@ -245,14 +249,15 @@ def refine(
                 model = with_effects(o.cell, o.readings, mode, named, named, catalogue)
             how = NOTHING if latest is None else o.history(latest.number)
             found = refine_model(model, fitted, mode, say, how)
-        rows: list[Row] = []
-        for k, step in enumerate(found.steps):
-            if k == 0 and latest is not None:
-                number = latest.number
-            else:
-                parent = rows[-1].number if rows else None
-                number = o.store(step.fit, step.diagnosis, step.added, step.removed, parent)
-            rows.append(Row(number, step.fit, step.diagnosis.verdict, step.added, step.removed))
+            rows: list[Row] = []
+            for k, step in enumerate(found.steps):
+                finish(step.fit, say)
+                if k == 0 and latest is not None:
+                    number = latest.number
+                else:
+                    parent = rows[-1].number if rows else None
+                    number = o.store(step.fit, step.diagnosis, step.added, step.removed, parent)
+                rows.append(Row(number, step.fit, step.diagnosis.verdict, step.added, step.removed))
         t.show(text_refine.revisions_table([r.shown for r in rows]))
         t.show(text_refine.key())
         t.show(options_line(rows[-1].fit))

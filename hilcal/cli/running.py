@@ -136,10 +136,12 @@ def run(
             t.show(f'The goal "{goal.goal.text}" is met: {full_words(goal.status)}.')
     of = "" if measured == planned else f" of {planned}"
     t.show(f"{measured}{of} readings are in {output}. Go on with: hilcal refine {output}")
-    t.document(document)
+    missed: CannotAnswerError | None = None
     if goal is not None and not goal.status.met:
-        on = f"hilcal plan {cell} --after {output}"
-        raise CannotAnswerError(f"{missed_words(goal.status, measured)}; plan on with: {on}")
+        on = f"hilcal plan {cell} -o more.json --after {output}"
+        words = f"{missed_words(goal.status, measured)}; plan on with: {on}"
+        missed = CannotAnswerError(words)
+    t.document(document, missed)
 
 
 def _own_plan(

@@ -2,7 +2,7 @@
 
 import json
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, TextIO
@@ -10,6 +10,8 @@ from typing import Annotated, TextIO
 import typer
 from rich.console import Console, RenderableType
 
+from hilcal.cli.failing import error_document
+from hilcal.errors import HilcalError
 from hilcal.identify.fit_document import plain
 
 WIDTH = 100
@@ -61,10 +63,22 @@ class Terminal:
         """Print a command on a line of its own, which no line's end divides, to be copied."""
         self.people.print(f"  {line}", markup=False, highlight=False, soft_wrap=True)
 
-    def document(self, content: object) -> None:
-        """Print the JSON document, where it is asked for."""
+    def document(self, content: Mapping[str, object], failed: HilcalError | None = None) -> None:
+        """Print the JSON document, where it is asked for.
+
+        Args:
+            content: of the document.
+            failed: why the command fails nevertheless; it is in the document as "error".
+
+        Raises:
+            HilcalError: `failed`, after printing.
+        """
+        if failed is not None:
+            content = {**content, **error_document(failed)}
         if self.json:
             print(json.dumps(plain(content), allow_nan=False, indent=2), file=self.out, flush=True)
+        if failed is not None:
+            raise failed
 
 
 def terminal(as_json: bool) -> Terminal:

@@ -12,7 +12,7 @@ from hilcal.cli.files import called, fit_of, titles
 from hilcal.cli.terminal import Json, Revision, Run, terminal
 from hilcal.data.lengths import parse_length
 from hilcal.data.same_readings import never_fitted
-from hilcal.errors import CannotAnswerError, InputError, LimitError
+from hilcal.errors import CannotAnswerError, HilcalError, InputError, LimitError
 from hilcal.identify.acceptance import acceptance
 from hilcal.identify.extrapolation import extrapolation
 from hilcal.identify.validation import validate as predict_other
@@ -95,6 +95,10 @@ def validate(
         t.show(
             "Was the tracker set up anew for these readings? Then --register fits its place first."
         )
+    failed: HilcalError | None = None
+    if shares.passed is False:
+        words = text_validate.failure(shares, judged)
+        failed = CannotAnswerError(words) if shares.undecided else LimitError(words)
     t.document(
         {
             "revision": judged.number,
@@ -110,8 +114,6 @@ def validate(
             "noise_floor_m": found.noise_floor,
             **text_validate.to_json(beyond),
             **text_validate.shares_json(shares),
-        }
+        },
+        failed,
     )
-    if shares.passed is False:
-        words = text_validate.failure(shares, judged)
-        raise CannotAnswerError(words) if shares.undecided else LimitError(words)

@@ -70,7 +70,14 @@ def refuse(dry: DryRun, what: str) -> None:
     Raises:
         InputError: the first problem, and the number of others.
     """
-    if dry.problems:
-        more = len(dry.problems) - 1
-        others = f" (and {more} more: hilcal check --plan shows all)" if more else ""
-        raise InputError(f"{what} cannot be run: {dry.problems[0]}{others}")
+    if (found := refusal(dry, what)) is not None:
+        raise found
+
+
+def refusal(dry: DryRun, what: str) -> InputError | None:
+    """Return the same without raising it; None where the plan has passed."""
+    if not dry.problems:
+        return None
+    more = len(dry.problems) - 1
+    others = f" (and {more} more: hilcal check --plan shows all)" if more else ""
+    return InputError(f"{what} cannot be run: {dry.problems[0]}{others}")

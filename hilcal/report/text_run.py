@@ -33,9 +33,9 @@ def check_report(
         table.add_row(a.device, a.driver, mark, Text(name))
         if a.report is not None:
             for what, value in a.report.facts:
-                table.add_row("", "", "", Text(f"  {what}: {value}"))
+                table.add_row("", "", "", _hanging(f"{what}: {value}"))
         for problem in a.problems:
-            table.add_row("", "", Text("!", style="red"), Text(f"  {problem}"))
+            table.add_row("", "", Text("!", style="red"), _hanging(problem))
     yield Padding(table, (1, 0))
     count = sum(len(a.problems) for a in answers)
     if count:
@@ -44,6 +44,11 @@ def check_report(
         yield "All devices are ready. Nothing was moved."
     if dry is not None:
         yield from _dry_report(dry)
+
+
+def _hanging(words: str) -> RenderableType:
+    """Return words whose further lines stand below the first, both moved in."""
+    return Padding(Text(words), (0, 0, 0, 2))
 
 
 def _dry_report(dry: DryRun) -> Iterator[RenderableType]:

@@ -9,6 +9,7 @@ from hilcal.config.write import to_toml
 from hilcal.data.campaign_file import CampaignFile
 from tests.support.campaign_cases import STARVED, cell, nothing_goes_on
 from tests.support.campaign_site import Site
+from tests.support.cli_cases import run
 from tests.support.screen import AtTerminal
 
 __all__ = ["cell", "nothing_goes_on"]  # fixtures
@@ -70,3 +71,27 @@ def at_the_first_question(person: AtTerminal) -> None:
     person.keeps(ASKED, 2)
     person.types("\n")
     person.keeps("Done: nothing hangs.")
+
+
+def test_check_gives_every_fact_as_a_field(
+    cell: Site, toml: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    result = run(capsys, "check", toml, "--json")
+    assert result.code == 3  # nobody is at a terminal here
+    devices = {d["device"]: d for d in result.document["devices"]}
+    arm, tracker, force = (devices[name]["fields"] for name in ("arm", "tracker", "force sensor"))
+    assert (arm["model"], arm["remote_control"]) == ("UR10e", True)
+    assert devices["arm"]["facts"]["payload"].startswith(f"{arm['payload_kg']:.3f} kg")
+    assert arm["serial_number"] == devices["arm"]["facts"]["serial number"]
+    assert len(arm["joint_temperature_degC"]) == 6
+    told = devices["arm"]["facts"]["joint temperatures"]
+    assert told == ", ".join(f"{t:.1f}" for t in arm["joint_temperature_degC"]) + " °C"
+    assert devices["tracker"]["facts"]["target"].startswith(f"{tracker['distance_m']:.4f} m")
+    assert tracker["locked"] is True
+    assert tracker["std_across_m"] < 1e-4
+    assert force["rate_Hz"] == pytest.approx(100.0, rel=0.2)
+    assert force["port"] == devices["force sensor"]["facts"]["port"]
+    assert devices["operator"]["fields"]["person"] is True
+    error = result.document["error"]
+    assert (error["kind"], error["exit_code"]) == ("device", 3)
+    assert "not ready: operator" in error["message"]

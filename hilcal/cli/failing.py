@@ -1,0 +1,97 @@
+"""Telling why a command failed: one line for people, one document for scripts."""
+
+import json
+import re
+import shutil
+import sys
+import textwrap
+import traceback
+from typing import Any, TextIO
+
+from hilcal.errors import (
+    CannotAnswerError,
+    DeviceError,
+    HilcalError,
+    InputError,
+    LimitError,
+    StoppedError,
+)
+
+_COMMAND = re.compile(r"(.*:) (hilcal [^,;()]*)$")
+_KINDS = {
+    InputError: "input",
+    DeviceError: "device",
+    CannotAnswerError: "cannot_answer",
+    LimitError: "limit",
+    StoppedError: "interrupted",
+}
+
+
+def error_document(error: HilcalError) -> dict[str, object]:
+    """Return an error as a command's document holds it."""
+    return _document(" ".join(str(error).split()), error.exit_code)
+
+
+def _document(line: str, code: int) -> dict[str, object]:
+    kinds = {kind.exit_code: name for kind, name in _KINDS.items()}
+    kind = kinds.get(code, "unexpected")
+    return {"error": {"message": line, "kind": kind, "exit_code": code}}
+
+
+class Watched:
+    """A stream that knows whether anything was written to it."""
+
+    def __init__(self, stream: TextIO) -> None:
+        """Stand before a stream; everything but `write` is the stream's own."""
+        self.written = False
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        """Write, and take note."""
+        self.written = self.written or bool(text)
+        return self._stream.write(text)
+
+    def __getattr__(self, name: str) -> Any:
+        """Return what the stream has."""
+        return getattr(self._stream, name)
+
+
+class Failures:
+    """Tells people, and with --json scripts, why a command failed."""
+
+    def __init__(self, as_json: bool, out: Watched, debug: bool) -> None:
+        """Remember where the document goes, and whether people want to know more."""
+        self.out = out
+        self._json, self._debug = as_json, debug
+
+    def tell(self, error: BaseException | None, message: str, code: int) -> int:
+        """Say what failed in one line, and in one document; returns the exit code."""
+        if self._debug and error is not None:
+            traceback.print_exception(error)
+        line = " ".join(message.split())
+        print(_laid_out(f"error: {line}"), file=sys.stderr)
+        if self._json and not self.out.written:
+            self.out.write(json.dumps(_document(line, code), indent=2) + "\n")
+            self.out.flush()
+        return code
+
+
+def _laid_out(line: str) -> str:
+    """Return a line as people read it: on a terminal broken between words.
+
+    A command at its end has a line of its own there, to be copied as it stands.
+    """
+    if not sys.stderr.isatty():
+        return line
+    words, command = line, ""
+    if found := _COMMAND.match(line):
+        words, command = found.groups()
+    width = shutil.get_terminal_size().columns
+    told = textwrap.wrap(
+        words,
+        width,
+        subsequent_indent="  ",
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+    return "\n".join((*told, *([f"  {command}"] if command else ())))
