@@ -7,6 +7,7 @@ import numpy as np
 
 from drivers.simulated.conditions import joint_temperature
 from drivers.simulated.draw import Draw, joint_compliance, typical_torque
+from drivers.simulated.own_law import OwnLaw
 from drivers.simulated.rigid import rotation_vector
 from drivers.simulated.tracker import SimulatedNoise
 from drivers.simulated.truth import Truth
@@ -105,7 +106,7 @@ def nothing_hidden(
 
 
 def hide(
-    effect: str,
+    effect: str | OwnLaw,
     cell: Cell,
     states: States,
     strength_sigma: float,
@@ -128,7 +129,7 @@ def hide(
     Joints that drift with temperature do so from the states' first temperature on.
 
     Args:
-        effect: one of `EFFECTS`, or "none".
+        effect: one of `EFFECTS`, an effect of a user's own, or "none".
         cell: the cell as configured.
         states: N states at which the strength holds.
         strength_sigma: RMS over all whitened elements, >= 0.
@@ -154,6 +155,41 @@ def hide(
             world = replace(world, physics=world.physics.with_effect("joint_compliance", softer))
     if effect == "none" or strength_sigma == 0.0:
         return world
+    hidden, reference = (
+        _own(effect, world, rng)
+        if isinstance(effect, OwnLaw)
+        else _simulated(effect, world, states, harmonics, rng)
+    )
+    before = reference.sight(states)
+    pairs = None if readings_mode == "absolute" else _pairs(states, pose, cycle)
+    whiten = _whitening(reference.covariance(before, m), pairs)
+
+    def strength(factor: float) -> float:
+        change = _change(hidden(factor).sight(states), before, m)
+        if pairs is not None:
+            change = change[pairs[0]] - change[pairs[1]]
+        return float(np.sqrt(np.mean((whiten @ change[:, :, None]) ** 2)))
+
+    name = effect.effect.name if isinstance(effect, OwnLaw) else effect
+    return hidden(_scaled(strength, strength_sigma, name, readings_mode))
+
+
+def _own(
+    law: OwnLaw, world: World, rng: np.random.Generator
+) -> tuple[Callable[[float], World], World]:
+    """Return worlds with an effect of a user's own by its strength, and the one without."""
+    direction = law.drawn(rng)
+
+    def hidden(factor: float) -> World:
+        return replace(world, own=replace(law, theta=factor * direction))
+
+    return hidden, world
+
+
+def _simulated(
+    effect: str, world: World, states: States, harmonics: int, rng: np.random.Generator
+) -> tuple[Callable[[float], World], World]:
+    """Return worlds with an effect of `EFFECTS` by its strength, and the one without."""
     if effect in _SAID and not np.any(states.wrench):
         raise InputError(
             f"effect {effect!r} is an error of the measured load but no state has a load; "
@@ -162,9 +198,9 @@ def hide(
     if effect == "thermal_joint_drift":
         world = replace(world, joint_reference=_first_temperature(states))
     torque = np.maximum(
-        np.abs(world.drive_torque(states)).max(axis=0), 0.1 * typical_torque(cell.arm)
+        np.abs(world.drive_torque(states)).max(axis=0), 0.1 * typical_torque(world.cell.arm)
     )
-    draw = Draw(cell.arm, world.physics.joint_compliance, torque, harmonics)
+    draw = Draw(world.cell.arm, world.physics.joint_compliance, torque, harmonics)
     direction = draw.effect(effect, rng)
     start = getattr(world.physics, effect)
     if effect == "transmission_error":
@@ -173,24 +209,14 @@ def hide(
     if effect == "joint_compliance":  # always there; hiding it sets its size
         start = np.zeros_like(start)
     clean = world.physics.with_effect(effect, start)
-    reference = replace(world, physics=clean)
-    before = reference.sight(states)
-    pairs = None if readings_mode == "absolute" else _pairs(states, pose, cycle)
-    whiten = _whitening(reference.covariance(before, m), pairs)
 
     def hidden(factor: float) -> World:
         return replace(world, physics=clean.with_effect(effect, start + factor * direction))
 
-    def strength(factor: float) -> float:
-        change = _change(hidden(factor).sight(states), before, m)
-        if pairs is not None:
-            change = change[pairs[0]] - change[pairs[1]]
-        return float(np.sqrt(np.mean((whiten @ change[:, :, None]) ** 2)))
-
-    return hidden(_scaled(strength, strength_sigma, effect, readings_mode))
+    return hidden, replace(world, physics=clean)
 
 
-def _check(effect: str, strength: float, mode: str, m: int) -> None:
+def _check(effect: str | OwnLaw, strength: float, mode: str, m: int) -> None:
     """Refuse what cannot be hidden, by name."""
     if mode not in READINGS_MODES:
         raise InputError(f"readings {mode!r} is unknown; valid: {', '.join(READINGS_MODES)}")
@@ -198,6 +224,8 @@ def _check(effect: str, strength: float, mode: str, m: int) -> None:
         raise InputError(f"a reading has {m} elements; valid: 3 (position) or 6 (pose)")
     if not (np.isfinite(strength) and strength >= 0.0):
         raise InputError(f"strength {strength} sigma cannot be; valid: a number >= 0")
+    if isinstance(effect, OwnLaw):
+        return
     if effect not in (*EFFECTS, "none"):
         raise InputError(f"effect {effect!r} is unknown; valid: {', '.join((*EFFECTS, 'none'))}")
     if mode == "deflection" and effect not in (*DEFLECTION_EFFECTS, "none"):

@@ -19,9 +19,12 @@ from drivers.simulated.rehearsal import (
 )
 from hilcal.config import CellConfig
 from hilcal.data.plan import UNLOADED, Plan
+from hilcal.effects.catalogue import Catalogue
 
 
-def case_of_plan(config: CellConfig, plan: Plan, choice: str, seed: int) -> SimulationCase:
+def case_of_plan(
+    config: CellConfig, plan: Plan, choice: str, seed: int, catalogue: Catalogue | None = None
+) -> SimulationCase:
     """Hide an effect in the simulated cell of a configuration.
 
     Its strength holds for the readings of the plan, each the mean of several measurements; the
@@ -32,6 +35,7 @@ def case_of_plan(config: CellConfig, plan: Plan, choice: str, seed: int) -> Simu
         plan: what will be measured.
         choice: an effect, "random" or "nothing".
         seed: of everything random.
+        catalogue: has the effects of a user's own, which can be hidden, too.
 
     Raises:
         InputError: an unknown choice, or a cell without loads.
@@ -39,7 +43,7 @@ def case_of_plan(config: CellConfig, plan: Plan, choice: str, seed: int) -> Simu
     rng = np.random.default_rng(seed)
     mean = measurement_noise(config, config.acquire.samples)
     secret = simulation_case(
-        config, choice, rng, lambda cell: planned_states(cell, config, plan), mean
+        config, choice, rng, lambda cell: planned_states(cell, config, plan), mean, catalogue
     )
     return replace(secret, world=replace(secret.world, noise=measurement_noise(config)))
 

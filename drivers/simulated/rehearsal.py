@@ -6,12 +6,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drivers.simulated.injected_effects import DEFLECTION_EFFECTS, EFFECTS, hide, nothing_hidden
+from drivers.simulated.own_law import own_law, own_names
 from drivers.simulated.tracker import SimulatedNoise
 from drivers.simulated.world import World
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
 from hilcal.data.readings import Readings, States
 from hilcal.data.whitening import Mode
+from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError
 from hilcal.toml import suggest
 from hilcal.types import Ints
@@ -28,13 +30,18 @@ def choices() -> tuple[str, ...]:
     return tuple(e for e in EFFECTS if e != "joint_compliance")
 
 
-def check_choice(choice: str) -> None:
+def own_choices(catalogue: Catalogue | None) -> tuple[str, ...]:
+    """Effects of a user's own that can be hidden, too; see `own_law`."""
+    return () if catalogue is None else own_names(catalogue, EFFECTS)
+
+
+def check_choice(choice: str, catalogue: Catalogue | None = None) -> None:
     """Refuse what cannot be hidden.
 
     Raises:
         InputError: lists the valid choices.
     """
-    valid = (*choices(), RANDOM, NOTHING)
+    valid = (*choices(), *own_choices(catalogue), RANDOM, NOTHING)
     if choice not in valid:
         raise InputError(f"hide {choice!r}{suggest(choice, valid)}; valid: {', '.join(valid)}")
 
@@ -93,13 +100,13 @@ def measurement_noise(config: CellConfig, samples: int = 1) -> SimulatedNoise:
     )
 
 
-def as_told(config: CellConfig, choice: str) -> CellConfig:
+def as_told(config: CellConfig, choice: str, catalogue: Catalogue | None = None) -> CellConfig:
     """Return the configuration that the program is given when an effect is hidden.
 
     Raises:
         InputError: an unknown choice; lists the valid ones. No loads in the configuration.
     """
-    check_choice(choice)
+    check_choice(choice, catalogue)
     if not config.loads:
         raise InputError("the cell has no [[loads]]; a rehearsal needs at least one")
     if choice != "base_frame":
@@ -115,26 +122,32 @@ def simulation_case(
     rng: np.random.Generator,
     visit: Callable[[Cell], CampaignStates],
     noise: SimulatedNoise,
+    catalogue: Catalogue | None = None,
 ) -> SimulationCase:
     """Make a simulated cell and hide an effect in it at the configured strength.
 
     Args:
         config: the cell; `[simulation]` gives the strength.
-        choice: an effect of `choices()`, "random" or "nothing".
+        choice: an effect of `choices()` or `own_choices(catalogue)`, "random" or "nothing".
         rng: generator.
         visit: returns the states at which the strength holds.
         noise: the tracker's noise of one reading.
+        catalogue: has the effects of a user's own.
 
     Raises:
         InputError: an unknown choice; lists the valid ones. No loads in the configuration.
     """
-    config = as_told(config, choice)
+    config = as_told(config, choice, catalogue)
     hidden = choice
     if choice == RANDOM:  # a wrong registration shows only where one is believed
         hidden = str(rng.choice([e for e in choices() if e != "base_frame"]))
-    mode: Mode = "deflection" if choice in DEFLECTION_EFFECTS else "absolute"
     cell = cell_from_config(config)
     v = visit(cell)
+    own = None
+    if catalogue is not None and hidden in own_choices(catalogue):
+        own = own_law(catalogue, hidden, cell, v.states)
+    loaded = choice in DEFLECTION_EFFECTS if own is None else own.effect.elastic
+    mode: Mode = "deflection" if loaded else "absolute"
     joint_std = config.repeatability.per_joint(cell.arm.n)
     world = nothing_hidden(cell, rng, noise=noise, joint_std=joint_std)
     strength = 0.0
@@ -143,8 +156,9 @@ def simulation_case(
         if hidden == "joint_stiffening":
             softer = _SOFTER * world.physics.joint_compliance
             world = replace(world, physics=world.physics.with_effect("joint_compliance", softer))
+        what = own or hidden
         world = hide(
-            hidden, cell, v.states, strength, mode, rng, world=world, pose=v.pose, cycle=v.cycle
+            what, cell, v.states, strength, mode, rng, world=world, pose=v.pose, cycle=v.cycle
         )
     return SimulationCase(config, cell, mode, world, hidden, strength)
 

@@ -9,6 +9,7 @@ from drivers.simulated.elastic_tree import ElasticTree, build
 from drivers.simulated.elasticity import Elasticity, elasticity
 from drivers.simulated.mechanics import Equilibrium, equilibrium
 from drivers.simulated.misreading import Misreading
+from drivers.simulated.own_law import OwnLaw
 from drivers.simulated.rigid import displacement, inverse, moved_by, rotation_vector, turned
 from drivers.simulated.tracker import SimulatedNoise
 from drivers.simulated.truth import Truth
@@ -53,6 +54,7 @@ class World:
         joint_reference: temperature at which joints do not drift, °C.
         offsets: (T, 3) where each of several targets truly is beyond its configured place, flange
             axes, m; None for none. `physics.target_offset` moves all of them.
+        own: an effect of a user's own, on top of what the mechanics do; None for none.
     """
 
     cell: Cell
@@ -63,6 +65,7 @@ class World:
     joint_std: Floats
     joint_reference: float = 22.0
     offsets: Floats | None = None
+    own: OwnLaw | None = None
     _tree: ElasticTree = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -88,7 +91,8 @@ class World:
     @property
     def truth(self) -> dict[str, float]:
         """The hidden parameters that are not zero, as "effect.part": value in SI."""
-        return self.physics.named(self.cell.arm)
+        own = {} if self.own is None else self.own.truth
+        return {**self.physics.named(self.cell.arm), **own}
 
     @property
     def drives(self) -> Ints:
@@ -105,7 +109,7 @@ class World:
             hidden.thermal_growth,
             hidden.thermal_joint_drift,
         )
-        return any(bool(np.any(cause)) for cause in causes)
+        return self.own is not None or any(bool(np.any(cause)) for cause in causes)
 
     def joint_errors(self, states: States) -> Floats:
         """Return the joint displacements (N, n) that do not depend on the load, rad.
@@ -168,7 +172,8 @@ class World:
 
         T_sensor_target = exp(t [drift]) T_sensor_base exp([base_frame]) T_base_flange
         T_flange_target, the target shifted by its offset; the position then 1 + s times as
-        long, about the origin of the sensor's axes.
+        long, about the origin of the sensor's axes. An effect of a user's own displaces the target
+        before drift and scale.
 
         Raises:
             InputError: the states lack what a hidden effect depends on, e.g. a drifting
@@ -188,6 +193,9 @@ class World:
         )
         jac = moved_by(by_drive, (rest.flange[:, :3, :3] @ target[..., :3, 3:])[:, :, 0])
         jac = np.concatenate([view @ jac[:, :3], view @ jac[:, 3:]], axis=1)
+        if self.own is not None:
+            shift, turn = self.own.moved(self.cell, frame, hidden.joint_compliance, states)
+            position, rotation = position + shift, turn @ rotation
         if np.any(hidden.tracker_drift):
             if states.time is None:
                 raise InputError(

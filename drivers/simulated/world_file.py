@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from drivers.simulated.own_law import OwnLaw
 from drivers.simulated.tracker import SimulatedNoise
 from drivers.simulated.truth import Truth
 from drivers.simulated.world import World
@@ -53,6 +54,7 @@ def write_world(path: Path, world: World, config: CellConfig, base_dir: Path | N
         "joint_std": _listed(world.joint_std),
         "joint_reference": world.joint_reference,
         "offsets": None if world.offsets is None else _listed(world.offsets),
+        "own": None if world.own is None else world.own.to_json(),
         "noise": {
             "range_std": list(noise.range_std),
             "transverse_std": list(noise.transverse_std),
@@ -101,6 +103,7 @@ def read_world(path: Path) -> tuple[World, CellConfig]:
             joint_std=_array(data["joint_std"]),
             joint_reference=float(data["joint_reference"]),
             offsets=_array(data["offsets"]) if data.get("offsets") else None,
+            own=OwnLaw.from_json(cell, data["own"]) if data.get("own") else None,
         )
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise InputError(f"{path}: damaged: {type(error).__name__} {error}") from None

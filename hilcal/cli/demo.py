@@ -68,7 +68,7 @@ def demo(
     if number < 0:
         raise InputError(f"--seed {number}; valid: a whole number, 0 or more")
     choice = hide or config.simulation.hide or (in_doubt(number) if ambiguous else RANDOM)
-    check_choice(choice)
+    check_choice(choice, catalogue)
     may_write(output, True)  # before the planning, which takes a while
     if ambiguous:
         weaker = config.simulation.model_copy(update={"strength_sigma": STRENGTH})
@@ -117,12 +117,18 @@ def demo(
         t.show([text.heading("What was found against what is true"), *text_demo.truth_table(truth)])
     ok, words = _judge(r, found)
     t.show([text_refine.verdict_line(found.diagnosis), "", text.heading(words)])
+    if r.world.own is not None:
+        t.show(
+            f"The simulated arm moved by the law of {r.hidden} itself: this shows whether such a "
+            "campaign reveals it, not whether the law is right."
+        )
     chapters = [
         Chapter(k, s.added, s.fit, s.diagnosis, s.removed)
         for k, s in zip(numbered, found.steps, strict=True)
     ]
     record_story(t, chapters, record)
-    t.show(f"\nThe campaign is in {output}. Go on with: hilcal view {output}")
+    more = "".join(f" --effects-from {path}" for path in effects_from or ())
+    t.show(f"\nThe campaign is in {output}. Go on with: hilcal view {output}{more}")
     t.document(
         {
             "campaign": str(output),

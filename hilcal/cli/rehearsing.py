@@ -66,7 +66,7 @@ def first_plan(told: RehearsalSettings, config: CellConfig, poses: int, say: Say
         poses: number of poses.
         say: told what is being done.
     """
-    config = as_told(config, told.choice)
+    config = as_told(config, told.choice, told.catalogue)
     cell = cell_from_config(config, told.base_dir)
     plan = make_plan(cell, config, poses, told.seed, told.catalogue, say)
     refuse(dry_run(cell, config, plan), "the plan")
@@ -88,7 +88,7 @@ def on_devices(
     """
     with ExitStack() as stack:
         with working(t.progress) as say:
-            secret = case_of_plan(told.config, plan, told.choice, told.seed)
+            secret = case_of_plan(told.config, plan, told.choice, told.seed, told.catalogue)
             say("starting the simulated devices")
             there = stack.enter_context(simulated_cell(secret, told.seed, told.base_dir))
         made = create_run(told.output, there.config, told.base_dir, plan, True)
@@ -120,7 +120,7 @@ def in_process(
     They are written bit by bit, as a real campaign grows.
     """
     with working(t.progress):
-        secret = case_of_plan(told.config, plan, told.choice, told.seed)
+        secret = case_of_plan(told.config, plan, told.choice, told.seed, told.catalogue)
     source = "rehearsal in a simulated cell, without devices"
     made = secret.config.to_json()
     with CampaignFile.create(

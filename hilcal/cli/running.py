@@ -114,7 +114,7 @@ def run(
             with working(t.progress) as say:
                 say("starting the simulated devices")
                 choice = config.simulation.hide or NOTHING
-                secret = case_of_plan(config, made, choice, config.simulation.seed)
+                secret = case_of_plan(config, made, choice, config.simulation.seed, catalogue)
                 simulated = simulated_cell(secret, config.simulation.seed, base_dir)
                 config = stack.enter_context(simulated).config
         if append:

@@ -58,7 +58,8 @@ def simulate(
         else:
             made = load_plan(plan)
         say("preparing the simulated cell")
-        secret = case_of_plan(config, made, hide or config.simulation.hide or NOTHING, number)
+        choice = hide or config.simulation.hide or NOTHING
+        secret = case_of_plan(config, made, choice, number, catalogue)
     with told_to_end(signal.SIGTERM, signal.SIGINT, signal.SIGHUP) as wait, ExitStack() as stack:
         with working(t.progress) as say:
             say("starting the devices")

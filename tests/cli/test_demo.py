@@ -14,6 +14,7 @@ from hilcal.errors import InputError
 from hilcal.report.progress import Say
 from studies.random_campaigns import rehearse
 from tests.support.cli_cases import CELL, ok, refused, rehearsal
+from tests.support.user_effect_cases import CLASS
 
 Capsys = pytest.CaptureFixture[str]
 FAST = "--without-devices"
@@ -89,6 +90,25 @@ def test_the_demo_does_not_replace_another_file(tmp_path: Path, capsys: Capsys) 
     line = refused(capsys, 2, "demo", FAST, "--hide", "nothing", "-o", path, "--json")
     assert "notes.txt" in line
     assert path.read_text(encoding="utf-8") == "mine"
+
+
+@pytest.mark.slow
+def test_an_effect_of_ones_own_is_hidden_and_found(tmp_path: Path, capsys: Capsys) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text(CLASS, encoding="utf-8")
+    path = tmp_path / "own.hilcal"
+    own = ("--effects-from", file)
+    line = refused(capsys, 2, "demo", FAST, "--hide", "mine", "-o", path)
+    assert "'mine'" in line
+    result = ok(capsys, "demo", FAST, "--poses", "4", "--hide", "mine", *own, "-o", path, "--json")
+    d = result.document
+    assert (d["hidden"], d["found"], d["verdict"]) == ("mine", True, "adequate")
+    (parameter,) = [p for p in d["parameters"] if p["name"] == "mine.a"]
+    assert d["truth"]["mine.a"] == parameter["true"] != 0.0
+    assert abs(parameter["value"] - parameter["true"]) < 4 * parameter["std"]
+    words = " ".join(result.err.split())
+    assert "moved by the law of mine itself" in words
+    assert f"hilcal view {path} --effects-from {file}" in words
 
 
 def test_what_cannot_be_hidden(tmp_path: Path, capsys: Capsys) -> None:

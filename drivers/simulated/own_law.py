@@ -1,0 +1,123 @@
+"""An effect of a user's own, hidden in the simulated world.
+
+The world has mechanics of its own for every effect that ships, so that a diagnosis is not tested
+against itself. For a law that only the user's file knows there is nothing else to compute it by:
+**this is the only case in which the world shares a law with the model.** What the law does to the
+target, as a model of joint compliance and this law predicts it, is added to where the world's own
+mechanics hold the target. It shows whether a campaign reveals the law, not whether it is coded
+right; `hilcal.check_effect` is for that.
+"""
+
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hilcal.cell import Cell
+from hilcal.data.readings import States
+from hilcal.effects.catalogue import Catalogue, installed
+from hilcal.effects.joint_compliance import JointCompliance
+from hilcal.effects.protocol import Effect
+from hilcal.errors import InputError
+from hilcal.model import Model
+from hilcal.robot import se3
+from hilcal.types import Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OwnLaw:
+    """An effect with its true parameters.
+
+    Attributes:
+        effect: set up for `states`.
+        states: of the campaign that it was set up for.
+        catalogue: that the effect is from.
+        theta: (P,) its parameters, SI.
+    """
+
+    effect: Effect
+    states: States
+    catalogue: Catalogue
+    theta: Floats
+
+    @property
+    def truth(self) -> dict[str, float]:
+        """The parameters that are not zero, as "effect.part": value in SI."""
+        pairs = zip(self.effect.parameters, self.theta, strict=True)
+        return {f"{self.effect.name}.{p.name}": float(value) for p, value in pairs if value}
+
+    def drawn(self, rng: np.random.Generator) -> Floats:
+        """Draw (P,) parameters of ordinary magnitude."""
+        scale = np.array([p.scale for p in self.effect.parameters])
+        return np.asarray(scale * rng.standard_normal(len(scale)))
+
+    def moved(
+        self, cell: Cell, frame: Floats, compliance: Floats, states: States
+    ) -> tuple[Floats, Floats]:
+        """Return by how much N readings are displaced (N, 3) and turned (N, 3, 3), sensor axes.
+
+        Args:
+            cell: the cell as configured.
+            frame: (4, 4) the true T_sensor_base.
+            compliance: (n,) of the drives, rad/(N·m), which the law may build on.
+            states: N states.
+
+        Raises:
+            InputError: the states lack what the law depends on.
+        """
+        if not self.effect.computable(states):
+            needs = ", ".join(self.effect.needs)
+            raise InputError(f"effect {self.effect.name} needs {needs}, which the cell lacks")
+        where = replace(cell, registration=frame)
+        soft = JointCompliance(where, states)
+        without = Model(where, (soft,), self.catalogue)
+        within = Model(where, (soft, self.effect), self.catalogue)
+        before = without.predict(states, compliance).observation
+        after = within.predict(states, np.concatenate([compliance, self.theta])).observation
+        turn = se3.product(after.rotation, np.swapaxes(before.rotation, 1, 2))
+        return after.position - before.position, turn
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the law as JSON: its file, and what it was set up with."""
+        file = self.catalogue.file_of(self.effect.name)
+        given = {f.name: getattr(self.states, f.name) for f in fields(States)}
+        return {
+            "name": self.effect.name,
+            "file": None if file is None else file.path,
+            "sha256": None if file is None else file.sha256,
+            "options": dict(self.effect.options),
+            "theta": self.theta.tolist(),
+            "states": {k: np.asarray(v).tolist() for k, v in given.items() if v is not None},
+        }
+
+    @staticmethod
+    def from_json(cell: Cell, data: dict[str, Any]) -> "OwnLaw":
+        """Return the law of `to_json`.
+
+        Raises:
+            InputError: its file cannot be used, or has changed.
+        """
+        catalogue = installed()
+        if data["file"] is not None:
+            catalogue = catalogue.with_file(Path(data["file"]))
+            if catalogue.files[-1].sha256 != data["sha256"]:
+                raise InputError(f"{data['file']}: changed since the simulated world was made")
+        states = States(**{k: np.array(v) for k, v in data["states"].items()})
+        effect = catalogue.make(data["name"], cell, states, data["options"])
+        return OwnLaw(effect, states, catalogue, np.array(data["theta"], dtype=np.float64))
+
+
+def own_names(catalogue: Catalogue, known: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the effects of a catalogue that the world has no mechanics for."""
+    return tuple(k.name for k in catalogue.with_role("effect") if k.name not in known)
+
+
+def own_law(catalogue: Catalogue, name: str, cell: Cell, states: States) -> OwnLaw:
+    """Return an effect without strength, set up for the states of a campaign.
+
+    Raises:
+        InputError: an unknown effect, or states that lack what it needs.
+    """
+    effect = catalogue.make(name, cell, states)
+    return OwnLaw(effect, states, catalogue, np.zeros(len(effect.parameters)))
