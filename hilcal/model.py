@@ -195,7 +195,10 @@ class Model:
         the static equilibrium is differentiated implicitly (`hilcal.equilibrium`).
         """
         count = len(prediction.situation.angle)
-        sizes = [len(e.parameters) for e in effects]
+        if effects is self.effects:  # naming a thousand parameters takes long
+            sizes = [s.stop - s.start for s in self.slices()]
+        else:
+            sizes = [len(e.parameters) for e in effects]
         place = np.full(sum(sizes), -1)
         live = np.arange(len(place)) if live is None else live
         place[live] = np.arange(len(live))

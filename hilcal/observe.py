@@ -96,7 +96,11 @@ class Motion:
     def by_columns(self, c: Columns) -> Floats:
         """Motion (N, m, P) by the parameters of one block of columns."""
         if c.field == "dq":
-            return self.drives[:, :, c.element] * c.values[:, None, :]
+            out = np.empty((len(self.dq), self.m, len(c.parameter)))
+            for joint, mine in c.runs():
+                moved = self.drives[:, :, joint, None]
+                np.multiply(moved, c.values[:, None, mine], out=out[:, :, mine])
+            return out
         if c.field == "scale":
             out = zeros(len(self.dq), self.m, len(c.parameter))
             out[:, :3] = self._unscaled()[:, :, None] * c.values[:, None, :]

@@ -134,7 +134,7 @@ def tree_share(p: Linearisation) -> float:
         mine = fold == f
         if mine.all() or not mine.any():
             continue
-        trees = ExtraTreesRegressor(TREES, min_samples_leaf=LEAF, random_state=0)
+        trees = ExtraTreesRegressor(TREES, min_samples_leaf=LEAF, random_state=0, n_jobs=-1)
         left[mine] -= trees.fit(features[~mine], target[~mine]).predict(features[mine])
     total = max(float(np.sum(target**2)), 1e-300)
     gain = (total - float(np.sum(left**2))) / total

@@ -7,8 +7,9 @@ returns `load_change` or `wrench_change`, and their derivative `wrench_columns`.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import ClassVar, Literal, Self
 
 import numpy as np
@@ -110,6 +111,12 @@ class Columns:
         return Columns(
             self.field, self.parameter[wanted], self.element[wanted], self.values[:, wanted]
         )
+
+    def runs(self) -> Iterator[tuple[int, slice]]:
+        """Yield each joint or slot that moves, and successive columns that move it."""
+        starts = np.flatnonzero(np.diff(self.element, prepend=-1)).tolist()
+        for start, end in pairwise([*starts, len(self.element)]):
+            yield int(self.element[start]), slice(start, end)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -352,9 +359,8 @@ def total(columns: tuple[Columns, ...], theta: Floats, s: Situation) -> Deviatio
         field = fields.setdefault(c.field, zeros(count, *width.get(c.field, (6,))))
         t = theta[c.parameter]
         if c.field in ("dq", "twist"):
-            for e in np.unique(c.element):
-                mine = c.element == e
-                field[:, e] += np.einsum("np...,p->n...", c.values[:, mine], t[mine])
+            for e, mine in c.runs():
+                field[:, e] += np.tensordot(c.values[:, mine], t[mine], axes=(1, 0))
         else:
             field += np.einsum("np...,p->n...", c.values, t)
     return Deviation(**fields)

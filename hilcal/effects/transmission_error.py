@@ -54,9 +54,16 @@ class TransmissionError(PerJoint):
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:
         """Waves: ∂dq_j/∂a_jk = cos k q_j, ∂dq_j/∂b_jk = sin k q_j."""
-        phase = s.angle[:, :, None] * self.harmonics
-        waves = np.stack([np.cos(phase), np.sin(phase)], axis=-1)
-        return (self.kind_columns(waves.reshape(*s.angle.shape, -1)),)
+        # exp(i k q), each half of the harmonics from the other: many times as fast as sines.
+        count, done = len(self.harmonics), 1
+        waves = np.empty((*s.angle.shape, count), dtype=np.complex128)
+        waves[:, :, 0] = np.exp(1j * s.angle)
+        while done < count:
+            more = min(done, count - done)
+            last = waves[:, :, done - 1 : done]
+            np.multiply(waves[:, :, :more], last, out=waves[:, :, done : done + more])
+            done += more
+        return (self.kind_columns(waves.view(np.float64)),)
 
     def groups(self) -> Ints:
         """One variance per group of joints and harmonic."""

@@ -13,6 +13,7 @@ the model without it where it is not.
 """
 
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 
@@ -111,19 +112,38 @@ def left_out_residual(
         for fold in folds:
             left[fold.out] = white[fold.out] - p.rows[fold.out] @ fold.step()
         return left
-    cross, gram, rhs = p.rows.T @ x, x.T @ x, x.T @ white
-    gram[np.diag_indices_from(gram)] += max(ridge, FAMILY_ROUNDING * float(gram.max(initial=0.0)))
+    parts = [_Products.of(p.rows[f.out], x[f.out], white[f.out]) for f in folds]
+    whole = reduce(_Products.plus, parts)
+    least = max(ridge, FAMILY_ROUNDING * float(whole.gram.max(initial=0.0)))
     left = np.zeros(len(white))
-    for fold in folds:
-        out, own, r = x[fold.out], p.rows[fold.out], white[fold.out]
+    for fold, own in zip(folds, parts, strict=True):
         # Eliminate the model's own coordinates, then solve for the family.
-        c = cross - own.T @ out
-        solved = fold.solve(np.column_stack([c, fold.rhs]))
-        h = gram - out.T @ out - c.T @ solved[:, :-1]
-        b = rhs - out.T @ r - c.T @ solved[:, -1]
-        step = positive_solve(h, b)
-        left[fold.out] = r - own @ (solved[:, -1] - solved[:, :-1] @ step) - out @ step
+        lifted = fold.inverse_root @ np.column_stack([whole.cross - own.cross, fold.rhs])
+        along, size = lifted[:, :-1], lifted[:, -1]
+        h = whole.gram - own.gram - along.T @ along
+        h[np.diag_indices_from(h)] += least
+        step = positive_solve(h, whole.rhs - own.rhs - along.T @ size)
+        back = fold.inverse_root.T @ (size - along @ step)
+        left[fold.out] = white[fold.out] - p.rows[fold.out] @ back - x[fold.out] @ step
     return left
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Products:
+    """BᵀX, XᵀX and Xᵀr of some rows."""
+
+    cross: Floats
+    gram: Floats
+    rhs: Floats
+
+    @classmethod
+    def of(cls, rows: Floats, x: Floats, white: Floats) -> "_Products":
+        """Form them."""
+        return cls(rows.T @ x, x.T @ x, x.T @ white)
+
+    def plus(self, other: "_Products") -> "_Products":
+        """Return those of both."""
+        return _Products(self.cross + other.cross, self.gram + other.gram, self.rhs + other.rhs)
 
 
 def left_out_residuals(

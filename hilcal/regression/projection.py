@@ -47,8 +47,8 @@ class Projection:
             x: (R, P) whitened columns.
             gram: (P, P) XᵀX where it is known.
         """
-        cross = self.rows.T @ x
-        return np.asarray((x.T @ x if gram is None else gram) - cross.T @ self.solve(cross))
+        lifted = self.inverse_root @ (self.rows.T @ x)
+        return np.asarray((x.T @ x if gram is None else gram) - lifted.T @ lifted)
 
     def residual(self, y: Floats, z: Floats) -> Floats:
         """Return the residual (R,) after the model's own remaining step.

@@ -149,7 +149,7 @@ def _at(blocks: Sequence[BlockRows], ridge: Floats, variance: Floats) -> _Point:
 
     def project(x: list[Floats]) -> list[Floats]:
         """P x of columns (G, S, Q)."""
-        cross = sum(np.einsum("gsk,gsq->kq", w, part) for w, part in zip(weighted, x, strict=True))
+        cross = sum(_flat(w).T @ _flat(part) for w, part in zip(weighted, x, strict=True))
         step = t.T @ (t @ cross)
         parts = zip(inverses, weighted, x, strict=True)
         return [inverse @ part - w @ step for inverse, w, part in parts]
@@ -159,7 +159,7 @@ def _at(blocks: Sequence[BlockRows], ridge: Floats, variance: Floats) -> _Point:
     trace = np.zeros(len(variance))
     moved = []
     for b, inverse, w, p in zip(blocks, inverses, weighted, py, strict=True):
-        root = w @ t.T
+        root = (_flat(w) @ t.T).reshape(w.shape)  # one product is faster than G
         own = inverse - root @ np.swapaxes(root, 1, 2)
         trace += np.einsum("gij,cgji->c", own, b.components)
         moved.append(np.einsum("cgij,gj->gic", b.components, p))
@@ -173,6 +173,11 @@ def _at(blocks: Sequence[BlockRows], ridge: Floats, variance: Floats) -> _Point:
         np.asarray(-0.5 * (trace - quadratic)),
         np.asarray(0.25 * (information + np.transpose(information))),
     )
+
+
+def _flat(x: Floats) -> Floats:
+    """(G·S, Q) rows of blocks (G, S, Q)."""
+    return x.reshape(-1, x.shape[2])
 
 
 def _log_det(t: Floats) -> float:
