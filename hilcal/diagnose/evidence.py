@@ -9,7 +9,13 @@ from hilcal.data.arm_scatter import ArmScatter
 from hilcal.diagnose.arm_repeatability import instrument_instead
 from hilcal.diagnose.backward_elimination import backward_elimination
 from hilcal.diagnose.catalogue_sufficiency import Insufficiency, insufficiency
-from hilcal.diagnose.effect_ranking import Suspect, candidates, rank_suspects
+from hilcal.diagnose.effect_ranking import (
+    FALSE_ALARM,
+    LEAST_SHARE,
+    Suspect,
+    candidates,
+    rank_suspects,
+)
 from hilcal.diagnose.misfit_breakdown import MisfitShare, misfit_breakdown
 from hilcal.diagnose.noise import PureError, pure_error
 from hilcal.diagnose.noise_verdict import MISFIT_ALARM
@@ -90,7 +96,8 @@ class Evidence:
     @cached_property
     def pose_alone(self) -> PoseAlone | None:
         """A misfit that is the same under every load of a pose."""
-        return pose_alone(self.linearisation, self.effects)
+        level = FALSE_ALARM / max(len(self.effects), 1)
+        return pose_alone(self.linearisation, self.effects, level, LEAST_SHARE)
 
     @cached_property
     def by_arrivals(self) -> "Evidence | None":

@@ -82,7 +82,7 @@ def _least(
     moved = np.sqrt(np.mean(np.sum(np.einsum("dip,pk->dik", full.motion, beta) ** 2, axis=1)))
     for displacement in GRID * start.displacement_m:
         t = float(displacement / moved)
-        if np.mean(_found(p, of, s, t * signal + error, level, least_share, largest)) >= POWER:
+        if np.mean(found(p, of, s, t * signal + error, level, least_share, largest)) >= POWER:
             own = tuple(
                 (unit, t * float(np.sqrt(np.mean(full.scale[_of_unit(full, unit)] ** 2))))
                 for unit, _ in start.parameters
@@ -97,7 +97,7 @@ def _of_unit(of: EffectColumns, unit: str) -> list[int]:
     return [k for k, q in enumerate(of.effect.parameters) if q.unit == unit]
 
 
-def _found(
+def found(
     p: Linearisation,
     of: EffectColumns,
     s: Floats,

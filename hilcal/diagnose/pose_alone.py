@@ -7,7 +7,9 @@ much: what is missing depends on the pose, and on nothing else that changed with
 The residual is split by constants of each pose, three displacements of the target. Where they leave
 noise and take nearly all of the misfit, the effects are listed whose own columns are such constants
 to nearly all of their square. A family tells its parameters from each other when the poses measure
-as many elements as it has parameters; so many more poses are stated.
+about as many elements as it has parameters. How many more poses tell is the least number of those
+tried with which the first of these effects, at the size of the misfit, passes every test of a
+suspect nine times in ten (see `more_poses`).
 """
 
 from collections.abc import Sequence
@@ -17,6 +19,7 @@ import numpy as np
 from scipy.stats import chi2
 from scipy.stats import f as f_distribution
 
+from hilcal.diagnose.more_poses import enough
 from hilcal.diagnose.noise_verdict import MISFIT_ALARM
 from hilcal.effects.protocol import Effect
 from hilcal.identify.linearisation import Linearisation, effect_columns
@@ -38,13 +41,16 @@ class PoseAlone:
         share: share of the misfit that constants of each pose take, less what chance would.
         effects: those that depend on the pose alone, most parameters first.
         poses: number of poses that were measured.
-        more: how many more would measure as many elements as the first of them has parameters.
+        more: how many more poses, read unloaded, tell of the first of them.
+        chance: that they do, where it is there with the size of the misfit; None where the model
+            holds a coarser version of it.
     """
 
     share: float
     effects: tuple[str, ...]
     poses: int
     more: int
+    chance: float | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,12 +90,16 @@ def pose_constants(p: Linearisation) -> PoseConstants | None:
     return PoseConstants(u, gain, p_value)
 
 
-def pose_alone(p: Linearisation, effects: Sequence[Effect]) -> PoseAlone | None:
+def pose_alone(
+    p: Linearisation, effects: Sequence[Effect], level: float, least: float
+) -> PoseAlone | None:
     """Return a misfit that depends on the pose alone; None where it does not, or nothing does that.
 
     Args:
         p: linearisation of the fit.
         effects: that are not in the model.
+        level: of the test of a suspect, between 0 and 1.
+        least: share of the misfit on poses left out that a suspect must explain.
     """
     found = pose_constants(p)
     if found is None:
@@ -105,10 +115,16 @@ def pose_alone(p: Linearisation, effects: Sequence[Effect]) -> PoseAlone | None:
         x = p.project_out(effect_columns(fit, full).white)
         square = float(np.sum(x**2))
         if square > 0 and float(np.sum((found.basis.T @ x) ** 2)) >= ALIKE * square:
-            able.append((len(full.parameters), e.name))
+            able.append((len(full.parameters), e))
     if not able:
         return None
     able.sort(key=lambda pair: -pair[0])
     poses = int(fit.pose.max()) + 1
-    more = max(int(np.ceil(able[0][0] / fit.whitening.m)) - poses, 0)
-    return PoseAlone(share, tuple(name for _, name in able), poses, more) if more else None
+    about = max(int(np.ceil(able[0][0] / fit.whitening.m)) - poses, 0)
+    if not about:
+        return None
+    names, first = tuple(e.name for _, e in able), able[0][1]
+    if first.name in fit.model.names:
+        return PoseAlone(share, names, poses, about, None)
+    told = enough(p, first, about, level, least)
+    return PoseAlone(share, names, poses, told.more, told.chance)

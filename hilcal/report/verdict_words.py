@@ -146,12 +146,13 @@ def _percent(share: float) -> str:
 
 def _pose_alone(d: Diagnosis, a: PoseAlone) -> str:
     first, *rest = a.effects
+    chance = "" if a.chance is None else f" with a chance of {100 * a.chance:.0f} %"
     others = f", or {' or '.join(rest[:2])}," if rest else ""
     return (
         f"Residuals are {_spread(d)}, and {100 * a.share:.0f} % of the misfit is the same under "
         f"every load of a pose: it depends on the pose alone. {first} finer than {a.poses} poses "
         f"can resolve{others} would do that, and so would an arm that repeats worse than stated, "
-        f"where each pose was arrived at once; {a.more} more poses tell"
+        f"where each pose was arrived at once; {a.more} more poses tell{chance}"
     )
 
 

@@ -7,9 +7,12 @@ import pytest
 
 from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.diagnose.doubt import in_doubt
+from hilcal.diagnose.effect_ranking import candidates
+from hilcal.diagnose.more_poses import chance, enough
 from hilcal.diagnose.verdict import diagnose
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import fit
+from hilcal.identify.linearisation import linearise
 from hilcal.report.diagnosis_document import to_json
 from hilcal.report.verdict_words import message
 from tests.support.campaigns import campaign, measured, plan
@@ -38,7 +41,8 @@ def test_a_transmission_error_too_fine_for_thirty_poses_is_ambiguous(seed: int) 
     # 2 · 40 harmonics of six joints, three elements per pose.
     assert (d.pose_alone.poses, d.pose_alone.more) == (30, 130)
     assert "the same under every load of a pose" in message(d)
-    assert "130 more poses tell" in message(d)
+    assert d.pose_alone.chance > 0.9
+    assert "130 more poses tell with a chance of" in message(d)
     assert in_doubt(d)[:2] == ("transmission_error", "link_geometry")
     assert to_json(d)["pose_alone"]["more"] == 130
 
@@ -49,3 +53,17 @@ def test_what_depends_on_the_load_is_not_of_the_pose_alone() -> None:
     assert d.pose_alone is None
     assert d.lead is not None
     assert d.lead.effect == "creep"
+
+
+def test_the_chance_grows_with_the_poses() -> None:
+    """Thirty poses hardly ever tell, many do."""
+    options = {"plan_seed": 0, "poses": 30, "strength": 2.0, "harmonics": 21}
+    c = campaign("transmission_error", "absolute", 0, **options)
+    p = linearise(fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute"))
+    effect = next(e for e in candidates(p.fit) if e.name == "transmission_error")
+    few, many = (chance(p, effect, n, 1e-4, 0.01) for n in (0, 160))
+    assert few < 0.2
+    assert many > 0.9
+    least = enough(p, effect, 130, 1e-4, 0.01)
+    assert least.chance >= 0.9
+    assert 33 < least.more <= 195
