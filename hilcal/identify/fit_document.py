@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from hilcal.identify.before import error_before
 from hilcal.identify.fit import Fit
 from hilcal.identify.frames_document import fit_to_json, frames_of_fit
 from hilcal.identify.full_prediction import full_prediction
@@ -37,7 +38,11 @@ def to_json(fit: Fit) -> dict[str, object]:
         "inflated": fit.uncertainty.inflated,
         "variance_factor": fit.variance_factor,
         "variance_factor_interval": list(fit.variance_factor_interval),
-        "error": {"fit": fit.error.to_json(), "holdout": fit.holdout.to_json()},
+        "error": {
+            "before": error_before(fit).to_json(),
+            "fit": fit.error.to_json(),
+            "holdout": fit.holdout.to_json(),
+        },
         "noise_floor_m": full_prediction(fit).noise_floor,
         "outliers": outliers(fit),
         "arm_scatter": None if scatter is None else scatter.to_json(),

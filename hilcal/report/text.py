@@ -7,9 +7,10 @@ import numpy as np
 from rich.console import RenderableType
 from rich.text import Text
 
-from hilcal.diagnose.effect_ranking import LEAST_SHARE
+from hilcal.diagnose.effect_ranking import FALSE_ALARM, LEAST_SHARE
 from hilcal.diagnose.misfit_breakdown import Group, MisfitShare
 from hilcal.effects.protocol import Effect
+from hilcal.identify.before import error_before
 from hilcal.identify.fit import Fit
 from hilcal.identify.fit_document import notes
 from hilcal.identify.full_prediction import FullPrediction, full_prediction
@@ -61,7 +62,8 @@ def kind(fit: Fit) -> str:
 def fit_report(fit: Fit) -> Iterator[RenderableType]:
     """Yield all that people want to know of a fit."""
     yield heading(f"Model: {model_name(fit.model.names)}")
-    yield f"Fitted to {kind(fit)}; scaling {fit.scaling}.\n"
+    yield f"Fitted to {kind(fit)}; scaling {fit.scaling}."
+    yield f"{before_and_after(fit)}\n"
     yield from parameters(fit)
     yield errors(fit)
     yield ""
@@ -134,9 +136,14 @@ def family(fit: Fit, effect: Effect, index: Ints) -> RenderableType:
 
 
 def errors(fit: Fit) -> RenderableType:
-    """Return the table of errors: fitted, left out, and what noise alone leaves."""
+    """Return the table of errors: before, fitted, left out, and what noise alone leaves."""
     out = table("3-D position error", "rms", "mean", "largest", "rms in σ")
-    for name, e in (("poses fitted", fit.error), ("poses left out", fit.holdout)):
+    rows = (
+        ("before: rigid nominal arm", error_before(fit)),
+        ("poses fitted", fit.error),
+        ("poses left out", fit.holdout),
+    )
+    for name, e in rows:
         out.add_row(
             name,
             numbers.length(e.rms_m),
@@ -146,6 +153,18 @@ def errors(fit: Fit) -> RenderableType:
         )
     out.add_row("noise alone", numbers.length(full_prediction(fit).noise_floor), "", "", "1.00")
     return out
+
+
+def before_and_after(fit: Fit) -> str:
+    """Say in a sentence what was there before, and what the model leaves."""
+    before = numbers.length(error_before(fit).rms_m)
+    floor = numbers.length(full_prediction(fit).noise_floor)
+    was = (
+        f"Deflections of {before} rms were measured"
+        if fit.mode == "deflection"
+        else f"The rigid nominal arm, in the fitted frames, is off by {before} rms"
+    )
+    return f"{was}; the model leaves {numbers.length(fit.error.rms_m)} (noise alone: {floor})."
 
 
 def remarks(fit: Fit) -> Iterator[RenderableType]:
@@ -247,9 +266,15 @@ def where_table(places: Sequence[MisfitShare]) -> Iterator[RenderableType]:
     yield Text(
         "share of the misfit: what a smooth law of the variable predicts on poses left out (these "
         "overlap); what is the same in all readings of a pose; what points along a direction"
-        f"{more}.",
+        f"{more}. p-value: chance of that share in noise; {numbers.many_tests(*tests_of(places))}",
         style="dim",
     )
+
+
+def tests_of(places: Sequence[MisfitShare]) -> tuple[int, float, str]:
+    """Return how many variables were looked at, and the level that they share."""
+    kinds = [p for p in places if p.group not in ("pose", "direction")]
+    return len(kinds), FALSE_ALARM, "variables"
 
 
 @dataclass(frozen=True, slots=True)
