@@ -20,6 +20,7 @@ from hilcal.cli.commands import COMMANDS
 from hilcal.config import CellConfig, load_config
 from hilcal.data.appended import with_new_names
 from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.columns import joint_columns
 from hilcal.data.covariance import WHOLE
 from hilcal.data.plan import Plan, load_plan
 from hilcal.data.readings import Readings
@@ -33,7 +34,7 @@ Capsys = pytest.CaptureFixture[str]
 FEW = "candidates = 60\nagainst = []\n"
 """In [planning]: so that planning takes a second."""
 SEED = 3
-ELSEWHERE = {"simulate", "demo", "init", "compensate"}
+ELSEWHERE = {"simulate", "demo", "init"}
 """Commands of the section that other tests run."""
 
 
@@ -68,6 +69,8 @@ def test_every_command_in_order(
         if words[0] == "run":
             draw(config, words)
             continue
+        if words[0] == "compensate":
+            points(Path(words[1]), Path(words[2]))
         quick = ["--quick"] if words[0] in ("plan", "next") else []
         if "--plan" in words and words[words.index("--plan") + 1] == "next.json":
             continue
@@ -85,6 +88,7 @@ def test_every_command_in_order(
     assert "it is not the accuracy of the robot" in told
     assert "joint_compliance.j1" in said(shown, "identify run.hilcal")
     assert "adequate" in said(shown, "refine run.hilcal")
+    assert "2 points compensated" in said(shown, "compensate run.hilcal")
 
 
 def said(shown: dict[str, Outcome], command: str) -> str:
@@ -119,6 +123,15 @@ def draw(config: CellConfig, words: list[str], noise: int = 1) -> None:
 def readings(config: CellConfig, plan: Plan, noise: int) -> Readings:
     """Readings of a plan in the one world of this file."""
     return read_plan(case_of_plan(config, plan, "nothing", SEED), plan, [SEED, noise]).readings
+
+
+def points(run: Path, path: Path) -> None:
+    """Write a table with two of the poses that were measured."""
+    with CampaignFile.open(run, read_only=True) as c:
+        q = c.readings().states.q[:2]
+    header = ",".join(["pose", *joint_columns(q.shape[1])])
+    rows = [",".join([name, *map(str, row)]) for name, row in zip("ab", q.tolist(), strict=True)]
+    path.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
 
 
 def others(config: CellConfig, directory: Path) -> None:
