@@ -172,7 +172,13 @@ class Campaign:
     def restore(self, record: RevisionRecord) -> Fit:
         """Return the fit of a stored revision; raises as `fit` does."""
         check_sources(record, self.path, self.catalogue)
-        return restore(record, self.cell, self.readings, self.catalogue)
+        try:
+            return restore(record, self.cell, self.readings, self.catalogue)
+        except InputError as error:
+            if record.number != self.file.accepted():
+                raise
+            on = f"it is the accepted one: hilcal accept {self.path} N accepts another"
+            raise InputError(f"{error}; {on}") from None
 
     def fitted_readings(self, record: RevisionRecord) -> Readings:
         """Return the readings that a revision was fitted to; later ones come after them."""

@@ -299,6 +299,8 @@ def init(
     if cell.exists() and not force and not (there and agreed(t, f"{cell} exists. Replace it?")):
         raise InputError(f"{cell}: the file exists; choose another name or give --force")
     draft = Draft(cell.absolute().parent)
+    if there:
+        t.notice(f"Enter alone leaves a thing open; Ctrl-C ends, and {cell} is not written.\n")
     for item in items():
         if item.option in given:
             for words in given[item.option]:
@@ -358,9 +360,10 @@ def _ask(t: Terminal, draft: Draft, item: Item) -> None:
         found = ports()
         t.notice("Serial ports here: " + (", ".join(found) if found else "none") + ".")
     hint = f" (Enter: {item.without})" if item.without else ""
-    question = f"{item.question}{hint}: "
+    question = f"{item.question}{hint}:"
     while True:
-        t.progress.print(question, end="", markup=False, highlight=False, style="bold")
+        t.progress.print(question, markup=False, highlight=False, style="bold")
+        t.progress.print("> ", end="", markup=False, highlight=False)
         answer = sys.stdin.readline()
         if not answer:
             raise StoppedError("nothing is written: the input ended")
@@ -374,7 +377,7 @@ def _ask(t: Terminal, draft: Draft, item: Item) -> None:
             continue
         if not item.again:
             return
-        question = "Another one (Enter: no more): "
+        question = "Another one (Enter: no more):"
 
 
 def _shortly(error: InputError) -> str:

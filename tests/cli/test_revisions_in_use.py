@@ -15,6 +15,7 @@ from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.revision import from_text, to_text
 from hilcal.errors import InputError
 from tests.support.cli_cases import CELL, ok, refused, table
+from tests.support.cli_cases import run as command
 
 Capsys = pytest.CaptureFixture[str]
 BASE = ["base_frame", "joint_compliance"]
@@ -82,12 +83,12 @@ READING = (
 
 
 @pytest.mark.parametrize(
-    ("command", "revisions"),
+    ("reading", "revisions"),
     [*((c, True) for c in READING), *((c, False) for c in READING[:3])],
     ids=lambda x: x[0] if isinstance(x, tuple) else ("fresh", "fitted")[x],
 )
 def test_a_command_that_reads_writes_nothing_to_the_campaign(
-    command: tuple[str, ...],
+    reading: tuple[str, ...],
     revisions: bool,
     fresh: bytes,
     fitted: bytes,
@@ -102,7 +103,7 @@ def test_a_command_that_reads_writes_nothing_to_the_campaign(
     run.chmod(0o444)
     home.chmod(0o555)
     before = state(home)
-    name, *rest = (part.format(run=run, out=out) for part in command)
+    name, *rest = (part.format(run=run, out=out) for part in reading)
     ok(capsys, name, run, *rest)
     assert state(home) == before
     home.chmod(0o755)
@@ -141,9 +142,9 @@ def test_every_command_that_reads_a_model_takes_a_revision(
     run: Path, cell: Path, tmp_path: Path, capsys: Capsys
 ) -> None:
     two = [*BASE, "hysteresis"]
-    for command in ("compare", "diagnose"):
-        assert ok(capsys, command, run, "--json").document["model"][-1] == "base_compliance"
-        d = ok(capsys, command, run, "--revision", "2", "--json").document
+    for name in ("compare", "diagnose"):
+        assert ok(capsys, name, run, "--json").document["model"][-1] == "base_compliance"
+        d = ok(capsys, name, run, "--revision", "2", "--json").document
         assert (d["revision"], d["model"]) == (2, two)
     d = ok(capsys, "validate", run, run, "--revision", "2", "--json").document
     assert (d["revision"], d["model"]) == (2, two)
@@ -155,12 +156,12 @@ def test_every_command_that_reads_a_model_takes_a_revision(
     assert "hysteresis.j2" in parameters.read_text()
     said = refused(capsys, 2, "export", run, "--table", tmp_path / "t.csv", "--revision", "2")
     assert "--parameters" in said
-    plan = ("plan", cell, "-o", tmp_path / "plan.json", "--poses", "2", "--quick", "--json")
-    d = ok(capsys, *plan, "--after", run, "--revision", "2").document
+    plan = ("plan", cell, "-o", tmp_path / "plan.json", "--poses", "2", "--quick")
+    d = ok(capsys, *plan, "--after", run, "--revision", "2", "--json").document
     assert any("hysteresis" in name for name in d["predicted_std"])
     assert "--after" in refused(capsys, 2, *plan, "--revision", "2")
-    for command in ("compare", "diagnose", "view"):
-        said = refused(capsys, 2, command, run, "--revision", "9")
+    for name in ("compare", "diagnose", "view"):
+        said = refused(capsys, 2, name, run, "--revision", "9")
         assert said.endswith("no revision 9; there are 1 to 3")
 
 
@@ -189,8 +190,8 @@ def test_exploring_does_not_change_what_others_use_once_a_revision_is_accepted(
 ) -> None:
     words = ok(capsys, "accept", run, "2").out
     assert "Accepted: revision 2" in words
-    for command in ("compare", "diagnose"):
-        result = ok(capsys, command, run, "--json")
+    for name in ("compare", "diagnose"):
+        result = ok(capsys, name, run, "--json")
         assert result.document["revision"] == 2
         assert "using revision 2, which is accepted; the latest is 3" in result.err
     ok(capsys, "add", run, "load_point")  # from the accepted one; it stays accepted
@@ -207,6 +208,22 @@ def test_exploring_does_not_change_what_others_use_once_a_revision_is_accepted(
     assert d == {"accepted": None, "in_use": 5, "latest": 5}
     ok(capsys, "identify", run)
     assert ok(capsys, "compare", run, "--json").document["revision"] == 6
+
+
+def test_an_accepted_revision_that_has_become_too_old_says_how_to_go_on(
+    run: Path, capsys: Capsys
+) -> None:
+    ok(capsys, "accept", run, "2")
+    with Campaign.open(run) as o:
+        o.file.append_readings(o.file.readings()[:5])
+    result = command(capsys, "compare", run)
+    assert result.code == 2
+    said = result.err.splitlines()[-1]
+    assert "revision 2 was fitted before readings were appended" in said
+    assert said.endswith(f"hilcal accept {run} N accepts another")
+    ok(capsys, "identify", run)
+    ok(capsys, "accept", run)
+    assert ok(capsys, "compare", run, "--json").document["revision"] == 4
 
 
 def test_what_cannot_be_accepted_is_refused(run: Path, fresh: bytes, capsys: Capsys) -> None:
