@@ -56,7 +56,7 @@ def test_identify_reports_what_the_contract_asks_for(campaign: Path, capsys: Cap
     assert d["condition"]["scaled"] < d["condition"]["unscaled"]
     low, high = d["variance_factor_interval"]
     assert low < d["variance_factor"] < high
-    assert set(d["error"]) == {"fit", "holdout"}
+    assert set(d["error"]) == {"before", "fit", "holdout"}
     assert all(set(block) == ERROR for block in d["error"].values())
     by_name = {p["name"]: p for p in d["parameters"]}
     j2 = by_name["joint_compliance.j2"]
