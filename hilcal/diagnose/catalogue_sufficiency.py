@@ -77,7 +77,9 @@ class Insufficiency:
 def forward_selection(fit: Fit) -> ForwardSelection:
     """Add all significant effects by algebra, the one of largest evidence first."""
     linear = linearise(fit)
-    families = families_beside(linear.projection, linear.residual, fit.dof, *catalogue_columns(fit))
+    x, columns, most = catalogue_columns(fit)
+    beside = linear.information(x)
+    families = families_beside(beside, linear.residual, fit.dof, x, columns, most)
     tested = max(len(families.columns), 1)
     added: list[str] = []
     for step in selection.forward_selection(families, MOST_TOGETHER):

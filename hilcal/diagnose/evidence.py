@@ -27,7 +27,12 @@ from hilcal.effects.protocol import Effect
 from hilcal.errors import InputError
 from hilcal.identify.arm_scatter import estimate_arm_scatter, with_arm_scatter
 from hilcal.identify.fit import Fit, fit
-from hilcal.identify.linearisation import Linearisation, linearise
+from hilcal.identify.linearisation import (
+    Linearisation,
+    ModelColumns,
+    linearise,
+    model_columns,
+)
 
 
 class Evidence:
@@ -125,7 +130,7 @@ class Evidence:
     @cached_property
     def redundant(self) -> tuple[str, ...]:
         """Effects of the model without which the readings are explained as well."""
-        return tuple(n.effect for n in backward_elimination(self.fit))
+        return tuple(n.effect for n in backward_elimination(self.fit, self._model_columns))
 
     @cached_property
     def insufficiency(self) -> Insufficiency | None:
@@ -134,7 +139,11 @@ class Evidence:
 
     @cached_property
     def _alternatives(self) -> StepwiseAlternatives:
-        return StepwiseAlternatives(self.fit)
+        return StepwiseAlternatives(self.fit, self._model_columns)
+
+    @cached_property
+    def _model_columns(self) -> ModelColumns:
+        return model_columns(self.fit)
 
     def alternative(self, effect: str, excluded: Collection[str]) -> Alternative:
         """Return what could replace an effect of the model.

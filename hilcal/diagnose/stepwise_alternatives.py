@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from hilcal.diagnose.effect_ranking import SAME_EVIDENCE, catalogue_columns
 from hilcal.identify.fit import Fit
-from hilcal.identify.linearisation import eliminate_effect, model_columns
+from hilcal.identify.linearisation import ModelColumns, eliminate_effect, model_columns
 from hilcal.regression.forward_selection import families_beside, forward_selection
 
 MOST_TOGETHER = 3
@@ -56,12 +56,16 @@ class Alternative:
 class StepwiseAlternatives:
     """Alternatives to the effects of a fitted model, from the catalogue."""
 
-    def __init__(self, fit: Fit) -> None:
-        """Compute the columns of the model and of all effects that are not in it."""
-        self._fit = fit
-        self._model = model_columns(fit)
+    def __init__(self, fit: Fit, model: ModelColumns | None = None) -> None:
+        """Compute the columns of all effects that are not in a model, and products with its own.
+
+        Args:
+            fit: the fit.
+            model: the columns of its model where they are known.
+        """
+        self._fit, self._model = fit, model_columns(fit) if model is None else model
         self._x, self._columns, self._most = catalogue_columns(fit)
-        self._gram = self._x.T @ self._x
+        self._gram, self._products = self._x.T @ self._x, self._model.white.T @ self._x
 
     def of(self, effect: str, excluded: Collection[str] = ()) -> Alternative:
         """Return the other effects that explain together what one of the model does.
@@ -73,13 +77,12 @@ class StepwiseAlternatives:
         reduced = eliminate_effect(self._fit, self._model, effect)
         own = reduced.score().log_evidence
         families = families_beside(
-            reduced.projection,
+            reduced.information(self._x, self._gram, self._products),
             reduced.residual,
             reduced.dof,
             self._x,
             self._columns,
             self._most,
-            self._gram,
         )
         # What an effect does, a finer form of it does as well: no alternative.
         barred = {*excluded, *(name for name in self._columns if name.startswith(f"{effect}("))}

@@ -25,6 +25,7 @@ from hilcal.identify.outliers import bulk, limit
 from hilcal.identify.smooth_nuisance import smooth_nuisance_columns
 from hilcal.model import Model
 from hilcal.regression.projection import projection
+from hilcal.regression.small_forms import quadratic_forms
 from hilcal.types import Bools, Floats, Ints
 
 SMALLEST = 3e-3
@@ -120,10 +121,7 @@ def _inverse_root(a: Floats, trace: float) -> Floats:
 
 def _t2(g: Floats, a: Floats, trace: Floats) -> Floats:
     """(N,) t²; zero for a reading without eigenvalues above `LEVERAGE`."""
-    values, vectors = np.linalg.eigh(a)
-    c = np.einsum("kij,ki->kj", vectors, g)
-    kept = values > LEVERAGE * np.maximum(trace, 1e-300)[:, None]
-    return np.asarray(np.sum(np.where(kept, c**2 / np.where(kept, values, 1.0), 0.0), axis=1))
+    return quadratic_forms(a, g, LEVERAGE * np.maximum(trace, 1e-300))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

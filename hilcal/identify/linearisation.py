@@ -174,11 +174,13 @@ class ModelColumns:
         parameter: (L,) indices of the parameters, ascending.
         scale: (L,) ordinary magnitudes, SI.
         white: (R, L) whitened columns.
+        gram: (L, L) their products.
     """
 
     parameter: Ints
     scale: Floats
     white: Floats
+    gram: Floats
 
 
 def model_columns(fit: Fit) -> ModelColumns:
@@ -193,7 +195,8 @@ def model_columns(fit: Fit) -> ModelColumns:
     scale = scales_of(model)[parameter]
     jacobian = model.jacobian(s.prediction, s.theta, w.m, parameter)
     jacobian *= scale
-    return ModelColumns(parameter, scale, w.whiten_readings(jacobian))
+    white = w.whiten_readings(jacobian)
+    return ModelColumns(parameter, scale, white, white.T @ white)
 
 
 def eliminate_effect(fit: Fit, columns: ModelColumns, effect: str) -> ReducedModel:
@@ -208,8 +211,9 @@ def eliminate_effect(fit: Fit, columns: ModelColumns, effect: str) -> ReducedMod
     index, scale, s = columns.parameter, columns.scale, fit.solution
     theta, prior = s.theta[index] / scale, s.prior[index] / scale
     out = (index >= mine.start) & (index < mine.stop)
-    rank = fit.whitening.rank
-    return eliminate_columns(columns.white, fit.white, theta, prior, out, s.beta, rank)
+    return eliminate_columns(
+        columns.white, columns.gram, fit.white, theta, prior, out, s.beta, fit.whitening.rank
+    )
 
 
 def by_pose(fit: Fit, white: Floats) -> Floats:

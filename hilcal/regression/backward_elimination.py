@@ -13,24 +13,31 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilcal.regression.evidence import FamilyScore, score_family
-from hilcal.regression.normal_equations import find_basis
-from hilcal.regression.projection import Projection, projection
+from hilcal.regression.normal_equations import Basis, find_basis, normal_equations
 from hilcal.types import Bools, Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReducedModel:
-    """A model without some of its columns.
+    """A model without some of its columns, which are not copied: they can be many.
 
     Attributes:
-        columns: (R, E) the eliminated ones.
-        projection: M of those that stay.
+        columns: (R, P) all columns of the model.
+        out: (P,) the eliminated ones.
+        basis: coordinates of those that stay, flat ones first.
+        flat: (R, F) rows by the flat coordinates.
+        inverse_root: (K, K) T with Tᵀ T = H⁻¹.
+        gram: (P, P) of all columns.
         residual: (R,) r₀.
         dof: degrees of freedom of r₀.
     """
 
     columns: Floats
-    projection: Projection
+    out: Bools
+    basis: Basis
+    flat: Floats
+    inverse_root: Floats
+    gram: Floats
     residual: Floats
     dof: float
 
@@ -39,14 +46,31 @@ class ReducedModel:
         """‖r₀‖²."""
         return float(self.residual @ self.residual)
 
+    def information(self, x: Floats, gram: Floats, products: Floats) -> Floats:
+        """Return Xᵀ M X (Q, Q), M the projection off the columns that stay.
+
+        Args:
+            x: (R, Q) whitened columns.
+            gram: (Q, Q) XᵀX.
+            products: (P, Q) of all columns of the model with X.
+        """
+        held, count = self.basis.held, self.flat.shape[1]
+        sigma = self.basis.transform[held, count + np.arange(len(held))]
+        cross = np.vstack([self.flat.T @ x, sigma[:, None] * products[held]])
+        lifted = self.inverse_root @ cross
+        return np.asarray(gram - lifted.T @ lifted)
+
     def score(self) -> FamilyScore:
         """Score the eliminated columns against the model without them."""
-        s = self.projection.information(self.columns)
-        return score_family(s, self.columns.T @ self.residual, self.rss, self.dof)
+        products = self.gram[:, self.out]
+        x = self.columns[:, self.out]
+        s = self.information(x, products[self.out], products)
+        return score_family(s, x.T @ self.residual, self.rss, self.dof)
 
 
 def eliminate_columns(
     columns: Floats,
+    gram: Floats,
     white: Floats,
     theta: Floats,
     prior: Floats,
@@ -57,7 +81,8 @@ def eliminate_columns(
     """Take columns out of a fitted model.
 
     Args:
-        columns: (R, P) whitened columns of all parameters.
+        columns: (R, P) A, whitened columns of all parameters.
+        gram: (P, P) AᵀA.
         white: (R,) whitened residual of the fit.
         theta: (P,) parameters of the fit.
         prior: (P,) their prior standard deviations: infinite for flat ones, zero for those held
@@ -68,9 +93,23 @@ def eliminate_columns(
     """
     stay = ~out & (prior > 0)
     basis = find_basis(columns, np.ones(columns.shape[1]), np.where(stay, prior, 0.0))
-    p = projection(basis.rows(columns), beta * basis.prior_precision)
+    y = white + columns @ np.where(out, theta, 0.0)
+    equations = normal_equations(columns, y, basis, gram)
     # Priors pull to zero, not to where the fit stands.
-    z = np.zeros(len(p.ridge))
-    z[len(basis.singular) :] = (theta / np.where(stay, prior, 1.0))[basis.held]
-    y = white + columns[:, out] @ theta[out]
-    return ReducedModel(columns[:, out], p, p.residual(y, z), rank - p.effective())
+    count, ridge = len(basis.singular), beta * basis.prior_precision
+    z = np.zeros(len(ridge))
+    z[count:] = (theta / np.where(stay, prior, 1.0))[basis.held]
+    root = equations.inverse_root(beta)
+    step = basis.transform @ (root.T @ (root @ (equations.rhs - ridge * z)))
+    shrunk = float(np.sum(ridge * np.sum(root**2, axis=0)))
+    determined = float(np.count_nonzero(np.any(root, axis=1)))
+    return ReducedModel(
+        columns=columns,
+        out=out,
+        basis=basis,
+        flat=basis.flat_rows(columns),
+        inverse_root=root,
+        gram=gram,
+        residual=y - columns @ step,
+        dof=rank - (determined - shrunk),
+    )

@@ -14,7 +14,6 @@ from functools import cached_property
 import numpy as np
 
 from hilcal.regression.evidence import FamilyScore, score_family
-from hilcal.regression.projection import Projection
 from hilcal.regression.schur import eliminate
 from hilcal.types import Floats
 
@@ -70,28 +69,25 @@ class Families:
 
 
 def families_beside(
-    p: Projection,
+    information: Floats,
     residual: Floats,
     dof: float,
     x: Floats,
     columns: Mapping[str, slice],
     most: Mapping[str, float],
-    gram: Floats | None = None,
 ) -> Families:
     """Return families beside a model.
 
     Args:
-        p: of the model.
-        residual: (R,) its residual r.
+        information: (P, P) S of all families' columns beside the model.
+        residual: (R,) residual r of the model.
         dof: degrees of freedom of r.
         x: (R, P) whitened columns of all families, in ordinary magnitudes.
         columns: of each family.
         most: largest plausible strength of each family that has one.
-        gram: (P, P) XᵀX where it is known.
     """
     rss = float(residual @ residual)
-    s = p.information(x, gram)
-    return Families(s, x.T @ residual, rss, dof, columns, most=most)
+    return Families(information, x.T @ residual, rss, dof, columns, most=most)
 
 
 @dataclass(frozen=True, eq=False)

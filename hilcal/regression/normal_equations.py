@@ -57,6 +57,11 @@ class Basis:
     condition_unscaled: float
     condition_scaled: float
 
+    def flat_rows(self, a: Floats) -> Floats:
+        """Return rows (R, F) by the flat coordinates of rows A (R, P) by the parameters."""
+        flat = np.flatnonzero(self.flat)
+        return np.asarray(a[:, flat] @ self.transform[flat, : len(self.singular)])
+
     def rows(self, a: Floats) -> Floats:
         """Return rows (R, K) by z of rows A (R, P) by the parameters: A T.
 
@@ -153,7 +158,7 @@ def normal_equations(a: Floats, target: Floats, basis: Basis, gram: Floats) -> N
     costs no accuracy; columns with a prior are taken from the gram AᵀA (P, P), for speed.
     """
     flat = len(basis.singular)
-    rows = a @ basis.transform[:, :flat]
+    rows = basis.flat_rows(a)
     held = basis.held
     sigma = basis.transform[held, flat + np.arange(len(held))]
     size = basis.transform.shape[1]

@@ -57,7 +57,7 @@ def test_a_model_without_columns_is_as_a_refit_without_them(out: list[int]) -> N
     beta = 1.7
     a, _, y, theta = case(beta)
     mine = np.isin(np.arange(6), out)
-    reduced = eliminate_columns(a, y - a @ theta, theta, PRIOR, mine, beta, 60)
+    reduced = eliminate_columns(a, a.T @ a, y - a @ theta, theta, PRIOR, mine, beta, 60)
     again = refit(a[:, ~mine], y, PRIOR[~mine], beta)
     np.testing.assert_allclose(reduced.residual, y - a[:, ~mine] @ again, atol=1e-11)
     h = a[:, ~mine].T @ a[:, ~mine] + np.diag(beta / PRIOR[~mine] ** 2)
