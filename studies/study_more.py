@@ -81,7 +81,7 @@ def measure_more(
     number = visit.pose + len(before.pose_names)
     after = simulate(case.world, states, number, visit.load, visit.cycle, hung, rng)
     plan = found.planned.ordered.plan
-    return _joined(before, after, tuple(f"next {name}" for name in plan.pose_names))
+    return joined(before, after, tuple(f"next {name}" for name in plan.pose_names))
 
 
 def suspects(d: Diagnosis) -> tuple[str, ...]:
@@ -90,7 +90,7 @@ def suspects(d: Diagnosis) -> tuple[str, ...]:
     return in_doubt(d, MOST) or d.significant[:1] or best
 
 
-def _joined(a: Readings, b: Readings, poses: tuple[str, ...]) -> Readings:
+def joined(a: Readings, b: Readings, poses: tuple[str, ...]) -> Readings:
     """One after the other; what only one of them has is left out."""
 
     def both(name: str) -> Floats | None:

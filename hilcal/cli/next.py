@@ -1,6 +1,6 @@
 """`next`: the measurements that separate the leading suspects."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -9,7 +9,7 @@ import typer
 from hilcal.campaign import Campaign
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import check_record, effect_names, fit_of
-from hilcal.cli.plan_output import POSES, Csv, Output, Poses, Quick, Seed, generator, write
+from hilcal.cli.plan_output import POSES, Csv, Output, Quick, Seed, generator, write
 from hilcal.cli.planning import read_cell
 from hilcal.cli.terminal import Json, Record, Revision, Run, Terminal, terminal
 from hilcal.data.plan import REFERENCE, Plan, read_plan
@@ -17,18 +17,21 @@ from hilcal.data.run_log import PLAN
 from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.diagnose.doubt import MOST, in_doubt
 from hilcal.diagnose.effect_ranking import Suspect
+from hilcal.diagnose.more_poses import pose_powers
+from hilcal.diagnose.pose_alone import PoseAlone
 from hilcal.diagnose.stepwise import remove
 from hilcal.diagnose.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.fit import Fit
 from hilcal.plan.checked_plan import checked
-from hilcal.plan.next import Next, measure_next
+from hilcal.plan.many_poses import measure_poses
+from hilcal.plan.next import Next, PairPower, measure_next
 from hilcal.plan.planner import Request
 from hilcal.plan.summary import about, summarise
 from hilcal.report import numbers as words_of
 from hilcal.report.progress import Say, working
-from hilcal.report.text_next import next_report
+from hilcal.report.text_next import next_report, poses_report
 from hilcal.report.text_plan import plan_report
 from hilcal.types import Floats
 
@@ -36,7 +39,14 @@ from hilcal.types import Floats
 def next_(
     run: Run,
     output: Output,
-    poses: Poses = POSES,
+    poses: Annotated[
+        int | None,
+        typer.Option(
+            "--poses",
+            help="As many readings as so many poses take under every load, 20 unless given; new "
+            "poses, where a misfit depends on the pose alone.",
+        ),
+    ] = None,
     suspects: Annotated[
         str | None,
         typer.Option("--suspects", metavar="A,B", help="Separate these, whatever is diagnosed."),
@@ -57,19 +67,28 @@ def next_(
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     check_record(record)
     rng = generator(seed)
-    if poses < 1:
+    if poses is not None and poses < 1:
         raise InputError(f"--poses {poses}; valid: a whole number from 1")
     with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
         config, numbers = (o.config, o.cell) if cell is None else read_cell(cell)
-        before, effects = _without_suspects(t, o, revision, _named(suspects, catalogue), say)
-        place = reference_of(o)
-        found = measure_next(numbers, config, before, effects, Request(poses), rng, say, place)
-        summary = summarise(found.planned, config, rng, say, compare=not quick)
+        doubt = _without_suspects(t, o, revision, _named(suspects, catalogue), say)
+        before, effects, place = doubt.fit, doubt.suspects, reference_of(o)
+        if doubt.alone is None:
+            asked = Request(POSES if poses is None else poses)
+            found = measure_next(numbers, config, before, effects, asked, rng, say, place)
+        else:
+            count = doubt.alone.more if poses is None else poses
+            planned = measure_poses(numbers, config, before, count, rng, say, place)
+            say("predicting the powers")
+            powers = tuple(PairPower(*row, False) for row in pose_powers(before, effects, count))
+            found = Next(planned, powers, {}, 1.0, ())
+        summary = summarise(found.planned, config, rng, say, compare=not quick and not doubt.alone)
         say("checking every motion in a dry run")
         made = checked(numbers, config, plan_of(found, effects), summary)
     write(t, numbers, config, made, output, csv, record, found.powers)
     t.show(f"In doubt: {words_of.names(effects, 'or')}.\n")
-    t.show(next_report(found, made.summary.poses, made.summary.readings))
+    report = next_report if doubt.alone is None else poses_report
+    t.show(report(found, made.summary.poses, made.summary.readings))
     t.show(plan_report(made.summary))
     t.show(f"The plan is in {output}. Measure it into the same campaign with:")
     t.show(f"  hilcal run {cell or 'CELL.toml'} -o {run} --append --plan {output}")
@@ -101,10 +120,25 @@ def plan_of(found: Next, suspects: tuple[str, ...]) -> Plan:
     return replace(found.planned.ordered.plan, about=more)
 
 
+@dataclass(frozen=True, slots=True)
+class _Doubt:
+    """What is to be separated.
+
+    Attributes:
+        fit: of a model without the suspects.
+        suspects: the effects.
+        alone: the misfit where more poses, unloaded, are what tells of it; None else.
+    """
+
+    fit: Fit
+    suspects: tuple[str, ...]
+    alone: PoseAlone | None = None
+
+
 def _without_suspects(
     t: Terminal, o: Campaign, revision: int | None, named: tuple[str, ...] | None, say: Say
-) -> tuple[Fit, tuple[str, ...]]:
-    """Return a fit, and the effects to separate that its model does not hold.
+) -> _Doubt:
+    """Return the effects to separate, and a fit whose model does not hold them.
 
     Raises:
         InputError: the revision is not in scaling gc.
@@ -116,7 +150,7 @@ def _without_suspects(
             f"revision {number} has scaling {newest.scaling}; next needs gc: run hilcal identify "
             "again"
         )
-    suspects = named
+    suspects, alone = named, None
     if suspects is None:
         say("diagnosing" if number is None else f"diagnosing revision {number}")
         d = diagnose(newest, o.history(number), say)
@@ -126,11 +160,13 @@ def _without_suspects(
         finer = [s for s in d.suspects if s.coarse and s.effect in suspects]
         if finer:
             raise CannotAnswerError(f"not two effects, but one in doubt: {differ(o, finer[0])}")
+        a = d.pose_alone
+        alone = a if a is not None and a.chance is not None and newest.mode == "absolute" else None
     for name in suspects:
         if name in newest.model.names:
             say(f"fitting without {name}")
             newest = remove(newest, name)
-    return newest, suspects
+    return _Doubt(newest, suspects, alone)
 
 
 def _settled(o: Campaign, d: Diagnosis) -> str:

@@ -7,13 +7,17 @@ unloaded ones at further poses within the range of the joints so far; parameters
 found; noise; every test that a suspect must pass.
 """
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from hilcal.data.readings import Readings
+from hilcal.diagnose.effect_ranking import FALSE_ALARM, LEAST_SHARE
 from hilcal.diagnose.family_detection import found
 from hilcal.diagnose.plausible_size import most, unloaded_readings
+from hilcal.diagnose.stepwise import add
 from hilcal.effects.protocol import Effect
 from hilcal.errors import HilcalError
 from hilcal.identify.fit import Fit, fit
@@ -43,6 +47,22 @@ class Poses:
     chance: float
 
 
+class PosePower(NamedTuple):
+    """Chance that an effect passes every test of a suspect beside a rival that is fitted.
+
+    Attributes:
+        effect: the effect, which is there with the size that explains the misfit.
+        rival: the one that the model holds.
+        now: with the readings so far.
+        then: with further poses as well.
+    """
+
+    effect: str
+    rival: str
+    now: float
+    then: float
+
+
 def enough(p: Linearisation, effect: Effect, about: int, level: float, least: float) -> Poses:
     """Return the least number of further poses that tell, or the most that were tried.
 
@@ -62,7 +82,14 @@ def enough(p: Linearisation, effect: Effect, about: int, level: float, least: fl
     return tried
 
 
-def chance(p: Linearisation, effect: Effect, more: int, level: float, least: float) -> float:
+def chance(
+    p: Linearisation,
+    effect: Effect,
+    more: int,
+    level: float,
+    least: float,
+    strength: float | None = None,
+) -> float:
     """Return the chance that a family passes every test with so many more poses.
 
     Args:
@@ -71,15 +98,12 @@ def chance(p: Linearisation, effect: Effect, more: int, level: float, least: flo
         more: further poses, read unloaded.
         level: of the test of a suspect, between 0 and 1.
         least: share of the misfit on poses left out that must be explained.
+        strength: standard deviation of its parameters in ordinary magnitudes, where it is not that
+            which explains the misfit of this fit.
     """
     rng = np.random.default_rng(_SEED)
-    now = p.fit.readings[~p.fit.outlier]
-    full = effect.fine(now.states) or effect
-    x = effect_columns(p.fit, full).white
-    size = float(np.sum(p.project_out(x) ** 2))
-    if size <= 0.0:
-        return 0.0
-    t = min(float(np.sqrt(p.misfit() / size)), full.most())
+    t = strength_of(p, effect) if strength is None else strength
+    full = effect.fine(p.fit.readings[~p.fit.outlier].states) or effect
     try:
         then = _with(p.fit, more, rng) if more else p.fit
     except HilcalError:
@@ -93,6 +117,36 @@ def chance(p: Linearisation, effect: Effect, more: int, level: float, least: flo
     s = q.information(scored.white)
     largest = most(scored, unloaded_readings(then))
     return float(np.mean(found(q, scored, s, y, level, least, largest)))
+
+
+def pose_powers(before: Fit, effects: Sequence[str], more: int) -> Iterator[PosePower]:
+    """Yield how well the first of some effects is told from each of the others.
+
+    Args:
+        before: a fit of a model without them.
+        effects: two effects or more that depend on the pose alone.
+        more: further poses, read unloaded.
+    """
+    states = before.readings[~before.outlier].states
+    first, *rivals = effects
+    made = before.model.catalogue.make(first, before.model.cell, states, m=before.readings.m)
+    count = len(before.model.catalogue.effects) - len(before.model.effects)
+    level = FALSE_ALARM / max(count, 1)
+    strength = strength_of(linearise(before), made)
+    for rival in rivals:
+        try:
+            p = linearise(add(before, rival))
+        except HilcalError:
+            continue
+        now, then = (chance(p, made, n, level, LEAST_SHARE, strength) for n in (0, more))
+        yield PosePower(first, rival, now, then)
+
+
+def strength_of(p: Linearisation, effect: Effect) -> float:
+    """Return the strength with which an effect, as fine as it may be, explains the misfit."""
+    full = effect.fine(p.fit.readings[~p.fit.outlier].states) or effect
+    square = float(np.sum(p.project_out(effect_columns(p.fit, full).white) ** 2))
+    return min(float(np.sqrt(p.misfit() / square)), full.most()) if square > 0.0 else 0.0
 
 
 def _with(before: Fit, more: int, rng: np.random.Generator) -> Fit:

@@ -26,7 +26,7 @@ from hilcal.plan.predicted import predicted
 from hilcal.plan.run_order import Chosen, Ordering, order_plan
 from hilcal.plan.t_optimality import Pair
 from hilcal.robot.chain import evaluate
-from hilcal.types import Floats
+from hilcal.types import Floats, Ints
 
 CANDIDATES = 600
 """Most poses to choose from. A choice: more cost time and hardly raise the power."""
@@ -188,29 +188,50 @@ def _from_reference(
 ) -> Planned:
     """Return the plan in an order from another reference pose, without what that cannot reach."""
     space, of = Space(cell, config), made.problem
-    counts, usable = made.counts.astype(np.int64), np.flatnonzero(made.usable)
+    counts = made.counts.astype(np.int64)
     for load in of.candidates.loads:
         taken = [k for k in np.flatnonzero(counts) if load in readings_of(of.what[k], of.mode)]
         if taken:
             q = of.candidates.q[[of.what[k][0] for k in taken]]
             counts[np.array(taken)[~space.passable(reference, q, load)]] = 0
-    taken = list(np.flatnonzero(counts))
-    if not taken:
+    if not counts.any():
         raise CannotAnswerError(
             "none of the poses that separate the suspects is reached from the campaign's "
             "reference pose; start another campaign for them"
         )
-    plan = made.ordered.plan
+    steps = made.ordered.plan.steps
+    repeats = sum(s.load == UNLOADED and s.cycle > 0 and s.pose != REFERENCE for s in steps)
+    how = Ordering(unloaded=request.unloaded, repeats=repeats)
+    return reordered(space, made, counts, reference, rng, how)
+
+
+def reordered(
+    space: Space,
+    made: Planned,
+    counts: Ints,
+    reference: Floats,
+    rng: np.random.Generator,
+    how: Ordering,
+) -> Planned:
+    """Return a plan with other units of its problem, in an order of its own.
+
+    Args:
+        space: what the cell allows.
+        made: the plan.
+        counts: (K,) how often each unit is taken.
+        reference: (n,) joints of the reference pose, from which all units are reached, rad.
+        rng: generator.
+        how: the order.
+    """
+    of, usable, taken = made.problem, np.flatnonzero(made.usable), np.flatnonzero(counts)
     poses = sorted({of.what[k][0] for k in taken})
     names = {pose: f"p{k}" for k, pose in enumerate(poses, start=1)}
     chosen = [
         Chosen(names[of.what[k][0]], readings_of(of.what[k], of.mode), int(counts[k]))
         for k in taken
     ]
-    repeats = sum(s.load == UNLOADED and s.cycle > 0 and s.pose != REFERENCE for s in plan.steps)
-    how = Ordering(unloaded=request.unloaded, repeats=repeats)
     ordered = order_plan(
-        cell, config, list(names.values()), of.candidates.q[poses], reference, chosen,
+        space.cell, space.config, list(names.values()), of.candidates.q[poses], reference, chosen,
         space.passable, rng, how,
     )  # fmt: skip
     information = made.asked.prior + of.units.information(counts.astype(float))

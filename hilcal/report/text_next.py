@@ -39,6 +39,31 @@ def next_report(found: Next, poses: int, readings: int) -> Iterator[RenderableTy
         yield f"note: {note}"
 
 
+def poses_report(found: Next, poses: int, readings: int) -> Iterator[RenderableType]:
+    """Yield what further poses tell of a misfit that depends on the pose alone.
+
+    Args:
+        found: the plan and the powers.
+        poses: of the plan, beside the reference.
+        readings: of the plan.
+    """
+    yield text.heading("Poses where nothing was read yet")
+    yield (
+        f"The misfit is the same under every load of a pose, so that loads tell nothing of it: "
+        f"{readings} unloaded readings at {poses} poses, spread over the joints' range.\n"
+    )
+    if found.powers:
+        out = text.table("if this is there", "and this is fitted", "now", "then", left=(0, 1))
+        for row in power_rows(found.powers):
+            out.add_row(*row)
+        yield out
+        yield Text(
+            "now, then: chance that it passes every test of a missing effect, poses left out "
+            "included, with the readings so far and with those planned as well.\n",
+            style="dim",
+        )
+
+
 def power_rows(powers: Sequence[PairPower]) -> Iterator[tuple[str, str, str, str]]:
     """Yield the rows of `POWER_COLUMNS`."""
     for t in powers:

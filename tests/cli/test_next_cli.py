@@ -10,8 +10,10 @@ from hilcal.cli.doubting import in_doubt
 from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.plan import load_plan
 from hilcal.robot.catalogue import configs_dir
+from tests.support.campaigns import configuration
 from tests.support.cli_cases import ok, refused
 from tests.support.next_cases import SMALL, doubtful
+from tests.unit.plan.test_many_poses import fine_error
 
 Capsys = pytest.CaptureFixture[str]
 TILT, LINK, BASE = "joint_tilt_compliance", "link_compliance", "base_compliance"
@@ -76,6 +78,22 @@ def test_an_effect_that_was_added_in_doubt_is_in_doubt_still(
     d = ok(capsys, "next", ambiguous, "-o", tmp_path / "n.json", *arguments).document
     assert d["suspects"][0] == added
     assert len(d["suspects"]) > 1
+
+
+def test_a_misfit_of_the_pose_alone_asks_for_new_poses(tmp_path: Path, capsys: Capsys) -> None:
+    path = tmp_path / "run.hilcal"
+    with CampaignFile.create(path, configuration().to_json(), CELLS, "a test") as campaign:
+        campaign.append_readings(fine_error()[1])
+    ok(capsys, "identify", path, "--readings", "absolute")
+    plan = tmp_path / "next.json"
+    result = ok(capsys, "next", path, "-o", plan, "--poses", "10", "--json")
+    d = result.document
+    assert d["suspects"][0] == "transmission_error"
+    assert d["poses"] == 10
+    assert set(d["readings_by_load"]) == {"none"}
+    assert {e for e, _, _ in d["separates"]} == {"transmission_error"}
+    assert all(0.0 <= p <= 1.0 for _, _, p in (*d["separates"], *d["separates_now"]))
+    assert "unloaded readings at 10 poses" in " ".join(result.err.split())
 
 
 def test_named_suspects_need_no_diagnosis(tmp_path: Path, capsys: Capsys) -> None:
