@@ -58,10 +58,17 @@ def test_comments_and_examples_are_those_of_the_configuration(
     CellConfig.model_validate(tomllib.loads(used))
 
 
+def test_check_reads_the_file_and_asks_for_what_was_left_open(
+    tmp_path: Path, capsys: Capsys
+) -> None:
+    path = tmp_path / "CELL.toml"
+    ok(capsys, "init", path, "--robot", "ur5e", "--load", "5 kg")
+    assert "[robot] driver is missing" in refused(capsys, 2, "check", path)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("options", "poses"),
-    [(OPTIONS, 1), pytest.param(("--robot", "ur5e"), 6, marks=pytest.mark.slow)],
-    ids=["whole", "least"],
+    ("options", "poses"), [(OPTIONS, 1), (("--robot", "ur5e"), 6)], ids=["whole", "least"]
 )
 def test_the_file_is_planned_without_an_edit(
     options: tuple[str, ...], poses: int, tmp_path: Path, capsys: Capsys
