@@ -26,6 +26,7 @@ from hilcal.errors import DeviceError
 from hilcal.identify.full_covariance import campaign_readings
 from hilcal.plan.checked_plan import refuse
 from hilcal.report.progress import Say, counting, working
+from hilcal.report.text_demo import NEWCOMER
 
 TRIES = 4
 BREAK = 600.0
@@ -91,6 +92,7 @@ def on_devices(
             secret = case_of_plan(told.config, plan, told.choice, told.seed, told.catalogue)
             say("starting the simulated devices")
             there = stack.enter_context(simulated_cell(secret, told.seed, told.base_dir))
+        t.notice(NEWCOMER)
         made = create_run(told.output, there.config, told.base_dir, plan, True)
         campaign = stack.enter_context(made)
 

@@ -7,11 +7,18 @@ from rich.console import RenderableType
 from rich.text import Text
 
 from hilcal.diagnose.diagnosis import Diagnosis
+from hilcal.diagnose.live_model import LEAST
 from hilcal.identify.fit import Fit
 from hilcal.report import numbers, text, text_refine
 from hilcal.report.verdict_words import message
 
 MOST = 24
+
+NEWCOMER = f"""\
+The lines that follow are those of a real run: what the arm does, and each reading with its pose,
+load and cycle. It begins beside the reference pose, so that every joint arrives there from a known
+side. From {LEAST} poses on, a first model predicts each reading before it counts: the residual is
+how far it misses. While it is fitted to few poses, and lacks what is hidden, that is a lot."""
 
 
 def step_report(number: int, change: str, d: Diagnosis) -> Iterator[RenderableType]:

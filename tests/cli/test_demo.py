@@ -87,7 +87,7 @@ def test_the_demo_in_words(tmp_path: Path, capsys: Capsys, monkeypatch: pytest.M
 def test_the_demo_does_not_replace_another_file(tmp_path: Path, capsys: Capsys) -> None:
     path = tmp_path / "notes.txt"
     path.write_text("mine", encoding="utf-8")
-    line = refused(capsys, 2, "demo", FAST, "--hide", "nothing", "-o", path, "--json")
+    line = refused(capsys, 2, "demo", FAST, "--hide", "nothing", "-o", path)
     assert "notes.txt" in line
     assert path.read_text(encoding="utf-8") == "mine"
 
