@@ -282,7 +282,8 @@ def log_line(d: Digest, r: StoryRevision) -> str:
 
 GUIDE = """### How to read this
 **Timelines** (bottom left): *revision* goes through the models, the first one first: drag the
-slider, or press Space to play. *pose* moves the arm through all poses, with the last model; the bright ball is the present pose.
+slider, or press Space to play. *pose* moves the arm through all poses, with the last model; the
+bright ball is the present pose.
 
 **Residuals** (3-D): each green ball is where noise alone would leave 99 % of the readings.
 An arrow that leaves its ball = the model is wrong there. Grey: noise. Amber: beyond 99 %.
