@@ -131,6 +131,8 @@ def rank_suspects(
     effects: Sequence[Effect],
     level: float = FALSE_ALARM,
     refit: Callable[[Fit, str], Fit] = add,
+    *,
+    detectable: bool = True,
 ) -> tuple[Suspect, ...]:
     """Score all effects; best first, see `ranked`.
 
@@ -139,9 +141,14 @@ def rank_suspects(
         effects: that are not in the model.
         level: of the test over all of them together.
         refit: returns a fit with one more effect.
+        detectable: whether to simulate what large families would have to be like to be found,
+            which takes most of the time; no verdict depends on it.
     """
     bare = unloaded_readings(p.fit)
-    found = [_suspect(p, effect_columns(p.fit, e), bare, level / len(effects)) for e in effects]
+    found = [
+        _suspect(p, effect_columns(p.fit, e), bare, level / len(effects), detectable)
+        for e in effects
+    ]
     tested = max(sum(s.score.rank > 0 for s in found), 1)
     out: list[Suspect] = []
     geometry: Floats | None = None
@@ -203,7 +210,9 @@ def ranked(suspects: Iterable[Suspect], rejected: Collection[str] = ()) -> tuple
     )
 
 
-def _suspect(p: Linearisation, of: EffectColumns, bare: Unloaded | None, level: float) -> Suspect:
+def _suspect(
+    p: Linearisation, of: EffectColumns, bare: Unloaded | None, level: float, detectable: bool
+) -> Suspect:
     s = p.information(of.white)
     largest = most(of, bare)
     result = p.score(of.white, s, largest)
@@ -217,7 +226,7 @@ def _suspect(p: Linearisation, of: EffectColumns, bare: Unloaded | None, level: 
         max(p.fit.variance_factor, 1.0),
         level,
     )
-    if large(of, s, p.fit.dof):
+    if detectable and large(of, s, p.fit.dof):
         least = least_of_family(p, of, s, least, level, LEAST_SHARE, largest)
     return Suspect(
         effect=of.effect.name,

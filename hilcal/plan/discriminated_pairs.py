@@ -150,6 +150,18 @@ def not_separable_message(pairs: Sequence[tuple[str, str]]) -> str:
     return f"no measurement in this cell separates {', nor '.join(each)}"
 
 
+def not_ruled_out(pairs: Sequence[tuple[str, str]]) -> str:
+    """Say of pairs (effect that is there, rival) that no measurement rules out the rival."""
+    named: dict[str, list[str]] = {}
+    for e, f in pairs:
+        named.setdefault(e, []).append(f)
+    each = [f"{' or '.join(fs)} where {e} is there" for e, fs in named.items()]
+    return (
+        f"no measurement in this cell rules out {', nor '.join(each)}: {MANY} of the best readings "
+        f"would do so with a chance of less than {100 * LEAST_POWER:.0f} %"
+    )
+
+
 def _best_power(problem: Problem, of: DiscriminatedPairs, pair: Pair) -> float:
     """Power of the best plan of `MANY` readings for one pair."""
     try:

@@ -11,10 +11,11 @@ from hilcal.data.plan import REFERENCE, UNLOADED
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.fit import Fit
 from hilcal.plan.discriminated_pairs import (
+    LEAST_POWER,
     LEVEL,
     DiscriminatedPairs,
     discriminated_pairs,
-    not_separable_message,
+    not_ruled_out,
     pair_of,
     power,
     supported_parameters,
@@ -47,7 +48,8 @@ class PairPower:
         rival: the one that is fitted in its stead.
         now: chance that the readings so far reject the rival, by a test at 1 %.
         then: the same with the planned readings.
-        not_separable: whether no measurement in this cell would do.
+        not_separable: whether no measurement in this cell would do: neither these readings nor
+            `discriminated_pairs.MANY` others reach a power of `LEAST_POWER`.
     """
 
     effect: str
@@ -136,8 +138,9 @@ def measure_next(
     seen = {e.name for e in made.problem.families}
     lost = [n for n in names if n not in seen]
     notes = tuple(n for n in made.problem.notes if n.split(":")[0] in lost)
-    if of.not_separable:
-        notes = (*notes, not_separable_message(of.not_separable))
+    never = tuple((p.effect, p.rival) for p in powers if p.not_separable and p.effect in seen)
+    if never:
+        notes = (*notes, not_ruled_out(never))
     weakest = min(of.pairs, key=lambda pair: power(pair, then))
     shares, stretched = _where(made, weakest, then)
     return Next(made, powers, shares, stretched, notes)
@@ -171,11 +174,12 @@ def _pair_powers(
         for f in names:
             if e == f:
                 continue
-            if e not in seen or f not in seen:
-                yield PairPower(e, f, LEVEL, LEVEL, e not in seen)
+            if e not in seen:
+                yield PairPower(e, f, LEVEL, LEVEL, True)
                 continue
             now, later = (expected(problem, (e, f), betas, m) for m in (of.prior, then))
-            yield PairPower(e, f, now, later, (e, f) in of.not_separable)
+            never = (e, f) in of.not_separable and later < LEAST_POWER
+            yield PairPower(e, f, now, later, never)
 
 
 def _from_reference(

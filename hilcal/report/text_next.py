@@ -30,8 +30,8 @@ def next_report(found: Next, poses: int, readings: int) -> Iterator[RenderableTy
         out.add_row(*row)
     yield out
     yield Text(
-        "now, then: chance that the test at 1 % rules it out, with the readings so far and with "
-        "those planned as well.\n",
+        "now, then: where the first effect is there, the chance that the readings so far, and with "
+        "those planned as well, reject a fit with the second in its place (test at 1 %).\n",
         style="dim",
     )
     yield f"{summary(found.powers, poses, readings)} {_difference(found)}\n"
@@ -67,22 +67,41 @@ def poses_report(found: Next, poses: int, readings: int) -> Iterator[RenderableT
 def power_rows(powers: Sequence[PairPower]) -> Iterator[tuple[str, str, str, str]]:
     """Yield the rows of `POWER_COLUMNS`."""
     for t in powers:
-        then = "never" if t.not_separable else numbers.percent(t.then)
-        yield t.effect, t.rival, numbers.percent(t.now), then
+        then = "not in this cell" if t.not_separable else chance(t.then)
+        yield t.effect, t.rival, chance(t.now), then
+
+
+def chance(power: float) -> str:
+    """Write a chance; no test is certain."""
+    return "> 99 %" if power > 0.995 else numbers.percent(power)
+
+
+def _at_least(power: float) -> str:
+    """Write a lower bound of a chance, rounded down."""
+    return f"{min(int(100 * power + 1e-9), 99)} %"
 
 
 def summary(powers: Sequence[PairPower], poses: int, readings: int) -> str:
     """Say in a sentence what the plan will settle."""
     able = [t for t in powers if not t.not_separable]
-    least = min(able, key=lambda t: t.then)
     head = f"{readings} readings at {poses} poses"
-    if least.then >= SURE and len(able) == len(powers):
-        return f"{head} will tell: whichever is there, the others are ruled out with at least " + (
-            f"{numbers.percent(least.then)} chance."
+    if not able:
+        return f"{head} rule out none of the suspects."
+    least = min(able, key=lambda t: t.then)
+    if least.then < SURE:
+        return (
+            f"{head}: the weakest pair is {least.effect}, where it is there, and {least.rival}, "
+            f"which they rule out with a chance of {chance(least.then)} ({chance(least.now)} now); "
+            "more poses raise it."
+        )
+    if len(able) == len(powers):
+        return (
+            f"{head} separate the suspects: whichever is there, each of the others is ruled out "
+            f"with a chance of at least {_at_least(least.then)}."
         )
     return (
-        f"{head}: the weakest pair is {least.effect} from {least.rival}, told with a chance of "
-        f"{numbers.percent(least.then)} ({numbers.percent(least.now)} now); more poses raise it."
+        f"{head} separate what can be separated in this cell: each of these pairs with a chance of "
+        f"at least {_at_least(least.then)}."
     )
 
 

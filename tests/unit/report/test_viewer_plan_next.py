@@ -37,7 +37,7 @@ def test_the_suspects_and_their_powers_come_before_the_plan(tmp_path):
     lines = text.replace("\\", "").splitlines()
     assert lines[0] == "### Which is it: joint_tilt_compliance or link_compliance?"
     assert "| joint_tilt_compliance | link_compliance | 74 % | 98 % |" in lines[1:5]
-    assert "| link_compliance | joint_tilt_compliance | 56 % | never |" in lines[1:5]
+    assert "| link_compliance | joint_tilt_compliance | 56 % | not in this cell |" in lines[1:5]
     assert any(line.startswith("**Plan: 3 poses") for line in lines[5:])
 
 
