@@ -8,7 +8,7 @@ import numpy as np
 import typer
 
 from drivers.simulated.rehearsal import NOTHING, RANDOM, Rehearsal, check_choice
-from hilcal.cli.doubting import FIRST, STRENGTH, Doubted, doubted, in_doubt
+from hilcal.cli.doubting import CAMPAIGNS, Doubted, doubted, doubtful_case
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import check_record, finish, record_story
 from hilcal.cli.plan_output import POSES
@@ -17,7 +17,6 @@ from hilcal.cli.rehearsing import RehearsalSettings, first_plan, in_process, on_
 from hilcal.cli.terminal import Json, Record, Terminal, terminal
 from hilcal.config import load_config
 from hilcal.data.campaign_file import CampaignFile, may_write
-from hilcal.data.plan import Plan
 from hilcal.data.records import content_hash
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
@@ -26,7 +25,7 @@ from hilcal.refine import refine as refine_model
 from hilcal.report import numbers, text, text_demo, text_refine
 from hilcal.report.build_story import Chapter
 from hilcal.report.diagnosis_document import to_json
-from hilcal.report.progress import Say, working
+from hilcal.report.progress import working
 from hilcal.report.verdict_words import message
 from hilcal.revisions import to_record
 from hilcal.robot.catalogue import configs_dir
@@ -67,27 +66,39 @@ def demo(
     number = config.simulation.seed if seed is None else seed
     if number < 0:
         raise InputError(f"--seed {number}; valid: a whole number, 0 or more")
-    choice = hide or config.simulation.hide or (in_doubt(number) if ambiguous else RANDOM)
-    check_choice(choice, catalogue)
+    wanted = hide or config.simulation.hide
+    check_choice(wanted or RANDOM, catalogue)
     may_write(output, True)  # before the planning, which takes a while
-    if ambiguous:
-        weaker = config.simulation.model_copy(update={"strength_sigma": STRENGTH})
-        config = config.model_copy(update={"simulation": weaker})
     there = output.exists()
-    told = RehearsalSettings(config, choice, number, output, path.parent, catalogue)
+    told = RehearsalSettings(config, wanted or RANDOM, number, output, path.parent, catalogue)
     doubt: Doubted | None = None
-    with working(t.progress) as say:
-        plan = _plan(told, poses, ambiguous, say)
-    with (in_process if without_devices else on_devices)(t, told, plan) as (r, further):
-        if there:
-            t.notice(f"{output} existed and is replaced")
-        _introduce(t, r, choice, number)
-        if ambiguous:
+    measured = in_process if without_devices else on_devices
+    tries = 0
+    while True:
+        with working(t.progress) as say:
+            if ambiguous:
+                hidden = None if wanted == RANDOM else wanted
+                told, plan, another = doubtful_case(told, hidden, say, tries)
+            else:
+                plan = first_plan(told, config, poses, say)
+        with measured(t, told, plan) as (r, further):
+            if there:
+                t.notice(f"{output} existed and is replaced")
+            there = False
+            _introduce(t, r, wanted or RANDOM, number)
+            if not ambiguous:
+                break
             doubt = doubted(t, r, number, plan, poses, catalogue)
             if doubt.plan is not None:
                 r = further(doubt.plan)
                 new = len(r.readings) - doubt.readings
                 t.show(f"\n{new} readings were added. All {len(r.readings)} together:\n")
+                break
+            tries += 1
+            if not another or tries == CAMPAIGNS:
+                t.show("These readings leave no doubt; another --seed or --hide may.\n")
+                break
+            t.show("These readings leave no doubt: another arm is measured.\n")
     hashed = content_hash(r.readings)
     with working(t.progress) as say:
         model = baseline(r.cell, r.readings, r.mode, catalogue)
@@ -147,14 +158,6 @@ def demo(
             "diagnoses": [to_json(s.diagnosis) for s in found.steps],
         }
     )
-
-
-def _plan(told: RehearsalSettings, poses: int, ambiguous: bool, say: Say) -> Plan:
-    """Return the first plan; a small one under some of the loads where there is to be doubt."""
-    if not ambiguous:
-        return first_plan(told, told.config, poses, say)
-    some = told.config.model_copy(update={"loads": told.config.loads[1::2] or told.config.loads})
-    return first_plan(told, some, FIRST, say)
 
 
 def _introduce(t: Terminal, r: Rehearsal, choice: str, seed: int) -> None:

@@ -1,17 +1,26 @@
 """`hilcal next` and `hilcal demo --ambiguous`: what they say, write and refuse."""
 
-import json
 from pathlib import Path
 
 import pytest
 
 from drivers.simulated.injected_effects import HARD_TO_SEPARATE
-from hilcal.cli.doubting import in_doubt
+from drivers.simulated.on_the_wire import case_of_plan, read_plan
+from hilcal.cli import doubting
+from hilcal.cli.rehearsing import RehearsalSettings
+from hilcal.config import load_config
 from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.plan import load_plan
+from hilcal.diagnose.diagnosis import History
+from hilcal.diagnose.doubt import in_doubt
+from hilcal.diagnose.evidence import Evidence
+from hilcal.diagnose.verdict import judge
+from hilcal.effects.catalogue import installed
+from hilcal.identify.baseline import baseline
+from hilcal.identify.fit import fit
 from hilcal.robot.catalogue import configs_dir
 from tests.support.campaigns import configuration
-from tests.support.cli_cases import ok, refused
+from tests.support.cli_cases import CELL, ok, refused
 from tests.support.next_cases import SMALL, doubtful
 from tests.unit.plan.test_many_poses import fine_error
 
@@ -185,7 +194,35 @@ def test_a_demo_without_devices_can_be_viewed(tmp_path: Path, capsys: Capsys) ->
     ok(capsys, "view", path, "--record", tmp_path / "demo.rrd", "--json")
 
 
-def test_the_effect_of_an_ambiguous_demo_is_drawn_from_the_seed() -> None:
-    assert {in_doubt(seed) for seed in range(20)} == set(HARD_TO_SEPARATE)
-    assert in_doubt(3) == in_doubt(3)
-    assert json.dumps(in_doubt(1))
+def rehearsal_of(seed: int, path: Path) -> RehearsalSettings:
+    return RehearsalSettings(load_config(CELL), "random", seed, path, CELL.parent, installed())
+
+
+def in_doubt_at_first(seed: int, path: Path) -> bool:
+    """Whether the first readings of an ambiguous demo, which the seed determines, leave a doubt."""
+    case, plan, doubtful = doubting.doubtful_case(rehearsal_of(seed, path), None, print)
+    assert doubtful
+    assert case.choice in HARD_TO_SEPARATE
+    secret = case_of_plan(case.config, plan, case.choice, case.seed)
+    r = read_plan(secret, plan, [case.seed, 1])  # as `in_process` draws them
+    d = judge(Evidence(fit(baseline(r.cell, r.readings, r.mode), r.readings, r.mode)), History())
+    return d.verdict == "ambiguous" and case.choice in in_doubt(d)
+
+
+def test_an_ambiguous_demo_is_in_doubt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doubting, "DRAWS", 2)
+    assert in_doubt_at_first(2, tmp_path / "x")
+
+
+@pytest.mark.slow
+def test_every_ambiguous_demo_is_in_doubt(tmp_path: Path) -> None:
+    assert all(in_doubt_at_first(seed, tmp_path / "x") for seed in range(10))
+
+
+def test_a_case_without_a_doubt_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An effect that everything separates is hidden all the same, if that is asked for."""
+    monkeypatch.setattr(doubting, "TRIES", 2)
+    monkeypatch.setattr(doubting, "_resembled", lambda r, case: False)
+    case, _, doubtful = doubting.doubtful_case(rehearsal_of(0, tmp_path / "x"), "creep", print)
+    assert case.choice == "creep"
+    assert not doubtful
