@@ -73,9 +73,11 @@ def test_the_commands_of_the_guide_to_effects(
         file.append_readings(rehearse(config, "nothing", 3, 6).readings)
     lines = guide.read_text(encoding="utf-8").splitlines()
     commands = [line.split("#")[0].split()[1:] for line in lines if line.startswith("    hilcal ")]
-    assert [words[0] for words in commands] == ["effects", "diagnose"]
+    rehearsed = [words for words in commands if words[0] in ("demo", "simulate")]
+    assert [words[0] for words in commands[: -len(rehearsed) or None]] == ["effects", "diagnose"]
     for words in commands:
-        ok(capsys, *words)
+        if words not in rehearsed:  # hiding an effect of one's own: test_own_law
+            ok(capsys, *words)
     module = ModuleType("cable_pull")
     law, check, *_ = blocks(guide)
     exec(law, module.__dict__)
