@@ -7,6 +7,7 @@ import numpy as np
 from rich.console import RenderableType
 from rich.text import Text
 
+from hilcal.data.plan import UNLOADED
 from hilcal.data.whitening import Mode
 from hilcal.identify.acceptance import BAND, Acceptance, Share
 from hilcal.identify.errors import ErrorBlock
@@ -129,7 +130,9 @@ def _beyond(v: Beyond) -> str:
     if v.unit == "rad":
         low, high, most = (f"{np.degrees(x):.0f}°" for x in (v.low, v.high, v.most))
     else:
-        low, high, most = (f"{numbers.digits(x)} {v.unit}" for x in (v.low, v.high, v.most))
+        unit = "°C" if v.unit == "K" else v.unit  # the readings hold °C, differences are in K
+        low, high = (f"{numbers.digits(x)} {unit}" for x in (v.low, v.high))
+        most = f"{numbers.digits(v.most)} {v.unit}"
     return f"{v.variable}: {v.count}, by up to {most} (measured: {low} to {high})"
 
 
@@ -168,7 +171,7 @@ def _verdict(s: Share, limit: float | None) -> tuple[str, ...]:
 def _limit_words(found: Acceptance, limit: float) -> str:
     size, a = numbers.length(limit), found.everything
     worst = found.poses[0]
-    largest = f"the largest error is {numbers.length(a.max_m)}, at {worst.name} under {worst.worst}"
+    largest = f"the largest error is {numbers.length(a.max_m)}, at {_place(worst)}"
     if found.passed:
         return f"PASSED: no error is over the limit of {size}; {largest}.\n"
     poses = sum(not s.passes(limit) for s in found.poses)
@@ -178,13 +181,18 @@ def _limit_words(found: Acceptance, limit: float) -> str:
     )
 
 
+def _place(worst: Share) -> str:
+    """Return a pose and the load of its largest error."""
+    return f"{worst.name} " + ("unloaded" if worst.worst == UNLOADED else f"under {worst.worst}")
+
+
 def failure(found: Acceptance, judged: Judged) -> str:
     """Return the one line on a limit that is not kept."""
     limit, worst = found.limit_m or 0.0, found.poses[0]
     head = (
         f"the limit of {numbers.length(limit)} is not kept: {found.over} of "
-        f"{found.everything.count} {judged.what} are further off, {worst.name} under {worst.worst} "
-        f"by {numbers.length(worst.max_m)}"
+        f"{found.everything.count} {judged.what} are further off, {_place(worst)} by "
+        f"{numbers.length(worst.max_m)}"
     )
     if not found.undecided:
         return head
