@@ -14,15 +14,17 @@ arm.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
 
-from hilcal.calibration.compensation import Pose, invert
+from hilcal.calibration.compensation import Inverse, Pose, invert, singular
+from hilcal.calibration.compiled import Compiled, compiled
 from hilcal.calibration.measured import Measured
-from hilcal.calibration.poses import Compensation, ToolPoses
+from hilcal.calibration.poses import ToolPoses
 from hilcal.calibration.scatter import Scatter, scatter_of
 from hilcal.calibration.tool import Tool, one_of_each, tool_of, tool_poses
 from hilcal.data.readings import States
@@ -35,10 +37,68 @@ from hilcal.identify.predictive import predictive
 from hilcal.model import Model, Prediction
 from hilcal.robot import se3
 from hilcal.robot.chain import evaluate
-from hilcal.types import Floats, Ints
+from hilcal.types import Bools, Floats, Ints
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
+class Compensation:
+    """Joint values that put the tool where it was asked to be; the rest is computed when asked for.
+
+    Attributes:
+        inverse: joint values, and what is left.
+    """
+
+    inverse: Inverse
+    _calibration: "Calibration"
+    _tool: Tool
+    _states: States
+    _wanted: tuple[Floats, Floats] | None
+    _std: bool
+
+    @property
+    def q(self) -> Floats:
+        """(N, n) the joint values, rad."""
+        return self.inverse.q
+
+    @cached_property
+    def before(self) -> ToolPoses:
+        """The tool at the joint values that were given; without uncertainties."""
+        return self._calibration.poses(self._tool, self._states, self._goal, std=False)
+
+    @cached_property
+    def after(self) -> ToolPoses:
+        """The tool at the joint values that were found."""
+        found = replace(self._states, q=self.q)
+        return self._calibration.poses(self._tool, found, self._goal, std=self._std)
+
+    @property
+    def limits(self) -> Bools:
+        """(N, n) joint values that are beyond the arm's limits."""
+        arm = self._tool.model.cell.arm
+        return np.asarray((self.q < arm.q_min) | (self.q > arm.q_max))
+
+    @cached_property
+    def singular(self) -> Bools:
+        """(N,) whether the pose is singular."""
+        arm = self._tool.model.cell.arm
+        return singular(arm, evaluate(arm, self.q), self.after.position)
+
+    @property
+    def usable(self) -> Bools:
+        """(N,) points that are solved, not singular, within limits and what was measured."""
+        good = self.inverse.solved & ~self.singular & ~self.limits.any(axis=1)
+        for o in self.after.outside:
+            good &= ~o.points
+        return np.asarray(good)
+
+    @cached_property
+    def _goal(self) -> tuple[Floats, Floats]:
+        if self._wanted is None:
+            return self._calibration.nominal(self._tool, self._states)
+        return self._wanted
+
+
+@dataclass(frozen=True, eq=False)
 class Calibration:
     """A fitted model with what is known of it.
 
@@ -157,7 +217,7 @@ class Calibration:
             InputError: another shape, or a column is missing that the model needs.
         """
         states, of = self._states(q, wrench, recorded), self._tool(tool)
-        return self._poses(of, states, self._nominal(of, states), std)
+        return self.poses(of, states, self.nominal(of, states), std)
 
     def compensate(
         self,
@@ -184,23 +244,29 @@ class Calibration:
             InputError: as for `predict`.
         """
         states, of = self._states(q, wrench, recorded), self._tool(tool)
-        rotation, position = self._nominal(of, states)
+        goal = None
         if wanted is not None:
             given = np.broadcast_to(np.asarray(wanted, dtype=float), (len(states), 4, 4))
-            rotation, position = given[:, :3, :3], given[:, :3, 3]
+            goal = np.array(given[:, :3, :3]), np.array(given[:, :3, 3])
+        fast = self._compiled if of is self._tracked else compiled(of, self.mode)
+        if fast is not None:
+            found, left = fast.compensate(states.q, states.wrench, *(goal or (None, None)))
+            inverse = Inverse(found, left[:, 0], left[:, 1])
+        else:
+            inverse = self._invert(of, states, goal or self.nominal(of, states))
+        return Compensation(inverse, self, of, states, goal, std)
 
+    @cached_property
+    def _compiled(self) -> Compiled | None:
+        """The model for the compiled kernel, with the tracked target as the tool."""
+        return compiled(self._tracked, self.mode)
+
+    def _invert(self, of: Tool, states: States, goal: tuple[Floats, Floats]) -> Inverse:
         def poses(at: Floats, points: Ints) -> Pose:
             prediction = of.model.predict(replace(states[points], q=at), of.theta)
             return (*tool_poses(of, prediction), prediction.situation.chain)
 
-        arm = self.model.cell.arm
-        found = invert(arm, poses, states.q, rotation, position)
-        return Compensation(
-            inverse=found,
-            before=self._poses(of, states, (rotation, position), std=False),
-            after=self._poses(of, replace(states, q=found.q), (rotation, position), std),
-            limits=(found.q < arm.q_min) | (found.q > arm.q_max),
-        )
+        return invert(self.model.cell.arm, poses, states.q, *goal)
 
     def tool_pose(self, tool: Floats | None = None) -> Floats:
         """(4, 4) T_flange_tool: as given, or the tracked target as fitted."""
@@ -221,7 +287,7 @@ class Calibration:
     ) -> States:
         """Return the points as states; raises as `predict` does."""
         n, every = self.model.cell.arm.n, one_of_each(self.model.cell)
-        q = np.atleast_2d(np.asarray(q, dtype=float))
+        q = np.array(q, dtype=float, order="C", ndmin=2)
         if q.shape[1:] != (n,) or not len(q):
             raise InputError(f"q has shape {q.shape}; valid: ({n},) or (N, {n})")
         given = {"wrench": np.zeros(6) if wrench is None else wrench, **(recorded or {})}
@@ -233,7 +299,7 @@ class Calibration:
             shape, values = (len(q), *kind.shape[1:]), np.asarray(value, dtype=float)
             if values.shape not in (shape, shape[1:]):
                 raise InputError(f"{name} has shape {values.shape}; valid: {shape} or {shape[1:]}")
-            columns[name] = np.array(np.broadcast_to(values, shape))
+            columns[name] = np.array(np.broadcast_to(values, shape), order="C")
         for name, column in {"q": q, **columns}.items():
             if not np.isfinite(column).all():
                 raise InputError(f"{name} has values that are not finite")
@@ -245,7 +311,7 @@ class Calibration:
                 )
         return states
 
-    def _nominal(self, of: Tool, states: States) -> tuple[Floats, Floats]:
+    def nominal(self, of: Tool, states: States) -> tuple[Floats, Floats]:
         """Orientation and position of the tool that errors are counted from."""
         if self.mode == "deflection":
             unloaded = replace(states, wrench=np.zeros((len(states), 6)))
@@ -254,9 +320,17 @@ class Calibration:
         rotation = se3.product(chain.rotation[-1], of.pose[:3, :3])
         return rotation, chain.point(of.pose[:3, 3])
 
-    def _poses(
+    def poses(
         self, of: Tool, states: States, nominal: tuple[Floats, Floats], std: bool
     ) -> ToolPoses:
+        """Return where a tool is.
+
+        Args:
+            of: the tool.
+            states: N points.
+            nominal: orientation (N, 3, 3) and position (N, 3) that errors are counted from.
+            std: also state the uncertainty.
+        """
         prediction = of.model.predict(states, of.theta)
         rotation, position = tool_poses(of, prediction)
         known = covariance = None

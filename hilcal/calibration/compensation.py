@@ -41,13 +41,11 @@ class Inverse:
         q: (N, n) joint values.
         residual_m: (N,) distance from the wanted position that is left.
         residual_rad: (N,) angle from the wanted orientation that is left.
-        singular: (N,) points whose pose is singular.
     """
 
     q: Floats
     residual_m: Floats
     residual_rad: Floats
-    singular: Bools
 
     @property
     def solved(self) -> Bools:
@@ -73,18 +71,13 @@ def invert(
     """
     q, count = q.copy(), len(q)
     left = np.full((count, 2), np.inf)
-    singular = np.zeros(count, dtype=np.bool_)
     active = np.arange(count)
     scale = np.array([arm.reach] * 3 + [1.0] * 3)
     for _ in range(MOST_STEPS):
         r, p, chain = poses(q[active], active)
         e = _error(r, p, rotation[active], position[active])
         left[active] = np.stack([np.linalg.norm(part, axis=1) for part in (e[:, :3], e[:, 3:])], 1)
-        jacobian = joint_jacobian(chain, p)
-        if arm.coupling is not None:
-            jacobian = jacobian @ arm.coupling
-        u, s, vt = np.linalg.svd(jacobian / scale[:, None], full_matrices=False)
-        singular[active] = s[:, -1] < LEAST_SINGULAR * s[:, 0]
+        u, s, vt = np.linalg.svd(_jacobian(arm, chain, p), full_matrices=False)
         step = np.einsum("nji,nj,nkj,nk->ni", vt, 1.0 / np.maximum(s, 1e-6), u, e / scale)
         going = left[active].max(axis=1) > TOLERANCE
         if not going.any():
@@ -93,7 +86,20 @@ def invert(
         step *= np.minimum(1.0, MOST_TURN / np.maximum(longest, 1e-300))
         q[active[going]] += step[going]
         active = active[going]
-    return Inverse(q, left[:, 0], left[:, 1], singular)
+    return Inverse(q, left[:, 0], left[:, 1])
+
+
+def singular(arm: Arm, chain: Chain, position: Floats) -> Bools:
+    """(N,) whether poses with the tool at points (N, 3) are singular."""
+    s = np.linalg.svd(_jacobian(arm, chain, position), compute_uv=False)
+    return np.asarray(s[:, -1] < LEAST_SINGULAR * s[:, 0])
+
+
+def _jacobian(arm: Arm, chain: Chain, position: Floats) -> Floats:
+    """(N, 6, n) derivative of displacement over reach, and turn, by the controller's values."""
+    jacobian = joint_jacobian(chain, position)
+    jacobian[:, :3] /= arm.reach
+    return jacobian if arm.coupling is None else np.asarray(jacobian @ arm.coupling)
 
 
 def _error(r: Floats, p: Floats, rotation: Floats, position: Floats) -> Floats:

@@ -5,11 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
-from hilcal.calibration.compensation import Inverse
 from hilcal.calibration.measured import Outside
 from hilcal.errors import InputError
 from hilcal.robot import se3
-from hilcal.types import Bools, Floats
+from hilcal.types import Floats
 
 BAND = 0.95
 """Share of points whose error lies within the stated band."""
@@ -80,33 +79,3 @@ def band(covariance: Floats) -> Floats:
     first = np.maximum(np.trace(covariance, axis1=1, axis2=2), 1e-300)
     second = np.maximum(np.einsum("nij,nji->n", covariance, covariance), 1e-300 * first)
     return np.asarray(np.sqrt(second / first * chi2.ppf(BAND, first**2 / second)))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Compensation:
-    """Joint values that put the tool where it was asked to be.
-
-    Attributes:
-        inverse: joint values, and what is left.
-        before: the tool at the joint values that were given.
-        after: the tool at those that were found.
-        limits: (N, n) joint values that are beyond the arm's limits.
-    """
-
-    inverse: Inverse
-    before: ToolPoses
-    after: ToolPoses
-    limits: Bools
-
-    @property
-    def q(self) -> Floats:
-        """(N, n) the joint values, rad."""
-        return self.inverse.q
-
-    @property
-    def usable(self) -> Bools:
-        """(N,) points that are solved, not singular, within limits and what was measured."""
-        good = self.inverse.solved & ~self.inverse.singular & ~self.limits.any(axis=1)
-        for o in self.after.outside:
-            good &= ~o.points
-        return np.asarray(good)

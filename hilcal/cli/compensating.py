@@ -11,9 +11,8 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from hilcal.calibration.calibration import Calibration
+from hilcal.calibration.calibration import Calibration, Compensation
 from hilcal.calibration.points import Points, on_branch, read_points
-from hilcal.calibration.poses import Compensation
 from hilcal.calibration.urscript import JOINTS, movej_program, program_points, with_joints
 from hilcal.campaign import Campaign
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
@@ -227,7 +226,7 @@ def _refuse(path: Path, names: tuple[str, ...], refused: list[str], found: Compe
     named = "; ".join(f"{names[k]}: {refused[k]}" for k in bad[:NAMED])
     more = f"; and {len(bad) - NAMED} more" if len(bad) > NAMED else ""
     words = f"{path}: {len(bad)} of {len(names)} points are refused: {named}{more}"
-    lost = ~found.inverse.solved | found.inverse.singular | found.limits.any(axis=1)
+    lost = ~found.inverse.solved | found.singular | found.limits.any(axis=1)
     if lost[bad].any():
         raise InputError(words)
     raise CannotAnswerError(f"{words}; measure there, or give --allow-outside")

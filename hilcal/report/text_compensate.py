@@ -5,9 +5,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from rich.console import RenderableType
 
-from hilcal.calibration.calibration import Calibration
+from hilcal.calibration.calibration import Calibration, Compensation
 from hilcal.calibration.measured import Outside
-from hilcal.calibration.poses import BAND, Compensation
+from hilcal.calibration.poses import BAND
 from hilcal.report import numbers, text
 from hilcal.types import Floats
 
@@ -23,7 +23,7 @@ def refusals(c: Compensation, allowed_outside: bool) -> list[str]:
         if not c.inverse.solved[k]:
             left = numbers.length(float(c.inverse.residual_m[k]))
             why.append(f"cannot be reached on its branch, {left} are left")
-        if c.inverse.singular[k]:
+        if c.singular[k]:
             why.append("the pose is singular")
         for j in np.flatnonzero(c.limits[k]):
             why.append(f"joint {j + 1} would be beyond its limit ({_degrees(c.q[k, j])})")

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 import hilcal as hc
 from hilcal.calibration.calibration import Calibration
+from hilcal.calibration.compiled import compiled
 from hilcal.calibration.poses import band
 from hilcal.calibration.scatter import Scatter
 from hilcal.calibration.storage import from_json, to_json
@@ -120,6 +121,39 @@ def test_a_wanted_pose_is_reached_from_joint_values_nearby() -> None:
     wanted = se3.matrix(*(x[:5] for x in nominal(c, q)))
     k = c.compensate(q + 0.05, wanted=wanted, std=False)
     np.testing.assert_allclose(k.q, c.compensate(q, std=False).q, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("effect", "mode", "fast"),
+    [
+        ("none", "absolute", True),
+        ("link_geometry", "absolute", True),
+        ("transmission_error", "absolute", True),
+        ("link_mass", "absolute", True),
+        ("load_point", "absolute", True),
+        ("joint_stiffening", "absolute", True),
+        ("backlash", "absolute", True),
+        ("joint_tilt_compliance", "deflection", True),
+        ("link_compliance", "deflection", True),
+        ("tool_compliance", "absolute", True),
+        ("periodic_joint_compliance", "absolute", False),
+    ],
+)
+def test_the_kernel_finds_what_the_model_says(effect: str, mode: Mode, fast: bool) -> None:
+    c, states = calibrated(effect, mode), fresh(1)
+    wrench = states.wrench * np.linspace(-1, 1, len(states))[:, None]  # through small torques, too
+    tool = se3.matrix(se3.rotation(np.array([0.3, -0.2, 0.5])), np.array([0.1, 0.0, 0.2]))
+    for pose in (None, tool):
+        assert (compiled(c._tool(pose), mode) is not None) == fast
+        k = c.compensate(states.q, wrench, tool=pose, std=False)
+        of, given = c._tool(pose), replace(states, wrench=wrench)
+        slow = c._invert(of, given, c.nominal(of, given))
+        np.testing.assert_array_equal(k.inverse.solved, slow.solved)
+        good = slow.solved & ~k.singular
+        assert good.mean() > 0.8
+        np.testing.assert_allclose(k.q[good], slow.q[good], atol=2e-9)
+        assert k.after.error_m[good].max() < 1e-9
+        assert k.after.error_rad[good].max() < 1e-9
 
 
 def nominal(c: Calibration, q: Floats) -> tuple[Floats, Floats]:

@@ -1,0 +1,338 @@
+"""One point at a time, compiled: the deviated chain at equilibrium, and its inverse.
+
+The same equations as `robot.chain`, `robot.statics` and `compensation`, for models whose effects
+`compiled` could bring into the form
+
+    dq_j = a_j + T_j(q_j) + Σ_i L_ji q_i + c_j · w_j + G_j(τ_j),      ξ_k = b_k + C_k w_k
+
+w_k the wrench through slot k. Chain, wrenches and Newton step are iterated together: each is about
+10³ times closer after every round. Machine code is made by numba when a process first needs it.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from hilcal.types import Floats
+
+Arrays = tuple[Floats, ...]
+
+ROUNDS = 40
+"""Rounds at most; five are usual."""
+SETTLED = 1e-12
+"""Change of the deviations that ends the rounds, m and rad."""
+
+
+@njit(cache=True)
+def _interpolate(x: float, low: float, step: float, value: Floats, slope: Floats) -> float:
+    """Cubic Hermite interpolation in a table with equal steps; linear outside."""
+    last = len(value) - 1
+    at = (x - low) / step
+    k = math.floor(at)
+    if k < 0:
+        return float(value[0] + (x - low) * slope[0])
+    if k >= last:
+        return float(value[last] + (x - low - last * step) * slope[last])
+    t = at - k
+    u = 1.0 - t
+    begin = value[k] * u * u * (1.0 + 2.0 * t) + value[k + 1] * t * t * (3.0 - 2.0 * t)
+    return float(begin + step * t * u * (slope[k] * u - slope[k + 1] * t))
+
+
+@njit(cache=True)
+def _product(a: Floats, b: Floats, out: Floats) -> None:
+    """Write a b, (3, 3) each; `out` is none of both."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
+
+
+@njit(cache=True)
+def _add_turned(r: Floats, v: Floats, out: Floats) -> None:
+    """Add r v to a vector."""
+    for i in range(3):
+        out[i] += r[i, 0] * v[0] + r[i, 1] * v[1] + r[i, 2] * v[2]
+
+
+@njit(cache=True)
+def _add_cross(a: Floats, b: Floats, out: Floats) -> None:
+    """Add a × b to a vector."""
+    out[0] += a[1] * b[2] - a[2] * b[1]
+    out[1] += a[2] * b[0] - a[0] * b[2]
+    out[2] += a[0] * b[1] - a[1] * b[0]
+
+
+@njit(cache=True)
+def _exp(twist: Floats, r: Floats, v: Floats) -> None:
+    """Write rotation (3, 3) and translation (3,) of exp of a twist."""
+    x, y, z = twist[3], twist[4], twist[5]
+    t2 = x * x + y * y + z * z
+    if t2 < 1e-8:
+        a, b, c = 1.0 - t2 / 6.0, 0.5 - t2 / 24.0, 1.0 / 6.0 - t2 / 120.0
+    else:
+        t = math.sqrt(t2)
+        a, b, c = math.sin(t) / t, (1.0 - math.cos(t)) / t2, (t - math.sin(t)) / (t2 * t)
+    r[0, 0], r[0, 1], r[0, 2] = 1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y
+    r[1, 0], r[1, 1], r[1, 2] = b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x
+    r[2, 0], r[2, 1], r[2, 2] = b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)
+    u, w, q = twist[0], twist[1], twist[2]
+    cx, cy, cz = y * q - z * w, z * u - x * q, x * w - y * u
+    v[0] = u + b * cx + c * (y * cz - z * cy)
+    v[1] = w + b * cy + c * (z * cx - x * cz)
+    v[2] = q + b * cz + c * (x * cy - y * cx)
+
+
+@njit(cache=True)
+def _chain(
+    arm: Arrays,
+    dq: Floats,
+    twist: Floats,
+    q: Floats,
+    rotation: Floats,
+    position: Floats,
+    body: Floats,
+    com: Floats,
+    scratch: Floats,
+) -> None:
+    """Write frames of the slots, axes of the bodies and their centres of mass."""
+    link_r, link_p, coms = arm
+    n = len(q)
+    step_r, start, before = scratch[0], scratch[1], scratch[2]
+    step_p = scratch[3, 0]
+    for i in range(3):
+        for j in range(3):
+            before[i, j] = 1.0 if i == j else 0.0
+    for k in range(n + 1):
+        p = position[k]
+        for i in range(3):
+            p[i] = 0.0 if k == 0 else position[k - 1, i]
+        _add_turned(before, link_p[k], p)
+        moved = False
+        for i in range(6):
+            moved = moved or twist[k, i] != 0.0
+        if moved:
+            _product(before, link_r[k], start)
+            _exp(twist[k], step_r, step_p)
+            _add_turned(start, step_p, p)
+            _product(start, step_r, rotation[k])
+        else:
+            _product(before, link_r[k], rotation[k])
+        if k < n:
+            angle = q[k] + dq[k]
+            co, si = math.cos(angle), math.sin(angle)
+            r, before = rotation[k], body[k]
+            for i in range(3):
+                before[i, 0] = r[i, 0] * co + r[i, 1] * si
+                before[i, 1] = r[i, 1] * co - r[i, 0] * si
+                before[i, 2] = r[i, 2]
+                com[k, i] = p[i]
+            _add_turned(before, coms[k], com[k])
+
+
+@njit(cache=True)
+def _wrenches(
+    load: Any,
+    applied: Floats,
+    rotation: Floats,
+    position: Floats,
+    body: Floats,
+    com: Floats,
+    out: Floats,
+    scratch: Floats,
+) -> None:
+    """Write the wrench (n + 1, 6) through each slot, slot axes."""
+    point, tool_mass, tool_com, gravity, masses, moments = load
+    n = len(com)
+    f, t, lever, weight = scratch[0, 0], scratch[0, 1], scratch[0, 2], scratch[1, 0]
+    for i in range(3):
+        lever[i] = 0.0
+        t[i] = applied[3 + i]
+    _add_turned(rotation[n], point, lever)
+    _add_cross(lever, applied[:3], t)
+    for i in range(3):
+        lever[i] = 0.0
+        weight[i] = tool_mass * gravity[i]
+        f[i] = applied[i] + weight[i]
+    _add_turned(rotation[n], tool_com, lever)
+    _add_cross(lever, weight, t)
+    for k in range(n, -1, -1):
+        if k < n:
+            for i in range(3):
+                lever[i] = position[k + 1, i] - position[k, i]
+            _add_cross(lever, f, t)
+            for i in range(3):
+                lever[i] = masses[k] * (com[k, i] - position[k, i])
+            _add_turned(body[k], moments[k], lever)
+            _add_cross(lever, gravity, t)
+            for i in range(3):
+                f[i] += masses[k] * gravity[i]
+        r = rotation[k]
+        for i in range(3):
+            out[k, i] = r[0, i] * f[0] + r[1, i] * f[1] + r[2, i] * f[2]
+            out[k, 3 + i] = r[0, i] * t[0] + r[1, i] * t[1] + r[2, i] * t[2]
+
+
+@njit(cache=True)
+def _deviations(
+    laws: Arrays, tables: Any, q: Floats, wrench: Floats, dq: Floats, twist: Floats
+) -> float:
+    """Write the deviations; returns their largest change."""
+    a, linear, by_wrench, b, compliance = laws
+    waves, wave_slopes, wave_low, wave_step, gives, give_slopes, give_low, give_step = tables
+    n, change = len(q), 0.0
+    for j in range(n):
+        new = a[j]
+        for i in range(n):
+            new += linear[j, i] * q[i]
+        for e in range(6):
+            new += by_wrench[j, e] * wrench[j, e]
+        if len(waves) > 0:
+            new += _interpolate(q[j], wave_low, wave_step, waves[j], wave_slopes[j])
+        if len(gives) > 0:
+            new += _interpolate(wrench[j, 5], give_low[j], give_step[j], gives[j], give_slopes[j])
+        change = max(change, abs(new - dq[j]))
+        dq[j] = new
+    for k in range(n + 1):
+        for e in range(6):
+            new = b[k, e]
+            for f in range(6):
+                new += compliance[k, e, f] * wrench[k, f]
+            change = max(change, abs(new - twist[k, e]))
+            twist[k, e] = new
+    return change
+
+
+@njit(cache=True)
+def _solve(matrix: Floats, right: Floats) -> bool:
+    """Solve a small system in place by elimination with pivots; False where it is singular."""
+    n = len(right)
+    for c in range(n):
+        best = c
+        for r in range(c + 1, n):
+            if abs(matrix[r, c]) > abs(matrix[best, c]):
+                best = r
+        if abs(matrix[best, c]) < 1e-12:
+            return False
+        if best != c:
+            for k in range(n):
+                matrix[c, k], matrix[best, k] = matrix[best, k], matrix[c, k]
+            right[c], right[best] = right[best], right[c]
+        for r in range(c + 1, n):
+            factor = matrix[r, c] / matrix[c, c]
+            for k in range(c, n):
+                matrix[r, k] -= factor * matrix[c, k]
+            right[r] -= factor * right[c]
+    for c in range(n - 1, -1, -1):
+        for k in range(c + 1, n):
+            right[c] -= matrix[c, k] * right[k]
+        right[c] /= matrix[c, c]
+    return True
+
+
+@njit(cache=True)
+def _turn(wanted: Floats, r: Floats, out: Floats) -> float:
+    """Write the rotation vector of wanted rᵀ, for angles below π; returns its length."""
+    trace = 0.0
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        out[i] = 0.0
+        for c in range(3):
+            trace += wanted[i, c] * r[i, c]
+            out[i] += 0.5 * (wanted[k, c] * r[j, c] - wanted[j, c] * r[k, c])
+    s = math.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2])
+    if s < 1e-9:
+        return s
+    angle = math.atan2(s, 0.5 * (trace - 1.0))
+    for i in range(3):
+        out[i] *= angle / s
+    return angle
+
+
+@njit(cache=True, nogil=True)
+def invert_all(
+    arm: Arrays,
+    load: Any,
+    laws: Arrays,
+    tables: Any,
+    tool: Floats,
+    reach: float,
+    most_turn: float,
+    tolerance: float,
+    q: Floats,
+    applied: Floats,
+    rotations: Floats,
+    positions: Floats,
+    newton: bool,
+    out_q: Floats,
+    left: Floats,
+) -> None:
+    """Invert N points; without `newton` write the poses at q into `rotations` and `positions`.
+
+    Args:
+        arm: links (n + 1, 3, 3) and (n + 1, 3), centres of mass (n, 3).
+        load: where the load acts, and all weights.
+        laws: constants and compliances of the deviations.
+        tables: of what depends on one angle, or one torque.
+        tool: (4, 4) T_flange_tool.
+        reach: of the arm, m.
+        most_turn: largest step of a joint, rad.
+        tolerance: residual at which a point is solved, m and rad.
+        q: (N, n) joint values to begin with, rad.
+        applied: (N, 6) wrenches at the load point, base axes.
+        rotations: (N, 3, 3) wanted orientations.
+        positions: (N, 3) wanted positions, m.
+        newton: whether to change q.
+        out_q: (N, n) joint values found.
+        left: (N, 2) residuals, m and rad.
+    """
+    count, n = q.shape
+    rotation, position = np.empty((n + 1, 3, 3)), np.empty((n + 1, 3))
+    body, com = np.empty((n, 3, 3)), np.empty((n, 3))
+    wrench, dq, twist = np.empty((n + 1, 6)), np.empty(n), np.empty((n + 1, 6))
+    jacobian, e, at = np.empty((n, n)), np.empty(n), np.empty(n)
+    scratch, r = np.empty((4, 3, 3)), np.empty((3, 3))
+    p, lever, column = np.empty(3), np.empty(3), np.empty(3)
+    for point in range(count):
+        at[:] = q[point]
+        dq[:] = 0.0
+        twist[:] = 0.0
+        for _ in range(ROUNDS):
+            _chain(arm, dq, twist, at, rotation, position, body, com, scratch)
+            _product(rotation[n], tool[:3, :3], r)
+            p[:] = position[n]
+            _add_turned(rotation[n], tool[:3, 3], p)
+            _wrenches(load, applied[point], rotation, position, body, com, wrench, scratch)
+            change = _deviations(laws, tables, at, wrench, dq, twist)
+            if not newton:
+                rotations[point] = r
+                positions[point] = p
+                if change < SETTLED:
+                    break
+                continue
+            far = 0.0
+            for i in range(3):
+                e[i] = positions[point, i] - p[i]
+                far += e[i] * e[i]
+                e[i] /= reach
+            left[point, 0] = math.sqrt(far)
+            left[point, 1] = _turn(rotations[point], r, e[3:])
+            if change < SETTLED and max(left[point, 0], left[point, 1]) < tolerance:
+                break
+            for j in range(n):
+                for i in range(3):
+                    lever[i] = (p[i] - position[j, i]) / reach
+                    jacobian[3 + i, j] = rotation[j, i, 2]
+                    column[i] = 0.0
+                _add_cross(rotation[j, :, 2], lever, column)
+                jacobian[:3, j] = column
+            if not _solve(jacobian, e):
+                break
+            longest = 0.0
+            for j in range(n):
+                longest = max(longest, abs(e[j]))
+            part = min(1.0, most_turn / max(longest, 1e-300))
+            for j in range(n):
+                at[j] += part * e[j]
+        out_q[point] = at

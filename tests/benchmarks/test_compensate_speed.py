@@ -1,0 +1,54 @@
+"""Cost of compensation against evaluating the nominal chain once for the same points."""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hilcal.calibration.calibration import Calibration
+from hilcal.identify.baseline import baseline
+from hilcal.identify.fit import fit
+from hilcal.robot.chain import evaluate
+from tests.benchmarks.conftest import Claim
+from tests.support.campaigns import campaign, plan
+
+pytestmark = pytest.mark.slow
+
+POINTS = 10_000
+ROUNDS = 5
+
+
+def shortest(work: Callable[[], object], times: int = 1) -> float:
+    """Return the median of some calls, least of all rounds, s."""
+    out = []
+    for _ in range(ROUNDS):
+        each = []
+        for _ in range(times):
+            begun = time.perf_counter()
+            work()
+            each.append(time.perf_counter() - begun)
+        out.append(float(np.median(each)))
+    return min(out)
+
+
+@pytest.mark.parametrize("effect", ["joint_tilt_compliance", "transmission_error"])
+def test_compensation(effect: str, benchmark: Any, claim: Claim) -> None:
+    c = campaign(effect, "absolute", 0, poses=24)
+    model = baseline(c.cell, c.readings, "absolute")
+    model = model + model.catalogue.make(effect, c.cell, c.readings.states)
+    calibration = Calibration.of(fit(model, c.readings, "absolute"))
+    states = plan(40, 5000).states
+    rows = np.arange(POINTS) % len(states)
+    q, wrench = states.q[rows], states.wrench[rows]
+    found = calibration.compensate(q, wrench)  # the kernel is compiled here
+    assert found.inverse.solved.mean() > 0.95
+    one = shortest(lambda: calibration.compensate(q[0], wrench[0]), 500)
+    many = shortest(lambda: calibration.compensate(q, wrench))
+    chain = shortest(lambda: evaluate(calibration.model.cell.arm, q))
+    claim(f"one compensation, {effect}", f"{1e6 * one:.0f} µs", "200 µs")
+    claim(f"{POINTS} compensations, {effect}", f"{many:.3f} s", "0.2 s")
+    claim(f"the same over one evaluation of {POINTS} chains", f"{many / chain:.2f}", "no limit")
+    benchmark.extra_info["over one chain"] = many / chain
+    benchmark.pedantic(lambda: calibration.compensate(q, wrench), rounds=ROUNDS)
