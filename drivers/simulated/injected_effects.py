@@ -56,8 +56,8 @@ EFFECTS = (
 """Every effect that can be hidden."""
 
 HARD_TO_SEPARATE = ("base_compliance", "link_compliance")
-"""Effects that a campaign of six poses hardly ever separates from others: of 8 seeds of
-`demo --ambiguous`, 7 and 8 were in doubt; of `joint_tilt_compliance` 4 were."""
+"""Effects that a campaign of six poses often does not separate from each other, or from
+`joint_tilt_compliance`: `demo --ambiguous` draws arms until it does not."""
 
 _SAID = ("wrench_bias", "wrench_gain", "sensor_misalignment")  # need something to misread
 READINGS_MODES = ("absolute", "deflection")
