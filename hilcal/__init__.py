@@ -44,6 +44,7 @@ _PLACES = {
     "preview_table": "hilcal.identify.table_preview",
     "read_table": "hilcal.library",
     "refine": "hilcal.library",
+    "validate": "hilcal.validate",
     "view": "hilcal.library",
 }
 
@@ -66,6 +67,7 @@ if TYPE_CHECKING:
     from hilcal.library import baseline, fit, plan, read_table, refine, view
     from hilcal.model import Model
     from hilcal.refine import Refinement
+    from hilcal.validate import validate
 
 
 def __getattr__(name: str) -> object:

@@ -6,6 +6,7 @@ from pathlib import Path
 from hilcal.campaign import Campaign
 from hilcal.cli.terminal import Terminal
 from hilcal.data.readings import Readings
+from hilcal.data.revision import RevisionRecord
 from hilcal.data.whitening import MODES, SCALINGS, Mode, Scaling
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.options import Options
@@ -28,6 +29,15 @@ def fit_of(t: Terminal, run: Campaign, say: Say, revision: int | None) -> tuple[
             f"{found.mode} readings); hilcal identify keeps it"
         )
     return number, found
+
+
+def record_of(t: Terminal, run: Campaign, say: Say, revision: int | None) -> RevisionRecord:
+    """Return the revision in use as stored; without any that of the baseline, number 0."""
+    record = run.in_use(revision)
+    if record is None:
+        return run.record(fit_of(t, run, say, revision)[1])
+    _tell_accepted(t, run, revision)
+    return record
 
 
 def stored_fit(t: Terminal, run: Campaign, say: Say, revision: int | None) -> tuple[int, Fit]:

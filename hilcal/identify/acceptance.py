@@ -6,12 +6,44 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
+from hilcal.data.whitening import Mode
 from hilcal.identify.extrapolation import Extrapolation
 from hilcal.identify.validation import Validation
 from hilcal.types import Bools, Floats, Ints
 
 BAND = 0.95
 """Probability of the band that is stated, as is usual (GUM, coverage of about 95 %)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """Which readings are judged.
+
+    Attributes:
+        number: of the revision; None for a baseline that is not kept.
+        mode: kind of measurements.
+        readings: all in the other campaign.
+        fitted: those of them that the revision was fitted to.
+        spoilt: further ones whose unloaded reading was fitted.
+        unseen: whether those that are judged were never fitted; False where all were.
+    """
+
+    number: int | None
+    mode: Mode
+    readings: int
+    fitted: int
+    spoilt: int
+    unseen: bool
+
+    @property
+    def model(self) -> str:
+        """The revision, in words."""
+        return "the baseline" if self.number is None else f"revision {self.number}"
+
+    @property
+    def what(self) -> str:
+        """The measurements, in words."""
+        return "deflections" if self.mode == "deflection" else "positions"
 
 
 @dataclass(frozen=True, slots=True)

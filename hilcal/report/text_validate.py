@@ -1,15 +1,14 @@
 """What `validate` says: errors of readings that were never fitted, by load, by pose, by a limit."""
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 
 import numpy as np
 from rich.console import RenderableType
 from rich.text import Text
 
 from hilcal.data.plan import UNLOADED
-from hilcal.data.whitening import Mode
-from hilcal.identify.acceptance import BAND, Acceptance, Share
+from hilcal.identify.acceptance import BAND, Acceptance, Judged, Share
 from hilcal.identify.errors import ErrorBlock
 from hilcal.identify.extrapolation import Beyond, Extrapolation
 from hilcal.identify.validation import Validation
@@ -22,37 +21,6 @@ WORST = 6
 """Poses that are listed."""
 DOUBTED = 1.5
 """Error over the stated standard deviation from which the statement is called too small."""
-
-
-@dataclass(frozen=True, slots=True)
-class Judged:
-    """Which readings are judged.
-
-    Attributes:
-        number: of the revision; None for a baseline that is not kept.
-        mode: kind of measurements.
-        readings: all in the other campaign.
-        fitted: those of them that the revision was fitted to.
-        spoilt: further ones whose unloaded reading was fitted.
-        unseen: whether those that are judged were never fitted; False where all were.
-    """
-
-    number: int | None
-    mode: Mode
-    readings: int
-    fitted: int
-    spoilt: int
-    unseen: bool
-
-    @property
-    def model(self) -> str:
-        """The revision, in words."""
-        return "the baseline" if self.number is None else f"revision {self.number}"
-
-    @property
-    def what(self) -> str:
-        """The measurements, in words."""
-        return "deflections" if self.mode == "deflection" else "positions"
 
 
 def opening(judged: Judged, found: Validation) -> Iterator[str]:
