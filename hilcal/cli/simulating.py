@@ -21,6 +21,9 @@ from hilcal.data.plan import load_plan
 from hilcal.errors import InputError
 from hilcal.report.progress import working
 
+FASTEST = 200.0
+"""Clock of a simulated world, as `[simulation] clock` allows."""
+
 
 def simulate(
     cell: CellFile,
@@ -42,6 +45,14 @@ def simulate(
             help="`run` asks you for each load, as in a real cell; without it nobody is asked.",
         ),
     ] = False,
+    clock: Annotated[
+        float | None,
+        typer.Option(
+            "--clock",
+            metavar="N",
+            help="The simulated world goes so many times faster than real time, e.g. 20.",
+        ),
+    ] = None,
     effects_from: EffectsFrom = None,
 ) -> None:
     """Run simulated devices for a cell until Ctrl-C, for `check` and `run` to talk to."""
@@ -50,6 +61,11 @@ def simulate(
     number = config.simulation.seed if seed is None else seed
     if number < 0:
         raise InputError(f"--seed {number}; valid: a whole number, 0 or more")
+    if clock is not None:
+        if not 1.0 <= clock <= FASTEST:
+            raise InputError(f"--clock {clock:g}; valid: a number from 1 to {FASTEST:g}")
+        simulation = config.simulation.model_copy(update={"clock": clock})
+        config = config.model_copy(update={"simulation": simulation})
     base_dir = cell.absolute().parent
     with working(t.progress) as say:
         if plan is None:

@@ -124,7 +124,7 @@ def test_payload_is_set_also_with_its_centre_at_the_flange(arm, sim):
 
 def test_payload_that_the_controller_does_not_take_is_told(arm, sim, monkeypatch):
     monkeypatch.setattr(Control, "set_payload", lambda *_: True)
-    with pytest.raises(DeviceError, match=r"it says 2\.5 kg at .* told a payload of 4 kg"):
+    with pytest.raises(DeviceError, match=r"it says 2\.5 kg at .* after a payload of 4 kg"):
         arm.set_payload(4.0, cases.COM)
     assert sim.admin()["payload"] == cases.MASS
 
