@@ -13,11 +13,13 @@ from hilcal.identify.baseline import baseline
 from hilcal.identify.before import error_before
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.fit_document import to_json
+from hilcal.identify.full_prediction import full_prediction
 from hilcal.report import numbers, text, text_refine
 from hilcal.report.build_story import Chapter, build_story
 from hilcal.report.diagnosis_document import to_json as diagnosis_json
 from hilcal.report.verdict_words import message
 from hilcal.report.viewer import words
+from hilcal.report.viewer.digest import Limits, digest
 from tests.support.campaigns import campaign
 
 
@@ -111,3 +113,12 @@ def test_how_many_were_tested_stands_where_p_values_do(absolute):
 def test_a_suspect_counts_only_below_the_shared_level(absolute):
     d = diagnose(absolute)
     assert all(s.score.p_value * d.tested < FALSE_ALARM for s in d.suspects if s.passes)
+
+
+def test_terminal_and_viewer_call_the_worst_pose_by_its_name(absolute):
+    worst = text.worst_poses(full_prediction(absolute))[0]
+    story = build_story([Chapter(1, None, absolute, None)])
+    d = digest(story, Limits())
+    assert worst.pose in absolute.readings.pose_names
+    assert story.pose_name(d.worst(story.revisions[0])) == worst.pose
+    assert f"Worst: pose {worst.pose}, load {worst.load}," in words.details(d, story.revisions[0])
