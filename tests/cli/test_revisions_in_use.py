@@ -1,8 +1,9 @@
 """Which revision a command reads, and that commands which only read leave the file alone."""
 
 import hashlib
-import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,7 @@ from hilcal.errors import InputError
 from hilcal.revisions import chain
 from tests.support.cli_cases import CELL, ok, refused, table
 from tests.support.cli_cases import run as command
+from tests.support.paths import ROOT
 
 Capsys = pytest.CaptureFixture[str]
 BASE = ["base_frame", "joint_compliance"]
@@ -124,19 +126,23 @@ def test_a_reading_connection_can_write_nothing(run: Path) -> None:
             o.file.append_revision(record)
 
 
+KILLED = """
+import os, pathlib, sys
+from hilcal.data import schema
+connection = schema.connect(pathlib.Path(sys.argv[1]))
+connection.execute("PRAGMA cache_size = 1")
+connection.execute("BEGIN IMMEDIATE")
+for k in range(400):
+    connection.execute("INSERT INTO meta VALUES (?, ?, ?)", (f"key {k}", "x" * 3000, 0))
+os._exit(9)
+"""
+"""A program that is killed in the middle of a transaction."""
+
+
 def test_what_a_killed_program_left_unfinished_is_undone_before_it_is_read(run: Path) -> None:
     """A journal beside the file: SQLite must undo it, which a read-only connection cannot."""
     before = run.read_bytes()
-    child = os.fork()
-    if child == 0:  # pragma: no cover  (killed in the middle of a transaction)
-        connection = schema.connect(run)
-        connection.execute("PRAGMA cache_size = 1")
-        connection.execute("BEGIN IMMEDIATE")
-        for k in range(400):
-            row = (f"key {k}", "x" * 3000, 0)
-            connection.execute("INSERT INTO meta VALUES (?, ?, ?)", row)
-        os._exit(9)
-    os.waitpid(child, 0)
+    subprocess.run([sys.executable, "-c", KILLED, str(run)], cwd=ROOT, check=False)
     assert run.with_name("run.hilcal-journal").exists()
     assert run.read_bytes() != before
     with Campaign.open(run, read_only=True) as o:
@@ -212,6 +218,9 @@ def test_exploring_does_not_change_what_others_use_once_a_revision_is_accepted(
         result = ok(capsys, name, run, "--json")
         assert result.document["revision"] == 2
         assert "using revision 2, which is accepted; the latest is 3" in result.err
+    result = ok(capsys, "validate", run, run, "--json")
+    assert result.document["revision"] == 2
+    assert "using revision 2, which is accepted" in result.err
     ok(capsys, "add", run, "load_point")  # from the accepted one; it stays accepted
     ok(capsys, "identify", run)
     assert ok(capsys, "compare", run, "--json").document["revision"] == 2
