@@ -272,6 +272,19 @@ class Calibration:
         """(4, 4) T_flange_tool: as given, or the tracked target as fitted."""
         return self._tool(tool).pose
 
+    def base_in_tracker(self) -> Floats:
+        """(4, 4) T_sensor_base as fitted."""
+        first = one_of_each(self.model.cell)
+        if self.model.cell.targets is not None:
+            first = replace(first, target=np.zeros(1, dtype=np.int64))
+        situation = self.model.predict(first, self.theta).situation
+        pose = self.model.cell.registration
+        for e, mine in zip(self.model.effects, self.model.slices(), strict=True):
+            moved = e.deviation(self.theta[mine], situation).base
+            if e.role == "registration" and moved is not None:
+                pose = pose @ se3.matrix(*(x[0] for x in se3.exp(moved)))
+        return np.asarray(pose)
+
     def _tool(self, pose: Floats | None) -> Tool:
         """Return the tool with a pose on the flange; raises as `predict` does."""
         if pose is None:

@@ -1,7 +1,7 @@
 """`import` and `export`: tables in, tables out."""
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,6 +9,11 @@ import numpy as np
 import typer
 from rich.padding import Padding
 
+from hilcal.calibration.calibration import Calibration
+from hilcal.calibration.corrected import corrected
+from hilcal.calibration.handover import frames as frames_file
+from hilcal.calibration.handover import ur_kinematics as ur_kinematics_file
+from hilcal.calibration.handover import urdf as urdf_file
 from hilcal.campaign import Campaign
 from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
@@ -176,6 +181,18 @@ def export(
             help="The identified arm, ready for compensate on any machine.",
         ),
     ] = None,
+    urdf: Annotated[
+        Path | None,
+        typer.Option("--urdf", metavar="F.urdf", help="The arm with its corrected geometry."),
+    ] = None,
+    ur_kinematics: Annotated[
+        Path | None,
+        typer.Option("--ur-kinematics", metavar="F.yaml", help="The same for UR's ROS driver."),
+    ] = None,
+    frames: Annotated[
+        Path | None,
+        typer.Option("--frames", metavar="F.json", help="Tool and base as fitted, m and rad."),
+    ] = None,
     revision: Revision = None,
     force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
     effects_from: EffectsFrom = None,
@@ -183,15 +200,18 @@ def export(
 ) -> None:
     """Write readings and parameters as CSV, the calibration as JSON."""
     t = terminal(as_json)
-    wanted = [path for path in (table, parameters, calibration) if path is not None]
+    geometry = {"urdf": urdf, "ur-kinematics": ur_kinematics, "frames": frames}
+    of_model = [parameters, calibration, *geometry.values()]
+    wanted = [path for path in (table, *of_model) if path is not None]
     if not wanted:
         raise InputError(
-            "nothing to export; give --table F.csv, --parameters F.csv or --calibration F.json"
+            "nothing to export; give --table F.csv, --parameters F.csv, --calibration F.json, "
+            "--urdf F.urdf, --ur-kinematics F.yaml or --frames F.json"
         )
     for path in wanted:
         if path.exists() and not force:
             raise InputError(f"{path}: the file exists; choose another name or give --force")
-    if revision is not None and parameters is None and calibration is None:
+    if revision is not None and not any(of_model):
         raise InputError("--revision is about the model; give --parameters or --calibration, too")
     with Campaign.open(run, catalogue_with(effects_from), read_only=True) as opened_run:
         record = opened_run.in_use(revision)
@@ -204,11 +224,38 @@ def export(
             rows = record.result_json["identify"]["parameters"]
             _write_parameters(parameters, rows)
             t.show(f"{parameters}: {len(rows)} parameters of revision {record.number}")
-        if calibration is not None:
+        if calibration is not None or any(geometry.values()):
             found = opened_run.calibration(revision)
-            found.save(calibration)
-            t.show(f"{calibration}: the calibration of revision {found.source['revision']}")
+            if calibration is not None:
+                found.save(calibration)
+                t.show(f"{calibration}: the calibration of revision {found.source['revision']}")
+            t.show(_write_geometry(found, geometry))
     t.document({"written": [str(path) for path in wanted]})
+
+
+def _write_geometry(found: Calibration, wanted: Mapping[str, Path | None]) -> Iterator[str]:
+    """Write the corrected geometry in the forms that are wanted; yields what was written."""
+    paths = {form: path for form, path in wanted.items() if path is not None}
+    if not paths:
+        return
+    arm = corrected(found)
+    nominal, beyond = found.model.cell.arm, None
+    note = f"{nominal.name} as calibrated with hilcal, {found.source['campaign']}"
+    texts = {}
+    if "ur-kinematics" in paths:
+        texts["ur-kinematics"], beyond = ur_kinematics_file(nominal, arm.arm)
+    if "urdf" in paths:
+        texts["urdf"] = urdf_file(arm.arm, note)
+    if "frames" in paths:
+        texts["frames"] = frames_file(found, arm, beyond)
+    for form, path in paths.items():
+        try:
+            path.write_text(texts[form], encoding="utf-8")
+        except OSError as e:
+            raise InputError(f"{path}: cannot be written ({e.strerror})") from None
+        yield f"{path}: {form} with {', '.join(arm.within) or 'the nominal geometry'}"
+    if arm.beyond:
+        yield f"Not in it, since not constant: {', '.join(arm.beyond)}; hilcal compensate has it"
 
 
 def _write_parameters(path: Path, rows: Sequence[dict[str, object]]) -> None:

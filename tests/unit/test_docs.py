@@ -79,12 +79,14 @@ def test_the_guide_to_compensation_runs_as_it_stands(
     monkeypatch.chdir(tmp_path)
     with CampaignFile.create("run.hilcal", config.to_json(), str(cell.parent), "test") as file:
         file.append_readings(rehearse(config, "nothing", 3, 20).readings)
-    ok(capsys, "identify", "run.hilcal", "--readings", "absolute")
+    given = ("--effects", "joint_compliance,encoder_offset")
+    ok(capsys, "identify", "run.hilcal", "--readings", "absolute", *given)
     (table,) = blocks(guide, "csv")
     Path("points.csv").write_text(table)
     for line in "".join(blocks(guide, "sh")).splitlines():
         ok(capsys, *line.split()[1:])
-    for name in ("corrected.csv", "corrected.script", "corrected.json"):
+    written = ("corrected.csv", "corrected.script", "corrected.json", "arm.urdf", "arm.yaml")
+    for name in (*written, "frames.json"):
         assert Path(name).stat().st_size > 100
     (code,) = blocks(guide)
     exec(code, {})
