@@ -8,7 +8,7 @@ redundant where its F-test is not significant.
 from dataclasses import dataclass
 
 from hilcal.identify.fit import Fit
-from hilcal.identify.linearisation import ModelColumns, eliminate_effect, model_columns
+from hilcal.identify.linearisation import eliminate_effect, model_columns
 from hilcal.regression.evidence import FamilyScore
 
 CHANCE = 0.01
@@ -28,17 +28,12 @@ class Redundant:
     score: FamilyScore
 
 
-def backward_elimination(fit: Fit, x: ModelColumns | None = None) -> tuple[Redundant, ...]:
-    """Return the redundant effects of a fit, the least significant first.
-
-    Args:
-        fit: the fit.
-        x: the columns of its model where they are known.
-    """
+def backward_elimination(fit: Fit) -> tuple[Redundant, ...]:
+    """Return the redundant effects of a fit, the least significant first."""
     judged = [e.name for e in fit.model.effects if e.role == "effect"]
     if not judged:
         return ()
-    x = model_columns(fit) if x is None else x
+    x = model_columns(fit)
     found = []
     for name in judged:
         result = eliminate_effect(fit, x, name).score()

@@ -27,12 +27,7 @@ from hilcal.effects.protocol import Effect
 from hilcal.errors import InputError
 from hilcal.identify.arm_scatter import estimate_arm_scatter, with_arm_scatter
 from hilcal.identify.fit import Fit, fit
-from hilcal.identify.linearisation import (
-    Linearisation,
-    ModelColumns,
-    linearise,
-    model_columns,
-)
+from hilcal.identify.linearisation import Linearisation, linearise
 
 
 class Evidence:
@@ -60,6 +55,7 @@ class Evidence:
         if fit.scaling != "gc":
             raise InputError(f"diagnosis needs scaling gc, this fit has {fit.scaling}")
         self.fit, self._refit, self._say, self._detectable = fit, refit, say, detectable
+        self._known: dict[tuple[str, frozenset[str]], Alternative] = {}
 
     @cached_property
     def linearisation(self) -> Linearisation:
@@ -135,26 +131,25 @@ class Evidence:
     @cached_property
     def redundant(self) -> tuple[str, ...]:
         """Effects of the model without which the readings are explained as well."""
-        return tuple(n.effect for n in backward_elimination(self.fit, self._model_columns))
+        return tuple(n.effect for n in backward_elimination(self.fit))
 
     @cached_property
     def insufficiency(self) -> Insufficiency | None:
         """What all effects of the catalogue together leave, where it is not noise."""
         return insufficiency(self.fit, self._refit, self._say)
 
-    @cached_property
-    def _alternatives(self) -> StepwiseAlternatives:
-        return StepwiseAlternatives(self.fit, self._model_columns)
-
-    @cached_property
-    def _model_columns(self) -> ModelColumns:
-        return model_columns(self.fit)
-
-    def alternative(self, effect: str, excluded: Collection[str]) -> Alternative:
-        """Return what could replace an effect of the model.
+    def alternatives(
+        self, effects: Collection[str], excluded: Collection[str]
+    ) -> tuple[Alternative, ...]:
+        """Return what could replace effects of the model.
 
         Args:
-            effect: of the model.
+            effects: of the model.
             excluded: effects that are not to be used.
         """
-        return self._alternatives.of(effect, excluded)
+        keys = [(name, frozenset(excluded)) for name in effects]
+        if any(key not in self._known for key in keys):
+            # Not kept: the columns of the whole catalogue are the largest arrays of a judgement.
+            algebra = StepwiseAlternatives(self.fit)
+            self._known |= {key: algebra.of(key[0], excluded) for key in keys}
+        return tuple(self._known[key] for key in keys)

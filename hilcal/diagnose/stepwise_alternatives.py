@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from hilcal.diagnose.effect_ranking import SAME_EVIDENCE, catalogue_columns
 from hilcal.identify.fit import Fit
-from hilcal.identify.linearisation import ModelColumns, eliminate_effect, model_columns
+from hilcal.identify.linearisation import eliminate_effect, model_columns
 from hilcal.regression.forward_selection import families_beside, forward_selection
 
 MOST_TOGETHER = 3
@@ -56,14 +56,9 @@ class Alternative:
 class StepwiseAlternatives:
     """Alternatives to the effects of a fitted model, from the catalogue."""
 
-    def __init__(self, fit: Fit, model: ModelColumns | None = None) -> None:
-        """Compute the columns of all effects that are not in a model, and products with its own.
-
-        Args:
-            fit: the fit.
-            model: the columns of its model where they are known.
-        """
-        self._fit, self._model = fit, model_columns(fit) if model is None else model
+    def __init__(self, fit: Fit) -> None:
+        """Compute the columns of the model and of all effects that are not in it."""
+        self._fit, self._model = fit, model_columns(fit)
         self._x, self._columns, self._most = catalogue_columns(fit)
         self._gram, self._products = self._x.T @ self._x, self._model.white.T @ self._x
 

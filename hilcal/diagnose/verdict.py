@@ -107,7 +107,7 @@ def judge(e: Evidence, history: History) -> Diagnosis:
 def _judged(e: Evidence, history: History) -> Diagnosis:
     """Judge by the evidence as it is."""
     suspects = ranked(e.suspects, history.rejected)
-    alternatives = tuple(e.alternative(name, history.removed) for name in history.added)
+    alternatives = e.alternatives(history.added, history.removed)
     lead = suspects[0] if suspects and suspects[0].passes else None
     insufficiency, noise, scatter = None, None, e.fit.readings.arm_scatter
     rivals: tuple[Separability, ...] = ()

@@ -191,7 +191,10 @@ def _minimise(
         converged = settled and float(moved @ moved) <= CONVERGED**2 * noise
         if converged:
             break
-        settled = (linear.whitened and square < 1) or abs(square / before - 1) <= SETTLED
+        del linear  # before the next one is made
+        settled = (problem.w.scaling != "none" and square < 1) or abs(
+            square / before - 1
+        ) <= SETTLED
     return point, by, iterations, converged
 
 
