@@ -175,7 +175,7 @@ def _minimise(
     point = problem.at(np.where(sigma > 0, theta, 0.0))
     by: Regularisation  # set in the first step
     square, settled, converged = np.inf, False, False
-    path = _Path()
+    path = Acceleration()
     for iterations in range(1, MAX_ITERATIONS + 1):  # noqa: B007 - reported
         linear = _linearise(problem, point, sigma)
         if not settled:
@@ -231,7 +231,7 @@ def _step(linear: LinearProblem, by: Regularisation, groups: Ints) -> tuple[Regu
     return by, aim
 
 
-class _Path:
+class Acceleration:
     """Anderson's acceleration of the steps that follow once priors and rank are settled.
 
     Where a residual remains, steps in a weakly determined direction shrink by a constant factor
@@ -243,6 +243,7 @@ class _Path:
     """
 
     def __init__(self) -> None:
+        """Begin without steps."""
         self._aims: list[Floats] = []
         self._moves: list[Floats] = []
 

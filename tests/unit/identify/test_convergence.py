@@ -8,6 +8,7 @@ import pytest
 from hilcal.data.readings import Readings, States
 from hilcal.data.whitening import whitening
 from hilcal.identify.fit import Fit, fit
+from hilcal.identify.gauss_newton import Acceleration
 from hilcal.identify.priors import scales_of
 from hilcal.identify.residual import residual
 from hilcal.model import Model
@@ -97,3 +98,15 @@ def test_sideways_pulls_separate_the_first_joints_offset_from_the_registration(s
     )
     down = fit(model, replace(readings, states=states, value=readings.value + shift), "absolute")
     assert not down.uncertainty.identifiable[pair].any()
+
+
+def test_steps_that_shrink_by_constant_factors_lead_to_their_limit() -> None:
+    """Anderson's combination of steps x → x* + D (x − x*), D diagonal with two factors."""
+    rng = np.random.default_rng(0)
+    limit, factor = rng.normal(size=8), np.where(np.arange(8) < 4, -0.55, 0.6)
+    path, x = Acceleration(), np.zeros(8)
+    for _ in range(4):
+        aim = limit + factor * (x - limit)
+        shortcut = path.accelerated(aim, aim - x)
+        x = aim if shortcut is None else shortcut
+    np.testing.assert_allclose(x, limit, rtol=0, atol=1e-10)
