@@ -297,7 +297,7 @@ def _refuse_without_unloaded(readings: Readings) -> None:
     Raises:
         InputError: names it.
     """
-    has = _has_unloaded(readings, [readings.pose, readings.cycle])
+    has = has_unloaded(readings)
     if not has.all():
         row = int(np.argmin(has))
         name = readings.pose_names[readings.pose[row]]
@@ -351,5 +351,9 @@ def usual_mode(readings: Readings) -> Mode:
     """Deflections where every loaded reading has an unloaded one in its pose and cycle."""
     if readings.unloaded.all():
         return "absolute"
-    has = _has_unloaded(readings, [readings.pose, readings.cycle])
-    return "deflection" if has.all() else "absolute"
+    return "deflection" if has_unloaded(readings).all() else "absolute"
+
+
+def has_unloaded(readings: Readings) -> Bools:
+    """Return (N,) which readings have an unloaded one, or are one, in their pose and cycle."""
+    return _has_unloaded(readings, [readings.pose, readings.cycle])

@@ -10,7 +10,7 @@ from hilcal.acquire.progress import GoalStatus
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.data.readings import Readings
-from hilcal.data.whitening import Mode, usual_mode
+from hilcal.data.whitening import Mode, has_unloaded
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import HilcalError, InputError
 from hilcal.identify.baseline import with_effects
@@ -29,11 +29,11 @@ SHARE = 0.1
 
 
 class GoalRule:
-    """Judges a campaign by its goal, with the fit that `hilcal identify` would make.
+    """Judges a campaign by its goal, with the fit that `hilcal identify` would make at its end.
 
-    The model is the baseline, or the effects of `[planning] model`, fitted to deflections where
-    every loaded reading has its unloaded one, else to the readings as they are; `[planning]
-    readings = "absolute"` fits them so in any case.
+    The model is the effects of `[planning] model`. `[planning] readings` says what is fitted:
+    positions, or deflections: then a loaded reading counts from its unloaded one on, and readings
+    that are all unloaded are fitted as positions.
 
     The goal counts as met by a fit that converged, to readings that determine what the goal is
     about: unloaded readings, for one, determine no deflection. Where the residual is more than
@@ -110,14 +110,20 @@ class GoalRule:
             self._took = self._ended - begun
         return self.status
 
-    def _mode(self, readings: Readings) -> Mode:
-        wanted = self._config.planning.readings
-        return "absolute" if wanted == "absolute" else usual_mode(readings)
+    def _fitted(self, readings: Readings) -> tuple[Readings, Mode]:
+        """Return the readings that are judged, and how.
+
+        Where deflections are planned, a loaded reading counts as soon as its unloaded one is read.
+        """
+        if self._config.planning.readings == "absolute":
+            return readings, "absolute"
+        kept = readings[has_unloaded(readings)]
+        return kept, "absolute" if kept.unloaded.all() else "deflection"
 
     def _news(self, readings: Readings) -> bool:
         """Whether the last reading is more than an unloaded one that no deflection has yet."""
         free = readings.unloaded
-        if not free[-1] or self._mode(readings) == "absolute":
+        if not free[-1] or self._fitted(readings)[1] == "absolute":
             return True
         same = (readings.pose == readings.pose[-1]) & (readings.cycle == readings.cycle[-1])
         return bool((same & ~free).any())
@@ -125,8 +131,8 @@ class GoalRule:
     def _fit(self, readings: Readings) -> tuple[GoalStatus, Fit] | None:
         """Fit and judge; None where that cannot be done yet."""
         try:
+            readings, mode = self._fitted(readings)
             readings = with_joint_scatter(self._cell, readings, self._scatter)
-            mode = self._mode(readings)
             wanted = planned_effects(self._config, self._catalogue)
             model = with_effects(self._cell, readings, mode, wanted, wanted, self._catalogue)
             found = fit(model, readings, mode)
@@ -145,8 +151,11 @@ class GoalRule:
         That of the fit's covariance T H⁻¹ Tᵀ, widened as `identify` widens the parameters'.
         Infinite where directions that the readings do not determine move the prediction. A family
         that the fit holds at zero may be so for want of readings, so that there have to be more
-        degrees of freedom than it has parameters, and more than one in any case.
+        degrees of freedom than it has parameters, and more than one in any case; where deflections
+        are planned, some have to be read.
         """
+        if found.mode != self._config.planning.readings:
+            return float(np.inf)
         if found.dof <= max(int((found.solution.prior == 0).sum()), 1):
             return float(np.inf)
         where = {"work_q_rad": self._work_q, "work_min_m": None, "work_max_m": None}

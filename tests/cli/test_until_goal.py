@@ -62,12 +62,14 @@ def test_it_is_what_identify_states(mode: Any) -> None:
         assert f"joint std {share:.0f} % (j6)" == status_words(status)
 
 
-def test_readings_that_lack_their_unloaded_ones_are_fitted_as_they_are() -> None:
-    """So it is in the middle of a plan that takes half of the unloaded readings at the end."""
+def test_loaded_readings_count_from_their_unloaded_ones_on() -> None:
+    """In the middle of a plan that takes half of the unloaded readings at the end."""
     c = campaign(mode="deflection", poses=8)
-    kept = c.readings[~((c.readings.pose > 4) & c.readings.unloaded)]
-    status = rule("joint std < 90 %", c)(kept, last=False)
-    assert status.fitted == "absolute"
+    lacking = c.readings[~((c.readings.pose > 4) & c.readings.unloaded)]
+    status = rule("joint std < 90 %", c)(lacking, last=False)
+    paired = rule("joint std < 90 %", c)(c.readings[c.readings.pose <= 4], last=False)
+    assert status.fitted == "deflection"
+    assert status.std == pytest.approx(paired.std)
     assert status.met
 
 
