@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import typer
 
 from hilcal.acquire.connect import ConnectionResult, connect
-from hilcal.acquire.dry_run import dry_run
+from hilcal.acquire.dry_run import DryRun, dry_run
 from hilcal.campaign import Campaign
 from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
@@ -119,7 +119,7 @@ def check(
         raise InputError(f"{cell.name}: {error}") from None
     dry = None
     if plan is not None:
-        dry = dry_run(numbers, config, load_plan(plan))
+        dry = dry_checked(t, numbers, config, load_plan(plan))
     with working(t.progress) as say:
         say("connecting to every device")
         rig, answers = connect(config)
@@ -139,6 +139,13 @@ def check(
         },
         failed,
     )
+
+
+def dry_checked(t: Terminal, cell: Cell, config: CellConfig, plan: Plan) -> DryRun:
+    """Return the dry run of a plan, which takes seconds where it is long."""
+    with working(t.progress) as say:
+        say("checking every motion in a dry run")
+        return dry_run(cell, config, plan)
 
 
 def read_cell(path: Path) -> tuple[CellConfig, Cell]:

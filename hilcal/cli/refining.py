@@ -330,17 +330,21 @@ def view(
         record_story(t, chapters, record)
         t.document({"recording": str(record), "revisions": [c.number for c in chapters]})
         return
-    from hilcal.report.viewer import serve  # loads the viewer's library, which takes a while
+    with working(t.progress) as say:
+        say("preparing the viewer")
+        from hilcal.report.viewer import serve  # loads the viewer's library, which takes a while
 
+        story = build_story(chapters)
     # Ending the server can wait for a viewer that does not answer; the campaign is closed.
     guard = threading.Timer(ENDING, os._exit, (0,))
     guard.daemon = True
     try:
         with (
             told_to_end(signal.SIGINT, signal.SIGTERM) as wait,
-            serve(build_story(chapters), port=port) as served,
+            serve(story, port=port) as served,
         ):
-            t.show(f"Open the viewer with:\n  {viewer_command()} {served.url}")
+            t.show("Open the viewer with:")
+            t.command(f"{viewer_command()} {served.url}")
             t.document({"url": served.url, "revisions": [c.number for c in chapters]})
             sys.stdout.flush()
             t.notice("Serving until Ctrl-C.")

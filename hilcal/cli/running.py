@@ -15,7 +15,6 @@ from drivers.simulated.on_the_wire import case_of_plan, simulated_cell
 from drivers.simulated.rehearsal import NOTHING
 from hilcal.acquire.clock import Clock
 from hilcal.acquire.connect import ConnectionResult, connect
-from hilcal.acquire.dry_run import dry_run
 from hilcal.acquire.progress import Watcher
 from hilcal.acquire.rig import Rig
 from hilcal.acquire.run import HOW_ON
@@ -28,6 +27,7 @@ from hilcal.cli.planning import (
     CellFile,
     PlanFile,
     answer_json,
+    dry_checked,
     make_checked,
     read_cell,
     refuse_unready,
@@ -100,7 +100,7 @@ def run(
             check_same_cell(campaign, config)
             made = RunLog(campaign).plans[0]
         elif append:
-            campaign, further = _append(stack, output, plan, config, numbers)
+            campaign, further = _append(t, stack, output, plan, config, numbers)
             made = RunLog(campaign).plans[0]
         else:
             if output.exists():
@@ -109,7 +109,7 @@ def run(
                     "--append, or choose another name"
                 )
             made = load_plan(plan) if plan else _own_plan(t, cell, config, numbers, catalogue, yes)
-            refuse(dry_run(numbers, config, made), str(plan or "the plan"))
+            refuse(dry_checked(t, numbers, config, made), str(plan or "the plan"))
         if rehearse:
             with working(t.progress) as say:
                 say("starting the simulated devices")
@@ -197,7 +197,7 @@ def _says_how_to_resume(campaign: CampaignFile, planned: int, on: str) -> Iterat
 
 
 def _append(
-    stack: ExitStack, output: Path, plan: Path | None, config: CellConfig, cell: Cell
+    t: Terminal, stack: ExitStack, output: Path, plan: Path | None, config: CellConfig, cell: Cell
 ) -> tuple[CampaignFile, Plan]:
     """Open a campaign, and return it with a further plan that has been checked.
 
@@ -209,7 +209,7 @@ def _append(
     campaign = stack.enter_context(CampaignFile.open(output))
     check_same_cell(campaign, config)
     further = RunLog(campaign).with_new_names(load_plan(plan))
-    refuse(dry_run(cell, config, further), str(plan))
+    refuse(dry_checked(t, cell, config, further), str(plan))
     return campaign, further
 
 
