@@ -120,9 +120,12 @@ def urscript_list(values: Floats) -> str:
 
 
 def movej_program(names: Sequence[str], q: Floats) -> str:
-    """Return a program that moves to joint values (N, 6), one after the other."""
+    """Return a program that moves to joint values (N, 6), one after the other.
+
+    The controller runs it as it is when it comes in on its script ports (30001 to 30003).
+    """
     lines = [f"  movej({urscript_list(row)})  # {name}" for name, row in zip(names, q, strict=True)]
-    return "\n".join(["def compensated():", *lines, "end", "compensated()", ""])
+    return "\n".join(["def compensated():", *lines, "end", ""])
 
 
 def _without_comments(program: str) -> str:

@@ -8,6 +8,7 @@ import numpy as np
 from drivers.simulated.blackboard import Blackboard
 from drivers.simulated.ur.script import PROGRAM_STOP, ControlScript, ProtectiveStop
 from drivers.simulated.ur.state import ArmState, RobotMode, Runtime, SafetyMode
+from drivers.simulated.ur.waypoints import WaypointProgram
 from hilcal.types import Floats
 
 SAFETY_STOP = 15.0
@@ -45,7 +46,7 @@ class Controller:
         self.scripts = 0
         self.unlock_after = UNLOCK_AFTER
         self._board = board
-        self._program: ControlScript | None = None
+        self._program: ControlScript | WaypointProgram | None = None
         self._compiling: tuple[float, str] | None = None
         self._powering: tuple[float, RobotMode] | None = None
         self._interrupted: tuple[Floats, float, float] | None = None
@@ -214,13 +215,18 @@ class Controller:
 
     def _start_program(self, text: str) -> None:
         self._compiling = None
+        program: ControlScript | WaypointProgram
         try:
-            self._program = ControlScript(text, self.arm)
-        except ValueError:  # somebody else's: it stops whatever moved, does its work and ends
-            self.arm.note(f"foreign program: {text[:60]!r}")
-            return
+            program, what = ControlScript(text, self.arm), "control script"
+        except ValueError:
+            try:
+                program, what = WaypointProgram(text, self.arm), "program of waypoints"
+            except ValueError:  # another one: it stops whatever moved, does its work and ends
+                self.arm.note(f"foreign program: {text[:60]!r}")
+                return
+        self._program = program
         self.arm.runtime = Runtime.PLAYING
-        self.arm.note("control script plays")
+        self.arm.note(f"{what} plays")
 
     def _poll(self) -> None:
         assert self._program is not None  # noqa: S101 - for the type checker
