@@ -34,7 +34,7 @@ def fine_error() -> tuple[Campaign, Readings]:
 
 @pytest.mark.slow
 def test_the_poses_that_are_planned_end_in_the_effect_that_is_there() -> None:
-    """Ambiguous at first, named when measured as planned: so it was with the seeds 0 to 4."""
+    """Ambiguous at first, named when measured as planned: so it was with all seven of ten seeds."""
     c, before = fine_error()
     first = fit(baseline(c.cell, before, "absolute"), before, "absolute")
     alone = diagnose(first).pose_alone
