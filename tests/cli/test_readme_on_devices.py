@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from hilcal.config import load_config
-from tests.cli.test_readme import ELSEWHERE, FEW, others
+from tests.cli.test_readme import ELSEWHERE, FEW, others, points
 from tests.support import readme
 from tests.support.cli_cases import Outcome, run, start
 
@@ -60,6 +60,8 @@ def test_every_command_on_devices(
             if words[0] in ELSEWHERE or ("--append" in words and not separated):
                 continue
             given = [str(there) if w == "CELL.toml" else w for w in words]
+            if words[0] == "compensate":
+                points(Path(words[1]), Path(words[2]))
             if words[0] == "validate":
                 plan = ["--plan", "plan.json", "-o", "other.hilcal"]
                 assert measured(capsys, ["run", str(there), *plan]).code == 0
