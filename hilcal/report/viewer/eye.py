@@ -8,6 +8,10 @@ from hilcal.types import Bools, Floats
 _TURNS = np.deg2rad(np.array([0, 15, -15, 30, -30, 45, -45, 60, -60, 90, -90, 120, -120, 150, 180]))
 _HEIGHTS = (0.75, 1.2)
 _SAMPLES = np.linspace(0.0, 0.98, 80)  # of a line of sight
+_FOV = np.deg2rad(55.0)  # of the viewer's eye, upright
+_ASPECT = 1.15  # of a small window, without the room for labels at both sides
+_EDGE = 0.92  # of the view is used at most
+_FACTORS = np.arange(0.7, 2.51, 0.05)
 _WORTH = 0.02  # share of points that must come into sight for the eye to go one place further
 
 
@@ -48,3 +52,21 @@ def direction(
         for k, place in enumerate(places)
     ]
     return places[int(np.argmin(cost))]
+
+
+def in_view(eye: Floats, look: Floats, points: Floats) -> Bools:
+    """Return (K,) which of the points (K, 3) an eye sees that looks at a place, z upwards."""
+    ahead = (look - eye) / np.linalg.norm(look - eye)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    way = points - eye
+    depth = way @ ahead
+    half = _EDGE * np.tan(_FOV / 2) * depth
+    upright = np.abs(way @ np.cross(right, ahead))
+    return np.asarray((depth > 0.0) & (upright < half) & (np.abs(way @ right) < _ASPECT * half))
+
+
+def near(look: Floats, way: Floats, points: Floats) -> Floats:
+    """Return the place (3,) of the eye, as near along `way` from `look` as shows all points."""
+    places = [look + f * way for f in _FACTORS]
+    return next((x for x in places if in_view(x, look, points).all()), places[-1])

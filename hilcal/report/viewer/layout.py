@@ -3,9 +3,9 @@
 import numpy as np
 import rerun.blueprint as rrb
 
-from hilcal.report.viewer import errors, flat
+from hilcal.report.viewer import errors, eye, flat
 from hilcal.report.viewer.digest import Digest
-from hilcal.report.viewer.scene import center
+from hilcal.report.viewer.scene import center, seen
 
 FOLLOWS = "Residual against suspect"
 LIMITS = "Could have been seen"
@@ -90,7 +90,7 @@ def _view3d(d: Digest, name: str, hidden: str) -> rrb.Spatial3DView:
         ),
         eye_controls=rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital,
-            position=middle + _EYE * size,
+            position=eye.near(middle, _EYE * size, seen(d)),
             look_target=middle,
             eye_up=(0.0, 0.0, 1.0),
         ),

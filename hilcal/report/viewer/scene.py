@@ -146,6 +146,13 @@ def leader(d: Digest, i: int) -> Floats:
     return np.asarray(d.story.anchor[i] + ends[:, :, None] * np.array([0.0, 0.0, 1.0]))
 
 
+def seen(d: Digest) -> Floats:
+    """(K, 3) what is to be in the picture: targets, the arm in its worst poses, labels, m."""
+    worst = [d.worst(r) for r in d.story.revisions]
+    stands = d.bodies[d.row[worst], :, :3, 3].reshape(-1, 3)
+    return np.vstack([d.story.anchor, stands, d.story.anchor[worst] + _LABEL_ABOVE])
+
+
 def center(d: Digest) -> tuple[Floats, float]:
     """Middle of everything drawn and its half size: where the eye looks, m."""
     points = np.vstack([d.story.anchor, np.zeros((1, 3))])

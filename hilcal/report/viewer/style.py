@@ -75,10 +75,8 @@ def number(value: float, digits: int = 3) -> str:
 
 
 def micrometres(length: float) -> str:
-    """Return a length in m as words in µm, or mm from 10 mm on."""
-    if abs(length) >= 0.01:
-        return f"{number(length * 1e3)} mm"
-    return f"{number(length * 1e6)} µm" if abs(length) < 1e-5 else f"{length * 1e6:.0f} µm"
+    """Return a length in m as the terminal writes it."""
+    return numbers.length(length)
 
 
 def quantity(value: float, std: float | None, unit: str) -> tuple[str, str, str]:

@@ -155,7 +155,7 @@ def suspects(r: StoryRevision) -> str:
             style.percent(max(s.holdout_share, 0.0)),
             numbers.chance(s.p_value),
         ]
-        rows.append([*told, *[", ".join(escaped(e) for e in s.same_as) or " "] * alike])
+        rows.append([*told, *[escaped(numbers.few(s.same_as, 1)) or " "] * alike])
     if len(r.suspects) > len(shown):
         rows.append([f"{len(r.suspects) - len(shown)} weaker", *[" "] * (len(head) - 1)])
     return "\n".join(f"| {' | '.join(row)} |" for row in rows) + "\n"

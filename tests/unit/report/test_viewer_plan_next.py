@@ -79,3 +79,13 @@ def test_what_stands_behind_an_obstacle_is_hidden_and_nothing_else(thing):
     points = np.array([behind, above, aside, before], dtype=float)
     found = eye.hidden(np.array([2.0, 0.0, 0.5]), points, (thing,))
     assert found.tolist() == [True, False, False, False]
+
+
+def test_the_eye_is_as_near_as_shows_everything():
+    look, way = np.array([0.0, 0.0, 0.5]), np.array([1.0, -1.3, 0.5])
+    corners = np.array([[x, y, z] for x in (-0.6, 0.6) for y in (-0.6, 0.6) for z in (0.0, 1.0)])
+    place = eye.near(look, way, corners)
+    assert eye.in_view(place, look, corners).all()
+    assert not eye.in_view(look + 0.9 * (place - look), look, corners).all()
+    behind = place + (place - look)
+    assert not eye.in_view(place, look, behind[None])[0]
