@@ -18,6 +18,7 @@ from hilcal.cli.terminal import Terminal
 from hilcal.config import CellConfig
 from hilcal.data.appended import with_new_names
 from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.covariance import COVERS, WHOLE
 from hilcal.data.plan import Plan
 from hilcal.data.readings import Readings
 from hilcal.data.run_log import RunLog, create_run
@@ -126,7 +127,7 @@ def in_process(
     source = "rehearsal in a simulated cell, without devices"
     made = secret.config.to_json()
     with CampaignFile.create(
-        told.output, made, str(told.base_dir), source, overwrite=True
+        told.output, made, str(told.base_dir), source, overwrite=True, more={COVERS: WHOLE}
     ) as campaign:
 
         def measured(part: Plan, number: int, begun: float) -> Rehearsal:
