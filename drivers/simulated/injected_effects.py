@@ -58,6 +58,8 @@ EFFECTS = (
 HARD_TO_SEPARATE = ("base_compliance", "link_compliance")
 """Effects that a campaign of six poses often does not separate from each other, or from
 `joint_tilt_compliance`: `demo --ambiguous` draws arms until it does not."""
+RESEMBLING = (*HARD_TO_SEPARATE, "joint_tilt_compliance")
+"""Effects that few readings take for one another."""
 
 _SAID = ("wrench_bias", "wrench_gain", "sensor_misalignment")  # need something to misread
 READINGS_MODES = ("absolute", "deflection")

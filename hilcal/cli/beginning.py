@@ -17,6 +17,7 @@ from hilcal.cell import cell_from_config
 from hilcal.cli.asking import agreed, somebody_there
 from hilcal.cli.terminal import Json, Terminal, terminal
 from hilcal.config import CellConfig
+from hilcal.config.planning import WITHOUT_LOADS
 from hilcal.config.template import cell_text
 from hilcal.effects.catalogue import installed
 from hilcal.errors import InputError, StoppedError
@@ -387,7 +388,7 @@ def _shortly(error: InputError) -> str:
 def _complete(draft: Draft) -> None:
     """Add what a plan and a rehearsal need, and check the whole."""
     if not draft.data.get("loads"):
-        draft.set("planning", readings="absolute", model=["encoder_offset"])
+        draft.set("planning", readings="absolute", model=list(WITHOUT_LOADS))
     draft.set("simulation", clock=CLOCK)
     config = check_section(draft.data, CellConfig, "the cell")
     check_effects(cell_from_config(config, draft.base_dir), config, installed())

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drivers.simulated.injected_effects import HARD_TO_SEPARATE
+from drivers.simulated.injected_effects import HARD_TO_SEPARATE, RESEMBLING
 from drivers.simulated.on_the_wire import case_of_plan, read_plan
 from drivers.simulated.rehearsal import NOTHING, Rehearsal
 from hilcal.acquire.dry_run import dry_run
@@ -34,8 +34,6 @@ from hilcal.report.progress import Say, working
 from hilcal.report.text_next import next_report
 from hilcal.report.verdict_words import message
 
-RIVALS = (*HARD_TO_SEPARATE, "joint_tilt_compliance")
-"""Effects that few readings take for one another."""
 STRENGTH = 4.0
 """Of what is hidden, in units of the noise: clearly there in so few readings."""
 FIRST = 6
@@ -127,7 +125,7 @@ def _fit(r: Rehearsal, case: RehearsalSettings) -> Fit:
 def _resembled(r: Rehearsal, case: RehearsalSettings) -> bool:
     """Whether the hidden effect is clearly there, and a rival explains the readings as well."""
     p = linearise(_fit(r, case))
-    effects = [e for e in candidates(p.fit) if e.name in (r.hidden, *RIVALS)]
+    effects = [e for e in candidates(p.fit) if e.name in (r.hidden, *RESEMBLING)]
     found = {s.effect: s for s in rank_suspects(p, effects, detectable=False)}
     own = found.pop(r.hidden, None)
     if own is None or not (own.passes or any(s.passes for s in found.values())):
