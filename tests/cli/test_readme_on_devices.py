@@ -75,4 +75,4 @@ def test_every_command_on_devices(
                 assert "standard uncertainty (rms) of the predicted deflection" in words_of(result)
     finally:
         devices.terminate()
-        devices.wait(30)
+        devices.communicate(timeout=30)  # closes its pipes
