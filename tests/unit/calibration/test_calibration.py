@@ -13,19 +13,23 @@ from hypothesis import strategies as st
 import hilcal as hc
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.compiled import compiled
+from hilcal.calibration.measured import Measured
 from hilcal.calibration.poses import band
 from hilcal.calibration.scatter import Scatter
 from hilcal.calibration.storage import from_json, to_json
-from hilcal.calibration.tool import tool_poses
+from hilcal.calibration.tool import one_of_each, tool_poses
 from hilcal.data.readings import States
 from hilcal.data.whitening import Mode
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import fit
+from hilcal.model import Model
 from hilcal.robot import se3
+from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate, joint_jacobian
+from hilcal.robot.conventions import with_conventions
 from hilcal.types import Floats
-from tests.support.campaigns import campaign, plan
+from tests.support.campaigns import campaign, cell_of, plan
 
 POSES = 24
 
@@ -266,3 +270,30 @@ def test_the_document_is_plain_json() -> None:
     document = json.loads(json.dumps(to_json(calibrated("none")), allow_nan=False))
     again = from_json(document)
     np.testing.assert_array_equal(again.theta, calibrated("none").theta)
+
+
+def test_coupled_joints_are_compensated_by_the_controllers_values() -> None:
+    follows = np.zeros((6, 6))
+    follows[2, 1], follows[5, 4] = -1.0, 0.5
+    sign = np.array([1.0, 1.0, -1.0, 1.0, 1.0, 1.0])
+    arm = with_conventions(load_arm("ur10e"), sign, np.zeros(6), follows)
+    cell, known = replace(cell_of(registration_known=True), arm=arm), hc.installed()
+    names = ("encoder_offset", "joint_compliance")
+    effects = tuple(known.make(name, cell, one_of_each(cell)) for name in names)
+    c = Calibration(
+        model=Model(cell, effects, known),
+        theta=np.repeat([1e-3, 1e-5], 6),
+        mode="absolute",
+        root=np.zeros((12, 1)),
+        misfit=0.0,
+        scatter=Scatter(np.zeros(6), 0.0, known=False),
+        measured=Measured((), 1.0),
+        loads={},
+        source={},
+    )
+    q = np.random.default_rng(0).uniform(-1.5, 1.5, (30, 6))
+    k = c.compensate(q, np.array([0.0, 0.0, -80.0, 0.0, 0.0, 0.0]))
+    assert k.inverse.solved.all()
+    wanted = evaluate(arm, q).point(cell.target[:3, 3])
+    np.testing.assert_allclose(c.predict(k.q, [0, 0, -80, 0, 0, 0]).position, wanted, atol=1e-9)
+    assert k.before.error_m.mean() > 1e-3
