@@ -12,6 +12,7 @@ from hilcal.cli.doubting import CAMPAIGNS, Doubted, doubted, doubtful_case
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import check_record, finish, record_story
 from hilcal.cli.plan_output import POSES
+from hilcal.cli.put_to_use import put_to_use, said
 from hilcal.cli.refining import Row, revisions_json
 from hilcal.cli.rehearsing import RehearsalSettings, first_plan, in_process, on_devices
 from hilcal.cli.terminal import Json, Record, Terminal, terminal
@@ -126,6 +127,11 @@ def demo(
     truth = text_demo.compared(found.steps[-1].fit, r.world.truth)
     if truth:
         t.show([text.heading("What was found against what is true"), *text_demo.truth_table(truth)])
+    with working(t.progress) as say:
+        say("moving the simulated arm to corrected joint values")
+        improved = put_to_use(r, found.steps[-1].fit, number)
+    if improved is not None:
+        t.show([text.heading("Put to use"), *said(improved, r.mode == "deflection"), ""])
     ok, words = _judge(r, found)
     t.show([text_refine.verdict_line(found.diagnosis), "", text.heading(words)])
     if r.world.own is not None:
@@ -155,6 +161,7 @@ def demo(
             "revisions": revisions_json(rows),
             "parameters": [asdict(p) for p in truth],
             "truth": r.world.truth,
+            "compensation": None if improved is None else asdict(improved),
             "diagnoses": [to_json(s.diagnosis) for s in found.steps],
         }
     )

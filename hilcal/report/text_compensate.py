@@ -68,8 +68,8 @@ def report(
     yield (
         f"  error before   {numbers.length(float(now.mean()))} mean, "
         f"{numbers.length(float(now.max()))} largest, from where {asked} has the tool\n"
-        f"  error after    {BAND:.0%} of the points within {numbers.length(float(later.max()))}; "
-        f"expected {numbers.length(float(_rms(c.after.std_m)))} rms"
+        f"  error after    {100 * BAND:.0f} % of the points within "
+        f"{numbers.length(float(later.max()))}; expected {numbers.length(_rms(c.after.std_m))} rms"
     )
     yield f"  the latter has {', '.join(_parts(calibration))}"
     out = text.table("point", "before", "after, 95 %", "largest correction")
