@@ -126,7 +126,7 @@ def _resembled(r: Rehearsal, case: RehearsalSettings) -> bool:
     """Whether the hidden effect is clearly there, and a rival explains the readings as well."""
     p = linearise(_fit(r, case))
     effects = [e for e in candidates(p.fit) if e.name in (r.hidden, *RESEMBLING)]
-    found = {s.effect: s for s in rank_suspects(p, effects, detectable=False)}
+    found = {s.effect: s for s in rank_suspects(p, effects)}
     own = found.pop(r.hidden, None)
     if own is None or not (own.passes or any(s.passes for s in found.values())):
         return False
@@ -136,7 +136,7 @@ def _resembled(r: Rehearsal, case: RehearsalSettings) -> bool:
 
 def _left_open(r: Rehearsal, case: RehearsalSettings) -> bool:
     """Whether the diagnosis leaves the hidden effect and others that could be separated from it."""
-    d = judge(Evidence(_fit(r, case), detectable=False), History())
+    d = judge(Evidence(_fit(r, case)), History())
     return r.hidden in left_open(d) and all(rival.possible for rival in d.separability)
 
 

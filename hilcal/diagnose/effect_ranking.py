@@ -13,6 +13,7 @@ effect is implausible, and the size that it would need is stated.
 from collections.abc import Callable, Collection, Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -33,6 +34,9 @@ SAME_EVIDENCE = 3.0
 """Two suspects whose evidence differs by less than e³ = 20 : 1 count as inseparable."""
 FALSE_ALARM = 0.001
 """Chance of naming any effect where none is missing, over the whole catalogue."""
+MOST_KEPT = 1_000_000
+"""Numbers of an effect's columns up to which they are kept until the smallest strength that would
+be revealed is asked for, 8 MB; a choice."""
 LEAST_SHARE = 0.01
 """An effect that explains less of the misfit on poses left out is not worth adding; a guess."""
 
@@ -40,6 +44,21 @@ LEAST_SHARE = 0.01
 LOST = 0.2
 """Share of its evidence that an effect may lose at plausible sizes. A choice: a prior that is too
 narrow by half costs a few units however strong the evidence is."""
+
+
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """The smallest strength that would be revealed, which takes most of the time of a ranking.
+
+    No verdict depends on it; so it is computed when it is first asked for.
+    """
+
+    _compute: Callable[[], Strength]
+
+    @cached_property
+    def least(self) -> Strength:
+        """The smallest strength that these readings would reveal."""
+        return self._compute()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,7 +74,8 @@ class Suspect:
         sure: whether the error on poses left out falls by more than it scatters from pose to
             pose, beside geometry, too, where no load was hung (see `gravity`); not so where a refit
             has shown that it does not fall.
-        least: the smallest strength of it that these readings would reveal.
+        detection: the smallest strength of it that these readings would reveal, computed when it
+            is first asked for.
         needs: where it is implausible, its size: (unit, rms of the parameters that it would need,
             rms that is plausible), SI.
         kept: share of what the linearisation promised that the exact model keeps; 1 where that
@@ -71,11 +91,16 @@ class Suspect:
     holdout_share: float
     explains: bool
     sure: bool
-    least: Strength
+    detection: "Detection"
     needs: tuple[tuple[str, float, float], ...] = ()
     kept: float = 1.0
     same_as: tuple[str, ...] = ()
     coarse: str = ""
+
+    @property
+    def least(self) -> Strength:
+        """The smallest strength of it that these readings would reveal."""
+        return self.detection.least
 
     @property
     def passes(self) -> bool:
@@ -131,8 +156,6 @@ def rank_suspects(
     effects: Sequence[Effect],
     level: float = FALSE_ALARM,
     refit: Callable[[Fit, str], Fit] = add,
-    *,
-    detectable: bool = True,
 ) -> tuple[Suspect, ...]:
     """Score all effects; best first, see `ranked`.
 
@@ -141,14 +164,9 @@ def rank_suspects(
         effects: that are not in the model.
         level: of the test over all of them together.
         refit: returns a fit with one more effect.
-        detectable: whether to simulate what large families would have to be like to be found,
-            which takes most of the time; no verdict depends on it.
     """
     bare = unloaded_readings(p.fit)
-    found = [
-        _suspect(p, effect_columns(p.fit, e), bare, level / len(effects), detectable)
-        for e in effects
-    ]
+    found = [_suspect(p, effect_columns(p.fit, e), bare, level / len(effects)) for e in effects]
     tested = max(sum(s.score.rank > 0 for s in found), 1)
     out: list[Suspect] = []
     geometry: Floats | None = None
@@ -210,24 +228,29 @@ def ranked(suspects: Iterable[Suspect], rejected: Collection[str] = ()) -> tuple
     )
 
 
-def _suspect(
-    p: Linearisation, of: EffectColumns, bare: Unloaded | None, level: float, detectable: bool
-) -> Suspect:
+def _suspect(p: Linearisation, of: EffectColumns, bare: Unloaded | None, level: float) -> Suspect:
     s = p.information(of.white)
     largest = most(of, bare)
     result = p.score(of.white, s, largest)
     held = p.held_out(of.white, result)
-    least = least_strength(
-        s,
-        of.motion,
-        of.scale,
-        tuple(q.unit for q in of.effect.parameters),
-        p.fit.dof,
-        max(p.fit.variance_factor, 1.0),
-        level,
-    )
-    if detectable and large(of, s, p.fit.dof):
-        least = least_of_family(p, of, s, least, level, LEAST_SHARE, largest)
+
+    def least() -> Strength:
+        found = least_strength(
+            s,
+            of.motion,
+            of.scale,
+            tuple(q.unit for q in of.effect.parameters),
+            p.fit.dof,
+            max(p.fit.variance_factor, 1.0),
+            level,
+        )
+        if large(of, s, p.fit.dof):
+            return least_of_family(p, of, s, found, level, LEAST_SHARE, largest)
+        return found
+
+    detection = Detection(least)
+    if of.white.size > MOST_KEPT:
+        detection = _computed(detection.least)
     return Suspect(
         effect=of.effect.name,
         coarse=of.effect.coarse,
@@ -237,8 +260,13 @@ def _suspect(
         explains=False,
         sure=held.sure,
         needs=_implausible(p, of, s, result, largest),
-        least=least,
+        detection=detection,
     )
+
+
+def _computed(found: Strength) -> Detection:
+    """Return what needs no columns any more."""
+    return Detection(lambda: found)
 
 
 def _implausible(

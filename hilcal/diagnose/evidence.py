@@ -38,8 +38,6 @@ class Evidence:
         fit: Fit,
         refit: Callable[[Fit, str], Fit] = add,
         say: Callable[[str], None] = lambda text: None,
-        *,
-        detectable: bool = True,
     ) -> None:
         """Take a fit.
 
@@ -47,14 +45,13 @@ class Evidence:
             fit: the fit.
             refit: returns a fit with one more effect.
             say: takes progress, one line each.
-            detectable: see `rank_suspects`.
 
         Raises:
             InputError: for a fit whose residual is not whitened.
         """
         if fit.scaling != "gc":
             raise InputError(f"diagnosis needs scaling gc, this fit has {fit.scaling}")
-        self.fit, self._refit, self._say, self._detectable = fit, refit, say, detectable
+        self.fit, self._refit, self._say = fit, refit, say
         self._known: dict[tuple[str, frozenset[str]], Alternative] = {}
 
     @cached_property
@@ -70,9 +67,7 @@ class Evidence:
     @cached_property
     def suspects(self) -> tuple[Suspect, ...]:
         """All of them scored."""
-        return rank_suspects(
-            self.linearisation, self.effects, refit=self._refit, detectable=self._detectable
-        )
+        return rank_suspects(self.linearisation, self.effects, refit=self._refit)
 
     @cached_property
     def misfit_breakdown(self) -> tuple[MisfitShare, ...]:
