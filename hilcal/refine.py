@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode
 from hilcal.diagnose.diagnosis import Diagnosis, History, Verdict
+from hilcal.diagnose.effect_ranking import LEAST_SHARE
 from hilcal.diagnose.evidence import Evidence
 from hilcal.diagnose.promise import LEAST_KEPT, kept_by_refit
 from hilcal.diagnose.stepwise import Refits, add, exchange, predicts_better, remove
@@ -216,15 +217,23 @@ class Path:
         return True
 
     def _better(self, last: Step, other: Alternative) -> bool:
-        """Whether others are worth a trial: far better ones while the residual is not noise."""
-        known = last.diagnosis.residual_is_noise
-        return other.better and (known or other.log_evidence > (1.0 + FAR) * other.own)
+        """Whether others are worth a trial.
+
+        While the residual is not noise they must be far better. When it is, several in the place of
+        one must lower the error by a share worth naming: the log evidence of n residuals grows by
+        n δ where their rms falls by a small share δ.
+        """
+        if not last.diagnosis.residual_is_noise:
+            return other.better and other.log_evidence > (1.0 + FAR) * other.own
+        worth = LEAST_SHARE * last.fit.dof if len(other.others) > 1 else 0.0
+        return other.better and other.log_evidence > other.own + worth
 
     def _exchange(self, last: Step, other: Alternative) -> bool:
-        """Put others in the place of an effect, unless the error on poses left out rises.
+        """Put another in the place of an effect, unless the error on poses left out rises.
 
-        While the residual is not noise, although the evidence takes it for noise, the error must
-        fall beyond chance.
+        The error must fall beyond chance where several take the place of one, since a model that is
+        no better need not be larger; and while the residual is not noise, although the evidence
+        takes it for noise.
         """
         self._say(f"trying {' + '.join(other.others)} in place of {other.effect}")
         first, *rest = other.others
@@ -232,7 +241,7 @@ class Path:
         for name in rest:
             trials.append(self._refits.add(trials[-1], name))
         found = trials[-1]
-        if last.diagnosis.residual_is_noise:
+        if last.diagnosis.residual_is_noise and not rest:
             if found.holdout.rms_sigma > last.fit.holdout.rms_sigma:
                 return False
         elif not predicts_better(last.fit, found):
