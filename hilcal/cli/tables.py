@@ -225,7 +225,9 @@ def export(
             _write_parameters(parameters, rows)
             t.show(f"{parameters}: {len(rows)} parameters of revision {record.number}")
         if calibration is not None or any(geometry.values()):
-            found = opened_run.calibration(revision)
+            with working(t.progress) as say:
+                say("restoring the fit, and what it knows of other readings")
+                found = opened_run.calibration(revision)
             if calibration is not None:
                 found.save(calibration)
                 t.show(f"{calibration}: the calibration of revision {found.source['revision']}")
