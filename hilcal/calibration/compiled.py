@@ -98,7 +98,7 @@ def compiled(tool: Tool, mode: Mode) -> Compiled | None:
         return None
     model = tool.model
     arm, cell = model.cell.arm, model.cell
-    if arm.n != 6 or arm.drive is not None or arm.coupling is not None or tool.swaying:
+    if arm.n != 6 or arm.drive is not None or arm.coupling is not None or tool.moving:
         return None
     situation = _situation(tool)
     if situation is None:
@@ -138,8 +138,8 @@ class _Form:
     by_wrench: Floats
     b: Floats
     compliance: Floats
-    waves: Floats
-    gives: Floats
+    by_angle: Floats
+    by_torque: Floats
     torque: Floats
 
     @classmethod
@@ -155,16 +155,16 @@ class _Form:
     def tables(self) -> tuple[Any, ...]:
         angle = np.linspace(-TURN, TURN, NODES)
         steps = 2 * self.torque / (TORQUE_NODES - 1)
-        slopes = np.zeros_like(self.waves)
-        if len(self.waves):
-            slopes = CubicSpline(angle, self.waves, axis=1)(angle, 1)
-        give_slopes = np.zeros_like(self.gives)
-        for j, values in enumerate(self.gives):
+        slopes = np.zeros_like(self.by_angle)
+        if len(self.by_angle):
+            slopes = CubicSpline(angle, self.by_angle, axis=1)(angle, 1)
+        torque_slopes = np.zeros_like(self.by_torque)
+        for j, values in enumerate(self.by_torque):
             grid = np.linspace(-self.torque[j], self.torque[j], TORQUE_NODES)
-            give_slopes[j] = CubicSpline(grid, values)(grid, 1)
+            torque_slopes[j] = CubicSpline(grid, values)(grid, 1)
         return (
-            self.waves, _c(slopes), -TURN, float(angle[1] - angle[0]),
-            self.gives, give_slopes, -self.torque, steps,
+            self.by_angle, _c(slopes), -TURN, float(angle[1] - angle[0]),
+            self.by_torque, torque_slopes, -self.torque, steps,
         )  # fmt: skip
 
     def take(self, e: Effect, theta: Floats, s: Situation) -> bool:
@@ -209,8 +209,8 @@ class _Form:
         if not _same(found, dq, None):
             return False
         self.torque = torque
-        self.gives = values.T + (self.gives if len(self.gives) else 0.0)
-        self.gives = _c(self.gives)
+        self.by_torque = values.T + (self.by_torque if len(self.by_torque) else 0.0)
+        self.by_torque = _c(self.by_torque)
         return True
 
     def _rigid(self, e: Effect, theta: Floats, s: Situation) -> bool:
@@ -242,7 +242,7 @@ class _Form:
         self.b += twist
         self.a += solved[-1]
         self.linear += solved[:-1].T
-        self.waves = _c(own.T + (self.waves if len(self.waves) else 0.0))
+        self.by_angle = _c(own.T + (self.by_angle if len(self.by_angle) else 0.0))
         return True
 
 

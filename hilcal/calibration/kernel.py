@@ -180,7 +180,16 @@ def _deviations(
 ) -> float:
     """Write the deviations; returns their largest change."""
     a, linear, by_wrench, b, compliance = laws
-    waves, wave_slopes, wave_low, wave_step, gives, give_slopes, give_low, give_step = tables
+    (
+        by_angle,
+        angle_slopes,
+        angle_low,
+        angle_step,
+        by_torque,
+        torque_slopes,
+        torque_low,
+        torque_step,
+    ) = tables
     n, change = len(q), 0.0
     for j in range(n):
         new = a[j]
@@ -188,10 +197,12 @@ def _deviations(
             new += linear[j, i] * q[i]
         for e in range(6):
             new += by_wrench[j, e] * wrench[j, e]
-        if len(waves) > 0:
-            new += _interpolate(q[j], wave_low, wave_step, waves[j], wave_slopes[j])
-        if len(gives) > 0:
-            new += _interpolate(wrench[j, 5], give_low[j], give_step[j], gives[j], give_slopes[j])
+        if len(by_angle) > 0:
+            new += _interpolate(q[j], angle_low, angle_step, by_angle[j], angle_slopes[j])
+        if len(by_torque) > 0:
+            new += _interpolate(
+                wrench[j, 5], torque_low[j], torque_step[j], by_torque[j], torque_slopes[j]
+            )
         change = max(change, abs(new - dq[j]))
         dq[j] = new
     for k in range(n + 1):

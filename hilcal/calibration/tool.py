@@ -28,14 +28,14 @@ class Tool:
         theta: (P,) its parameters.
         kept: (P,) which of the parameters of the fitted model they are.
         pose: (4, 4) T_flange_tool, with what the fit knows of it.
-        swaying: effects that move base or target and are no frames, with their parameters.
+        moving: effects that move base or target and are no frames, with their parameters.
     """
 
     model: Model
     theta: Floats
     kept: Ints
     pose: Floats
-    swaying: tuple[tuple[Effect, slice], ...]
+    moving: tuple[tuple[Effect, slice], ...]
 
 
 def tool_of(model: Model, theta: Floats, pose: Floats | None) -> Tool:
@@ -48,20 +48,20 @@ def tool_of(model: Model, theta: Floats, pose: Floats | None) -> Tool:
     """
     every = np.arange(model.size)
     if pose is None:
-        return Tool(model, theta, every, _fitted_target(model, theta), _swaying(model, theta))
+        return Tool(model, theta, every, _fitted_target(model, theta), _moving(model, theta))
     named = [e for e in model.effects if e.role != "target"]
     parts = [every[s] for e, s in zip(model.effects, model.slices(), strict=True) if e in named]
     kept = np.concatenate([every[:0], *parts])
     cell = replace(model.cell, targets=None, target_names=(), targets_known=())
     cell = replace(cell, target=pose, target_known=True)
     own = replace(model, cell=cell, effects=tuple(named))
-    return Tool(own, theta[kept], kept, pose, _swaying(own, theta[kept]))
+    return Tool(own, theta[kept], kept, pose, _moving(own, theta[kept]))
 
 
 def tool_poses(tool: Tool, prediction: Prediction) -> tuple[Floats, Floats]:
     """Orientation (N, 3, 3) and position (N, 3) of the tool in base axes, m."""
     chain, s = prediction.situation.chain, prediction.situation
-    moved = [e.deviation(tool.theta[mine], s) for e, mine in tool.swaying]
+    moved = [e.deviation(tool.theta[mine], s) for e, mine in tool.moving]
     own = sum((d.target for d in moved if d.target is not None), np.zeros((1, 6)))
     flange, offset = chain.rotation[-1], tool.pose[:3, 3] + own[:, :3]
     position = chain.point(offset if len(own) > 1 else offset[0])
@@ -89,7 +89,7 @@ def one_of_each(cell: Cell) -> States:
     )
 
 
-def _swaying(model: Model, theta: Floats) -> tuple[tuple[Effect, slice], ...]:
+def _moving(model: Model, theta: Floats) -> tuple[tuple[Effect, slice], ...]:
     """Effects that move base or target and are no frames, with where their parameters are."""
     situation = model.predict(_one(model.cell), theta).situation
     return tuple(

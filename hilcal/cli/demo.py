@@ -128,7 +128,7 @@ def demo(
     if truth:
         t.show([text.heading("What was found against what is true"), *text_demo.truth_table(truth)])
     with working(t.progress) as say:
-        say("moving the simulated arm to corrected joint values")
+        say("correcting joint values, and asking the simulated arm where they lead")
         improved = put_to_use(r, found.steps[-1].fit, number)
     if improved is not None:
         t.show([text.heading("Put to use"), *said(improved, r.mode == "deflection"), ""])

@@ -1,4 +1,7 @@
-"""The end of `demo`: the arm goes to corrected joint values, and the error is measured again."""
+"""The end of `demo`: where the simulated arm is at corrected joint values, by its own mechanics.
+
+No device moves for it: the world that the readings came from is asked directly.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -38,7 +41,7 @@ class Improvement:
 
 
 def put_to_use(r: Rehearsal, found: Fit, seed: int) -> Improvement | None:
-    """Move the simulated arm to corrected joint values; None where no pose can be corrected.
+    """Return the error at corrected joint values; None where no pose can be corrected.
 
     Args:
         r: the rehearsal; its world moves and repeats as badly as in the campaign.
@@ -75,12 +78,14 @@ def put_to_use(r: Rehearsal, found: Fit, seed: int) -> Improvement | None:
 def said(i: Improvement, deflections: bool) -> Iterator[str]:
     """Yield what was achieved."""
     asked = "the unloaded arm" if deflections else "the nominal arm"
+    share = f"{100 * BAND:.0f} %"
     yield (
-        f"At {i.points} loaded poses between the measured ones, the tool of the simulated arm was "
+        f"At {i.points} loaded poses between the measured ones, the tool is "
         f"{numbers.length(i.before_m)} from where {asked} has it (mean). At the joint values that "
-        f"compensation finds it is {numbers.length(i.after_m)} (mean); {i.inside} of {i.points} "
-        f"are within the distance stated for {100 * BAND:.0f} % of them, at most "
-        f"{numbers.length(i.stated_m)}."
+        f"compensation finds it is off by {numbers.length(i.after_m)} (mean); {i.inside} of "
+        f"{i.points} are within the distance stated for {share} of them, at most "
+        f"{numbers.length(i.stated_m)}. The simulated arm's own mechanics say so; no device moves "
+        "for it."
     )
 
 

@@ -394,8 +394,7 @@ def load_mapping(path: Path) -> Mapping:
             ones of its section), missing key or bad value.
     """
     mapping = load_section(path, Mapping)
-    second = mapping.second_file
-    if second is None or second.path is None:
+    if (second := mapping.second_file) is None or second.path is None:
         return mapping
-    where = str(path.absolute().parent / second.path)
-    return mapping.model_copy(update={"second_file": second.model_copy(update={"path": where})})
+    second = second.model_copy(update={"path": str(path.absolute().parent / second.path)})
+    return mapping.model_copy(update={"second_file": second})

@@ -24,7 +24,7 @@ PREDICTABLE = 0.1
 """Share s of the misfit that must be predictable for the model to be to blame. The predictable part
 is then a third of the rest in standard deviation, s / (1 - s) = 1/9: a standard uncertainty of less
 than a third of the largest one need not be evaluated in detail (Eurachem/CITAC Guide CG 4,
-*Quantifying uncertainty in analytical measurement*, 3rd ed. 2012, step 3 of the process)."""
+*Quantifying uncertainty in analytical measurement*, 3rd ed. 2012)."""
 
 NoiseReason = Literal["as_stated", "repeats", "too_large", "lack_of_fit", "predictable", "unknown"]
 """Why the noise is, or is not, to blame:

@@ -13,15 +13,14 @@ from hilcal.data.plan import REFERENCE
 from hilcal.effects.protocol import FRAME_ROLES, Role
 from hilcal.errors import CannotAnswerError
 from hilcal.plan.approximate_design import relax
-from hilcal.plan.candidates import reading_derivatives
 from hilcal.plan.choice import choose, only, unknown
 from hilcal.plan.compound_criteria import compound_objective
 from hilcal.plan.confounding import Confounding
+from hilcal.plan.detectable import DetectableEffect, detectable_effects
 from hilcal.plan.information import Problem
 from hilcal.plan.planner import Planned, Say
 from hilcal.plan.predicted import Predicted, predicted
 from hilcal.plan.timing import Duration
-from hilcal.regression.evidence import VISIBLE
 from hilcal.regression.schur import schur_complement
 from hilcal.types import Floats
 
@@ -31,9 +30,6 @@ SHARES = (0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
 """Budgets of the sample-size curve by the plan's own. A choice."""
 LOOSE = 3e-3
 """Relative gap of the continuous optima of the curve. A choice: below what a plot resolves."""
-DRAWS = 5
-"""Random directions of an effect whose median is its minimum detectable strength. A choice."""
-_SEED = 20240611
 _LEFT_OUT = {
     "deflection": "geometry, registration, repeatability and effects outside of the model",
     "position": "repeatability and effects outside of the model",
@@ -99,20 +95,6 @@ class CurvePoint:
     poses: int
     position_std_m: float
     efficiency: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class DetectableEffect:
-    """Minimum detectable strength of an effect outside of the model.
-
-    Attributes:
-        effect: its name.
-        least_m: rms displacement of the target, m, whose whitened residual after fitting the
-            model is one sigma; None where the model absorbs the effect.
-    """
-
-    effect: str
-    least_m: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,7 +216,7 @@ def summarise(
         position=planned.work.what,
         criteria=tuple(_criteria(planned, rng)) if compare else (),
         curve=tuple(_curve(planned)) if compare else (),
-        detectable=tuple(_detectable(planned, config)),
+        detectable=tuple(detectable_effects(planned, config)),
         longer=planned.ordered.longer,
         confounding=planned.ordered.confounding,
         shortest=planned.ordered.confounding_shortest,
@@ -376,39 +358,3 @@ def _curve(planned: Planned) -> Iterator[CurvePoint]:
         position = _finite(predicted(of, information=whole, work=planned.work).position)
         if position is not None:
             yield CurvePoint(poses, position)
-
-
-def _detectable(planned: Planned, config: CellConfig) -> Iterator[DetectableEffect]:
-    """Yield the minimum detectable strength of each effect outside of the model.
-
-    Of some directions of the effect's parameters the median: rms of the displacement, over the
-    plan's poses and loads, divided by the root of the non-centrality beyond the model.
-    """
-    of, size = planned.problem, planned.problem.model_size
-    taken = np.flatnonzero(planned.counts)
-    information = of.measured + of.units.information(planned.counts[taken], taken)
-    model = of.prior[:size, :size] - of.measured[:size, :size]
-    information[:size, :size] += model
-    poses = sorted({of.what[k][0] for k in taken})
-    chosen = type(of.candidates)(
-        of.candidates.q[poses],
-        of.candidates.loads,
-        of.candidates.wrench,
-        of.candidates.allowed[poses],
-    )
-    moves = [
-        part.jacobian[:, 1:] - part.jacobian[:, :1] if of.mode == "deflection" else part.jacobian
-        for part in reading_derivatives(of.nominal, config, chosen, of.families, of.scale)
-    ]
-    moved = np.concatenate([block[..., :3, :].reshape(-1, len(of.terms)) for block in moves])
-    rng = np.random.default_rng(_SEED)
-    for effect in of.families:
-        where = of.of_effect(effect.name)
-        left = schur_complement(information, where, np.arange(size))
-        least = []
-        for _ in range(DRAWS):
-            beta = rng.standard_normal(len(where))
-            apart = float(beta @ left @ beta)
-            size_m = float(np.sqrt(3.0 * np.mean((moved[:, where] @ beta) ** 2)))
-            least.append(size_m / np.sqrt(apart) if apart > VISIBLE * len(where) else np.inf)
-        yield DetectableEffect(effect.name, _finite(float(np.median(least))))

@@ -71,7 +71,7 @@ def report(
         f"  error after    {100 * BAND:.0f} % of the points within "
         f"{numbers.length(float(later.max()))}; expected {numbers.length(_rms(c.after.std_m))} rms"
     )
-    yield f"  the latter has {', '.join(_parts(calibration))}"
+    yield f"  the latter includes {', '.join(_parts(calibration))}"
     out = text.table("point", "before", "after, 95 %", "largest correction")
     order = np.argsort(-now, kind="stable")[:MOST]
     for k in sorted(order):

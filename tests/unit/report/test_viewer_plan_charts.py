@@ -9,7 +9,8 @@ from rerun.chunk import RrdReader
 
 from hilcal.data.plan import UNLOADED, Plan, Step
 from hilcal.errors import InputError
-from hilcal.plan.summary import DetectableEffect, PredictedParameter
+from hilcal.plan.detectable import DetectableEffect
+from hilcal.plan.summary import PredictedParameter
 from hilcal.report.viewer import plan_layout, plan_style, style
 from hilcal.report.viewer.plan_digest import plan_digest
 from hilcal.report.viewer.plan_stream import record_plan
