@@ -70,6 +70,22 @@ def test_the_guide_to_the_library_runs_as_it_stands(
         assert "creep" in run.fit().model.names
 
 
+def test_the_python_of_the_readme_runs_as_it_stands(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    section = (ROOT / "README.md").read_text().split("\n## From Python\n")[1].split("\n## ")[0]
+    code = "\n".join(line[4:] for line in section.splitlines() if line.startswith("    "))
+    cell = configs_dir() / "cells" / "demo_ur10e.toml"
+    config = load_config(cell)
+    monkeypatch.chdir(tmp_path)
+    with CampaignFile.create("run.hilcal", config.to_json(), str(cell.parent), "test") as file:
+        file.append_readings(rehearse(config, "joint_tilt_compliance", 3, 10).readings)
+    exec(code, {})
+    assert "missing_effect" in capsys.readouterr().out
+    with hc.Campaign.open("run.hilcal") as run:
+        assert "joint_tilt_compliance" in run.fit().model.names
+
+
 def test_the_guide_to_compensation_runs_as_it_stands(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
