@@ -31,6 +31,7 @@ _PLACES = {
     "HilcalError": "hilcal.errors",
     "InputError": "hilcal.errors",
     "Model": "hilcal.model",
+    "Posterior": "hilcal.identify.posterior",
     "Readings": "hilcal.data.readings",
     "Refinement": "hilcal.refine",
     "States": "hilcal.data.readings",
@@ -40,6 +41,7 @@ _PLACES = {
     "effect": "hilcal.effects.spec",
     "fit": "hilcal.library",
     "installed": "hilcal.effects.catalogue",
+    "load_posterior": "hilcal.library",
     "plan": "hilcal.library",
     "preview_table": "hilcal.identify.table_preview",
     "read_table": "hilcal.library",
@@ -63,8 +65,9 @@ if TYPE_CHECKING:
     from hilcal.effects.spec import effect
     from hilcal.errors import CannotAnswerError, DeviceError, HilcalError, InputError
     from hilcal.identify.fit import Fit
+    from hilcal.identify.posterior import Posterior
     from hilcal.identify.table_preview import preview_table
-    from hilcal.library import baseline, fit, plan, read_table, refine, view
+    from hilcal.library import baseline, fit, load_posterior, plan, read_table, refine, view
     from hilcal.model import Model
     from hilcal.refine import Refinement
     from hilcal.validate import validate

@@ -26,6 +26,7 @@ from hilcal.identify.full_covariance import (
     campaign_readings,
     covariance_parts,
 )
+from hilcal.identify.posterior import Posterior, Source
 from hilcal.identify.predictive import Predictive
 from hilcal.model import Model
 from hilcal.refine import Refinement
@@ -216,6 +217,22 @@ class Campaign:
                 "readings_sha256": record.data_hash,
             },
         )
+
+    def posterior(self, revision: int | None = None) -> Posterior:
+        """Return what a stored fit taught of the arm, which is the prior of another campaign.
+
+        Args:
+            revision: its number; the one in use where None, see `in_use`.
+
+        Raises:
+            InputError: no such revision, see `fit`, or one that is not fitted with scaling gc.
+            CannotAnswerError: its model has no effect of the arm.
+        """
+        record = self.in_use(revision)
+        if record is None:
+            raise InputError(f"{self.path}: no revision yet; run hilcal identify or refine first")
+        source = Source(self.path.name, record.number, record.created)
+        return Posterior.of(self.restore(record), source)
 
     def history(self, revision: int | None = None) -> History:
         """Return how the model of a revision was reached, which `diagnose` takes.

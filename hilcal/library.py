@@ -11,13 +11,16 @@ from hilcal.campaign import Campaign
 from hilcal.cell import Cell
 from hilcal.data.importing import import_readings
 from hilcal.data.readings import Readings
+from hilcal.data.schema import HEADER
 from hilcal.data.whitening import MODES, SCALINGS, Mode, usual_mode
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError
 from hilcal.identify import baseline as starting_models
 from hilcal.identify import fit as fits
+from hilcal.identify import posterior_document
 from hilcal.identify.fit import Fit
 from hilcal.identify.full_covariance import full_readings
+from hilcal.identify.posterior import Posterior
 from hilcal.model import Model
 from hilcal.plan.checked_plan import CheckedPlan, checked
 from hilcal.plan.planner import Request, make
@@ -112,6 +115,35 @@ def fit(
         if scaling == known:
             return fits.fit(model, data, _mode(readings, data), known, prior=prior)
     raise InputError(f"scaling {scaling!r} is unknown; valid: {', '.join(SCALINGS)}")
+
+
+def load_posterior(path: str | Path, catalogue: Catalogue | None = None) -> Posterior:
+    """Return what an earlier campaign taught of its arm, as prior of another one.
+
+    >>> with hc.Campaign.open(RUN) as run:
+    ...     number = run.append(hc.fit(hc.baseline(run.cell, run.readings), run.readings))
+    >>> posterior = hc.load_posterior(RUN)
+    >>> posterior.arm, posterior.effects[0].name
+    ('ur10e', 'joint_compliance')
+
+    Args:
+        path: a campaign file, of which the revision in use is taken, or a JSON file of a posterior.
+        catalogue: has its effects; the installed ones where None.
+
+    Raises:
+        InputError: no such file, neither of both, or a campaign without a revision.
+        CannotAnswerError: its model has no effect of the arm.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as stream:
+            is_campaign = stream.read(len(HEADER)) == HEADER
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    if not is_campaign:
+        return posterior_document.read(path)
+    with Campaign.open(path, catalogue, read_only=True) as run:
+        return run.posterior()
 
 
 def refine(model: Model, data: Readings, readings: str | None = None) -> Refinement:

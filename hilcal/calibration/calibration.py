@@ -33,7 +33,7 @@ from hilcal.diagnose.noise_verdict import MISFIT_ALARM
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit
-from hilcal.identify.predictive import predictive
+from hilcal.identify.predictive import parameter_factor, predictive
 from hilcal.model import Model, Prediction
 from hilcal.robot import se3
 from hilcal.robot.chain import evaluate
@@ -157,7 +157,7 @@ class Calibration:
         noise = np.trace(found.whitening.covariance[:, :3, :3], axis1=1, axis2=2)
         misfits = float(chi2.sf(found.chi2, found.dof)) < MISFIT_ALARM
         noisy = max(p.noise, 1.0)
-        kappa = max(1.0, (left_out**2 - noisy) / max(p.left_out, 1e-12))
+        kappa = parameter_factor(p, left_out)
         # A deflection is the difference of two readings.
         readings = 2 if found.mode == "deflection" else 1
         loads = () if model.cell.config is None else model.cell.config.loads

@@ -7,24 +7,9 @@ from typing import Any
 import numpy as np
 
 from hilcal.data.readings import States
-from hilcal.identify.extrapolation import FAR, MARGIN, variables
+from hilcal.identify.extrapolation import FAR, Range, ranges_of, variables
 from hilcal.identify.predictive import Predictive
 from hilcal.types import Bools, Floats
-
-
-@dataclass(frozen=True, slots=True)
-class Range:
-    """Values of one variable in the fitted readings; SI."""
-
-    variable: str
-    unit: str
-    low: float
-    high: float
-
-    def beyond(self, values: Floats) -> Bools:
-        """Which values are outside, by more than `MARGIN` of the range."""
-        allowed = MARGIN * (self.high - self.low) + 1e-9 * max(abs(self.low), abs(self.high), 1.0)
-        return np.asarray(np.maximum(values - self.high, self.low - values) > allowed)
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,11 +49,8 @@ class Measured:
             p: what the fit knows of others.
             noise: (D,) trace of the position's noise covariance of each measurement, m².
         """
-        ranges = (
-            Range(name, unit, float(v.min()), float(v.max())) for name, unit, v in variables(states)
-        )
         spread = p.factor * p.noise * noise * p.leverage / (1 - p.leverage)
-        return cls(tuple(ranges), float(np.sqrt(FAR * np.quantile(spread, 0.99))))
+        return cls(ranges_of(states), float(np.sqrt(FAR * np.quantile(spread, 0.99))))
 
     def outside(self, states: States, std_m: Floats | None) -> list[Outside]:
         """Return what points leave, by variable.

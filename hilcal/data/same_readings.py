@@ -47,6 +47,23 @@ def already(readings: Readings, others: Readings) -> Bools:
     return np.asarray(np.isfinite(distance))
 
 
+def prints(readings: Readings) -> Floats:
+    """(N, n + 4) what a reading is known by without its attitude: joints, position, whether loaded.
+
+    To be kept where the readings themselves are not; see `among`.
+    """
+    return _coordinates(readings, attitude=False)
+
+
+def among(readings: Readings, kept: Floats) -> Bools:
+    """(N,) which readings are among those whose `prints` (M, n + 4) were kept."""
+    own = prints(readings)
+    if not len(own) or not len(kept) or own.shape[1] != kept.shape[1]:
+        return np.zeros(len(readings), dtype=np.bool_)
+    distance, _ = cKDTree(kept).query(own, p=np.inf, distance_upper_bound=1.0 + 1e-9)
+    return np.asarray(np.isfinite(distance))
+
+
 def never_fitted(readings: Readings, fitted: Readings, deflections: bool) -> tuple[Bools, Bools]:
     """Return (N,) which readings were fitted, and (N,) which can be predicted as unseen ones.
 

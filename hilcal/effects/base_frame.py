@@ -16,6 +16,7 @@ class BaseFrame(Effect):
     summary = "registration of the tracker to the arm's base is off"
     plausible = 20.0
     """20 mm, 20 mrad: a base that was surveyed by hand. A choice."""
+    of_setup = True
     option_help: ClassVar = PRIOR_HELP
     role = "registration"
 

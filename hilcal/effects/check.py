@@ -113,6 +113,7 @@ def _class(kind: type[Effect]) -> None:
         ("summary", "the law in one line", lambda v: _is_text(v) and "\n" not in v),
         ("elastic", "True, False", lambda v: isinstance(v, bool)),
         ("local_response", "True, False", lambda v: isinstance(v, bool)),
+        ("of_setup", "True, False", lambda v: isinstance(v, bool)),
         (
             "needs",
             f"a tuple of some of {', '.join(NEEDS)}",

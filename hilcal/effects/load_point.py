@@ -19,6 +19,7 @@ class LoadPoint(Effect):
     summary = "the load acts elsewhere than configured (flange axes)"
     plausible = 10.0
     """10 cm: a hook or an eye instead of the flange. A choice."""
+    of_setup = True
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

@@ -173,6 +173,9 @@ class Effect(ABC):
         plausible: standard deviation of the parameters over arms and cells as they are, in their
             ordinary magnitudes: the range that a suspect of this name must stay in. An effect
             that states none is plausible at any size. See `most`.
+        of_setup: whether it is of how a campaign was set up (instrument, frames, tool, load,
+            force sensor), so that another campaign of the same arm learns it anew. Effects whose
+            role is that of a frame are, too.
 
     Attributes:
         coarse: of an effect from `refined`, the name of the one that it is finer than; else empty.
@@ -189,6 +192,7 @@ class Effect(ABC):
     role: ClassVar[Role] = "effect"
     for_missing_weight: ClassVar[bool] = False
     plausible: ClassVar[float] = np.inf
+    of_setup: ClassVar[bool] = False
 
     def __init__(self, cell: Cell, states: States, options: Options | None = None) -> None:
         """Build the effect for a cell and the states at hand.

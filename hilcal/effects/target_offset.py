@@ -23,6 +23,7 @@ class TargetOffset(Effect):
     summary = "the tracked target sits elsewhere on the flange than configured"
     plausible = 10.0
     """10 mm, 10 mrad: a target that was mounted anew. A choice."""
+    of_setup = True
     option_help: ClassVar = {
         "rotation": "True where the readings are poses, so that the target's axes matter.",
         **PRIOR_HELP,

@@ -22,6 +22,7 @@ class ToolCompliance(Effect):
     summary = "rotation a t_z + c t_⊥ at the flange: tool or force sensor tilts under the moment"
     plausible = 30.0
     """30 mrad at the rated torque of the last joint: a long, slender tool. A choice."""
+    of_setup = True
     elastic = True
     local_response = True
 

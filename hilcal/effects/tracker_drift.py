@@ -18,6 +18,7 @@ class TrackerDrift(Effect):
     summary = "the tracker's station moves linearly in time"
     plausible = 20.0
     """4 mm, 4 mrad over the campaign: a tripod on a soft floor. A choice."""
+    of_setup = True
     needs = ("time",)
     option_help: ClassVar = {
         "reference_s": "the time at which the station stands as registered; unless given, the "

@@ -15,6 +15,7 @@ class TrackerScale(Effect):
     summary = "position read = (1 + s) position: the tracker's ranges have a scale error"
     plausible = 100.0
     """1 mm/m: photogrammetry without a scale bar; refraction alone makes 0.05. A choice."""
+    of_setup = True
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

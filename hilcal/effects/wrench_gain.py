@@ -19,6 +19,7 @@ class WrenchGain(ForceSensorEffect):
     summary = "wrench read = (1 + g) true per axis: the force sensor has a gain error"
     plausible = 50.0
     """50 %: a wrong calibration matrix, a channel that hardly reads. A choice."""
+    of_setup = True
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

@@ -29,6 +29,21 @@ fitted measurements exceeds; a choice."""
 
 
 @dataclass(frozen=True, slots=True)
+class Range:
+    """Values of one variable in the fitted readings; SI."""
+
+    variable: str
+    unit: str
+    low: float
+    high: float
+
+    def beyond(self, values: Floats) -> Bools:
+        """Which values are outside, by more than `MARGIN` of the range."""
+        allowed = MARGIN * (self.high - self.low) + 1e-9 * max(abs(self.low), abs(self.high), 1.0)
+        return np.asarray(np.maximum(values - self.high, self.low - values) > allowed)
+
+
+@dataclass(frozen=True, slots=True)
 class Beyond:
     """Readings beyond the fitted range of one variable.
 
@@ -127,6 +142,13 @@ def variables(s: States) -> Iterator[tuple[str, str, Floats]]:
     if s.joint_temperature is not None:
         for j in range(s.joint_temperature.shape[1]):
             yield f"joint {j + 1} temperature", "K", s.joint_temperature[:, j]
+
+
+def ranges_of(s: States) -> tuple[Range, ...]:
+    """Return the ranges of `variables`."""
+    return tuple(
+        Range(name, unit, float(v.min()), float(v.max())) for name, unit, v in variables(s)
+    )
 
 
 def _error(raw: Floats, w: Whitening, mine: Bools) -> ErrorBlock | None:

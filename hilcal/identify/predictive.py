@@ -125,9 +125,26 @@ def _left_out(a: Floats, root: Floats, pose: Ints, noise: float) -> float:
 
 def open_prior(model: Model, theta: Floats, prior: Floats) -> Floats:
     """Prior standard deviations (P,) where the readings leave parameters open."""
-    std = np.where(np.isinf(prior), ordinary(model, theta), prior)
+    return family_prior(model, np.where(np.isinf(prior), ordinary(model, theta), prior))
+
+
+def family_prior(model: Model, prior: Floats) -> Floats:
+    """Prior standard deviations (P,), those of shrunk families at least the family's mean."""
+    std = prior.copy()
     groups = prior_of(model)[1]
     for mine in model.slices():
         if (groups[mine] >= 0).any():
             std[mine] = np.maximum(std[mine], np.sqrt(np.mean(prior[mine] ** 2)))
     return std
+
+
+def parameter_factor(p: Predictive, left_out_sigma: float) -> float:
+    """Factor, at least 1, by which C is too small where the noise alone is right.
+
+    With it the mean variance on a pose left out is the mean square that was found there.
+
+    Args:
+        p: what a fit knows.
+        left_out_sigma: rms of the whitened residual on poses left out.
+    """
+    return max(1.0, (left_out_sigma**2 - max(p.noise, 1.0)) / max(p.left_out, 1e-12))

@@ -1,0 +1,124 @@
+"""A posterior as JSON: arrays as their little-endian doubles in base64, so that none is rounded."""
+
+import base64
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hilcal import __version__
+from hilcal.data.arm_scatter import ArmScatter
+from hilcal.data.whitening import MODES
+from hilcal.errors import InputError
+from hilcal.identify.extrapolation import Range
+from hilcal.identify.posterior import LearntEffect, Posterior, Source
+from hilcal.types import Floats
+
+FORMAT, VERSION = "hilcal-posterior", 1
+
+
+def to_json(p: Posterior) -> dict[str, object]:
+    """Return a posterior as JSON, SI; of the information the lower triangle, row by row."""
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "hilcal": __version__,
+        "arm": p.arm,
+        "links": p.links.tolist(),
+        "readings": p.mode,
+        "source": asdict(p.source),
+        "effects": [{"name": e.name, "options": dict(e.options)} for e in p.effects],
+        "parameters": list(p.names),
+        "units": list(p.units),
+        "scale": p.scale.tolist(),
+        "mean": p.mean.tolist(),
+        "information": _pack(p.information[np.tril_indices(len(p.mean))]),
+        "own_precision": p.own_precision.tolist(),
+        "arm_scatter": None if p.scatter is None else p.scatter.to_json(),
+        "ranges": [asdict(r) for r in p.ranges],
+        "prints": {"columns": p.prints.shape[1], "values": _pack(p.prints)},
+    }
+
+
+def from_json(content: Mapping[str, Any]) -> Posterior:
+    """Return the posterior that `to_json` wrote.
+
+    Raises:
+        InputError: another kind of document, a newer version, or a damaged one.
+    """
+    if not isinstance(content, Mapping) or content.get("format") != FORMAT:
+        raise InputError(f'no prior; valid: a JSON document with "format": "{FORMAT}"')
+    if content.get("version") != VERSION:
+        raise InputError(
+            f"a prior of version {content.get('version')}, written by hilcal "
+            f"{content.get('hilcal')}; this program reads version {VERSION}"
+        )
+    try:
+        return _read(content)
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"a damaged prior: {error!r}") from None
+
+
+def read(path: Path) -> Posterior:
+    """Read a posterior from a JSON file.
+
+    Raises:
+        InputError: see `from_json`; or the file cannot be read.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: no prior: {error}") from None
+    try:
+        return from_json(content)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def write(p: Posterior, path: Path) -> None:
+    """Write a posterior to a JSON file.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    try:
+        path.write_text(json.dumps(to_json(p), allow_nan=False) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+
+
+def _read(content: Mapping[str, Any]) -> Posterior:
+    scatter, kept = content["arm_scatter"], content["prints"]
+    mean = np.array(content["mean"], dtype=float)
+    information = np.zeros((len(mean), len(mean)))
+    information[np.tril_indices(len(mean))] = _unpack(content["information"])
+    information += np.tril(information, -1).T
+    if len(content["parameters"]) != len(mean) or not np.isfinite(information).all():
+        raise ValueError("its arrays do not fit its parameters")
+    return Posterior(
+        arm=str(content["arm"]),
+        links=np.array(content["links"], dtype=float),
+        mode=MODES[MODES.index(content["readings"])],
+        effects=tuple(LearntEffect(str(e["name"]), dict(e["options"])) for e in content["effects"]),
+        names=tuple(content["parameters"]),
+        units=tuple(content["units"]),
+        scale=np.array(content["scale"], dtype=float),
+        mean=mean,
+        information=information,
+        own_precision=np.array(content["own_precision"], dtype=float),
+        scatter=None if scatter is None else ArmScatter.from_json(scatter),
+        ranges=tuple(Range(**r) for r in content["ranges"]),
+        prints=_unpack(kept["values"]).reshape(-1, int(kept["columns"])),
+        source=Source(**content["source"]),
+    )
+
+
+def _pack(values: Floats) -> str:
+    return base64.b64encode(np.ascontiguousarray(values, dtype="<f8").tobytes()).decode("ascii")
+
+
+def _unpack(text: str) -> Floats:
+    return np.frombuffer(base64.b64decode(text), dtype="<f8").astype(float)
