@@ -26,6 +26,7 @@ from hilcal.calibration.compiled import Compiled, compiled
 from hilcal.calibration.measured import Measured
 from hilcal.calibration.poses import ToolPoses
 from hilcal.calibration.scatter import Scatter, scatter_of
+from hilcal.calibration.sensed import SensorMount
 from hilcal.calibration.tool import Tool, one_of_each, tool_of, tool_poses
 from hilcal.data.readings import States
 from hilcal.data.whitening import Mode
@@ -120,6 +121,7 @@ class Calibration:
         measured: where the fitted readings lie.
         loads: (6,) wrench at the load point, base axes, by the name of a load of the cell.
         source: what it is from, for people.
+        sensor: where the force sensor stands; None without one.
     """
 
     model: Model
@@ -131,6 +133,7 @@ class Calibration:
     measured: Measured
     loads: Mapping[str, Floats]
     source: Mapping[str, Any]
+    sensor: SensorMount | None = None
     _tracked: Tool = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -171,6 +174,7 @@ class Calibration:
             measured=Measured.of(used.states, p, noise),
             loads={load.name: load.wrench(model.cell.gravity) for load in loads},
             source=dict(source or {}),
+            sensor=SensorMount.of(model.cell),
         )
 
     @classmethod
@@ -267,6 +271,29 @@ class Calibration:
             return (*tool_poses(of, prediction), prediction.situation.chain)
 
         return invert(self.model.cell.arm, poses, states.q, *goal)
+
+    def load_wrench(self, q: Floats, reading: Floats) -> Floats:
+        """Return the wrench of a load as the force sensor reads it, for `predict` and `compensate`.
+
+        Args:
+            q: (n,) or (N, n) joint values at which it was read, rad.
+            reading: (6,) or (N, 6) the sensor's reading with the load less that without it, sensor
+                axes, N and N·m.
+
+        Returns:
+            (N, 6) force and moment at the load point, base axes.
+
+        Raises:
+            InputError: the cell has no force sensor, or another shape.
+        """
+        if self.sensor is None:
+            raise InputError("the campaign's cell has no [force_sensor]: its place is not known")
+        at = self._states(q, None, None).q
+        reading = np.asarray(reading, dtype=float)
+        if reading.shape not in ((6,), (len(at), 6)) or not np.isfinite(reading).all():
+            raise InputError(f"reading: valid: finite, of shape (6,) or ({len(at)}, 6)")
+        every = np.broadcast_to(reading, (len(at), 6))
+        return self.sensor.load_wrench(self.model.cell, at, every)
 
     def tool_pose(self, tool: Floats | None = None) -> Floats:
         """(4, 4) T_flange_tool: as given, or the tracked target as fitted."""

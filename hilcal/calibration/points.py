@@ -7,7 +7,9 @@ One row per point, with a header; separator "," and decimal point:
   there; together with a position they say on which branch.
 - `x_m`, `y_m`, `z_m` (or `x_mm` …) and `rx_rad`, `ry_rad`, `rz_rad` (or `rx_deg` …), a rotation
   vector: the pose of the tool in base axes.
-- `load`: the name of a load, or `fx_N` … `mz_Nm`: force and moment at the load point, base axes.
+- `load`: the name of a load, or `fx_N` … `mz_Nm`: force and moment at the load point, base axes, or
+  `sensor_fx_N` … `sensor_mz_Nm`: the force sensor's reading with the load less that without it, at
+  this point, sensor axes.
 - `air_degC`, `joint1_degC` …, `load_time_s`, `time_s`, `approach1` …: where the model needs them.
 """
 
@@ -45,6 +47,8 @@ class Points:
         q: (N, n) joint values, rad; rows of NaN where only a pose is given.
         wanted: (N, 4, 4) T_base_tool, NaN where the joint values say where to go; None for all.
         wrench: (N, 6) force and moment at the load point, base axes; None where none are given.
+        sensed: (N, 6) what the load adds to the force sensor's reading, sensor axes; None where
+            it is not given.
         recorded: other columns of `States`.
     """
 
@@ -52,6 +56,7 @@ class Points:
     q: Floats
     wanted: Floats | None = None
     wrench: Floats | None = None
+    sensed: Floats | None = None
     recorded: Mapping[str, Floats] = field(default_factory=dict)
 
 
@@ -80,7 +85,7 @@ def read_points(path: Path, arm: Arm, loads: Mapping[str, Floats]) -> Points:
         q = np.radians(found.pop("q_deg"))
     named = table.text.get("pose")
     names = tuple(named) if named else tuple(str(k + 1) for k in range(len(table.rows)))
-    wrench = found.pop("wrench", None)
+    wrench, sensed = found.pop("wrench", None), found.pop("sensed", None)
     if "load" in table.text:
         wrench = np.stack([_load(table, k, loads) for k in range(len(table.rows))])
     wanted = _poses(found)
@@ -92,7 +97,7 @@ def read_points(path: Path, arm: Arm, loads: Mapping[str, Floats]) -> Points:
     if q is None:
         q = np.full((len(names), arm.n), np.nan)
     recorded = {k: v if v.shape[1] > 1 else v[:, 0] for k, v in found.items()}
-    return Points(names, q, wanted, wrench, recorded)
+    return Points(names, q, wanted, wrench, sensed, recorded)
 
 
 def on_branch(points: Points, arm: Arm, tool: Floats, near: Floats | None) -> Floats:
@@ -150,6 +155,7 @@ def _groups(n: int) -> dict[str, tuple[str, ...]]:
         "rotation_rad": ROTATION,
         "rotation_deg": tuple(name.replace("_rad", "_deg") for name in ROTATION),
         "wrench": WRENCH,
+        "sensed": tuple(f"sensor_{name}" for name in WRENCH),
         "air_temperature": ("air_degC",),
         "joint_temperature": temperature_columns(n),
         "load_time": ("load_time_s",),
@@ -183,8 +189,9 @@ def _checked(
     ):
         if groups[a][0] in header and groups[b][0] in header:
             raise InputError(f"{path}: both {groups[a][0]} and {groups[b][0]}; give one of them")
-    if "load" in header and WRENCH[0] in header:
-        raise InputError(f"{path}: both load and {WRENCH[0]}; give one of them")
+    told = [n for n in ("load", WRENCH[0], groups["sensed"][0]) if n in header]
+    if len(told) > 1:
+        raise InputError(f"{path}: both {told[0]} and {told[1]}; give one of them")
     text = [name for name in ("pose", "load") if name in header]
     return text, [name for name in header if name not in text]
 

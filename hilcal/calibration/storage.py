@@ -17,6 +17,7 @@ from hilcal import __version__
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.measured import Measured
 from hilcal.calibration.scatter import Scatter
+from hilcal.calibration.sensed import SensorMount
 from hilcal.calibration.tool import one_of_each
 from hilcal.cell import Cell
 from hilcal.data.whitening import MODES
@@ -88,6 +89,7 @@ def to_json(c: Calibration) -> dict[str, object]:
         "scatter": c.scatter.to_json(),
         "measured": c.measured.to_json(),
         "loads": {name: wrench.tolist() for name, wrench in c.loads.items()},
+        "force_sensor": None if c.sensor is None else c.sensor.to_json(),
     }
 
 
@@ -132,6 +134,7 @@ def from_json(content: Mapping[str, Any], catalogue: Catalogue | None = None) ->
         measured=Measured.from_json(content["measured"]),
         loads={name: _array(wrench) for name, wrench in content["loads"].items()},
         source=content["source"],
+        sensor=SensorMount.from_json(content.get("force_sensor")),
     )
 
 

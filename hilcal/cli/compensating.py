@@ -110,10 +110,12 @@ def compensate(
         calibration = _calibration(model, catalogue, revision)
         arm = calibration.model.cell.arm
         task = _task(points, calibration, tool)
-        acting = _wrench(task.points, calibration, load, wrench)
+        given = _wrench(task.points, calibration, load, wrench)
         start = None if near is None else np.radians(_numbers(near, arm.n, "--near"))
         say(f"compensating {len(task.points.names)} points")
         q = on_branch(task.points, arm, calibration.tool_pose(task.tool), start)
+        sensed = task.points.sensed
+        acting = given if sensed is None else calibration.load_wrench(q, sensed)
         found = calibration.compensate(q, acting, tool=task.tool, recorded=task.points.recorded)
     refused = text_compensate.refusals(found, outside)
     _refuse(points, task.points.names, refused, found)
@@ -185,7 +187,7 @@ def _wrench(
     Raises:
         InputError: it is given twice, or the load is not known.
     """
-    given = [x for x in (load, wrench, points.wrench) if x is not None]
+    given = [x for x in (load, wrench, points.wrench, points.sensed) if x is not None]
     if len(given) > 1:
         raise InputError("the load is given twice; valid: one of --load, --wrench, columns")
     if wrench is not None:

@@ -11,6 +11,8 @@ from hilcal.calibration.urscript import waypoints
 from hilcal.config import load_config
 from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.covariance import COVERS, WHOLE
+from hilcal.robot.chain import evaluate
+from hilcal.robot.se3 import rotation
 from tests.support.cli_cases import CELL, ok, refused, rehearsal
 
 JOINTS = "q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg"
@@ -142,3 +144,33 @@ def test_what_is_no_campaign_or_no_table_is_refused(capsys, fitted, tmp_path) ->
     bare = tmp_path / "bare.hilcal"
     made(bare)
     assert "no revision yet" in refused(capsys, 2, "compensate", bare, points)
+
+
+def test_a_load_as_the_force_sensor_reads_it_is_the_load(capsys, fitted, tmp_path) -> None:
+    points = table(tmp_path, fitted)
+    ok(capsys, "export", fitted, "--calibration", tmp_path / "arm.json")
+    ok(capsys, "compensate", fitted, points, "--load", "10kg", "-o", tmp_path / "named.csv")
+    c = hc.Calibration.load(tmp_path / "arm.json")
+    assert c.sensor is not None
+    lines = points.read_text().splitlines()
+    q = np.radians([[float(v) for v in line.split(",")[1:]] for line in lines[1:]])
+    # what a 10 kg weight does to a sensor: its force, and the moment of it about the sensor
+    flange = evaluate(c.model.cell.arm, q)
+    weight = c.loads["10kg"][:3]
+    to_sensor = flange.rotation[-1] @ rotation(c.sensor.rotvec)
+    lever = flange.rotation[-1] @ (c.model.cell.load_point - c.sensor.origin)
+    felt = [
+        np.concatenate([r.T @ weight, r.T @ np.cross(a, weight)])
+        for r, a in zip(to_sensor, lever, strict=True)
+    ]
+    np.testing.assert_allclose(c.load_wrench(q, np.array(felt)), [c.loads["10kg"]] * 3, atol=1e-9)
+    names = ",".join(f"sensor_{n}" for n in ("fx_N", "fy_N", "fz_N", "mx_Nm", "my_Nm", "mz_Nm"))
+    rows = [
+        f"{line},{','.join(map(repr, map(float, f)))}"
+        for line, f in zip(lines[1:], felt, strict=True)
+    ]
+    points.write_text("\n".join([f"{lines[0]},{names}", *rows]) + "\n")
+    ok(capsys, "compensate", tmp_path / "arm.json", points, "-o", tmp_path / "felt.csv")
+    assert (tmp_path / "felt.csv").read_text() == (tmp_path / "named.csv").read_text()
+    two = refused(capsys, 2, "compensate", fitted, points, "--load", "10kg")
+    assert "the load is given twice" in two
