@@ -11,6 +11,7 @@ from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
 from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.covariance import COVERS, INSTRUMENT, WHOLE
+from hilcal.data.purpose import refuse_fitting
 from hilcal.data.readings import Readings
 from hilcal.data.records import content_hash
 from hilcal.data.revision import RevisionRecord
@@ -282,7 +283,8 @@ class Campaign:
             The number of the revision.
 
         Raises:
-            InputError: it was fitted to other readings than those of this campaign.
+            InputError: it was fitted to other readings than those of this campaign, or these are
+                of a validation campaign (`data.purpose`).
         """
         if parent == len(self.file.revisions()):
             parent = None
@@ -297,6 +299,7 @@ class Campaign:
         parent: int | None = None,
     ) -> RevisionRecord:
         """Return what `store` stores, without storing it; raises as `store` does."""
+        refuse_fitting(self.file)
         hashed = content_hash(found.readings)
         if hashed != content_hash(self.readings):
             raise InputError(f"{self.path}: the fit is of other readings than this campaign's")
@@ -323,6 +326,7 @@ class Campaign:
         if record is not None:
             say(f"restoring revision {record.number}")
             return record.number, self.restore(record)
+        refuse_fitting(self.file)
         model = baseline(self.cell, self.readings, self.mode(), self.catalogue)
         say(f"fitting {' + '.join(model.names) or 'the nominal arm'}")
         return None, fit(model, self.readings, self.mode())

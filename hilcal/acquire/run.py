@@ -35,6 +35,7 @@ def run(
     live: LiveModel | None = None,
     wall: Callable[[], float] = time.time,
     goal: StoppingRule | None = None,
+    epoch: float | None = None,
 ) -> None:
     """Measure what is missing of a plan, or as much of it as a goal needs.
 
@@ -53,6 +54,8 @@ def run(
         wall: the time of day, s; it carries the campaign's time over a pause.
         goal: decides when the readings are enough; then the arm goes home, the load is taken
             off, and the rest is not measured.
+        epoch: the time of day, s, that the campaign's time counts from; its first session's
+            beginning unless given.
 
     Raises:
         InputError: the plan is not safe (names the first problem), or the store fails.
@@ -69,7 +72,7 @@ def run(
     for text in whole.remarks:
         watcher.notify(Remark(text))
     stops = route(left, cell.arm, config.limits.joint_margin_rad)
-    session = Session(rig, cell, config, plan, store, clock, watcher, live, wall, goal)
+    session = Session(rig, cell, config, plan, store, clock, watcher, live, wall, goal, epoch)
     try:
         session.walk(stops)
     except BaseException as error:

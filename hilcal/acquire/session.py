@@ -51,6 +51,7 @@ class Session:
         live: LiveModel | None = None,
         wall: Callable[[], float] = time.time,
         goal: StoppingRule | None = None,
+        epoch: float | None = None,
     ) -> None:
         """Read what earlier sessions stored; no device is used yet."""
         self.in_control = False
@@ -76,7 +77,9 @@ class Session:
         self._identified = 0
         self._temperatures: bool | None = None
         self._done = 0
-        self._begun, self._elapsed, self._epoch = clock.now(), 0.0, wall()
+        now = wall()
+        self._epoch = now if epoch is None else epoch
+        self._begun, self._elapsed = clock.now(), (now - self._epoch) * clock.scale
         self._remember()
 
     # earlier sessions

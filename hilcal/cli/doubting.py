@@ -12,7 +12,7 @@ from drivers.simulated.injected_effects import HARD_TO_SEPARATE, RESEMBLING
 from drivers.simulated.on_the_wire import case_of_plan, read_plan
 from drivers.simulated.rehearsal import NOTHING, Rehearsal
 from hilcal.acquire.dry_run import dry_run
-from hilcal.cli.next import plan_of, separates
+from hilcal.cli.next import separates
 from hilcal.cli.rehearsing import RehearsalSettings, first_plan
 from hilcal.cli.terminal import Terminal
 from hilcal.data.plan import REFERENCE, Plan
@@ -29,6 +29,7 @@ from hilcal.identify.linearisation import linearise
 from hilcal.plan.checked_plan import refuse
 from hilcal.plan.next import measure_next
 from hilcal.plan.planner import Request
+from hilcal.procedure.separate import plan_of
 from hilcal.report import numbers, text, text_demo
 from hilcal.report.progress import Say, working
 from hilcal.report.text_next import next_report

@@ -19,6 +19,7 @@ from hilcal.cli.files import (
     wanted_effects,
 )
 from hilcal.cli.terminal import Json, Revision, Run, terminal
+from hilcal.data.purpose import purpose_of, refuse_fitting, release
 from hilcal.data.whitening import Scaling
 from hilcal.diagnose.misfit_breakdown import misfit_breakdown
 from hilcal.effects.written import write_effect
@@ -55,6 +56,13 @@ def identify(
         str, typer.Option("--scaling", metavar="S", help="none, gu, gc or all, side by side.")
     ] = "gc",
     readings: Readings = None,
+    fit_validation: Annotated[
+        bool,
+        typer.Option(
+            "--fit-validation",
+            help="Release a validation campaign for fitting; its file says so for good.",
+        ),
+    ] = False,
     effects_from: EffectsFrom = None,
     as_json: Json = False,
 ) -> None:
@@ -62,6 +70,13 @@ def identify(
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     wanted, named = scalings(scaling), wanted_effects(effects, catalogue)
     with Campaign.open(run, catalogue) as o:
+        if fit_validation and purpose_of(o.file) is not None:
+            release(o.file, "hilcal identify --fit-validation")
+            t.notice(
+                f"{run}: A VALIDATION CAMPAIGN IS FITTED. Its readings test no model any more that "
+                "learns from this one; the file says so from now on"
+            )
+        refuse_fitting(o.file)
         mode = mode_of_option(o, readings)
         check_options(o, named or {})
         fits: dict[Scaling, Fit] = {}

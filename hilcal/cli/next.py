@@ -1,6 +1,5 @@
 """`next`: the measurements that separate the leading suspects."""
 
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -12,23 +11,18 @@ from hilcal.cli.files import check_record, effect_names, fit_of
 from hilcal.cli.plan_output import POSES, Csv, Output, Quick, Seed, generator, write
 from hilcal.cli.planning import read_cell
 from hilcal.cli.terminal import Json, Record, Revision, Run, Terminal, terminal
-from hilcal.data.plan import REFERENCE, Plan, read_plan
+from hilcal.data.plan import REFERENCE, read_plan
 from hilcal.data.run_log import PLAN
 from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.diagnose.doubt import MOST, in_doubt
 from hilcal.diagnose.effect_ranking import Suspect
-from hilcal.diagnose.more_poses import pose_powers
-from hilcal.diagnose.pose_alone import PoseAlone
-from hilcal.diagnose.stepwise import remove
 from hilcal.diagnose.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identify.fit import Fit
 from hilcal.plan.checked_plan import checked
-from hilcal.plan.many_poses import measure_poses
-from hilcal.plan.next import Next, PairPower, measure_next
-from hilcal.plan.planner import Request
-from hilcal.plan.summary import about, summarise
+from hilcal.plan.next import Next
+from hilcal.plan.summary import summarise
+from hilcal.procedure.separate import Doubt, plan_of, separating, without
 from hilcal.report import numbers as words_of
 from hilcal.report.progress import Say, working
 from hilcal.report.text_next import next_report, poses_report
@@ -72,16 +66,8 @@ def next_(
     with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
         config, numbers = (o.config, o.cell) if cell is None else read_cell(cell)
         doubt = _without_suspects(t, o, revision, _named(suspects, catalogue), say)
-        before, effects, place = doubt.fit, doubt.suspects, reference_of(o)
-        if doubt.alone is None:
-            asked = Request(POSES if poses is None else poses)
-            found = measure_next(numbers, config, before, effects, asked, rng, say, place)
-        else:
-            count = doubt.alone.more if poses is None else poses
-            planned = measure_poses(numbers, config, before, count, rng, say, place)
-            say("predicting the powers")
-            powers = tuple(PairPower(*row, False) for row in pose_powers(before, effects, count))
-            found = Next(planned, powers, {}, 1.0, ())
+        effects, place = doubt.suspects, reference_of(o)
+        found = separating(numbers, config, doubt, poses, rng, say, place, POSES)
         summary = summarise(found.planned, config, rng, say, compare=not quick and not doubt.alone)
         say("checking every motion in a dry run")
         made = checked(numbers, config, plan_of(found, effects), summary)
@@ -113,31 +99,9 @@ def separates(found: Next) -> dict[str, object]:
     }
 
 
-def plan_of(found: Next, suspects: tuple[str, ...]) -> Plan:
-    """Return the plan with what its file says of it."""
-    told = [[t.effect, t.rival, round(t.then, 4)] for t in found.powers]
-    more = {**about(found.planned), "suspects": list(suspects), "separates": told}
-    return replace(found.planned.ordered.plan, about=more)
-
-
-@dataclass(frozen=True, slots=True)
-class _Doubt:
-    """What is to be separated.
-
-    Attributes:
-        fit: of a model without the suspects.
-        suspects: the effects.
-        alone: the misfit where more poses, unloaded, are what tells of it; None else.
-    """
-
-    fit: Fit
-    suspects: tuple[str, ...]
-    alone: PoseAlone | None = None
-
-
 def _without_suspects(
     t: Terminal, o: Campaign, revision: int | None, named: tuple[str, ...] | None, say: Say
-) -> _Doubt:
+) -> Doubt:
     """Return the effects to separate, and a fit whose model does not hold them.
 
     Raises:
@@ -162,11 +126,7 @@ def _without_suspects(
             raise CannotAnswerError(f"not two effects, but one in doubt: {differ(o, finer[0])}")
         a = d.pose_alone
         alone = a if a is not None and a.chance is not None and newest.mode == "absolute" else None
-    for name in suspects:
-        if name in newest.model.names:
-            say(f"fitting without {name}")
-            newest = remove(newest, name)
-    return _Doubt(newest, suspects, alone)
+    return Doubt(without(newest, suspects, say), suspects, alone)
 
 
 def _settled(o: Campaign, d: Diagnosis) -> str:

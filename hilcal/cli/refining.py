@@ -28,6 +28,7 @@ from hilcal.cli.files import (
 )
 from hilcal.cli.fitting import Readings, options_json, options_line
 from hilcal.cli.terminal import Json, Record, Revision, Run, terminal
+from hilcal.data.purpose import refuse_fitting
 from hilcal.data.revision import change
 from hilcal.diagnose.diagnosis import History
 from hilcal.diagnose.effect_ranking import addition
@@ -230,6 +231,7 @@ def refine(
     if start and (named is not None or readings is not None or (from_latest and revision)):
         raise InputError(f"{start} keeps effects and readings; leave out the other options")
     with Campaign.open(run, catalogue) as o:
+        refuse_fitting(o.file)
         latest = o.latest() if from_latest else None if not start else o.in_use(revision)
         if start and latest is None:
             raise InputError(f"{run}: no revision yet; leave out {start}")

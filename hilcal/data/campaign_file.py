@@ -212,16 +212,18 @@ class CampaignFile:
             InputError: the file cannot be written.
             ValueError: a number in it is not finite.
         """
-        text = to_text(record)
         with schema.sqlite_errors(self.path), schema.transaction(self._connection):
-            (last,) = self._connection.execute(
-                "SELECT ifnull(max(id), 0) FROM revisions"
-            ).fetchone()
-            number = int(last) + 1
-            if record.parent is not None:
-                schema.require(self._connection, schema.CHOSEN_REVISION)
-            row = (number, text, rows.text_crc(str(number), text))
-            self._connection.execute("INSERT INTO revisions VALUES (?, ?, ?)", row)
+            return self.insert_revision(record)
+
+    def insert_revision(self, record: RevisionRecord) -> int:
+        """Do the same inside a transaction that the caller has begun."""
+        text = to_text(record)
+        (last,) = self._connection.execute("SELECT ifnull(max(id), 0) FROM revisions").fetchone()
+        number = int(last) + 1
+        if record.parent is not None:
+            schema.require(self._connection, schema.CHOSEN_REVISION)
+        row = (number, text, rows.text_crc(str(number), text))
+        self._connection.execute("INSERT INTO revisions VALUES (?, ?, ?)", row)
         return number
 
     def accepted(self) -> int | None:

@@ -2,6 +2,7 @@
 
 import json
 import sqlite3
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -28,17 +29,33 @@ ADDRESSES = {"driver", "host", "port", "baud", "options"}
 
 
 def create_run(
-    path: Path, config: CellConfig, base_dir: Path, plan: Plan, overwrite: bool = False
+    path: Path,
+    config: CellConfig,
+    base_dir: Path,
+    plan: Plan,
+    overwrite: bool = False,
+    *,
+    source: str = "measured by hilcal run",
+    more: Mapping[str, str] | None = None,
 ) -> CampaignFile:
     """Make the empty campaign of a run, its plan inside.
+
+    Args:
+        path: the file.
+        config: the cell's configuration.
+        base_dir: the directory to which its relative paths refer.
+        plan: what is measured.
+        overwrite: replace an existing campaign.
+        source: where the readings come from, in words.
+        more: further texts about it; that of the key `COVERS` where readings are stored with
+            another covariance than the instrument's.
 
     Raises:
         InputError: it cannot be written, or is there already.
     """
-    more = {PLAN: plan.to_json(), COVERS: INSTRUMENT}
-    source = "measured by hilcal run"
+    texts = {PLAN: plan.to_json(), COVERS: INSTRUMENT, **(more or {})}
     return CampaignFile.create(
-        path, config.to_json(), str(base_dir), source, overwrite=overwrite, more=more
+        path, config.to_json(), str(base_dir), source, overwrite=overwrite, more=texts
     )
 
 

@@ -1,0 +1,206 @@
+"""How far the tool was off before and after the correction, as the tracker has measured it.
+
+The error of a point is how far the tool was from where it was asked to be, by a reading y:
+
+    e = (y − ŷ(x)) + p̂(x) − p_wanted
+
+x the state of the reading as recorded, ŷ the reading that the fitted model predicts in it, p̂ the
+tool's position by the same model, all in the tracker's axes. With a model that knows nothing of
+the instruments but the registration T, e = y − T p_wanted; what it knows of their drift and their
+scale is taken off.
+
+Where deflections were fitted, y is a loaded reading minus the unloaded one of the same point, and
+p_wanted where the unloaded arm is: e is then the distance from the measured unloaded position.
+
+At corrected joint values p̂(x) = p_wanted as far as x is the state that was expected, and e is the
+prediction error of a reading that nobody has fitted: its covariance is that of the prediction, the
+tracker's noise and the arm's repeatability included.
+"""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+
+from hilcal.calibration.calibration import Calibration
+from hilcal.calibration.poses import BAND, band
+from hilcal.calibration.tool import tool_of, tool_poses
+from hilcal.data.readings import Readings, States
+from hilcal.data.whitening import Mode, whitening
+from hilcal.identify.errors import noise_floor
+from hilcal.identify.predictive import Predictive
+from hilcal.identify.residual import residual
+from hilcal.types import Bools, Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Size:
+    """Sizes of 3-D position errors, m."""
+
+    mean_m: float
+    rms_m: float
+    max_m: float
+
+    @classmethod
+    def of(cls, errors: Floats) -> "Size":
+        """Return the sizes of (N,) distances."""
+        rms = float(np.sqrt(np.mean(errors**2)))
+        return cls(float(errors.mean()), rms, float(errors.max()))
+
+
+@dataclass(frozen=True, slots=True)
+class Improved:
+    """Errors of some points before and after the correction.
+
+    Attributes:
+        name: of the load, or "all".
+        count: number of points.
+        before: at the uncorrected joint values.
+        after: at the corrected ones.
+        noise_m: root mean square error that the tracker's noise and the arm's repeatability alone
+            would leave.
+        band_m: the largest distance within which `BAND` of the errors were predicted to be.
+        inside: how many of the points are within theirs.
+        removed: share of what exceeds the noise that the correction took away,
+            1 − x_after/x_before with x² = rms² − noise²; None where nothing exceeded it.
+    """
+
+    name: str
+    count: int
+    before: Size
+    after: Size
+    noise_m: float
+    band_m: float
+    inside: int
+    removed: float | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Improvement:
+    """Errors of N points before and after the correction, as measured.
+
+    Attributes:
+        mode: kind of readings of the model.
+        poses: their names.
+        loads: name of each one's load.
+        before_m: (N,) distance from where the tool was asked to be.
+        after_m: (N,) the same at the corrected joint values.
+        band_m: (N,) distance within which `BAND` of such readings were predicted to be.
+        noise_m: (N,) root mean square distance by the tracker's noise and the arm's repeatability.
+        left_out: points that could not be corrected or reached, with the reason.
+    """
+
+    mode: Mode
+    poses: tuple[str, ...]
+    loads: tuple[str, ...]
+    before_m: Floats
+    after_m: Floats
+    band_m: Floats
+    noise_m: Floats
+    left_out: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def everything(self) -> Improved:
+        """All points."""
+        return self._part("all", np.ones(len(self.poses), dtype=np.bool_))
+
+    @property
+    def by_load(self) -> tuple[Improved, ...]:
+        """The points of each load."""
+        of = np.array(self.loads)
+        return tuple(self._part(name, of == name) for name in dict.fromkeys(self.loads))
+
+    def over(self, limit_m: float) -> int:
+        """Return how many points are farther off than a limit after the correction."""
+        return int(np.sum(self.after_m > limit_m))
+
+    def _part(self, name: str, mine: Bools) -> Improved:
+        before, after = Size.of(self.before_m[mine]), Size.of(self.after_m[mine])
+        noise = float(np.sqrt(np.mean(self.noise_m[mine] ** 2)))
+        first, last = (np.sqrt(max(s.rms_m**2 - noise**2, 0.0)) for s in (before, after))
+        return Improved(
+            name=name,
+            count=int(mine.sum()),
+            before=before,
+            after=after,
+            noise_m=noise,
+            band_m=float(self.band_m[mine].max()),
+            inside=int(np.sum(self.after_m[mine] <= self.band_m[mine])),
+            removed=float(1.0 - last / first) if first > 0 else None,
+        )
+
+    def to_dict(self) -> dict[str, object]:
+        """Return it as JSON, SI."""
+        rows = zip(self.poses, self.loads, self.before_m, self.after_m, self.band_m, strict=True)
+        return {
+            "readings": self.mode,
+            "error": asdict(self.everything),
+            "loads": [asdict(part) for part in self.by_load],
+            "band_share": BAND,
+            "points": [
+                {
+                    "pose": pose,
+                    "load": load,
+                    "before_m": float(before),
+                    "after_m": float(after),
+                    "band_m": float(width),
+                }
+                for pose, load, before, after, width in rows
+            ],
+            "left_out": [{"point": name, "why": why} for name, why in self.left_out],
+        }
+
+
+def improvement(
+    calibration: Calibration,
+    p: Predictive,
+    before: Readings,
+    after: Readings,
+    goal: States,
+    left_out: Sequence[tuple[str, str]] = (),
+) -> Improvement:
+    """Compare readings of the same points at uncorrected and at corrected joint values.
+
+    Args:
+        calibration: by which the points were corrected.
+        p: what its fit knows of readings that it has not seen.
+        before: readings at the uncorrected joint values; for deflections with the unloaded readings
+            of the points.
+        after: the same at the corrected ones, with the same poses, in the same order.
+        goal: (M,) states of `before` that say where the tool was asked to be: where the nominal arm
+            has it at their joint values; for deflections not used.
+        left_out: points that are missing in both, with the reason.
+    """
+    first, _, _ = _errors(calibration, p, before, goal)
+    last, covariance, noise = _errors(calibration, p, after, goal)
+    w = whitening(after, calibration.mode, "gc")
+    rows = w.reading
+    return Improvement(
+        mode=calibration.mode,
+        poses=tuple(after.pose_names[k] for k in after.pose[rows]),
+        loads=tuple(after.load_names[k] for k in after.load[rows]),
+        before_m=np.linalg.norm(first, axis=1),
+        after_m=np.linalg.norm(last, axis=1),
+        band_m=band(covariance[:, :3, :3]),
+        noise_m=np.array([noise_floor(c[None]) for c in noise]),
+        left_out=tuple(left_out),
+    )
+
+
+def _errors(
+    calibration: Calibration, p: Predictive, readings: Readings, goal: States
+) -> tuple[Floats, Floats, Floats]:
+    """Errors (D, 3), the covariances (D, m, m) predicted for them, and those of the noise."""
+    model, theta = calibration.model, calibration.theta
+    w = whitening(readings, calibration.mode, "gc")
+    prediction = model.predict(readings.states, theta)
+    raw = residual(readings, prediction, w)[:, :3]
+    of = tool_of(model, theta, None)
+    position = tool_poses(of, prediction)[1]
+    wanted = 0.0 * position
+    if calibration.mode == "absolute":
+        wanted = calibration.nominal(of, replace(goal, target=None))[1]
+    axes = prediction.observation.axes
+    moved = np.einsum("nij,nj->ni", axes, position - wanted)
+    total = p.of_reading(prediction, w)
+    return raw + w.raw(moved), total, w.covariance

@@ -1,0 +1,1 @@
+"""A whole calibration, step by step: each step is chosen from what the campaign's files hold."""

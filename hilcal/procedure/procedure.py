@@ -1,0 +1,452 @@
+"""The steps of a calibration: each reads what the files hold, does one thing, and appends it.
+
+    plan ─► measure ─► refine ─► decide ─► plan_validation ─► measure_validation ─► validate
+               ▲                    │                                                  │
+               └── a further plan ──┘          compare ◄─ measure_corrected ◄─ correct ◄─┘
+
+A step that was cut short has either appended all of its result or nothing; readings are stored one
+by one. So the next step follows from the files (`state.next_step`), whatever has stopped the one
+before, and nothing is measured twice.
+
+The validation campaign is a file of its own. Before anything is predicted of it, its hash enters
+the calibration's log; from then on it has to be just this.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from hilcal.calibration.calibration import Calibration
+from hilcal.calibration.improvement import Improvement, improvement
+from hilcal.campaign import Campaign
+from hilcal.cell import Cell
+from hilcal.config import CellConfig
+from hilcal.data.arm_scatter import ArmScatter
+from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.covariance import COVERS, INSTRUMENT
+from hilcal.data.plan import REFERENCE, Plan, read_plan
+from hilcal.data.procedure_log import ENTRY, ProcedureLog, entry
+from hilcal.data.purpose import CALIBRATION, CORRECTED, PURPOSE, VALIDATION
+from hilcal.data.readings import Readings
+from hilcal.data.records import content_hash
+from hilcal.data.revision import RevisionRecord
+from hilcal.data.run_log import PLAN, RunLog, check_same_cell, create_run
+from hilcal.data.same_readings import already
+from hilcal.data.whitening import Mode, usual_mode
+from hilcal.diagnose.verdict import diagnose
+from hilcal.effects.catalogue import Catalogue
+from hilcal.errors import InputError
+from hilcal.identify import validation
+from hilcal.identify.acceptance import Acceptance, acceptance
+from hilcal.identify.arm_scatter import with_arm_scatter
+from hilcal.identify.baseline import baseline
+from hilcal.identify.extrapolation import extrapolation
+from hilcal.identify.full_covariance import full_readings
+from hilcal.plan.checked_plan import CheckedPlan, checked
+from hilcal.plan.planner import Request, make
+from hilcal.plan.summary import about, remarks, summarise
+from hilcal.procedure.corrected import corrected_plan, expected_of, paired
+from hilcal.procedure.decision import Decision, PredictedError, decide, predicted_error
+from hilcal.procedure.state import (
+    BEGUN,
+    DECIDED,
+    FROZEN,
+    IMPROVED,
+    MEASURE,
+    REFINED,
+    STOP,
+    VALIDATED,
+    Files,
+    Settings,
+    Step,
+    identity,
+    next_step,
+    opened,
+    settings_of,
+)
+from hilcal.procedure.validation_plan import validation_plan
+from hilcal.refine import Refinement, refine
+from hilcal.types import Floats
+
+Say = Callable[[str], None]
+Measure = Callable[[CampaignFile, float | None], None]
+"""Measures what is missing of a campaign's plan and stores it there; the time of day, s, that its
+time counts from is given where it is not its own."""
+
+_FIRST, _FURTHER, _VALIDATION, _CORRECTED = range(4)
+"""Streams of random numbers."""
+
+
+@dataclass(frozen=True, eq=False)
+class Procedure:
+    """A calibration in a cell.
+
+    Attributes:
+        run: the campaign file that is fitted; the others stand beside it.
+        cell: the cell as configured.
+        config: its configuration.
+        base_dir: directory that paths in the configuration are relative to.
+        catalogue: the effects that a model can have.
+        settings: what is asked for.
+    """
+
+    run: Path
+    cell: Cell
+    config: CellConfig
+    base_dir: Path
+    catalogue: Catalogue
+    settings: Settings
+    _found: list[Refinement] = field(default_factory=list, repr=False)
+
+    @property
+    def files(self) -> Files:
+        """Its files."""
+        return Files(self.run)
+
+    def next(self) -> Step:
+        """Return the next step."""
+        return next_step(self.run)
+
+    # the first plan
+
+    def plan(self, say: Say = lambda words: None) -> CheckedPlan:
+        """Choose the first plan; nothing is stored yet.
+
+        Raises:
+            InputError: numbers or names that cannot be.
+            CannotAnswerError: the cell leaves too few poses.
+        """
+        rng, config = self._rng(_FIRST), self._planned()
+        chosen = make(
+            self.cell, config, Request(self.settings.poses), rng, None, say, self.catalogue
+        )
+        plan = replace(
+            chosen.ordered.plan, about={**about(chosen), "remarks": list(remarks(chosen))}
+        )
+        summary = summarise(chosen, config, rng, say, compare=False)
+        say("checking every motion in a dry run")
+        return checked(self.cell, config, plan, summary)
+
+    def begin(self, plan: Plan, config: CellConfig, *, covers: str = INSTRUMENT) -> None:
+        """Make the campaign file with its first plan.
+
+        Args:
+            plan: the plan.
+            config: the configuration that the file holds, with the devices that are used.
+            covers: what the covariance of the readings will cover.
+
+        Raises:
+            InputError: it cannot be written, or is there already.
+        """
+        for path in (self.files.validation, self.files.corrected):
+            if path.exists():
+                raise InputError(
+                    f"{path}: the file exists, and {self.run} does not; rename or move it away"
+                )
+        first = entry(BEGUN, {"settings": self.settings.to_json()})
+        more = {COVERS: covers, ENTRY.format(1): first}
+        create_run(self.run, config, self.base_dir, plan, source=_SOURCE, more=more).close()
+
+    def resume(self, campaign: CampaignFile) -> None:
+        """Keep what is asked for in the log of the campaign.
+
+        Raises:
+            InputError: the campaign is of another cell.
+        """
+        check_same_cell(campaign, self.config)
+        log = ProcedureLog(campaign)
+        told = self.settings.to_json()
+        before = log.last(BEGUN)
+        if before is None or before["settings"] != told:
+            log.append(BEGUN, {"settings": told})
+
+    # measuring
+
+    def measure(self, step: Step, measure: Measure) -> int:
+        """Measure what is missing of a plan; returns how many readings its campaign then holds.
+
+        Raises:
+            DeviceError: a device failed; what was measured is stored.
+            KeyboardInterrupt: somebody stopped it; the same holds.
+        """
+        epoch = None if step.path == self.run else self._epoch()
+        with CampaignFile.open(step.path) as campaign:
+            measure(campaign, epoch)
+            return campaign.n_readings
+
+    def _epoch(self) -> float | None:
+        """Return the time of day that the campaign's time counts from, s."""
+        with CampaignFile.open(self.run, read_only=True) as campaign:
+            details = RunLog(campaign).details()
+        return float(details[0]["epoch_wall_s"]) if details else None
+
+    # fitting
+
+    def refine(self, say: Say = lambda words: None) -> Refinement:
+        """Fit, diagnose, and change the model until it is adequate; all revisions are stored.
+
+        Raises:
+            CannotAnswerError: the readings do not determine the baseline.
+        """
+        with Campaign.open(self.run, self.catalogue) as o:
+            mode = self._mode(o.readings)
+            say("registering")
+            model = baseline(o.cell, o.readings, mode, o.catalogue)
+            found = refine(model, o.readings, mode, say)
+            say("computing standard uncertainties")
+            records = [
+                o.record(step.fit, step.diagnosis, step.added, step.removed) for step in found.steps
+            ]
+            ProcedureLog(o.file).append(
+                REFINED,
+                {"readings_sha256": content_hash(o.readings), "verdict": found.verdict},
+                revisions=records,
+            )
+        self._found[:] = [found]
+        return found
+
+    def decide(self, say: Say = lambda words: None) -> Decision:
+        """Decide whether to measure more; a further plan is in the campaign then."""
+        with Campaign.open(self.run, self.catalogue) as o:
+            log, run = ProcedureLog(o.file), RunLog(o.file)
+            if self._found:
+                d = self._found[0].diagnosis
+            else:
+                record = self._record(o)
+                say(f"diagnosing revision {record.number}")
+                d = diagnose(o.restore(record), o.history(record.number), say)
+            rng = self._rng(_FURTHER, len(run.plans))
+            reference = _reference(run.plans[0])
+            found = decide(
+                self.cell, self._planned(), self.settings, d, run.plans, reference, rng, say
+            )
+            content = found.to_json()
+            if found.measures and found.plan is not None:
+                plan = run.with_new_names(found.plan)
+                say("checking every motion in a dry run")
+                log.append(DECIDED, {"action": MEASURE, **content}, plan=plan)
+            else:
+                log.append(DECIDED, {"action": STOP, **content})
+        return found
+
+    def predicted(self) -> PredictedError:
+        """Predict the error after compensation with the model as it is."""
+        with Campaign.open(self.run, self.catalogue, read_only=True) as o:
+            calibration, record = self._calibration(o)
+            return predicted_error(calibration, o.fitted_readings(record).states, self.config)
+
+    # validating
+
+    def plan_validation(self, say: Say = lambda words: None) -> Plan:
+        """Choose poses and loads of the validation campaign, and make its file.
+
+        Raises:
+            CannotAnswerError: no pose is left.
+        """
+        with Campaign.open(self.run, self.catalogue, read_only=True) as o:
+            say("restoring the model")
+            calibration, record = self._calibration(o)
+            plan = validation_plan(
+                self.cell,
+                self.config,
+                calibration,
+                o.fitted_readings(record),
+                _reference(RunLog(o.file).plans[0]),
+                self.settings.validation,
+                self._rng(_VALIDATION),
+                say,
+            )
+            self._create(self.files.validation, VALIDATION, plan, o)
+        return plan
+
+    def validate(self, say: Say = lambda words: None) -> Acceptance:
+        """Freeze the validation campaign, and predict its readings.
+
+        Raises:
+            InputError: readings of it were fitted, or it has changed since it was frozen.
+        """
+        with (
+            Campaign.open(self.run, self.catalogue) as o,
+            opened(self.files.validation, VALIDATION, self.run) as unseen,
+        ):
+            log = ProcedureLog(o.file)
+            self._freeze(log, unseen)
+            record = self._record(o)
+            fitted = o.fitted_readings(record)
+            readings = self._readings(o, record, unseen)
+            if already(readings, fitted).any():
+                raise InputError(
+                    f"{unseen.path}: some of its readings were fitted by revision "
+                    f"{record.number} of {self.run}; they test nothing"
+                )
+            say(f"predicting {len(readings)} readings")
+            model, theta = o.restore_model(record)
+            mode = self._mode(fitted)
+            found = validation.validate(model, theta, fitted, readings, mode)
+            beyond = extrapolation(o.predictive(record, model, theta), fitted, found)
+            shares = acceptance(found, beyond)
+            every = shares.everything
+            log.append(
+                VALIDATED,
+                {
+                    "revision": record.number,
+                    "error": found.error.to_json(),
+                    "noise_floor_m": found.noise_floor,
+                    "stated_m": every.stated_m,
+                    "within": every.within,
+                },
+            )
+        return shares
+
+    def _freeze(self, log: ProcedureLog, unseen: CampaignFile) -> None:
+        """Record the hash of the validation campaign; later it has to be the same.
+
+        Raises:
+            InputError: it is another.
+        """
+        frozen, hashed = log.last(FROZEN), unseen.data_hash()
+        if frozen is None:
+            content = {"file": unseen.path.name, "readings_sha256": hashed}
+            log.append(FROZEN, {**content, "readings": unseen.n_readings})
+        elif frozen["readings_sha256"] != hashed:
+            raise InputError(
+                f"{unseen.path}: other readings than when it was frozen "
+                f"(SHA-256 {frozen['readings_sha256'][:12]}…, now {hashed[:12]}…)"
+            )
+
+    # correcting
+
+    def correct(self, say: Say = lambda words: None) -> Plan:
+        """Correct the joint targets of the validation poses, and make the file of their run.
+
+        Raises:
+            CannotAnswerError: no point can be corrected.
+        """
+        with (
+            Campaign.open(self.run, self.catalogue) as o,
+            opened(self.files.validation, VALIDATION, self.run) as unseen,
+        ):
+            self._freeze(ProcedureLog(o.file), unseen)
+            say("restoring the model")
+            calibration, record = self._calibration(o)
+            readings = self._readings(o, record, unseen)
+            made = read_plan(unseen.about(PLAN) or "", f"{unseen.path}, its plan")
+            reference = _reference(made)
+            time = readings.states.time
+            plan = corrected_plan(
+                self.cell,
+                self.config,
+                calibration,
+                readings,
+                readings.states.q[0] if reference is None else reference,
+                0.0 if time is None else float(time[-1]),
+                self._rng(_CORRECTED),
+                say,
+            )
+            self._create(self.files.corrected, CORRECTED, plan, o)
+        return plan
+
+    def compare(self, say: Say = lambda words: None) -> Improvement:
+        """Compare the errors at uncorrected and at corrected joint targets, as measured.
+
+        Raises:
+            InputError: the validation campaign has changed since it was frozen.
+        """
+        with (
+            Campaign.open(self.run, self.catalogue) as o,
+            opened(self.files.validation, VALIDATION, self.run) as unseen,
+            opened(self.files.corrected, CORRECTED, self.run) as moved,
+        ):
+            log = ProcedureLog(o.file)
+            self._freeze(log, unseen)
+            say("comparing errors before and after")
+            calibration, record = self._calibration(o)
+            first, last = (self._readings(o, record, file) for file in (unseen, moved))
+            before, after = paired(first, last, calibration.mode)
+            _, left_out = expected_of(read_plan(moved.about(PLAN) or "", f"{moved.path}, its plan"))
+            model, theta = o.restore_model(record)
+            found = improvement(
+                calibration,
+                o.predictive(record, model, theta),
+                before,
+                after,
+                before.states,
+                left_out,
+            )
+            if log.last(IMPROVED) is None:
+                content = {"revision": record.number, "readings_sha256": moved.data_hash()}
+                log.append(IMPROVED, {**content, **found.to_dict()})
+        return found
+
+    # what the steps share
+
+    def _rng(self, *stream: int) -> np.random.Generator:
+        return np.random.default_rng([self.settings.seed, *stream])
+
+    def _planned(self) -> CellConfig:
+        """Return the configuration for planning: of the kind of readings that is fitted."""
+        planning = self.config.planning.model_copy(update={"readings": self.settings.readings})
+        return self.config.model_copy(update={"planning": planning})
+
+    def _mode(self, readings: Readings) -> Mode:
+        """Return the kind of readings that is fitted; deflections where the readings allow."""
+        return "absolute" if self.settings.readings == "absolute" else usual_mode(readings)
+
+    def _record(self, o: Campaign) -> RevisionRecord:
+        """Return the revision that the last refinement ended with.
+
+        Raises:
+            InputError: there is none.
+        """
+        refined = ProcedureLog(o.file).last(REFINED)
+        if refined is None:
+            raise InputError(f"{self.run}: not refined yet")
+        return o.file.revision(int(refined["revisions"][-1]))
+
+    def _calibration(self, o: Campaign) -> tuple[Calibration, RevisionRecord]:
+        record = self._record(o)
+        return o.calibration(record.number), record
+
+    def _readings(self, o: Campaign, record: RevisionRecord, file: CampaignFile) -> Readings:
+        """Return the readings of another file with the covariance that the fit takes them for."""
+        model, _ = o.restore_model(record)
+        known = (True,) * len(model.cell.known_targets)
+        cell = replace(model.cell, registration_known=True)
+        cell = cell.with_targets(cell.all_targets, known)
+        found = full_readings(file.readings(), file.about(COVERS), cell, o.config)
+        scatter = record.parameters_json.get("arm_scatter")
+        if scatter is None:
+            return found
+        return with_arm_scatter(cell, found, ArmScatter.from_json(scatter))
+
+    def _create(self, path: Path, purpose: str, plan: Plan, o: Campaign) -> None:
+        """Make the file of a campaign that tests the model."""
+        more = {
+            PURPOSE: purpose,
+            CALIBRATION: identity(self.run),
+            COVERS: o.file.about(COVERS) or INSTRUMENT,
+        }
+        config = CellConfig.from_json(o.file.config_json)
+        create_run(path, config, self.base_dir, plan, source=_SOURCE, more=more).close()
+
+
+_SOURCE = "measured by hilcal calibrate"
+
+
+def continued(run: Path, cell: Cell, config: CellConfig, catalogue: Catalogue) -> Procedure:
+    """Return a calibration as its campaign file has it.
+
+    Raises:
+        InputError: the campaign is of another cell, or not of a calibration.
+    """
+    with CampaignFile.open(run, read_only=True) as campaign:
+        check_same_cell(campaign, config)
+        settings, base_dir = settings_of(campaign), Path(campaign.base_dir)
+    return Procedure(run, cell, config, base_dir, catalogue, settings)
+
+
+def _reference(plan: Plan) -> Floats | None:
+    """Return the joints (n,) of a plan's reference pose."""
+    return plan.joints(REFERENCE) if REFERENCE in plan.pose_names else None

@@ -1,0 +1,221 @@
+"""Where a calibration stands: the next step, by what its files hold and nothing else."""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal, Self
+
+from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.plan import Plan
+from hilcal.data.procedure_log import ProcedureLog
+from hilcal.data.purpose import CALIBRATION, CORRECTED, PURPOSE, VALIDATION
+from hilcal.data.run_log import RunLog
+from hilcal.data.whitening import Mode
+from hilcal.errors import InputError
+
+Kind = Literal[
+    "plan",
+    "measure",
+    "refine",
+    "decide",
+    "plan_validation",
+    "measure_validation",
+    "validate",
+    "correct",
+    "measure_corrected",
+    "compare",
+    "done",
+]
+MOVING: tuple[Kind, ...] = ("measure", "measure_validation", "measure_corrected")
+"""Steps in which the arm moves."""
+BEGUN, REFINED, DECIDED, FROZEN, VALIDATED, IMPROVED, WORLD = (
+    "begun",
+    "refined",
+    "decided",
+    "frozen",
+    "validated",
+    "improved",
+    "world",
+)
+"""Kinds of entries in the log."""
+MEASURE, STOP = "measure", "stop"
+"""What was decided: to measure a further plan, or that the model is as good as it gets."""
+SUFFIX = ".hilcal"
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What a calibration was asked for; kept in its campaign.
+
+    Attributes:
+        poses: size of the first plan, and of further ones.
+        validation: poses of the validation campaign.
+        max_time_s: how long measuring may last in all plans together, as they state it, cell s.
+        goal_m: the error that is wanted after compensation: 95 % of the points within it; None for
+            no goal beside an adequate model.
+        limit_m: the largest error that is allowed at corrected targets; None for none.
+        seed: of everything random.
+        readings: kind of readings that is fitted.
+        hide: what a rehearsal hides in its simulated cell; None on real devices.
+    """
+
+    poses: int = 20
+    validation: int = 20
+    max_time_s: float = 7200.0
+    goal_m: float | None = None
+    limit_m: float | None = None
+    seed: int = 0
+    readings: Mode = "deflection"
+    hide: str | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as JSON."""
+        return asdict(self)
+
+    @classmethod
+    def from_json(cls, content: dict[str, Any]) -> Self:
+        """Return what `to_json` wrote."""
+        return cls(**content)
+
+
+@dataclass(frozen=True, slots=True)
+class Files:
+    """The files of a calibration.
+
+    Attributes:
+        run: the campaign that is fitted.
+    """
+
+    run: Path
+
+    @property
+    def validation(self) -> Path:
+        """The validation campaign."""
+        return self._beside(VALIDATION)
+
+    @property
+    def corrected(self) -> Path:
+        """The run at corrected targets."""
+        return self._beside(CORRECTED)
+
+    def _beside(self, what: str) -> Path:
+        return self.run.with_name(f"{self.run.name.removesuffix(SUFFIX)}.{what}{SUFFIX}")
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What a calibration does next.
+
+    Attributes:
+        kind: what.
+        path: the campaign that it is about.
+        missing: readings that are missing, where the arm moves.
+        planned: readings of the plan, where the arm moves.
+        load_changes: how often a person has to change the load, where the arm moves.
+        seconds: how long the arm takes for what is missing, roughly, cell s.
+    """
+
+    kind: Kind
+    path: Path
+    missing: int = 0
+    planned: int = 0
+    load_changes: int = 0
+    seconds: float = 0.0
+
+    @property
+    def moves(self) -> bool:
+        """Whether the arm moves."""
+        return self.kind in MOVING
+
+
+def next_step(run: Path) -> Step:
+    """Return the next step of a calibration.
+
+    Raises:
+        InputError: the campaign is not one of a calibration, or a file is damaged.
+    """
+    files = Files(run)
+    if not run.exists():
+        return Step("plan", run)
+    with CampaignFile.open(run, read_only=True) as campaign:
+        log = ProcedureLog(campaign)
+        if log.last(BEGUN) is None:
+            raise InputError(
+                f"{run}: a campaign, but not one of hilcal calibrate; choose another name, or go "
+                "on with its own commands (hilcal info)"
+            )
+        decided = log.last(DECIDED)
+        if decided is None or decided["action"] == MEASURE:
+            missing = _missing("measure", campaign)
+            if missing is not None:
+                return missing
+            refined = log.last(REFINED)
+            if refined is None or refined["readings_sha256"] != campaign.data_hash():
+                return Step("refine", run)
+            return Step("decide", run)
+        looked, improved = log.last(VALIDATED) is not None, log.last(IMPROVED) is not None
+    if not files.validation.exists():
+        return Step("plan_validation", files.validation)
+    with opened(files.validation, VALIDATION, run) as campaign:
+        missing = _missing("measure_validation", campaign)
+    if missing is not None:
+        return missing
+    if not looked:
+        return Step("validate", files.validation)
+    if not files.corrected.exists():
+        return Step("correct", files.corrected)
+    with opened(files.corrected, CORRECTED, run) as campaign:
+        missing = _missing("measure_corrected", campaign)
+    if missing is not None:
+        return missing
+    return Step("done" if improved else "compare", run)
+
+
+def opened(path: Path, purpose: str, run: Path, *, read_only: bool = True) -> CampaignFile:
+    """Open a file of a calibration.
+
+    Raises:
+        InputError: it is another one.
+    """
+    campaign = CampaignFile.open(path, read_only=read_only)
+    if campaign.about(PURPOSE) != purpose or campaign.about(CALIBRATION) != identity(run):
+        campaign.close()
+        raise InputError(f"{path}: not the {purpose} campaign of {run}; rename or move it away")
+    return campaign
+
+
+def identity(run: Path) -> str:
+    """Return what the other files of a calibration know their campaign by: name and beginning."""
+    with CampaignFile.open(run, read_only=True) as campaign:
+        return f"{run.name} of {campaign.created}"
+
+
+def settings_of(campaign: CampaignFile) -> Settings:
+    """Return what a calibration was asked for, as it was last.
+
+    Raises:
+        InputError: the campaign is not one of a calibration.
+    """
+    begun = ProcedureLog(campaign).last(BEGUN)
+    if begun is None:
+        raise InputError(f"{campaign.path}: not a campaign of hilcal calibrate")
+    return Settings.from_json(begun["settings"])
+
+
+def duration_of(plan: Plan) -> float:
+    """Return how long a plan takes as it states it, cell s."""
+    told = plan.about.get("duration_s", {})
+    return float(told.get("total", 0.0)) if isinstance(told, dict) else 0.0
+
+
+def _missing(kind: Kind, campaign: CampaignFile) -> Step | None:
+    """Return the step that measures what is missing of the last plan; None where nothing is."""
+    log = RunLog(campaign)
+    last, done = log.plans[-1], log.done()
+    left = last.without(done).steps
+    if not left:
+        return None
+    loads = [s.load for s in left]
+    changes = sum(a != b for a, b in zip(["none", *loads], [*loads, "none"], strict=True))
+    share = len(left) / len(last.steps)
+    seconds = share * duration_of(last)
+    return Step(kind, campaign.path, len(left), len(last.steps), changes, seconds)

@@ -1,0 +1,121 @@
+"""A calibration in the simulated world without devices: its readings are drawn."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from drivers.simulated.on_the_wire import case_of_plan, read_plan
+from drivers.simulated.rehearsal import SimulationCase
+from hilcal.cell import cell_from_config
+from hilcal.config import CellConfig, load_config
+from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.covariance import WHOLE
+from hilcal.data.run_log import RunLog
+from hilcal.data.whitening import Mode
+from hilcal.effects.catalogue import installed
+from hilcal.procedure.procedure import Procedure
+from hilcal.procedure.state import Settings, Step
+from hilcal.robot.catalogue import configs_dir
+
+HOUR = 3600.0
+
+
+class KilledError(BaseException):
+    """The program was killed."""
+
+
+def small(loads: int = 2, **planning: object) -> CellConfig:
+    """The cell of the demo with few candidates, so that planning takes a second."""
+    config = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
+    quick = {"candidates": 60, "against": (), **planning}
+    changes = {
+        "planning": config.planning.model_copy(update=quick),
+        "loads": config.loads[::2][:loads] if loads else (),
+    }
+    return config.model_copy(update=changes)
+
+
+@dataclass
+class Drawn:
+    """A calibration whose readings are drawn in one simulated world.
+
+    Attributes:
+        procedure: the calibration.
+        hidden: what is hidden in the world.
+        dies_after: readings after which measuring is killed; None for never.
+        kinds: of the steps that were done.
+    """
+
+    procedure: Procedure
+    hidden: str
+    dies_after: int | None = None
+    kinds: list[str] = field(default_factory=list)
+
+    def case(self) -> SimulationCase:
+        """The world, made again from the first plan."""
+        p = self.procedure
+        with CampaignFile.open(p.run, read_only=True) as campaign:
+            plan = RunLog(campaign).plans[0]
+        return case_of_plan(p.config, plan, self.hidden, p.settings.seed, p.catalogue)
+
+    def measure(self, campaign: CampaignFile, epoch: float | None) -> None:
+        """Draw what is missing of a campaign, one reading after the other."""
+        log, case = RunLog(campaign), self.case()
+        number = len(campaign.path.name)
+        begun = HOUR * (len(log.plans) - 1 + 10 * (epoch is not None))
+        last = log.plans[-1]
+        seed = [self.procedure.settings.seed, number, len(log.plans)]
+        drawn = read_plan(case, last, seed, begun).readings
+        done = log.done()
+        for k, step in enumerate(last.steps):
+            if step in done:
+                continue
+            if self.dies_after is not None:
+                if self.dies_after == 0:
+                    raise KilledError
+                self.dies_after -= 1
+            log.record(drawn[slice(k, k + 1)], step, {"epoch_wall_s": 0.0})
+
+    def do(self, step: Step) -> object:
+        """Do one step."""
+        self.kinds.append(step.kind)
+        p = self.procedure
+        if step.kind == "plan":
+            p.begin(p.plan().plan, p.config, covers=WHOLE)
+            return None
+        if step.moves:
+            return p.measure(step, self.measure)
+        result: object = getattr(p, step.kind)()
+        return result
+
+    def to_the_end(self) -> object:
+        """Do all steps; returns the result of the last one."""
+        result = None
+        while (step := self.procedure.next()).kind != "done":
+            result = self.do(step)
+        return result
+
+
+def drawn(
+    path: Path,
+    hidden: str = "nothing",
+    *,
+    config: CellConfig | None = None,
+    seed: int = 1,
+    poses: int = 5,
+    validation: int = 5,
+    readings: Mode = "deflection",
+    goal_m: float | None = None,
+) -> Drawn:
+    """A small calibration in a file that need not be there yet."""
+    config = small() if config is None else config
+    settings = Settings(
+        poses=poses, validation=validation, seed=seed, readings=readings, goal_m=goal_m
+    )
+    cell = cell_from_config(config)
+    return Drawn(Procedure(path, cell, config, path.parent, installed(), settings), hidden)
+
+
+def again(d: Drawn) -> Drawn:
+    """The same calibration as another process finds it: nothing but its files."""
+    p = d.procedure
+    return replace(d, procedure=replace(p, _found=[]), dies_after=None)

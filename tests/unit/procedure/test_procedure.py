@@ -1,0 +1,171 @@
+"""A calibration from the plan to the measured improvement, stopped at every step."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import hilcal as hc
+from hilcal.calibration.improvement import Improvement
+from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.plan import REFERENCE
+from hilcal.data.procedure_log import ProcedureLog
+from hilcal.data.purpose import purpose_of, release
+from hilcal.data.run_log import RunLog
+from hilcal.data.same_readings import already
+from hilcal.errors import InputError
+from hilcal.procedure.state import FROZEN
+from tests.support.procedure_cases import Drawn, KilledError, again, drawn
+
+ALL = [
+    "plan",
+    "measure",
+    "refine",
+    "decide",
+    "plan_validation",
+    "measure_validation",
+    "validate",
+    "correct",
+    "measure_corrected",
+    "compare",
+]
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory: pytest.TempPathFactory) -> tuple[Drawn, Improvement]:
+    """A calibration that was stopped after each step, and in each measurement."""
+    d = drawn(tmp_path_factory.mktemp("run") / "run.hilcal", validation=6)
+    found = None
+    while (step := d.procedure.next()).kind != "done":
+        if step.moves and step.missing > 2:
+            d.dies_after = step.missing - 2
+            with pytest.raises(KilledError):
+                d.do(step)
+        else:
+            found = d.do(step)
+        d = again(d)
+    assert isinstance(found, Improvement)
+    return d, found
+
+
+def test_it_goes_on_after_any_stop(done: tuple[Drawn, Improvement]) -> None:
+    d, _ = done
+    assert list(dict.fromkeys(d.kinds)) == ALL
+    files = d.procedure.files
+    for path in (files.run, files.validation, files.corrected):
+        with CampaignFile.open(path) as campaign:
+            log = RunLog(campaign)
+            steps = log.plans[-1].steps
+            assert len(log.details()) == campaign.n_readings == len(steps)
+            assert log.done() == frozenset(steps)
+
+
+def test_the_error_falls_as_far_as_predicted(done: tuple[Drawn, Improvement]) -> None:
+    _, found = done
+    every = found.everything
+    assert every.count == 6
+    assert every.before.rms_m > 10 * every.after.rms_m
+    assert every.removed is not None
+    assert every.removed > 0.9
+    assert every.inside >= 4
+    assert sum(part.count for part in found.by_load) == 6
+    assert found.left_out == ()
+
+
+def test_validation_poses_lie_within_what_was_measured_and_are_new(
+    done: tuple[Drawn, Improvement],
+) -> None:
+    files = done[0].procedure.files
+    with CampaignFile.open(files.run) as run, CampaignFile.open(files.validation) as test:
+        fitted, unseen = run.readings(), test.readings()
+    q, new = fitted.states.q, unseen.states.q
+    slack = 0.02 * np.ptp(q, axis=0)
+    assert (new >= q.min(axis=0) - slack).all()
+    assert (new <= q.max(axis=0) + slack).all()
+    own = np.array([unseen.pose_names[k] != REFERENCE for k in unseen.pose])
+    apart = np.abs(new[own][:, None] - q[None]).max(axis=2)
+    assert apart.min() > 0.01
+    assert not already(unseen, fitted).any()
+
+
+def test_the_corrected_run_is_at_other_joint_values(done: tuple[Drawn, Improvement]) -> None:
+    files = done[0].procedure.files
+    with CampaignFile.open(files.validation) as test, CampaignFile.open(files.corrected) as moved:
+        first, last = test.readings(), moved.readings()
+    at = {f"{first.pose_names[p]}": q for p, q in zip(first.pose, first.states.q, strict=True)}
+    names = [last.pose_names[k] for k in last.pose]
+    turned = [
+        np.abs(q - at[name.split(" ")[0]]).max()
+        for name, q in zip(names, last.states.q, strict=True)
+        if name != REFERENCE
+    ]
+    assert min(turned) > 1e-5
+    assert max(turned) < 0.02
+
+
+def test_a_validation_campaign_is_frozen(done: tuple[Drawn, Improvement]) -> None:
+    d, _ = done
+    files = d.procedure.files
+    with CampaignFile.open(files.run) as run, CampaignFile.open(files.validation) as test:
+        frozen = ProcedureLog(run).last(FROZEN)
+        assert frozen is not None
+        assert frozen["readings_sha256"] == test.data_hash()
+        assert purpose_of(test) == "validation"
+    with hc.Campaign.open(files.validation) as o:
+        with pytest.raises(InputError, match=r"a validation campaign of run\.hilcal"):
+            o.fit_in_use()
+        found = hc.fit(hc.baseline(o.cell, o.readings), o.readings)
+        with pytest.raises(InputError, match="never to be fitted"):
+            o.append(found)
+        assert o.latest() is None
+
+
+def test_another_validation_campaign_is_refused(done: tuple[Drawn, Improvement]) -> None:
+    d, _ = done
+    files = d.procedure.files
+    kept = files.validation.read_bytes()
+    try:
+        with CampaignFile.open(files.validation) as test:
+            readings = test.readings()
+            release(test, "a test")
+            test.append_readings(readings[:1])
+        with pytest.raises(InputError, match="other readings than when it was frozen"):
+            d.procedure.compare()
+        with hc.Campaign.open(files.validation) as o:
+            assert o.fit_in_use()[0] is None  # released: it may be fitted, and the file says so
+    finally:
+        files.validation.write_bytes(kept)
+
+
+def test_a_goal_below_the_repeatability_is_not_measured_for(tmp_path) -> None:
+    d = drawn(tmp_path / "run.hilcal", goal_m=5e-6)
+    kinds = []
+    while (step := d.procedure.next()).kind != "plan_validation":
+        found = d.do(step)
+        kinds.append(step.kind)
+    assert kinds == ALL[:4]
+    assert found.reason == "floor"
+    assert found.error.floor_m > 5e-6
+
+
+def test_a_goal_within_reach_is_measured_for(tmp_path) -> None:
+    d = drawn(tmp_path / "run.hilcal", poses=4)
+    for _ in range(3):
+        d.do(d.procedure.next())
+    first = d.procedure.predicted()
+    goal = 0.5 * (first.now_m + first.floor_m)
+    settings = replace(d.procedure.settings, goal_m=goal)
+    d = replace(d, procedure=replace(d.procedure, settings=settings))
+    found = d.do(d.procedure.next())
+    assert found.reason == "goal"
+    assert found.then_m < first.now_m
+    kinds = []
+    while (step := d.procedure.next()).kind != "plan_validation":
+        found = d.do(step)
+        kinds.append(step.kind)
+    assert kinds[:3] == ["measure", "refine", "decide"]
+    assert found.error.now_m < first.now_m
+    with CampaignFile.open(d.procedure.run) as run:
+        log = RunLog(run)
+        assert len(log.plans) > 1
+        assert len(log.plan.steps) == run.n_readings
