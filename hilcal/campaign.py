@@ -109,6 +109,19 @@ class Campaign:
         """What the covariance of `readings` covers, as an exchange table states it."""
         return INSTRUMENT if self.covariance_parts in ("instrument", "as imported") else WHOLE
 
+    @property
+    def stored_covers(self) -> str:
+        """What the covariance of the file's readings covers, as an exchange table states it.
+
+        A file that does not say is read as it is: where importing would add the arm's scatter, its
+        table says that it is in it.
+        """
+        stored = self.file.about(COVERS)
+        if stored is not None:
+            return stored
+        added = covariance_parts(INSTRUMENT, self.config) != "instrument"
+        return WHOLE if added else INSTRUMENT
+
     def close(self) -> None:
         """Close the file."""
         self.file.close()

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import typer
 
 from hilcal.cli import application, execute
+from studies.compensation_command import compensation
 from studies.descriptions_command import descriptions
 from studies.diagnosis_command import diagnosis
 from studies.plans_command import plans
@@ -26,6 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     app.command("descriptions")(descriptions)
     app.command("scaling")(scaling)
     app.command("real")(real)
+    app.command("compensation")(compensation)
     app.command("results")(results)
     app.callback()(_group)
     execute(lambda: app, "studies", sys.argv[1:] if arguments is None else arguments)

@@ -4,12 +4,14 @@ URDF: fixed-axis roll, pitch, yaw and xyz of every joint's origin; every joint t
 
 UR's kinematics file (`ur_description`, `config/*/default_kinematics.yaml`; written for a single arm
 by `ur_calibration`) has one origin per joint in the frames of that package: those of this program
-moved along the joints' axes. It has none for the flange; what is left there is part of the tool,
-see `frames`. Its hash is not that of the controller's own calibration, which the driver warns of.
+moved along the joints' axes. The first one counts from `base_link_inertia`, which is the
+controller's base (`base`), half a turn about z from `base_link`. It has no origin for the flange;
+what cannot be moved before the last joint is part of the tool, see `frames`.
 """
 
 import hashlib
 import json
+import re
 from collections.abc import Iterator
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
@@ -18,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.corrected import Corrected
+from hilcal.calibration.dh_table import screw, twist_first
 from hilcal.errors import InputError
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
@@ -58,35 +61,52 @@ def urdf(arm: Arm, note: str = "") -> str:
     return f'<?xml version="1.0"?>\n{comment}{tostring(root, encoding="unicode")}\n'
 
 
-def ur_kinematics(nominal: Arm, arm: Arm) -> tuple[str, Floats]:
+def ur_kinematics(
+    nominal: Arm, arm: Arm, note: str = "", digest: str | None = None
+) -> tuple[str, Floats]:
     """Return UR's kinematics file, and (4, 4) from its last frame to the flange.
 
     Args:
         nominal: the arm of the catalogue.
         arm: the corrected one.
+        note: stands in a comment at the top.
+        digest: the driver's name of the connected arm's own calibration, "calib_…"; the driver logs
+            an error where the file has another. One of the file's content where None.
 
     Raises:
-        InputError: it is no UR arm.
+        InputError: it is no UR arm, or the digest is none.
     """
     if not nominal.name.startswith("ur") or arm.n != len(UR_JOINTS):
         raise InputError(f"{nominal.name}: UR's kinematics file is for UR arms")
+    if digest is not None and not re.fullmatch(r"calib_\d+", digest):
+        raise InputError(
+            f"--ur-hash {digest!r}; valid: calib_ and digits, the last line of the file that "
+            "ur_calibration writes, or of the driver's message"
+        )
     shift = np.zeros(arm.n)
-    for k in (0, 3, 4, 5):  # the frames of the package lie that far along the axes
+    for k in (0, 3, 4):  # the frames of the package lie that far along the axes
         shift[k] = nominal.links[k + 1][2, 3]
+    turn, shift[-1] = twist_first(arm.links[-1])  # a turn about the last axis can be made before it
     lines = ["kinematics:"]
     for k, name in enumerate(UR_JOINTS):
         before = np.eye(4) if k == 0 else _along(-shift[k - 1])
-        xyz, rpy = _origin(before @ arm.links[k] @ _along(shift[k]))
+        after = _along(shift[k]) if k < arm.n - 1 else screw(turn, shift[k])
+        xyz, rpy = _origin(before @ arm.links[k] @ after)
         lines.append(f"  {name}:")
         keys = ("x", "y", "z", "roll", "pitch", "yaw")
-        lines += [f"    {key}: {v:.17g}" for key, v in zip(keys, (*xyz, *rpy), strict=True)]
-    digest = int.from_bytes(hashlib.sha256("\n".join(lines).encode()).digest()[:8])
-    lines.append(f"  hash: calib_{digest}")
-    return "\n".join(lines) + "\n", _along(-shift[-1]) @ arm.links[-1]
+        lines += [f"    {key}: {_yaml(v)}" for key, v in zip(keys, (*xyz, *rpy), strict=True)]
+    own = int.from_bytes(hashlib.sha256("\n".join(lines).encode()).digest()[:8])
+    lines.append(f"  hash: {digest or f'calib_{own}'}")
+    comment = [f"# {line}" for line in note.splitlines()]
+    return "\n".join([*comment, *lines]) + "\n", screw(-turn, -shift[-1]) @ arm.links[-1]
 
 
 def frames(calibration: Calibration, found: Corrected, beyond_flange: Floats | None) -> str:
     """Return the frames that a controller asks for, as JSON: x, y, z, rx, ry, rz in m and rad.
+
+    `tool_on_flange` and `base_in_tracker` are those of the corrected arm. A controller computes
+    with its own arm: its tool centre point and its base have the constant parts of the two ends
+    with them, which are under "controller", in m and, as PolyScope shows them, in mm.
 
     Args:
         calibration: the calibration.
@@ -94,21 +114,35 @@ def frames(calibration: Calibration, found: Corrected, beyond_flange: Floats | N
         beyond_flange: (4, 4) from the last frame of UR's kinematics file to the flange; None where
             that file is not written.
     """
-    tool = calibration.tool_pose()
+    tool, base = calibration.tool_pose(), calibration.base_in_tracker()
+    nominal, arm = calibration.model.cell.arm, found.arm
+    tcp = se3.inverse(nominal.links[-1]) @ arm.links[-1] @ tool
+    own_base = base @ arm.links[0] @ se3.inverse(nominal.links[0])
+    tracker = se3.inverse(own_base)
     document = {
-        "arm": calibration.model.cell.arm.name,
-        "tool_on_flange": _six(tool),
-        "base_in_tracker": _six(calibration.base_in_tracker()),
+        "arm": nominal.name,
+        "tool_on_flange": se3.six(tool),
+        "base_in_tracker": se3.six(base),
         "in_transforms": list(found.within),
         "not_in_transforms": list(found.beyond),
+        "controller": {
+            "tcp_m_rad": se3.six(tcp),
+            "tcp_mm_rad": _millimetres(tcp),
+            "urscript": f"set_tcp(p[{', '.join(f'{v:.9f}' for v in se3.six(tcp))}])",
+            "base_in_tracker_m_rad": se3.six(own_base),
+            "tracker_in_base_m_rad": se3.six(tracker),
+            "tracker_in_base_mm_rad": _millimetres(tracker),
+        },
     }
     if beyond_flange is not None:
-        document["tcp_for_ur_kinematics"] = _six(beyond_flange @ tool)
+        document["tcp_for_ur_kinematics"] = se3.six(beyond_flange @ tool)
     return json.dumps(document, indent=1) + "\n"
 
 
-def _six(pose: Floats) -> list[float]:
-    return [*pose[:3, 3].tolist(), *se3.rotation_vector(pose[:3, :3]).tolist()]
+def _millimetres(pose: Floats) -> list[float]:
+    """Position in mm to 0.1 nm and rotation vector in rad, as a person types them."""
+    values = se3.six(pose)
+    return [round(1e3 * v, 7) for v in values[:3]] + [round(v, 9) for v in values[3:]]
 
 
 def _along(z: float) -> Floats:
@@ -118,8 +152,21 @@ def _along(z: float) -> Floats:
 
 
 def _origin(place: Floats) -> tuple[Floats, Floats]:
-    """Position and fixed-axis roll, pitch, yaw of a pose (4, 4)."""
-    return place[:3, 3], Rotation.from_matrix(place[:3, :3]).as_euler("xyz")
+    """Position and fixed-axis roll, pitch, yaw of a pose (4, 4), exact also at pitch ±90°."""
+    r = place[:3, :3]
+    pitch = np.arctan2(-r[2, 0], np.hypot(r[0, 0], r[1, 0]))
+    roll = np.arctan2(r[2, 1], r[2, 2])
+    # The rest turns about z, whatever roll rounding chose.
+    rest = r @ Rotation.from_euler("xyz", [roll, pitch, 0.0]).as_matrix().T
+    yaw = np.arctan2(rest[1, 0] - rest[0, 1], rest[0, 0] + rest[1, 1])
+    return place[:3, 3], np.array([roll, pitch, yaw])
+
+
+def _yaml(value: float) -> str:
+    """Return a number with a point: readers of YAML 1.1 take 1e-05 for text."""
+    text = f"{value:.17g}"
+    mantissa, e, exponent = text.partition("e")
+    return text if "." in mantissa else f"{mantissa}.0{e}{exponent}"
 
 
 def _numbers(values: Floats) -> str:

@@ -97,7 +97,7 @@ COMMANDS = {
     ),
     "view": Command("refining:view", "Tell the story of the revisions in rerun."),
     "export": Command(
-        "tables:export", "Write readings and parameters as CSV, the calibration as JSON."
+        "exporting:export", "Hand over: readings, parameters, calibration, URDF, DH, frames."
     ),
     "effects": Command(
         "effects:effects",

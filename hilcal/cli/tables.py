@@ -1,7 +1,5 @@
-"""`import` and `export`: tables in, tables out."""
+"""`import`: tables in."""
 
-import csv
-from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,22 +7,14 @@ import numpy as np
 import typer
 from rich.padding import Padding
 
-from hilcal.calibration.calibration import Calibration
-from hilcal.calibration.corrected import corrected
-from hilcal.calibration.handover import frames as frames_file
-from hilcal.calibration.handover import ur_kinematics as ur_kinematics_file
-from hilcal.calibration.handover import urdf as urdf_file
-from hilcal.campaign import Campaign
 from hilcal.cell import Cell, cell_from_config
-from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.previewing import show_preview
-from hilcal.cli.terminal import Json, Revision, Run, terminal
+from hilcal.cli.terminal import Json, terminal
 from hilcal.config import load_config
 from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.covariance import COVERS
 from hilcal.data.importing import import_readings
 from hilcal.data.readings import Readings
-from hilcal.data.table import write_table
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify import description_words, frames_document
 from hilcal.identify.full_covariance import covariance_parts
@@ -162,111 +152,3 @@ def _targets(cell: Cell, readings: Readings) -> list[dict[str, Any]]:
         {"name": name, "n_readings": int(count[k]), "known": known[k]}
         for k, name in enumerate(readings.target_names)
     ]
-
-
-def export(
-    run: Run,
-    table: Annotated[
-        Path | None, typer.Option("--table", metavar="F.csv", help="The readings, SI units.")
-    ] = None,
-    parameters: Annotated[
-        Path | None,
-        typer.Option("--parameters", metavar="F.csv", help="Parameters of the model."),
-    ] = None,
-    calibration: Annotated[
-        Path | None,
-        typer.Option(
-            "--calibration",
-            metavar="F.json",
-            help="The identified arm, ready for compensate on any machine.",
-        ),
-    ] = None,
-    urdf: Annotated[
-        Path | None,
-        typer.Option("--urdf", metavar="F.urdf", help="The arm with its corrected geometry."),
-    ] = None,
-    ur_kinematics: Annotated[
-        Path | None,
-        typer.Option("--ur-kinematics", metavar="F.yaml", help="The same for UR's ROS driver."),
-    ] = None,
-    frames: Annotated[
-        Path | None,
-        typer.Option("--frames", metavar="F.json", help="Tool and base as fitted, m and rad."),
-    ] = None,
-    revision: Revision = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
-    effects_from: EffectsFrom = None,
-    as_json: Json = False,
-) -> None:
-    """Write readings and parameters as CSV, the calibration as JSON."""
-    t = terminal(as_json)
-    geometry = {"urdf": urdf, "ur-kinematics": ur_kinematics, "frames": frames}
-    of_model = [parameters, calibration, *geometry.values()]
-    wanted = [path for path in (table, *of_model) if path is not None]
-    if not wanted:
-        raise InputError(
-            "nothing to export; give --table F.csv, --parameters F.csv, --calibration F.json, "
-            "--urdf F.urdf, --ur-kinematics F.yaml or --frames F.json"
-        )
-    for path in wanted:
-        if path.exists() and not force:
-            raise InputError(f"{path}: the file exists; choose another name or give --force")
-    if revision is not None and not any(of_model):
-        raise InputError("--revision is about the model; give --parameters or --calibration, too")
-    with Campaign.open(run, catalogue_with(effects_from), read_only=True) as opened_run:
-        record = opened_run.in_use(revision)
-        if parameters is not None and record is None:
-            raise InputError(f"{run}: no revision yet, so no parameters; run hilcal identify first")
-        if table is not None:
-            write_table(opened_run.readings, table, opened_run.covers)
-            t.show(f"{table}: {len(opened_run.readings)} readings")
-        if parameters is not None and record is not None:
-            rows = record.result_json["identify"]["parameters"]
-            _write_parameters(parameters, rows)
-            t.show(f"{parameters}: {len(rows)} parameters of revision {record.number}")
-        if calibration is not None or any(geometry.values()):
-            with working(t.progress) as say:
-                say("restoring the fit, and what it knows of other readings")
-                found = opened_run.calibration(revision)
-            if calibration is not None:
-                found.save(calibration)
-                t.show(f"{calibration}: the calibration of revision {found.source['revision']}")
-            t.show(_write_geometry(found, geometry))
-    t.document({"written": [str(path) for path in wanted]})
-
-
-def _write_geometry(found: Calibration, wanted: Mapping[str, Path | None]) -> Iterator[str]:
-    """Write the corrected geometry in the forms that are wanted; yields what was written."""
-    paths = {form: path for form, path in wanted.items() if path is not None}
-    if not paths:
-        return
-    arm = corrected(found)
-    nominal, beyond = found.model.cell.arm, None
-    note = f"{nominal.name} as calibrated with hilcal, {found.source['campaign']}"
-    texts = {}
-    if "ur-kinematics" in paths:
-        texts["ur-kinematics"], beyond = ur_kinematics_file(nominal, arm.arm)
-    if "urdf" in paths:
-        texts["urdf"] = urdf_file(arm.arm, note)
-    if "frames" in paths:
-        texts["frames"] = frames_file(found, arm, beyond)
-    for form, path in paths.items():
-        try:
-            path.write_text(texts[form], encoding="utf-8")
-        except OSError as e:
-            raise InputError(f"{path}: cannot be written ({e.strerror})") from None
-        yield f"{path}: {form} with {', '.join(arm.within) or 'the nominal geometry'}"
-    if arm.beyond:
-        yield f"Not in it, since not constant: {', '.join(arm.beyond)}; hilcal compensate has it"
-
-
-def _write_parameters(path: Path, rows: Sequence[dict[str, object]]) -> None:
-    names = ("name", "value", "std", "unit", "identifiable")
-    try:
-        with path.open("w", encoding="utf-8", newline="") as stream:
-            out = csv.writer(stream, lineterminator="\n")
-            out.writerow(names)
-            for row in rows:
-                out.writerow("" if row[k] is None else row[k] for k in names)
-    except OSError as e:
-        raise InputError(f"{path}: cannot be written ({e.strerror})") from e

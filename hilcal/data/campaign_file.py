@@ -178,7 +178,12 @@ class CampaignFile:
             return self.insert(readings)
 
     def insert(self, readings: Readings) -> int:
-        """Do the same inside a transaction that the caller has begun."""
+        """Do the same inside a transaction that the caller has begun.
+
+        Covariances are stored exactly symmetric, as tables hold them, whatever rounding made them.
+        """
+        cov = readings.covariance
+        readings = replace(readings, covariance=0.5 * (cov + np.swapaxes(cov, -1, -2)))
         if len(readings):
             self._claim_layout(layout_of(readings))
             readings = self._numbered_targets(readings)

@@ -35,6 +35,8 @@ INSTRUMENT = "instrument"
 """They cover the instrument alone, not the arm's repeatability."""
 WHOLE = "instrument+arm"
 """They include the arm's repeatability."""
+ROUNDING = "+rounding"
+"""End of either word in a table, where the covariances also include the rounding of positions."""
 PRIOR_REPEATS = 20.0
 """ν0: how many repeats the stated covariance is worth as a prior; a guess, no study set it."""
 

@@ -1,20 +1,19 @@
-"""The exchange table: readings as CSV, one row per reading."""
+"""The exchange table: readings as CSV or Parquet, one row per reading."""
 
-import csv
-import os
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from hilcal.data import checks, columns
-from hilcal.data.covariance import INSTRUMENT, WHOLE, TrackerNoise, tracker_covariance
+from hilcal.data.covariance import INSTRUMENT, ROUNDING, WHOLE, TrackerNoise, tracker_covariance
 from hilcal.data.csvfile import CsvTable, read_columns
 from hilcal.data.following import following_columns, with_following
 from hilcal.data.imported import ImportResult
 from hilcal.data.readings import Readings, States
 from hilcal.data.stated_noise import LEAST, floored, rounding_variance, with_rounding
+from hilcal.data.tabular import Column, is_parquet, read_parquet, write_columns
 from hilcal.errors import InputError
 from hilcal.robot.arm import Arm
 from hilcal.toml import suggest
@@ -35,7 +34,7 @@ def read_table(
     """Read an exchange table; every unit is SI, every complaint names row and column.
 
     Args:
-        path: a CSV file with the columns of `columns.known_columns`.
+        path: a CSV or Parquet file with the columns of `columns.known_columns`.
         arm: its number of joints, their limits and its reach are checked.
         noise: gives the covariances where the table has none.
         station: (3,) where the tracker's beam starts, m; the origin where None.
@@ -62,7 +61,9 @@ def import_table(
     Raises:
         InputError: anything that cannot be right.
     """
-    table = read_columns(path, lambda header: _choose(str(path), header, arm))
+    path = Path(path)
+    read = read_parquet if is_parquet(path) else read_columns
+    table = read(path, lambda header: _choose(str(path), header, arm))
     return readings_of(table, arm, noise, station, targets=targets)
 
 
@@ -113,8 +114,9 @@ def readings_of(
         spec = _instrument(table, value, noise, station) if tiny and noise is not None else None
         cov, notes = floored(table, stated, spec)
         notes = (FROM_TABLE, *notes)
+    covers, included = (INSTRUMENT, False) if stated is None else _covers(table)
     if rounding is None:
-        rounding = rounding_variance(value[:, :3], 1.0)
+        rounding = np.zeros(3) if included else rounding_variance(value[:, :3], 1.0)
     cov, rounded = with_rounding(cov, rounding)
     readings = Readings(
         states=states,
@@ -127,7 +129,6 @@ def readings_of(
         pose_names=tuple(pose_names),
         target_names=() if target is None else tuple(targets),
     )
-    covers = INSTRUMENT if stated is None else _covers(table)
     return ImportResult(readings, (*notes, *rounded), covers)
 
 
@@ -195,25 +196,28 @@ def _targets(table: CsvTable, names: Sequence[str]) -> Ints | None:
     return np.array([names.index(name) for name in given], dtype=np.int64)
 
 
-def _covers(table: CsvTable) -> str:
-    """What the table's covariances cover, by its column `covers`; the instrument where absent.
+def _covers(table: CsvTable) -> tuple[str, bool]:
+    """What the table's covariances cover, by its column `covers`, and whether rounding, too.
+
+    Without the column it is the instrument.
 
     Raises:
         InputError: another word, or not the same one in all rows.
     """
     given = table.text.get(columns.COVERS, [INSTRUMENT])
     for k, word in enumerate(given):
-        if word not in (INSTRUMENT, WHOLE):
+        if word.removesuffix(ROUNDING) not in (INSTRUMENT, WHOLE):
             raise InputError(
                 f"{table.at(k, columns.COVERS)}: {word!r} is unknown; valid: {INSTRUMENT} (the "
-                f"covariance of the tracker), {WHOLE} (the arm's repeatability is in it)"
+                f"covariance of the tracker), {WHOLE} (the arm's repeatability is in it), each "
+                f"with {ROUNDING} where the rounding of the positions is in it"
             )
         if word != given[0]:
             raise InputError(
                 f"{table.at(k, columns.COVERS)}: {word}, but {given[0]} in the first row; all "
                 "rows must say the same"
             )
-    return given[0]
+    return given[0].removesuffix(ROUNDING), given[0].endswith(ROUNDING)
 
 
 def _states(table: CsvTable, arm: Arm) -> States:
@@ -305,35 +309,45 @@ def _instrument(
     return tracker_covariance(value[:, :3], noise, origin, m)
 
 
-def write_table(readings: Readings, path: str | Path, covers: str = INSTRUMENT) -> None:
-    """Write an exchange table that `read_table` reads back exactly (shortest exact decimals).
+def write_table(
+    readings: Readings,
+    path: str | Path,
+    covers: str = INSTRUMENT,
+    about: Mapping[str, object] | None = None,
+) -> None:
+    """Write an exchange table that `read_table` reads back exactly: CSV, or Parquet by its name.
 
     Args:
         readings: the readings.
-        path: the file.
-        covers: what their covariances cover, see `data.covariance`.
+        path: the file; CSV unless it ends in .parquet.
+        covers: what their covariances cover, see `data.covariance` and `with_what_rounding_does`.
+        about: further metadata of a Parquet file.
 
     Raises:
-        InputError: a name that a table cannot hold, or the file cannot be written.
+        InputError: a name that a table cannot hold, no pyarrow, or the file cannot be written.
     """
-    text = [_names(readings.pose_names, readings.pose, "pose")]
-    text.append(_names(readings.load_names, readings.load, "load"))
-    text_names: tuple[str, ...] = columns.TEXT
+    path = Path(path)
+    found: dict[str, Column] = {
+        "pose": _names(readings.pose_names, readings.pose, "pose"),
+        "load": _names(readings.load_names, readings.load, "load"),
+    }
     if readings.states.target is not None:
-        text.append(_names(readings.target_names, readings.target, columns.TARGET))
-        text_names = (*text_names, columns.TARGET)
+        found[columns.TARGET] = _names(readings.target_names, readings.target, columns.TARGET)
     if covers != INSTRUMENT:
-        text.append([covers] * len(readings))
-        text_names = (*text_names, columns.COVERS)
+        found[columns.COVERS] = [covers] * len(readings)
     header, numbers = _number_columns(readings)
-    cells = [list(map(repr, column.tolist())) for column in numbers]
-    _write(
-        Path(path),
-        lambda out: (
-            out.writerow((*text_names, *header)),
-            out.writerows(zip(*text, *cells, strict=True)),
-        ),
-    )
+    found |= zip(header, numbers, strict=True)
+    write_columns(path, found, {"table": "readings", "covers": covers, **(about or {})})
+
+
+def with_what_rounding_does(covers: str, readings: Readings) -> str:
+    """Return what complete covariances cover, as the column of that name says it.
+
+    Where reading a table would add the variance of the positions' rounding, it says that this is in
+    them already.
+    """
+    rounding = rounding_variance(readings.value[:, :3], 1.0)
+    return covers + ROUNDING * bool(with_rounding(readings.covariance, rounding)[1])
 
 
 def _names(names: Sequence[str], index: Ints, what: str) -> list[str]:
@@ -358,7 +372,7 @@ def _number_columns(readings: Readings) -> tuple[list[str], list[Floats | Ints]]
         (columns.joint_columns(n), s.q),
         ((columns.POSITION + columns.ROTATION)[:m], readings.value),
         (columns.covariance_columns(m), readings.covariance[:, i, j]),
-        (columns.WRENCH, s.wrench if np.any(s.wrench) else None),
+        (columns.WRENCH, s.wrench if np.any(s.wrench) or np.signbit(s.wrench).any() else None),
         (("time_s",), s.time),
         (("load_time_s",), s.load_time),
         (("air_degC",), s.air_temperature),
@@ -373,15 +387,3 @@ def _number_columns(readings: Readings) -> tuple[list[str], list[Floats | Ints]]
             header += names
             numbers += list(block.reshape(len(readings), len(names)).T)
     return header, numbers
-
-
-def _write(path: Path, rows: Callable[..., object]) -> None:
-    """Write a CSV file; a file of that name is replaced when the new one is complete."""
-    new = path.with_name(f".{path.name}.new")
-    try:
-        with new.open("w", encoding="utf-8", newline="") as stream:
-            rows(csv.writer(stream, lineterminator="\n"))
-        os.replace(new, path)
-    except (OSError, UnicodeEncodeError) as e:
-        new.unlink(missing_ok=True)
-        raise InputError(f"{path}: cannot be written ({e})") from e

@@ -84,16 +84,7 @@ class Fit:
     @cached_property
     def holdout(self) -> ErrorBlock:
         """Error block of whole poses left out."""
-        raw, w = _with_outliers(self)
-        if w is self.whitening:
-            return error_block(self.left_out, w)
-        place = {
-            int(r): i for i, r in enumerate(np.flatnonzero(~self.outlier)[self.whitening.reading])
-        }
-        for i, r in enumerate(w.reading):
-            if int(r) in place:
-                raw[i] = self.left_out[place[int(r)]]
-        return error_block(raw, w)
+        return error_block(*all_left_out(self))
 
     @cached_property
     def uncertainty(self) -> Uncertainty:
@@ -297,10 +288,10 @@ def _assemble(
         dof=max(w.rank - solution.effective, 1.0),
         error=error_block(raw, w),
     )
-    return replace(found, error=error_block(*_with_outliers(found))) if outlier.any() else found
+    return replace(found, error=error_block(*with_outliers(found))) if outlier.any() else found
 
 
-def _with_outliers(of: Fit) -> tuple[Floats, Whitening]:
+def with_outliers(of: Fit) -> tuple[Floats, Whitening]:
     """Residual of all readings, and their gc-scaling; of the fitted ones where they are all.
 
     Readings that were set aside count in the errors: they are data, and took no part in the fit.
@@ -310,3 +301,16 @@ def _with_outliers(of: Fit) -> tuple[Floats, Whitening]:
     w = whitening(of.readings, of.mode, "gc")
     prediction = of.model.predict(of.readings.states, of.theta)
     return residual(of.readings, prediction, w), w
+
+
+def all_left_out(of: Fit) -> tuple[Floats, Whitening]:
+    """The same of the residual predicted without the pose of each measurement."""
+    raw, w = with_outliers(of)
+    if w is of.whitening:
+        return of.left_out, w
+    place = {int(r): i for i, r in enumerate(np.flatnonzero(~of.outlier)[of.whitening.reading])}
+    raw = raw.copy()
+    for i, r in enumerate(w.reading):
+        if int(r) in place:
+            raw[i] = of.left_out[place[int(r)]]
+    return raw, w

@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 
 from hilcal.config.joints import Conventions
 from hilcal.errors import InputError
+from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.robot.conventions import as_counted
 from hilcal.toml import NonNegative, Number, Positive, Section, Vector3, load_section
@@ -17,6 +18,8 @@ from hilcal.types import Floats
 
 _LENGTH = "a finite number in m"
 _ANGLE = "a finite number in degrees"
+_POSE = "six finite numbers: x, y, z in m and a rotation vector in rad"
+Pose = tuple[Number, Number, Number, Number, Number, Number]
 
 
 class JointRow(Section):
@@ -57,6 +60,8 @@ class DhTable(Conventions):
     convention: Literal["standard", "modified"] = Field(
         "standard", description='"standard" (classic rows) or "modified" (Craig\'s rows)'
     )
+    base_m_rad: Pose | None = Field(None, description=_POSE)
+    flange_m_rad: Pose | None = Field(None, description=_POSE)
     joints: tuple[JointRow, ...] = Field(min_length=1, description="sections [[joints]], in order")
 
 
@@ -72,6 +77,8 @@ def arm_from_dh(path: Path) -> Arm:
     L_0 = Rx(alpha_1) Tx(a_1) Rz(offset_1), L_i = Tz(d_i) Rx(alpha_{i+1}) Tx(a_{i+1})
     Rz(offset_{i+1}), L_n = Tz(d_n); in the body frame centres of mass are Tz(d) com.
 
+    With `base_m_rad` = B and `flange_m_rad` = E, as calibrated arms have, T_base_flange = B Π … E.
+
     Raises:
         InputError: unreadable file, unknown or missing key, bad value.
     """
@@ -86,6 +93,10 @@ def arm_from_dh(path: Path) -> Arm:
     links = _links([a @ b for a, b in zip(fixed, after, strict=True)], offsets)
     if table.convention == "modified":
         links[0] = turns[0] @ links[0]
+    if table.base_m_rad is not None:
+        links[0] = se3.of_six(table.base_m_rad) @ links[0]
+    if table.flange_m_rad is not None:
+        links[-1] = links[-1] @ se3.of_six(table.flange_m_rad)
     coms = [f[:3, :3] @ row.com_m + f[:3, 3] for f, row in zip(fixed, rows, strict=True)]
     arm = Arm(
         name=path.stem,

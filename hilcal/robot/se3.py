@@ -11,6 +11,7 @@ Source of the closed forms: Lynch and Park, *Modern Robotics*, chapter 3; Barfoo
 *State Estimation for Robotics*, section 7.1.
 """
 
+from collections.abc import Sequence
 from math import factorial
 
 import numpy as np
@@ -99,6 +100,17 @@ def inverse(t: Floats) -> Floats:
     """Inverse of a homogeneous rigid transform (..., 4, 4)."""
     r = np.swapaxes(t[..., :3, :3], -1, -2)
     return matrix(r, -(r @ t[..., :3, 3, None])[..., 0])
+
+
+def six(t: Floats) -> list[float]:
+    """x, y, z and rotation vector of a pose (4, 4), m and rad, as UR's controller writes poses."""
+    return [*t[:3, 3].tolist(), *rotation_vector(t[:3, :3]).tolist()]
+
+
+def of_six(values: Sequence[float]) -> Floats:
+    """Pose (4, 4) of what `six` returns."""
+    given = np.asarray(values, dtype=float)
+    return matrix(rotation(given[3:]), given[:3])
 
 
 def adjoint(r: Floats, p: Floats) -> Floats:

@@ -1,0 +1,347 @@
+"""`export`: a campaign and what was identified, for other programs, controllers and people."""
+
+import csv
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tomli_w
+import typer
+
+from hilcal.calibration import dh_table, handover
+from hilcal.calibration.calibration import Calibration
+from hilcal.calibration.corrected import Corrected, corrected
+from hilcal.campaign import Campaign
+from hilcal.cli.effects_from import EffectsFrom, catalogue_with
+from hilcal.cli.terminal import Json, Revision, Run, Terminal, terminal
+from hilcal.data.covariance import INSTRUMENT
+from hilcal.data.revision_table import revision_table
+from hilcal.data.table import with_what_rounding_does, write_table
+from hilcal.data.tabular import check_suffix, write_columns
+from hilcal.errors import InputError
+from hilcal.identify import parameters_document
+from hilcal.identify.residual_table import residual_table
+from hilcal.report.numbers import length
+from hilcal.report.progress import Say, working
+
+MANY = 10.0
+"""m; a distance along a joint's axis beyond which it is said that it cancels with others."""
+
+
+def _file(metavar: str, words: str) -> typer.models.OptionInfo:
+    found: typer.models.OptionInfo = typer.Option(metavar=metavar, help=words)
+    return found
+
+
+def export(
+    run: Run,
+    readings: Annotated[
+        Path | None, _file("F.csv|F.parquet", "The readings as stored, to be imported again.")
+    ] = None,
+    table: Annotated[
+        Path | None,
+        _file("F.csv|F.parquet", "The same with the arm's scatter in their covariance."),
+    ] = None,
+    cell: Annotated[
+        Path | None, _file("CELL.toml", "The cell's configuration, for --readings.")
+    ] = None,
+    residuals: Annotated[
+        Path | None,
+        _file("F.csv|F.parquet", "Residuals of the fit and on poses left out, one row a reading."),
+    ] = None,
+    revisions: Annotated[
+        Path | None, _file("F.csv|F.parquet", "All revisions: model, errors, verdict.")
+    ] = None,
+    parameters: Annotated[
+        Path | None,
+        _file("F.json|F.csv", "Parameters of the model; in JSON with their covariance."),
+    ] = None,
+    calibration: Annotated[
+        Path | None, _file("F.json", "The identified arm, ready for compensate on any machine.")
+    ] = None,
+    urdf: Annotated[Path | None, _file("F.urdf", "The arm with its corrected geometry.")] = None,
+    dh: Annotated[Path | None, _file("F.toml|F.csv", "The same as a DH table.")] = None,
+    modified: Annotated[
+        bool, typer.Option("--dh-modified", help="Rows of --dh as Craig writes them.")
+    ] = False,
+    ur_kinematics: Annotated[
+        Path | None, _file("F.yaml", "The same for UR's ROS driver: kinematics_params_file.")
+    ] = None,
+    ur_hash: Annotated[
+        str | None,
+        _file(
+            "calib_N", "The connected arm's hash, so that the driver takes the file for its own."
+        ),
+    ] = None,
+    frames: Annotated[
+        Path | None, _file("F.json", "Tool and base as fitted, and as a controller takes them.")
+    ] = None,
+    revision: Revision = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
+    effects_from: EffectsFrom = None,
+    as_json: Json = False,
+) -> None:
+    """Hand over: readings, parameters, calibration, URDF, DH, frames."""
+    t = terminal(as_json)
+    geometry = Geometry(urdf, dh, modified, ur_kinematics, ur_hash, frames)
+    data = [path for path in (readings, table, cell, revisions) if path is not None]
+    of_model = [residuals, parameters, calibration, *geometry.paths]
+    wanted = [*data, *(path for path in of_model if path is not None)]
+    _check(wanted, (readings, table, residuals, revisions), parameters, geometry, force)
+    if revision is not None and not any(of_model):
+        raise InputError("--revision is about the model; give --parameters or --calibration, too")
+    with Campaign.open(run, catalogue_with(effects_from), read_only=True) as opened:
+        record = opened.in_use(revision)
+        if record is None and (any(of_model) or revisions is not None):
+            raise InputError(f"{run}: no revision yet, so nothing of it; run hilcal identify first")
+        _write_data(t, opened, readings, table, cell)
+        if revisions is not None and record is not None:
+            records = opened.file.revisions()
+            about = {"table": "revisions", "campaign": run.name}
+            write_columns(revisions, revision_table(records, record.number), about)
+            t.show(f"{revisions}: {len(records)} revisions; {record.number} is in use")
+        if record is not None and any(of_model):
+            with working(t.progress) as say:
+                _write_model(t, say, opened, revision, residuals, parameters, calibration, geometry)
+    t.document({"written": [str(path) for path in wanted]})
+
+
+@dataclass(frozen=True, slots=True)
+class Geometry:
+    """Forms of the corrected geometry that are wanted."""
+
+    urdf: Path | None
+    dh: Path | None
+    modified: bool
+    ur_kinematics: Path | None
+    ur_hash: str | None
+    frames: Path | None
+
+    @property
+    def paths(self) -> list[Path]:
+        """Files that are wanted."""
+        every = (self.urdf, self.dh, self.ur_kinematics, self.frames)
+        return [path for path in every if path is not None]
+
+
+def _check(
+    wanted: Sequence[Path],
+    tables: Sequence[Path | None],
+    parameters: Path | None,
+    geometry: Geometry,
+    force: bool,
+) -> None:
+    """Refuse what cannot be written, before anything is computed."""
+    if not wanted:
+        raise InputError(
+            "nothing to export; give --readings, --table, --residuals or --revisions F.csv or "
+            "F.parquet, --cell CELL.toml, --parameters F.json, --calibration F.json, "
+            "--urdf F.urdf, --dh F.toml, --ur-kinematics F.yaml or --frames F.json"
+        )
+    for path in tables:
+        if path is not None:
+            check_suffix(path)
+    for given, option, valid in (
+        (parameters, "--parameters", (".json", ".csv")),
+        (geometry.dh, "--dh", (".toml", ".csv")),
+    ):
+        if given is not None and given.suffix.lower() not in valid:
+            raise InputError(f"{option} {given}: unknown kind of file; valid: {' or '.join(valid)}")
+    for what, option, needs in (
+        (geometry.modified and geometry.dh is None, "--dh-modified", "--dh"),
+        (geometry.ur_hash and geometry.ur_kinematics is None, "--ur-hash", "--ur-kinematics"),
+    ):
+        if what:
+            raise InputError(f"{option} is about {needs}; give it, too")
+    twice = [path for path in wanted if wanted.count(path) > 1]
+    if twice:
+        raise InputError(f"{twice[0]}: two things cannot be written to one file")
+    for path in wanted:
+        if path.exists() and not force:
+            raise InputError(f"{path}: the file exists; choose another name or give --force")
+
+
+def _write_data(
+    t: Terminal, run: Campaign, readings: Path | None, table: Path | None, cell: Path | None
+) -> None:
+    """Write readings and configuration."""
+    about = {"campaign": run.path.name, "source": run.file.source, "robot": run.cell.arm.name}
+    if readings is not None:
+        stored = run.file.readings()
+        covers = run.stored_covers
+        about["readings_sha256"] = run.file.data_hash()
+        write_table(stored, readings, with_what_rounding_does(covers, stored), about)
+        with_arm = "" if covers == INSTRUMENT else ", the arm's scatter in their covariance"
+        t.show(f"{readings}: {len(stored)} readings as stored{with_arm}")
+    if table is not None:
+        full = run.readings
+        write_table(full, table, with_what_rounding_does(run.covers, full), about)
+        t.show(f"{table}: {len(run.readings)} readings, covariance: {run.covariance_parts}")
+    if cell is not None:
+        _text(cell, cell_toml(run))
+        t.show(f"{cell}: the cell's configuration")
+
+
+def cell_toml(run: Campaign) -> str:
+    """Return the configuration that a campaign was measured with, as CELL.toml.
+
+    The file of a robot that is not of the catalogue is named by its whole path.
+    """
+    content = run.config.model_dump(mode="json", exclude_none=True)
+    robot = Path(run.file.base_dir) / run.config.robot.model
+    if robot.suffix:
+        content["robot"]["model"] = str(robot)
+    return f"# The cell of {run.path.name}, every key written out.\n{tomli_w.dumps(content)}"
+
+
+def _write_model(
+    t: Terminal,
+    say: Say,
+    run: Campaign,
+    revision: int | None,
+    residuals: Path | None,
+    parameters: Path | None,
+    calibration: Path | None,
+    geometry: Geometry,
+) -> None:
+    """Write what was identified."""
+    record = run.in_use(revision)
+    number = 0 if record is None else record.number
+    source: dict[str, object] = {"campaign": run.path.name, "revision": number}
+    if record is not None:
+        source["readings_sha256"] = record.data_hash
+    if parameters is not None and parameters.suffix.lower() == ".csv" and record is not None:
+        rows = record.result_json["identify"]["parameters"]
+        _write_parameters(parameters, rows)
+        t.show(f"{parameters}: {len(rows)} parameters of revision {number}")
+        parameters = None
+    if residuals is not None or parameters is not None:
+        say("restoring the fit")
+        fitted = run.fit(revision)
+        if parameters is not None:
+            say("computing uncertainties")
+            found = parameters_document.to_json(fitted, source)
+            _text(parameters, json.dumps(found, indent=1, allow_nan=False) + "\n")
+            known, every = found["covariance_of"], found["parameters"]
+            t.show(
+                f"{parameters}: {_count(every)} parameters of revision {number}, covariance of the "
+                f"{_count(known)} that the readings determine"
+            )
+        if residuals is not None:
+            say("predicting poses left out")
+            write_columns(residuals, residual_table(fitted), {"table": "residuals", **source})
+            kind = "deflections" if fitted.mode == "deflection" else "readings"
+            t.show(
+                f"{residuals}: measured − predicted of {len(fitted.raw)} fitted {kind}, revision "
+                f"{number}"
+            )
+    if calibration is None and not geometry.paths:
+        return
+    say("restoring the fit, and what it knows of other readings")
+    identified = run.calibration(revision)
+    if calibration is not None:
+        identified.save(calibration)
+        t.show(f"{calibration}: the calibration of revision {number}")
+    t.show(_write_geometry(identified, geometry))
+
+
+def _count(rows: object) -> int:
+    return len(rows) if isinstance(rows, list) else 0
+
+
+def _write_geometry(found: Calibration, wanted: Geometry) -> Iterator[str]:
+    """Write the corrected geometry in the forms that are wanted; yields what was written."""
+    if not wanted.paths:
+        return
+    arm = corrected(found)
+    nominal, beyond = found.model.cell.arm, None
+    note = f"{nominal.name} as calibrated with hilcal, {found.source['campaign']}"
+    holds = ", ".join(arm.within) or "the nominal geometry"
+    said: list[str] = []
+    write: list[Callable[[], object]] = []
+
+    def later(path: Path, text: str) -> None:
+        write.append(lambda: _text(path, text))
+
+    if wanted.ur_kinematics is not None:
+        words = _ur_note(note, arm, wanted.ur_hash)
+        text, beyond = handover.ur_kinematics(nominal, arm.arm, words, wanted.ur_hash)
+        later(wanted.ur_kinematics, text)
+        tilt = length(float(abs(beyond[:3, 3]).max()))
+        said.append(
+            f"{wanted.ur_kinematics}: kinematics_params_file of UR's ROS driver with {holds}; the "
+            f"flange's own shift ({tilt}) and tilt are in tcp_for_ur_kinematics of --frames"
+        )
+    if wanted.urdf is not None:
+        later(wanted.urdf, handover.urdf(arm.arm, note))
+        said.append(f"{wanted.urdf}: URDF, base_link to tool0, with {holds}")
+    if wanted.dh is not None:
+        rows = dh_table.dh_rows(arm.arm, "modified" if wanted.modified else "standard")
+        csv_rows = wanted.dh.suffix.lower() == ".csv"
+        text = (
+            dh_table.to_csv(rows, arm.arm)
+            if csv_rows
+            else dh_table.to_toml(rows, arm.arm, f"{note}, revision {found.source['revision']}")
+        )
+        later(wanted.dh, text)
+        said += _dh_words(wanted.dh, rows, holds, csv_rows)
+    if wanted.frames is not None:
+        later(wanted.frames, handover.frames(found, arm, beyond))
+        said.append(f"{wanted.frames}: tool and base, as fitted and as a controller takes them")
+    for each in write:
+        each()
+    yield from said
+    if arm.beyond:
+        yield f"Not in it, since not constant: {', '.join(arm.beyond)}; hilcal compensate have it"
+
+
+def _ur_note(note: str, arm: Corrected, digest: str | None) -> str:
+    lines = [f"{note}; for kinematics_params_file of ur_robot_driver."]
+    if arm.beyond:
+        lines.append(f"Not in it, since not constant: {', '.join(arm.beyond)}.")
+    if digest is None:
+        lines += [
+            "The hash is of this file. The driver logs that it is not that of the connected arm's",
+            "factory calibration, and goes on; --ur-hash takes the arm's.",
+        ]
+    return "\n".join(lines)
+
+
+def _dh_words(path: Path, rows: dh_table.DhRows, holds: str, alone: bool) -> Iterator[str]:
+    """Yield what a table holds, and what it does not."""
+    yield f"{path}: {rows.convention} DH rows with {holds}"
+    if max(rows.base_moves, rows.flange_moves) > dh_table.EXACT:
+        parts = (
+            f"where joint 1's axis lies in the base (up to {length(rows.base_moves)} at the flange)"
+            f" and how the flange sits on the last axis (up to {length(rows.flange_moves)})"
+        )
+        where = "they are left out" if alone else "base_m_rad and flange_m_rad of the file hold it"
+        yield f"A DH table has no place for {parts}; {where}."
+    elif rows.disagreement <= dh_table.EXACT:
+        yield "Forward kinematics of the rows is that of the corrected arm, to 1 nm."
+    far = abs(rows.d).max()
+    if far > MANY:
+        yield (
+            f"Nearly parallel axes have distant common normals: d up to {far:.0f} m, which cancel."
+        )
+
+
+def _write_parameters(path: Path, rows: Sequence[dict[str, object]]) -> None:
+    names = ("name", "value", "std", "unit", "identifiable")
+    try:
+        with path.open("w", encoding="utf-8", newline="") as stream:
+            out = csv.writer(stream, lineterminator="\n")
+            out.writerow(names)
+            for row in rows:
+                out.writerow("" if row[k] is None else row[k] for k in names)
+    except OSError as e:
+        raise InputError(f"{path}: cannot be written ({e.strerror})") from e
+
+
+def _text(path: Path, text: str) -> None:
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as e:
+        raise InputError(f"{path}: cannot be written ({e.strerror})") from None

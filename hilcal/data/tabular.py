@@ -1,0 +1,168 @@
+"""Columns to a file, CSV or Parquet by the name's ending, and columns of a Parquet file.
+
+Numbers keep every bit: CSV has the shortest decimals that are read back exactly, Parquet the
+doubles themselves. A unit is the end of its column's name; in Parquet it is also in the field's
+metadata, and what the table is about is in the schema's, as JSON under the key `hilcal`.
+"""
+
+import csv
+import json
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hilcal.data.csvfile import CsvTable
+from hilcal.errors import InputError
+from hilcal.types import Floats
+
+UNITS = ("m2", "rad2", "m", "rad", "N", "Nm", "s", "degC")
+"""Ends of names that are units."""
+KEY = b"hilcal"
+SUFFIXES = (".csv", ".parquet")
+MAGIC = b"PAR1"
+
+Column = Sequence[object] | np.ndarray
+"""Numbers, or words; None for a cell without a value."""
+
+
+def check_suffix(path: Path) -> None:
+    """Refuse names of other kinds of files.
+
+    Raises:
+        InputError: names the valid ones.
+    """
+    if path.suffix.lower() not in SUFFIXES:
+        raise InputError(f"{path}: unknown kind of table; valid: {' or '.join(SUFFIXES)}")
+
+
+def write_columns(path: Path, columns: Mapping[str, Column], about: Mapping[str, object]) -> None:
+    """Write columns of equal length; a file of that name is replaced when the new one is complete.
+
+    Args:
+        path: ends in .csv or .parquet.
+        columns: by name.
+        about: what the table is about, for the metadata of Parquet; CSV has no place for it.
+
+    Raises:
+        InputError: another ending, no pyarrow for Parquet, or the file cannot be written.
+    """
+    check_suffix(path)
+    plain = {k: v.tolist() if isinstance(v, np.ndarray) else list(v) for k, v in columns.items()}
+    if path.suffix.lower() == ".parquet":
+        table = _arrow(path, plain, about)
+        parquet = _pyarrow(path, "pyarrow.parquet")
+        _replaced(path, lambda new: parquet.write_table(table, new))
+        return
+
+    def write(new: Path) -> None:
+        with new.open("w", encoding="utf-8", newline="") as stream:
+            out = csv.writer(stream, lineterminator="\n")
+            out.writerow(plain)
+            cells = [[_cell(v) for v in values] for values in plain.values()]
+            out.writerows(zip(*cells, strict=True))
+
+    _replaced(path, write)
+
+
+def read_parquet(
+    path: Path, choose: Callable[[list[str]], tuple[Sequence[str], Sequence[str]]]
+) -> CsvTable:
+    """Read columns of a Parquet file; rows count from 1.
+
+    Args:
+        path: the file.
+        choose: checks the names and returns those of text and of number columns to keep.
+
+    Raises:
+        InputError: no pyarrow, a damaged file, a cell without a value or of another kind.
+    """
+    parquet = _pyarrow(path, "pyarrow.parquet")
+    try:
+        found = parquet.read_table(path)
+    except Exception as e:  # what a reader makes of a damaged file is not documented
+        words = " ".join(str(e).split())[:80]
+        raise InputError(f"{path}: damaged, or not a Parquet file ({words})") from e
+    header = list(found.column_names)
+    text, number = choose(header)
+    rows = np.arange(1, found.num_rows + 1)
+    if not found.num_rows:
+        raise InputError(f"{path}: columns but no readings")
+    texts = {name: _texts(path, name, found[name].to_pylist()) for name in text}
+    numbers = {name: _numbers(path, name, found[name]) for name in number}
+    return CsvTable(str(path), tuple(header), rows, texts, numbers)
+
+
+def is_parquet(path: Path) -> bool:
+    """Whether a file begins as Parquet does."""
+    try:
+        with path.open("rb") as stream:
+            return stream.read(len(MAGIC)) == MAGIC
+    except OSError:
+        return False
+
+
+def unit_of(name: str) -> str | None:
+    """Return the unit that a column's name ends in."""
+    if name.startswith("cov_"):
+        parts = ["rad" if part.startswith("r") else "m" for part in name.split("_")[1:3]]
+        return f"{parts[0]}2" if parts[0] == parts[1] else "m rad"
+    end = name.rpartition("_")[2]
+    return end if end in UNITS else None
+
+
+def _cell(value: object) -> object:
+    """Return a cell as CSV writes it."""
+    return "" if value is None else repr(value) if isinstance(value, float) else value
+
+
+def _arrow(path: Path, columns: Mapping[str, list[Any]], about: Mapping[str, object]) -> Any:
+    arrow = _pyarrow(path, "pyarrow")
+    arrays = [arrow.array(values) for values in columns.values()]
+    fields = []
+    for name, array in zip(columns, arrays, strict=True):
+        unit = unit_of(name)
+        fields.append(arrow.field(name, array.type, metadata={"unit": unit} if unit else None))
+    schema = arrow.schema(fields, metadata={KEY: json.dumps(dict(about)).encode()})
+    return arrow.table(arrays, schema=schema)
+
+
+def _texts(path: Path, name: str, values: list[object]) -> list[str]:
+    for k, value in enumerate(values, start=1):
+        if not isinstance(value, str):
+            raise InputError(f"{path}: row {k}, column '{name}': {value!r} is no text")
+    return [str(value).strip() for value in values]
+
+
+def _numbers(path: Path, name: str, column: Any) -> Floats:
+    """Return a column of numbers; raises where it is none."""
+    values = column.to_pylist()
+    for k, value in enumerate(values, start=1):
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not number or not np.isfinite(value):
+            raise InputError(f"{path}: row {k}, column '{name}': {value!r} is not a finite number")
+    return np.array(values, dtype=float)
+
+
+def _replaced(path: Path, write: Callable[[Path], object]) -> None:
+    """Write a file beside its place, and put it there when it is complete."""
+    new = path.with_name(f".{path.name}.new")
+    try:
+        write(new)
+        os.replace(new, path)
+    except (OSError, UnicodeEncodeError) as e:
+        new.unlink(missing_ok=True)
+        raise InputError(f"{path}: cannot be written ({e})") from e
+
+
+def _pyarrow(path: Path, module: str) -> Any:
+    from importlib import import_module
+
+    try:
+        return import_module(module)
+    except ImportError as e:
+        raise InputError(
+            f"{path}: Parquet needs the package pyarrow: pip install hilcal[tables]"
+        ) from e

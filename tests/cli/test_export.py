@@ -1,0 +1,208 @@
+"""What one campaign exports another imports, and other programs read."""
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as parquet
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import hilcal as hc
+from hilcal.config import load_config
+from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.covariance import COVERS, INSTRUMENT, WHOLE
+from hilcal.data.readings import Readings
+from hilcal.data.records import content_hash
+from hilcal.data.table import import_table, with_what_rounding_does, write_table
+from hilcal.identify.parameters_document import covariance_of, read
+from hilcal.robot.catalogue import load_arm
+from hilcal.robot.chain import evaluate
+from tests.support.cli_cases import CELL, ok, refused, rehearsal
+from tests.support.readings_cases import make_arm, simple
+
+
+def made(path: Path, readings: Readings, covers: str = INSTRUMENT) -> Path:
+    """Write a campaign without any revision."""
+    path.unlink(missing_ok=True)
+    config = load_config(CELL).to_json()
+    with CampaignFile.create(path, config, str(CELL.parent), "made", more={COVERS: covers}) as file:
+        file.append_readings(readings)
+    return path
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A campaign with one revision of corrected geometry."""
+    path = made(tmp_path_factory.mktemp("export") / "run.hilcal", rehearsal("nothing").readings)
+    with hc.Campaign.open(path) as run:
+        model = hc.baseline(run.cell, run.readings, "absolute") + hc.effect("encoder_offset")
+        run.append(hc.fit(model, run.readings, "absolute"))
+    return path
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+@pytest.mark.parametrize("covers", [INSTRUMENT, WHOLE])
+def test_a_campaign_imports_what_another_exported(
+    capsys, tmp_path: Path, kind: str, covers: str
+) -> None:
+    readings = rehearsal("nothing").readings
+    rounded = np.round(readings.value, 4)  # a reader adds the rounding's variance to others
+    first = made(tmp_path / "a.hilcal", replace(readings, value=rounded), covers)
+    table, cell, again = tmp_path / f"r.{kind}", tmp_path / "CELL.toml", tmp_path / "b.hilcal"
+    ok(capsys, "export", first, "--readings", table, "--cell", cell)
+    told = ok(capsys, "import", table, "--config", cell, "-o", again, "--json").document
+    with hc.Campaign.open(first) as a, hc.Campaign.open(again) as b:
+        assert a.file.data_hash() == b.file.data_hash()
+        assert content_hash(a.readings) == content_hash(b.readings)
+        assert a.covariance_parts == b.covariance_parts == told["covariance"]
+        assert a.config.robot == b.config.robot
+        assert a.config.to_json() == b.config.to_json()
+
+
+@settings(max_examples=15, deadline=None, derandomize=True)
+@given(
+    seed=st.integers(0, 10**6),
+    m=st.sampled_from([3, 6]),
+    parquet_file=st.booleans(),
+    digits=st.sampled_from([3, 17]),
+)
+def test_tables_of_readings_keep_every_bit(
+    tmp_path_factory, seed: int, m: int, parquet_file: bool, digits: int
+) -> None:
+    rng, x = np.random.default_rng(seed), simple(20, m=m)
+    n = x.states.q.shape[1]
+    states = replace(
+        x.states,
+        time=rng.uniform(0, 1e6, 20),
+        load_time=rng.uniform(0, 1e3, 20),
+        air_temperature=rng.uniform(15, 30, 20),
+        joint_temperature=rng.uniform(15, 50, (20, n)),
+        approach=np.sign(rng.standard_normal((20, n))),
+        q_actual=x.states.q + 1e-5 * rng.standard_normal((20, n)),
+    )
+    root = 1e-5 * rng.standard_normal((20, m, m))
+    x = replace(
+        x,
+        states=states,
+        cycle=rng.integers(0, 3, 20),
+        value=np.round(x.value + 1e-4 * rng.standard_normal(x.value.shape), digits),
+        covariance=(root @ np.swapaxes(root, 1, 2) + 1e-10 * np.eye(m)),
+    )
+    x = replace(x, covariance=0.5 * (x.covariance + np.swapaxes(x.covariance, 1, 2)))
+    path = tmp_path_factory.mktemp("bits") / ("t.parquet" if parquet_file else "t.csv")
+    write_table(x, path, with_what_rounding_does(WHOLE, x))
+    again = import_table(path, make_arm(), None)
+    assert again.covers == WHOLE
+    assert content_hash(again.readings) == content_hash(x)
+    for name in ("time", "load_time", "air_temperature", "joint_temperature", "q_actual"):
+        given_, read_ = (np.asarray(getattr(s, name)) for s in (states, again.readings.states))
+        assert given_.tobytes() == read_.tobytes()
+
+
+def test_other_programs_find_units_and_origin(capsys, fitted: Path, tmp_path: Path) -> None:
+    table, residuals, revisions = (tmp_path / f"{k}.parquet" for k in ("r", "e", "v"))
+    ok(
+        capsys, "export", fitted, "--readings", table, "--residuals", residuals,
+        "--revisions", revisions,
+    )  # fmt: skip
+    schema = parquet.read_schema(table)
+    assert schema.field("q1_rad").metadata == {b"unit": b"rad"}
+    assert schema.field("cov_x_x").metadata == {b"unit": b"m2"}
+    with hc.Campaign.open(fitted, read_only=True) as run:
+        found, n = run.fit(), len(run.readings)
+        about = json.loads(schema.metadata[b"hilcal"])
+        assert about["readings_sha256"] == run.file.data_hash()
+    rows = parquet.read_table(residuals).to_pydict()
+    assert len(rows["pose"]) == n
+    axes = ("x_m", "y_m", "z_m")
+    for what, values in (
+        ("residual", found.raw),
+        ("residual_base", found.residuals("base")),
+        ("left_out", found.left_out),
+    ):
+        np.testing.assert_array_equal(np.array([rows[f"{what}_{a}"] for a in axes]).T, values)
+    (row,) = parquet.read_table(revisions).to_pylist()
+    assert row["holdout_mean_m"] == pytest.approx(found.holdout.mean_m, rel=1e-4)
+    assert row["model"].endswith("encoder_offset")
+
+
+def test_deflections_leave_unloaded_readings_without_residual(capsys, tmp_path: Path) -> None:
+    run = made(tmp_path / "d.hilcal", rehearsal("nothing").readings, WHOLE)
+    ok(capsys, "identify", run)
+    ok(capsys, "export", run, "--residuals", tmp_path / "e.csv")
+    with (tmp_path / "e.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert {r["load"] for r in rows if r["residual_x_m"] == ""} == {"none"}
+    assert all(r["load"] != "none" for r in rows if r["residual_x_m"])
+
+
+def test_parameters_have_their_covariance(capsys, fitted: Path, tmp_path: Path) -> None:
+    ok(capsys, "export", fitted, "--parameters", tmp_path / "p.json")
+    p = read(tmp_path / "p.json")
+    with hc.Campaign.open(fitted, read_only=True) as run:
+        found = run.fit()
+    np.testing.assert_array_equal(p.value, found.theta)
+    known = p.identifiable
+    np.testing.assert_array_equal(p.std[known], found.uncertainty.std[known])
+    np.testing.assert_array_equal(p.covariance, covariance_of(found))
+    assert np.isnan(p.covariance[~known]).all()
+    c = p.covariance[np.ix_(known, known)]
+    np.testing.assert_allclose(np.diag(c), p.std[known] ** 2, rtol=1e-12)
+    assert np.linalg.eigvalsh(c / np.outer(p.std[known], p.std[known])).min() > -1e-9
+    assert [row.name for row in found.parameters] == list(p.names)
+
+
+def test_the_corrected_table_is_a_robot_again(capsys, fitted: Path, tmp_path: Path) -> None:
+    names = ("a.urdf", "s.toml", "k.yaml", "f.json")
+    paths = [tmp_path / name for name in names]
+    options = ("--urdf", "--dh", "--ur-kinematics", "--frames")
+    given = [word for pair in zip(options, paths, strict=True) for word in pair]
+    shown = ok(capsys, "export", fitted, *given, "--ur-hash", "calib_12345").out
+    assert "Not in it, since not constant: joint_compliance" in shown
+    assert "hash: calib_12345" in paths[2].read_text()
+    q = np.random.default_rng(0).uniform(-3, 3, (20, 6))
+    urdf, table = (evaluate(load_arm(str(path)), q) for path in paths[:2])
+    np.testing.assert_allclose(table.position[-1], urdf.position[-1], atol=1e-9)
+    np.testing.assert_allclose(table.rotation[-1], urdf.rotation[-1], atol=1e-9)
+    ok(capsys, "export", fitted, "--dh", tmp_path / "m.csv", "--dh-modified")
+    assert (tmp_path / "m.csv").read_text().startswith("joint,a_m,d_m,alpha_rad,offset_rad\n")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ((), "nothing to export; give --readings"),
+        (("--readings", "{out}/r.xlsx"), "unknown kind of table; valid: .csv or .parquet"),
+        (("--parameters", "{out}/p.txt"), "--parameters"),
+        (("--dh", "{out}/d.json"), "valid: .toml or .csv"),
+        (("--dh-modified", "--urdf", "{out}/a.urdf"), "--dh-modified is about --dh"),
+        (("--ur-hash", "calib_1", "--urdf", "{out}/a.urdf"), "--ur-hash is about"),
+        (("--ur-kinematics", "{out}/k.yaml", "--ur-hash", "mine"), "valid: calib_ and digits"),
+        (("--table", "{out}/t.csv", "--readings", "{out}/t.csv"), "two things cannot be written"),
+    ],
+)
+def test_what_cannot_be_written_is_refused(
+    capsys, fitted: Path, tmp_path: Path, arguments: tuple[str, ...], words: str
+) -> None:
+    given = [a.format(out=tmp_path) for a in arguments]
+    assert words in refused(capsys, 2, "export", fitted, *given)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_parquet_file_that_cannot_be_readings_is_refused(capsys, tmp_path: Path) -> None:
+    import pyarrow
+
+    path, run = tmp_path / "t.parquet", tmp_path / "run.hilcal"
+    made(tmp_path / "a.hilcal", rehearsal("nothing").readings)
+    ok(capsys, "export", tmp_path / "a.hilcal", "--readings", path)
+    good = parquet.read_table(path)
+    holed = good.set_column(3, "q1_rad", pyarrow.array([None, *good["q1_rad"].to_pylist()[1:]]))
+    parquet.write_table(holed.rename_columns(good.column_names), tmp_path / "holed.parquet")
+    (tmp_path / "cut.parquet").write_bytes(path.read_bytes()[:3000])
+    for name, words in (("holed", "row 1, column"), ("cut", "damaged")):
+        given = (tmp_path / f"{name}.parquet", "--config", CELL, "-o", run)
+        assert words in refused(capsys, 2, "import", *given)
