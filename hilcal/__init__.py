@@ -24,6 +24,7 @@ _PLACES = {
     "CannotAnswerError": "hilcal.errors",
     "Catalogue": "hilcal.effects.catalogue",
     "Cell": "hilcal.cell",
+    "Comparison": "hilcal.diagnose.comparison",
     "DeviceError": "hilcal.errors",
     "Diagnosis": "hilcal.diagnose.diagnosis",
     "Effect": "hilcal.effects.protocol",
@@ -37,6 +38,7 @@ _PLACES = {
     "States": "hilcal.data.readings",
     "baseline": "hilcal.library",
     "check_effect": "hilcal.effects.check",
+    "compare": "hilcal.compare",
     "diagnose": "hilcal.diagnose.verdict",
     "effect": "hilcal.effects.spec",
     "fit": "hilcal.library",
@@ -56,7 +58,9 @@ if TYPE_CHECKING:
     from hilcal.calibration.calibration import Calibration
     from hilcal.campaign import Campaign
     from hilcal.cell import Cell
+    from hilcal.compare import compare
     from hilcal.data.readings import Readings, States
+    from hilcal.diagnose.comparison import Comparison
     from hilcal.diagnose.diagnosis import Diagnosis
     from hilcal.diagnose.verdict import diagnose
     from hilcal.effects.catalogue import Catalogue, installed

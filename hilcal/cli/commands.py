@@ -73,7 +73,10 @@ COMMANDS = {
     "identify": Command(
         "fitting:identify", "Fit a model to the readings, and keep it as a revision."
     ),
-    "compare": Command("fitting:compare", "Show where the model fails."),
+    "compare": Command(
+        "comparing:compare",
+        "Show where the model fails; with a later campaign, what has changed on the arm.",
+    ),
     "diagnose": Command("refining:diagnose", "Say which effect the model lacks."),
     "add": Command("refining:add", "Add an effect to the model: error before and after."),
     "remove": Command(

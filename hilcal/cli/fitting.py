@@ -1,6 +1,5 @@
-"""`identify` and `compare`: fits, and how far they are from what was measured."""
+"""`identify`: fit a model to the readings."""
 
-from dataclasses import asdict
 from typing import Annotated
 
 import typer
@@ -8,27 +7,21 @@ import typer
 from hilcal.campaign import Campaign
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import (
-    called,
     check_options,
     chosen,
     finish,
-    fit_of,
     mode_of_option,
     scalings,
     titles,
     wanted_effects,
 )
-from hilcal.cli.terminal import Json, Revision, Run, terminal
+from hilcal.cli.terminal import Json, Run, terminal
 from hilcal.data.purpose import purpose_of, refuse_fitting, release
 from hilcal.data.whitening import Scaling
-from hilcal.diagnose.misfit_breakdown import misfit_breakdown
 from hilcal.effects.written import write_effect
-from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline, with_effects
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.fit_document import to_json
-from hilcal.identify.full_prediction import full_prediction
-from hilcal.identify.linearisation import linearise
 from hilcal.identify.other_arm import other_arm_of
 from hilcal.report import numbers, text
 from hilcal.report.covariance_words import covariance_words
@@ -119,45 +112,3 @@ def options_line(found: Fit) -> list[str]:
 def options_json(found: Fit) -> dict[str, dict[str, object]]:
     """Return all options of the effects, by name."""
     return {e.name: dict(e.options) for e in found.model.effects}
-
-
-def compare(
-    run: Run,
-    revision: Revision = None,
-    effects_from: EffectsFrom = None,
-    as_json: Json = False,
-) -> None:
-    """Show where the model fails."""
-    t, catalogue = terminal(as_json), catalogue_with(effects_from)
-    with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
-        number, found = fit_of(t, o, say, revision)
-        if found.scaling != "gc":
-            raise InputError(
-                f"revision {number} has scaling {found.scaling}; comparing needs gc: run hilcal "
-                "identify again"
-            )
-        say("looking where it fails")
-        places = misfit_breakdown(linearise(found))
-        finish(found, say)
-        e = full_prediction(found)
-        worst = text.worst_poses(e)
-    name = text.model_name(titles(found.model, found.readings))
-    t.show(text.heading(f"{called(number)}: {name}"))
-    t.show([text.misses(found), text.follows(places), "", text.errors(found), ""])
-    t.show([*text.where_table(places), ""])
-    t.show(text.worst_table(worst))
-    t.document(
-        {
-            "revision": number,
-            "model": list(found.model.names),
-            "readings": found.mode,
-            "error": {"fit": found.error.to_json(), "holdout": found.holdout.to_json()},
-            "variance_factor": found.variance_factor,
-            "variance_factor_interval": list(found.variance_factor_interval),
-            "noise_floor_m": e.noise_floor,
-            "where": [
-                {"variable": p.variable, "share": p.share, "p_value": p.p_value} for p in places
-            ],
-            "worst": [asdict(w) for w in worst],
-        }
-    )

@@ -6,6 +6,7 @@ import inspect
 import socket
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,14 +19,15 @@ from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.covariance import WHOLE
 from hilcal.data.table import write_table
 from hilcal.robot.catalogue import configs_dir
+from studies.change import measured
 from studies.random_campaigns import rehearse
 from tests.support.paths import ROOT
 
 CELL = configs_dir() / "cells" / "demo_ur10e.toml"
 WITHOUT_EXAMPLE = {
     # values that functions return, and errors
-    "CannotAnswerError", "DeviceError", "Diagnosis", "Effect", "Fit", "HilcalError", "InputError",
-    "Model", "Readings", "Refinement", "States", "Catalogue", "installed",
+    "CannotAnswerError", "Comparison", "DeviceError", "Diagnosis", "Effect", "Fit", "HilcalError",
+    "InputError", "Model", "Readings", "Refinement", "States", "Catalogue", "installed",
 }  # fmt: skip
 
 
@@ -34,12 +36,22 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     """A table and a campaign of ten poses in which the joints tilt."""
     folder = tmp_path_factory.mktemp("library")
     config = load_config(CELL)
-    readings = rehearse(config, "joint_tilt_compliance", 3, 10).readings
-    table, run = folder / "t.csv", folder / "run.hilcal"
+    case = rehearse(config, "joint_tilt_compliance", 3, 10)
+    readings = case.readings
+    table, run, later = folder / "t.csv", folder / "run.hilcal", folder / "later.hilcal"
     write_table(readings, table, WHOLE)
-    with CampaignFile.create(run, config.to_json(), str(CELL.parent), "test") as file:
-        file.append_readings(readings)
-    return SimpleNamespace(table=table, run=run, cell=CELL, folder=folder)
+    compliance = case.world.physics.joint_compliance * [1, 2, 1, 1, 1, 1]
+    worn = replace(
+        case.world, physics=case.world.physics.with_effect("joint_compliance", compliance)
+    )
+    loads = [(load.name, load.wrench(case.cell.gravity)) for load in config.loads]
+    for path, content in (
+        (run, readings),
+        (later, measured(worn, loads, 4, np.random.default_rng(8))),
+    ):
+        with CampaignFile.create(path, config.to_json(), str(CELL.parent), "test") as file:
+            file.append_readings(content)
+    return SimpleNamespace(table=table, run=run, later=later, cell=CELL, folder=folder)
 
 
 def names() -> list[str]:
@@ -53,6 +65,7 @@ def test_the_examples_of_a_docstring_run(name: str, site: SimpleNamespace) -> No
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     known = {"hc": hc, "np": np, "CELL": site.cell, "TABLE": site.table, "RUN": site.run}
+    known["LATER"] = site.later
     known["PORT"] = port
     finder = doctest.DocTestFinder(recurse=True)
     tests = [t for t in finder.find(thing, name, module=False, globs=known) if t.examples]

@@ -1,0 +1,103 @@
+"""`compare`: model against measurement, of one campaign or of a later one of the same arm."""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hilcal.campaign import Campaign
+from hilcal.cli.effects_from import EffectsFrom, catalogue_with
+from hilcal.cli.files import called, finish, fit_of, titles
+from hilcal.cli.terminal import Json, Revision, Run, Terminal, terminal
+from hilcal.compare import compare as compare_campaigns
+from hilcal.diagnose.misfit_breakdown import misfit_breakdown
+from hilcal.effects.catalogue import Catalogue
+from hilcal.errors import InputError
+from hilcal.identify.full_prediction import full_prediction
+from hilcal.identify.linearisation import linearise
+from hilcal.report import text, text_change
+from hilcal.report.progress import working
+
+
+def compare(
+    run: Run,
+    later: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[LATER.hilcal]",
+            help="A later campaign of the same arm, of 15 readings or more: what has changed?",
+        ),
+    ] = None,
+    same_setup: Annotated[
+        bool,
+        typer.Option(
+            "--same-setup",
+            help="With LATER: tracker and base stand as they did; else the tracker's place is "
+            "estimated from the later readings.",
+        ),
+    ] = False,
+    revision: Revision = None,
+    effects_from: EffectsFrom = None,
+    as_json: Json = False,
+) -> None:
+    """Show where the model fails; with a later campaign, what has changed on the arm."""
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
+    if later is None:
+        if same_setup:
+            raise InputError("--same-setup goes with a later campaign: compare A.hilcal B.hilcal")
+        _one(t, run, revision, catalogue)
+        return
+    with (
+        Campaign.open(run, catalogue, read_only=True) as o,
+        Campaign.open(later, catalogue, read_only=True) as there,
+        working(t.progress) as say,
+    ):
+        if o.in_use(revision) is None:
+            t.notice(f"{run}: no revision yet, taking the baseline; hilcal refine makes a model")
+        found = compare_campaigns(
+            o, there, revision, same_setup=True if same_setup else None, say=say
+        )
+    name = text.model_name(titles(found.fit.model, found.fit.readings))
+    t.show(text.heading(f"{called(found.number)} of {run.name}: {name}"))
+    t.show(text_change.comparison_report(found, run.name, later.name))
+    command = text_change.next_command(found, str(run), str(later))
+    if command is not None:
+        t.command(command)
+    t.document(text_change.to_json(found, str(run), str(later)))
+
+
+def _one(t: Terminal, run: Path, revision: int | None, catalogue: Catalogue) -> None:
+    """Show where the model fails on its own readings."""
+    with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
+        number, found = fit_of(t, o, say, revision)
+        if found.scaling != "gc":
+            raise InputError(
+                f"revision {number} has scaling {found.scaling}; comparing needs gc: run hilcal "
+                "identify again"
+            )
+        say("looking where it fails")
+        places = misfit_breakdown(linearise(found))
+        finish(found, say)
+        e = full_prediction(found)
+        worst = text.worst_poses(e)
+    name = text.model_name(titles(found.model, found.readings))
+    t.show(text.heading(f"{called(number)}: {name}"))
+    t.show([text.misses(found), text.follows(places), "", text.errors(found), ""])
+    t.show([*text.where_table(places), ""])
+    t.show(text.worst_table(worst))
+    t.document(
+        {
+            "revision": number,
+            "model": list(found.model.names),
+            "readings": found.mode,
+            "error": {"fit": found.error.to_json(), "holdout": found.holdout.to_json()},
+            "variance_factor": found.variance_factor,
+            "variance_factor_interval": list(found.variance_factor_interval),
+            "noise_floor_m": e.noise_floor,
+            "where": [
+                {"variable": p.variable, "share": p.share, "p_value": p.p_value} for p in places
+            ],
+            "worst": [asdict(w) for w in worst],
+        }
+    )

@@ -1,0 +1,361 @@
+"""What has changed on an arm since an earlier campaign, and whether it is more than uncertainty.
+
+At later readings the earlier fit, with its posterior as prior and the tracker's place flat where it
+was set up anew, leaves r with rᵀ M r (see `identify.remeasured`). Every candidate (see
+`change_candidates`) is scored by the evidence of its columns beside that, the formula of the
+diagnosis (`regression.evidence`). The scatter σ² is estimated from both: what the earlier fit
+states of it counts as ν_0 degrees of freedom beside those of r,
+
+    ‖r‖² = rᵀ M r + ν_0,    ν = dof + ν_0
+
+so that neither a scatter that is larger than stated nor a few lucky readings make a change. The
+candidates with most evidence are added to the model and fitted exactly; the one that then has the
+most is taken if its p-value, times the number of candidates tested, is below `LEVEL`; then the
+next is looked for beside it. A change that the others make needless is taken back. Candidates with
+nearly the same evidence (odds below 20 : 1) are not told apart by these readings.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import f as f_distribution
+
+from hilcal.diagnose.change_candidates import Candidate, candidates
+from hilcal.diagnose.effect_ranking import SAME_EVIDENCE
+from hilcal.errors import CannotAnswerError
+from hilcal.identify.remeasured import Earlier, Remeasured, Setting, remeasure
+from hilcal.regression.evidence import FamilyScore, log_evidence, score_family, visible
+from hilcal.regression.power import noncentrality_of_power
+from hilcal.types import Floats
+
+LEVEL = 0.01
+"""Of a false claim where nothing has changed, over all candidates together; a choice."""
+POWER = 0.9
+"""Probability with which a change of the stated least size would have been claimed."""
+STATED_DOF = 20.0
+"""ν_0. What the earlier fit states of the scatter is taken as that of 20 degrees of freedom: good
+to a sixth, since another day and another place differ. A choice."""
+TRIED = 5
+"""Candidates with most evidence in the linearisation that are fitted exactly; a choice."""
+MOST = 4
+"""Most changes that are looked for; more is another arm. A choice."""
+ABSORBED = 1e-4
+"""Share of a candidate's information that frames and prior must leave: with less, a hundredth of
+its motion, the readings cannot show it. A choice."""
+UNEXPLAINED = 1e-3
+"""Level at which what is left after all changes is called unexplained; a choice."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Size:
+    """One parameter of a change.
+
+    Attributes:
+        parameter: its name.
+        unit: SI.
+        value: by how much it has moved.
+        std: standard deviation of that.
+        before: what the earlier fit had found, and its standard deviation; None where it had none.
+    """
+
+    parameter: str
+    unit: str
+    value: float
+    std: float
+    before: tuple[float, float] | None = None
+
+    @property
+    def z(self) -> float:
+        """Size over its standard deviation."""
+        return self.value / self.std if self.std > 0 else 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Change:
+    """Something that has changed.
+
+    Attributes:
+        candidate: what.
+        sizes: by how much.
+        p_value: of the joint test when it was found, times the candidates tested, at most 1.
+        log_evidence: gain in log evidence beside the changes found before.
+        moved_m: rms displacement of the target that it makes in the later readings, m.
+        same_as: other candidates that these readings do not tell from it.
+    """
+
+    candidate: Candidate
+    sizes: tuple[Size, ...]
+    p_value: float
+    log_evidence: float
+    moved_m: float
+    same_as: tuple[Candidate, ...]
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """The parts of the cell that it may be of, the likeliest first."""
+        return tuple(dict.fromkeys(c.part for c in (self.candidate, *self.same_as)))
+
+
+@dataclass(frozen=True, slots=True)
+class Limit:
+    """The smallest change of a candidate that would have been claimed in nine cases of ten.
+
+    Attributes:
+        candidate: name.
+        part: of the cell.
+        unit: SI.
+        size: in this unit; infinite where these readings cannot show it.
+        moved_m: rms displacement of the target that it makes in the later readings, m.
+    """
+
+    candidate: str
+    part: str
+    unit: str
+    size: float
+    moved_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Changes:
+    """What has changed since an earlier campaign.
+
+    Attributes:
+        before: the earlier fit at the later readings, nothing changed.
+        after: with the changes.
+        found: the changes, strongest first.
+        limits: smallest changes that would have been claimed, of candidates with one parameter.
+        tested: number of candidates that the readings can show.
+        hidden: candidates that they cannot show: the frames absorb them.
+        unexplained: p-value of what is left after the changes as scatter.
+        scatter: rms of what is left over that which the earlier fit states.
+        earlier: the earlier fit.
+    """
+
+    before: Remeasured
+    after: Remeasured
+    found: tuple[Change, ...]
+    limits: tuple[Limit, ...]
+    tested: int
+    hidden: tuple[Candidate, ...]
+    unexplained: float
+    scatter: float
+    earlier: Earlier
+
+    @property
+    def explained(self) -> bool:
+        """Whether what is left is scatter as the earlier fit states it."""
+        return self.unexplained >= UNEXPLAINED
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Scored:
+    """A candidate beside the changes found so far."""
+
+    candidate: Candidate
+    score: FamilyScore
+    s: Floats
+    motion: Floats
+    shown: bool
+
+
+def find_changes(
+    at: Setting,
+    say: Callable[[str], None] = lambda text: None,
+) -> Changes:
+    """Find what has changed between an earlier fit and later readings of the same arm.
+
+    Args:
+        at: later readings, none of which was fitted, beside the earlier fit.
+        say: takes progress, one line each.
+
+    Raises:
+        CannotAnswerError: too few readings, or no static equilibrium.
+    """
+    earlier = at.earlier
+    before = remeasure(at)
+    if before.dof < 3:
+        raise CannotAnswerError(
+            f"{len(at.w)} later readings leave nothing to judge a change by; measure at least "
+            f"{-(-(before.free + 3) // at.w.m)}, better 15"
+        )
+    catalogue = earlier.fit.model.catalogue
+    known = candidates(at.model.cell, at.readings.states, catalogue, at.w.m, anew=at.anew)
+    now, tested = before, 0
+    steps: list[_Step] = []
+    hidden: tuple[Candidate, ...] = ()
+    for _ in range(MOST):
+        say("testing what may have changed" if not steps else "testing what else may have changed")
+        scored = [_score(now, c) for c in known if all(c is not s[0] for s in steps)]
+        seen = [s for s in scored if s.shown]
+        if not steps:
+            tested = len(seen)
+            hidden = tuple(s.candidate for s in scored if not s.shown)
+        step = _best(now, [s[0] for s in steps], seen, tested)
+        if step is None:
+            break
+        now, taken = step[0], step[1:]
+        steps.append(taken)
+    after, kept = _needed(now, steps, tested)
+    left = after.rss / after.dof if after.dof > 0 else 1.0
+    return Changes(
+        before=before,
+        after=after,
+        found=_sized(after, kept, earlier),
+        limits=_limits(after, known, [s[0] for s in kept], tested),
+        tested=tested,
+        hidden=hidden,
+        unexplained=float(f_distribution.sf(left, after.dof, earlier.fit.dof)),
+        scatter=float(np.sqrt(left)),
+        earlier=earlier,
+    )
+
+
+_Step = tuple[Candidate, float, float, tuple[Candidate, ...]]
+"""A change: candidate, p-value, log evidence, and what cannot be told from it."""
+
+
+def _pooled(now: Remeasured) -> tuple[float, float]:
+    """‖r‖² and ν, with what the earlier fit states of the scatter."""
+    stated = min(STATED_DOF, now.setting.earlier.fit.dof)
+    return now.rss + stated, now.dof + stated
+
+
+def _score(now: Remeasured, candidate: Candidate) -> _Scored:
+    x, motion = now.columns(candidate.moving)
+    s = now.projection.information(x)
+    g = x.T @ now.projection.project_out(now.target)
+    score = score_family(s, g, *_pooled(now))
+    left = float(np.trace(s)) > ABSORBED * float(np.sum(x**2))
+    return _Scored(candidate, score, s, motion, score.rank > 0 and left)
+
+
+def _best(
+    now: Remeasured, taken: Sequence[Candidate], seen: Sequence[_Scored], tested: int
+) -> tuple[Remeasured, Candidate, float, float, tuple[Candidate, ...]] | None:
+    """Return the minimum with one more change, and the change; None where none is sure."""
+    order = sorted(seen, key=lambda s: -s.score.log_evidence)
+    if not order or min(s.score.p_value for s in order) * tested >= LEVEL:
+        return None
+    tried: list[tuple[float, float, Remeasured, Candidate]] = []
+    for s in order[:TRIED]:
+        moving = [c.moving for c in (*taken, s.candidate)]
+        try:
+            after = remeasure(now.setting, moving, now)
+        except CannotAnswerError:
+            continue
+        evidence, p_value = _exact(now, after, len(s.candidate.parameters))
+        tried.append((evidence, p_value, after, s.candidate))
+    tried.sort(key=lambda t: -t[0])
+    sure = [t for t in tried if t[1] * tested < LEVEL and t[0] > 0.0]
+    if not sure:
+        return None
+    most = sure[0][0]
+    equal = [t for t in sure if most - t[0] < SAME_EVIDENCE]
+    # Of those that explain the readings alike, the one with fewest parameters.
+    evidence, p_value, after, best = min(equal, key=lambda t: len(t[3].parameters))
+    rivals = [(t[3], t[0]) for t in tried if t[3] is not best]
+    rivals += [(s.candidate, s.score.log_evidence) for s in order[TRIED:]]
+    same = tuple(c for c, e in rivals if most - e < SAME_EVIDENCE)
+    return after, best, min(p_value * tested, 1.0), evidence, same
+
+
+def _exact(before: Remeasured, after: Remeasured, count: int) -> tuple[float, float]:
+    """Log evidence and p-value of the last `count` sizes, from the exact minima."""
+    rss, dof = _pooled(before)
+    gain = max(before.rss - after.rss, 0.0)
+    s = np.linalg.pinv(after.inverse[-count:, -count:], hermitian=True)
+    values, vectors = np.linalg.eigh((s + s.T) / 2)
+    seen = visible(values)
+    rank = int(seen.sum())
+    if not rank or gain <= 0.0 or dof - rank < 1:
+        return 0.0, 1.0
+    explained = values[seen] * (vectors[:, seen].T @ after.sizes[-count:]) ** 2
+    explained *= gain / max(float(explained.sum()), 1e-300)
+    evidence = float(log_evidence(values[seen], explained, rss, dof).max())
+    rest = max((rss - gain) / (dof - rank), 1e-300)
+    return evidence, float(f_distribution.sf(gain / rank / rest, rank, dof - rank))
+
+
+def _needed(now: Remeasured, steps: list[_Step], tested: int) -> tuple[Remeasured, list[_Step]]:
+    """Return the minimum and the changes without those that the others make needless."""
+    while len(steps) > 1:
+        rss, dof = _pooled(now)
+        without = []
+        for k, step in enumerate(steps):
+            others = [s[0].moving for s in steps if s is not step]
+            left, count = remeasure(now.setting, others), len(step[0].parameters)
+            gain = max(left.rss - now.rss, 0.0)
+            p_value = float(f_distribution.sf(gain / count * dof / rss, count, dof))
+            without.append((p_value, k, left))
+        p_value, k, left = max(without, key=lambda w: w[0])
+        if p_value * tested < LEVEL:
+            break
+        now, steps = left, [*steps[:k], *steps[k + 1 :]]
+    return now, steps
+
+
+def _sized(after: Remeasured, steps: Sequence[_Step], earlier: Earlier) -> tuple[Change, ...]:
+    rss, dof = _pooled(after)
+    noise = rss / dof
+    out, at = [], 0
+    for candidate, p_value, evidence, same in steps:
+        count = len(candidate.parameters)
+        mine = slice(at, at + count)
+        at += count
+        value = candidate.scale * after.sizes[mine]
+        std = candidate.scale * np.sqrt(noise * np.diag(after.inverse)[mine])
+        _, motion = after.columns(candidate.moving)
+        moved = motion @ after.sizes[mine]
+        sizes = zip(candidate.parameters, candidate.units, value, std, strict=True)
+        out.append(
+            Change(
+                candidate=candidate,
+                sizes=tuple(
+                    Size(p, u, float(v), float(e), _before(earlier, candidate.effect, p))
+                    for p, u, v, e in sizes
+                ),
+                p_value=p_value,
+                log_evidence=evidence,
+                moved_m=float(np.sqrt(np.mean(np.sum(moved**2, axis=1)))),
+                same_as=same,
+            )
+        )
+    return tuple(sorted(out, key=lambda c: -c.log_evidence))
+
+
+def _before(earlier: Earlier, effect: str, parameter: str) -> tuple[float, float] | None:
+    """Value and standard deviation of a parameter in the earlier fit."""
+    for e, mine in zip(earlier.fit.model.effects, earlier.fit.model.slices(), strict=True):
+        names = [p.name for p in e.parameters]
+        if e.name == effect and parameter in names:
+            k = mine.start + names.index(parameter)
+            return float(earlier.fit.theta[k]), float(np.linalg.norm(earlier.root[k]))
+    return None
+
+
+def _limits(
+    after: Remeasured, known: Sequence[Candidate], found: Sequence[Candidate], tested: int
+) -> tuple[Limit, ...]:
+    """Return the smallest detectable changes of what was not found, of one parameter each."""
+    rss, dof = _pooled(after)
+    out = []
+    for candidate in known:
+        if len(candidate.parameters) != 1 or any(candidate is f for f in found):
+            continue
+        s = _score(after, candidate)
+        size = np.inf
+        if s.shown:
+            wanted = noncentrality_of_power(1, dof - 1, LEVEL / max(tested, 1), POWER)
+            size = float(np.sqrt(wanted * rss / dof / s.s[0, 0]))
+        moved = float(np.sqrt(np.mean(np.sum(s.motion[:, :, 0] ** 2, axis=1))))
+        out.append(
+            Limit(
+                candidate.name,
+                candidate.part,
+                candidate.units[0],
+                size * float(candidate.scale[0]),
+                size * moved if np.isfinite(size) else np.inf,
+            )
+        )
+    return tuple(out)

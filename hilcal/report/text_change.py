@@ -1,0 +1,339 @@
+"""What `compare A B` says: the error of the earlier calibration today, and what has changed."""
+
+from collections.abc import Iterator, Sequence
+
+from rich.console import RenderableType
+
+from hilcal.diagnose.change import LEVEL, POWER, Change, Limit, Size
+from hilcal.diagnose.change_candidates import Candidate
+from hilcal.diagnose.comparison import Comparison
+from hilcal.report import numbers, text
+
+JOINT_WORDS = {
+    "encoder_offset": "zero",
+    "joint_compliance": "compliance",
+    "joint_tilt_compliance": "tilt compliance",
+    "backlash": "play",
+    "hysteresis": "lost motion",
+    "transmission_error": "transmission error",
+}
+WORDS = {
+    "link_mass": "the tool's weight",
+    "base_compliance": "the ground under the base",
+    "tool_compliance": "the stiffness of what is bolted to the flange",
+    "load_point": "where the load acts on the tool",
+    "target_offset": "the target's place on the tool",
+    "wrench_bias": "the zero of the force sensor",
+    "wrench_gain": "the gain of the force sensor",
+    "tracker_scale": "the tracker's scale",
+    "thermal_growth": "the length of the links with the temperature",
+    "base_frame": "the place of the tracker, or of the base",
+}
+CAUSE = {
+    "encoder_offset": "repair, crash or a slipped joint?",
+    "joint_compliance": "wear, crash or repair?",
+    "joint_tilt_compliance": "wear or crash?",
+    "backlash": "wear or repair?",
+    "hysteresis": "wear or repair?",
+    "transmission_error": "another gear or encoder?",
+    "link_geometry": "crash?",
+    "base_compliance": "loose bolts?",
+}
+SEEN = ("encoder_offset", "joint_compliance", "hysteresis", "backlash")
+"""Changes of joints whose least visible size is listed."""
+MOST_PARAMETERS = 6
+"""Parameters of a change that are listed."""
+CLEAR = 2.0
+"""Standard deviations from which one of several parameters of a change is listed."""
+
+
+def words_of(c: Candidate) -> str:
+    """Return what may have changed, in words."""
+    if c.joint:
+        return f"joint {c.joint}'s {JOINT_WORDS.get(c.effect, c.effect)}"
+    if c.kind == "link":
+        return f"the geometry of {c.part}"
+    return WORDS.get(c.effect, c.effect)
+
+
+def comparison_report(c: Comparison, earlier: str, later: str) -> Iterator[RenderableType]:
+    """Yield everything that is said.
+
+    Args:
+        c: the comparison.
+        earlier: name of the earlier file.
+        later: name of the later file.
+    """
+    yield from _setup(c, earlier, later)
+    yield ""
+    yield from _today(c, earlier)
+    yield ""
+    yield from _changes(c)
+    yield ""
+    yield f"Next: {next_step(c, earlier)}"
+
+
+def _setup(c: Comparison, earlier: str, later: str) -> Iterator[str]:
+    what = "deflections" if c.mode == "deflection" else "positions"
+    count = len(c.today.prediction.raw)
+    yield f"{count} {what} of {later}, measured later."
+    if c.shared:
+        model = "the baseline" if c.number is None else f"revision {c.number}"
+        yield f"{c.shared} of its {c.readings} readings were fitted by {model}; they are left out."
+    if c.later_mode not in (None, c.mode):
+        yield (
+            f"{later} was fitted to {_kind(c.later_mode)}, {earlier} to {_kind(c.mode)}: "
+            f"{_kind(c.mode)} are compared."
+        )
+    if c.lacked:
+        yield (
+            f"The model of {earlier} lacks {numbers.names(c.lacked)} by its own readings; added "
+            f"for this comparison alone (hilcal refine {earlier} keeps it)."
+        )
+    if c.anew:
+        yield (
+            "The tracker's place is estimated from them, as if it had been set up anew"
+            + ("." if c.told else " (--same-setup: nobody moved tracker or base).")
+        )
+    else:
+        reason = "as told" if c.told else "both cells configure the same place"
+        yield f"The tracker's place is that of {earlier} ({reason})."
+    if c.tool:
+        yield f"[tool] {numbers.names(c.tool)} of {later} differ; those of {later} are used."
+
+
+def _kind(mode: str | None) -> str:
+    return "deflections" if mode == "deflection" else "absolute readings"
+
+
+def _today(c: Comparison, earlier: str) -> Iterator[RenderableType]:
+    t, error = c.today, c.today.prediction.error
+    out = text.table("3-D position error", "rms", "mean", "largest", "expected", "as drawn")
+    drawing = "-" if t.drawing_m is None else numbers.length(t.drawing_m)
+    sizes = (error.rms_m, error.mean_m, error.max_m, t.stated_m)
+    out.add_row(f"calibration of {earlier}", *map(numbers.length, sizes), drawing)
+    yield out
+    chance = numbers.p_equals(t.p_value)
+    share = f"{numbers.digits(t.z, 2)} times what it states, all correlations counted ({chance})"
+    if t.p_value < LEVEL:
+        yield f"The error is {share}: more than its uncertainty."
+    else:
+        yield f"The error is {share}: no more than its uncertainty."
+    beyond = t.beyond
+    if beyond.outside.any():
+        where = numbers.few([f"{v.variable}: {v.count}" for v in beyond.variables], 3)
+        yield (
+            f"{int(beyond.outside.sum())} of {len(beyond.outside)} lie outside of what {earlier} "
+            f"measured ({where}): an error there need not be a change."
+        )
+
+
+def _changes(c: Comparison) -> Iterator[RenderableType]:
+    found = c.changes
+    if not found.found and found.explained:
+        yield text.heading("Nothing has changed beyond the uncertainty.")
+        yield from _limits(c)
+        return
+    if c.another_arm:
+        yield text.heading("This looks like another arm of the same type.")
+        yield (
+            "The calibration predicts these readings no better than the arm as drawn, and no few "
+            "changes explain them."
+        )
+        return
+    if not found.found:
+        yield text.heading("Something has changed, and no single candidate explains it.")
+        yield _left(c)
+        return
+    yield text.heading("What has changed")
+    for change in found.found:
+        yield sentence(change)
+        if change.same_as:
+            others = numbers.names([words_of(o) for o in change.same_as], "or")
+            yield f"  These readings do not tell it from {others}."
+    yield ""
+    yield _table(found.found)
+    if not all(change.candidate.of_arm for change in found.found):
+        named = dict.fromkeys(words_of(x.candidate) for x in found.found if not x.candidate.of_arm)
+        yield f"Not of the arm: {numbers.names(list(named))}."
+    yield _left(c)
+    yield numbers.many_tests(found.tested, LEVEL, "candidates").replace("diagnoses", "comparisons")
+
+
+def sentence(change: Change) -> str:
+    """Return a change in one sentence."""
+    c, s = change.candidate, change.sizes[0]
+    what = words_of(c)
+    head = what[:1].upper() + what[1:]
+    why = CAUSE.get(c.effect, "")
+    if len(change.sizes) > 1:
+        return (
+            f"{head} has changed: it moves the target by {numbers.length(change.moved_m)} rms "
+            f"({numbers.p_equals(change.p_value)}). {why[:1].upper()}{why[1:]}".rstrip()
+        )
+    unit, factor = numbers.unit_for(s.unit, [s.value])
+    value, std = numbers.with_std(factor * s.value, factor * s.std)
+    share = ""
+    if c.effect == "joint_compliance" and s.before is not None and s.before[0] > 0:
+        share = f", to {numbers.digits((s.before[0] + s.value) / s.before[0], 2)} times what it was"
+    signed = value if value.startswith("-") else f"+{value}"
+    words = f"{head} has moved by {signed} ± {std} {unit}{share} ({abs(s.z):.0f} σ)"
+    return f"{words}: {why}" if why else f"{words}."
+
+
+def _table(found: Sequence[Change]) -> RenderableType:
+    out = text.table("change", "by", "±", "unit", "σ", "p", "at target", left=(0, 3))
+    for change in found:
+        first = True
+        shown = [s for s in change.sizes if len(change.sizes) == 1 or abs(s.z) >= CLEAR]
+        for s in shown[:MOST_PARAMETERS]:
+            unit, factor = numbers.unit_for(s.unit, [s.value, s.std])
+            value, std = numbers.with_std(factor * s.value, factor * s.std)
+            name = change.candidate.name if len(change.sizes) == 1 else _name(change, s)
+            more = (numbers.chance(change.p_value), numbers.length(change.moved_m))
+            out.add_row(name, value, std, unit, f"{abs(s.z):.1f}", *(more if first else ("", "")))
+            first = False
+        if first:
+            row = ("", "", "", "", numbers.chance(change.p_value), numbers.length(change.moved_m))
+            out.add_row(change.candidate.name, *row)
+        elif len(shown) > MOST_PARAMETERS:
+            out.add_row(f"  … {len(shown) - MOST_PARAMETERS} more", *[""] * 6)
+    return out
+
+
+def _name(change: Change, size: Size) -> str:
+    return f"{change.candidate.effect}.{size.parameter}"
+
+
+def _left(c: Comparison) -> str:
+    found = c.changes
+    if found.explained:
+        return (
+            f"What is left after that is scatter as stated ({numbers.digits(found.scatter, 2)} "
+            "times)."
+        )
+    return (
+        f"What is left is {numbers.digits(found.scatter, 2)} times the stated scatter "
+        f"({numbers.p_equals(found.unexplained)}): more has changed than the candidates explain, "
+        "or these readings are noisier than stated."
+    )
+
+
+def _limits(c: Comparison) -> Iterator[RenderableType]:
+    found = c.changes
+    by_joint: dict[str, dict[str, Limit]] = {}
+    for limit in found.limits:
+        effect = limit.candidate.split(".")[0]
+        if effect in SEEN:
+            by_joint.setdefault(limit.part, {})[effect] = limit
+    shown = [e for e in SEEN if any(e in of for of in by_joint.values())]
+    out = text.table("would have been seen", *(JOINT_WORDS[e] for e in shown))
+    for part, of in by_joint.items():
+        out.add_row(part, *(_least(of.get(e)) for e in shown))
+    yield out
+    yield (
+        f"The smallest change that these readings would have shown in {POWER * 10:.0f} cases of "
+        f"10; where nothing has changed, a change is claimed once in {1 / LEVEL:.0f}."
+    )
+    absorbed = [words_of(h) for h in found.hidden if h.joint and h.effect == "encoder_offset"]
+    if absorbed:
+        frames = "the place of the tracker" if c.anew else "what the earlier fit leaves open"
+        yield f"Not to be seen: {numbers.names(absorbed)}; {frames}, estimated anew, absorbs it."
+
+
+def _least(limit: Limit | None) -> str:
+    if limit is None or limit.size == float("inf"):
+        return "-"
+    return numbers.sizes([(limit.unit, limit.size)])
+
+
+def next_step(c: Comparison, earlier: str) -> str:
+    """Return in one sentence what to do next; `next_command` is the line for it."""
+    found = c.changes
+    if c.another_arm:
+        return "calibrate it by itself."
+    if not found.found and found.explained:
+        return f"nothing; the calibration of {earlier} holds."
+    arm = [x for x in found.found if x.candidate.of_arm]
+    if found.explained and found.found and not arm:
+        return f"put the setup right, and compare again; the calibration of {earlier} holds."
+    parts = numbers.names(list(dict.fromkeys(x.candidate.part for x in arm)))
+    what = f"recalibrate {parts}" if parts else "recalibrate the arm"
+    return f"{what} from a campaign of the arm as it is now."
+
+
+def next_command(c: Comparison, earlier: str, later: str) -> str | None:
+    """Return the command line for the next step; None where there is none."""
+    arm = [x for x in c.changes.found if x.candidate.of_arm]
+    return f"hilcal refine {later}" if arm or not c.changes.explained else None
+
+
+def to_json(c: Comparison, earlier: str, later: str) -> dict[str, object]:
+    """Return the comparison as JSON; SI."""
+    t, found = c.today, c.changes
+    return {
+        "revision": c.number,
+        "model": list(c.fit.model.names),
+        "readings": c.mode,
+        "n_readings": c.readings,
+        "n_fitted": c.shared,
+        "n_measurements": len(t.prediction.raw),
+        "tracker": "anew" if c.anew else "same",
+        "tool_differs": list(c.tool),
+        "added_to_earlier": list(c.lacked),
+        "error": t.prediction.error.to_json(),
+        "expected_m": t.stated_m,
+        "z": t.z,
+        "p_value": t.p_value,
+        "drawing_rms_m": t.drawing_m,
+        "n_outside": int(t.beyond.outside.sum()),
+        "outside": [v.variable for v in t.beyond.variables],
+        "changed": bool(found.found) or not found.explained,
+        "another_arm": c.another_arm,
+        "changes": [_change_json(change) for change in found.found],
+        "explained": found.explained,
+        "left_p_value": found.unexplained,
+        "left_over_stated": found.scatter,
+        "tested": found.tested,
+        "level": LEVEL,
+        "would_have_been_seen": [
+            {
+                "candidate": limit.candidate,
+                "part": limit.part,
+                "unit": limit.unit,
+                "size": limit.size if limit.size < float("inf") else None,
+                "moved_m": limit.moved_m if limit.moved_m < float("inf") else None,
+            }
+            for limit in found.limits
+        ],
+        "not_to_be_seen": [h.name for h in found.hidden],
+        "next": next_step(c, earlier),
+        "next_command": next_command(c, earlier, later),
+    }
+
+
+def _change_json(change: Change) -> dict[str, object]:
+    c = change.candidate
+    return {
+        "candidate": c.name,
+        "effect": c.effect,
+        "part": c.part,
+        "of_arm": c.of_arm,
+        "words": sentence(change),
+        "p_value": change.p_value,
+        "log_evidence": change.log_evidence,
+        "moved_m": change.moved_m,
+        "sizes": [
+            {
+                "parameter": s.parameter,
+                "unit": s.unit,
+                "value": s.value,
+                "std": s.std,
+                "z": s.z,
+                "before": None if s.before is None else s.before[0],
+                "before_std": None if s.before is None else s.before[1],
+            }
+            for s in change.sizes
+        ],
+        "same_as": [o.name for o in change.same_as],
+    }
