@@ -14,9 +14,10 @@ from hilcal.diagnose.comparison import Comparison, error_today
 from hilcal.diagnose.completed import completed
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.description_words import refuse_misdescribed
+from hilcal.identify.earlier import earlier_fit
 from hilcal.identify.fit import Fit
 from hilcal.identify.registration import register
-from hilcal.identify.remeasured import earlier_fit, setting
+from hilcal.identify.remeasured import setting
 from hilcal.revisions import mode_of
 
 

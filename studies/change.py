@@ -22,8 +22,9 @@ from hilcal.data.readings import Readings
 from hilcal.diagnose.change import Changes, find_changes
 from hilcal.errors import HilcalError
 from hilcal.identify.baseline import with_effects
+from hilcal.identify.earlier import Earlier, earlier_fit
 from hilcal.identify.fit import fit
-from hilcal.identify.remeasured import Earlier, earlier_fit, setting
+from hilcal.identify.remeasured import setting
 from hilcal.types import Floats
 from studies.random_campaigns import rehearsal_states
 from studies.study_cases import with_study_loads

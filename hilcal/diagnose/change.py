@@ -24,7 +24,8 @@ from scipy.stats import f as f_distribution
 from hilcal.diagnose.change_candidates import Candidate, candidates
 from hilcal.diagnose.effect_ranking import SAME_EVIDENCE
 from hilcal.errors import CannotAnswerError
-from hilcal.identify.remeasured import Earlier, Remeasured, Setting, remeasure
+from hilcal.identify.earlier import Earlier
+from hilcal.identify.remeasured import Remeasured, Setting, remeasure
 from hilcal.regression.evidence import FamilyScore, log_evidence, score_family, visible
 from hilcal.regression.power import noncentrality_of_power
 from hilcal.types import Floats

@@ -15,7 +15,8 @@ from hilcal.diagnose.change import Changes, find_changes
 from hilcal.diagnose.change_candidates import candidates
 from hilcal.effects.spec import effect
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identify.remeasured import earlier_fit, setting
+from hilcal.identify.earlier import earlier_fit
+from hilcal.identify.remeasured import setting
 from hilcal.robot.catalogue import configs_dir
 from studies.change import StudiedArm, remeasured, studied_arm
 
