@@ -27,7 +27,7 @@ from hilcal.calibration.measured import Measured
 from hilcal.calibration.poses import ToolPoses
 from hilcal.calibration.scatter import Scatter, scatter_of
 from hilcal.calibration.sensed import SensorMount
-from hilcal.calibration.tool import Tool, one_of_each, tool_of, tool_poses
+from hilcal.calibration.tool import Tool, in_chain, one_of_each, tool_of, tool_poses
 from hilcal.data.readings import States
 from hilcal.data.whitening import Mode
 from hilcal.diagnose.noise_verdict import MISFIT_ALARM
@@ -254,7 +254,7 @@ class Calibration:
             goal = np.array(given[:, :3, :3]), np.array(given[:, :3, 3])
         fast = self._compiled if of is self._tracked else compiled(of, self.mode)
         if fast is not None:
-            found, left = fast.compensate(states.q, states.wrench, *(goal or (None, None)))
+            found, left = fast.compensate(states.q, states.wrench, goal)
             inverse = Inverse(found, left[:, 0], left[:, 1])
         else:
             inverse = self._invert(of, states, goal or self.nominal(of, states))
@@ -268,9 +268,9 @@ class Calibration:
     def _invert(self, of: Tool, states: States, goal: tuple[Floats, Floats]) -> Inverse:
         def poses(at: Floats, points: Ints) -> Pose:
             prediction = of.model.predict(replace(states[points], q=at), of.theta)
-            return (*tool_poses(of, prediction), prediction.situation.chain)
+            return (*in_chain(of, *tool_poses(of, prediction)), prediction.situation.chain)
 
-        return invert(self.model.cell.arm, poses, states.q, *goal)
+        return invert(self.model.cell.arm, poses, states.q, *in_chain(of, *goal))
 
     def load_wrench(self, q: Floats, reading: Floats) -> Floats:
         """Return the wrench of a load as the force sensor reads it, for `predict` and `compensate`.
@@ -296,21 +296,12 @@ class Calibration:
         return self.sensor.load_wrench(self.model.cell, at, every)
 
     def tool_pose(self, tool: Floats | None = None) -> Floats:
-        """(4, 4) T_flange_tool: as given, or the tracked target as fitted."""
-        return self._tool(tool).pose
+        """(4, 4) T_flange_tool of the nominal arm: as given, or the tracked target."""
+        return self._tool(tool).nominal
 
     def base_in_tracker(self) -> Floats:
-        """(4, 4) T_sensor_base as fitted."""
-        first = one_of_each(self.model.cell)
-        if self.model.cell.targets is not None:
-            first = replace(first, target=np.zeros(1, dtype=np.int64))
-        situation = self.model.predict(first, self.theta).situation
-        pose = self.model.cell.registration
-        for e, mine in zip(self.model.effects, self.model.slices(), strict=True):
-            moved = e.deviation(self.theta[mine], situation).base
-            if e.role == "registration" and moved is not None:
-                pose = pose @ se3.matrix(*(x[0] for x in se3.exp(moved)))
-        return np.asarray(pose)
+        """(4, 4) T_sensor_base: as known, or where the nominal arm fits the readings best."""
+        return self.model.cell.registration
 
     def _tool(self, pose: Floats | None) -> Tool:
         """Return the tool with a pose on the flange; raises as `predict` does."""
@@ -357,8 +348,8 @@ class Calibration:
             unloaded = replace(states, wrench=np.zeros((len(states), 6)))
             return tool_poses(of, of.model.predict(unloaded, of.theta))
         chain = evaluate(of.model.cell.arm, states.q)
-        rotation = se3.product(chain.rotation[-1], of.pose[:3, :3])
-        return rotation, chain.point(of.pose[:3, 3])
+        rotation = se3.product(chain.rotation[-1], of.nominal[:3, :3])
+        return rotation, chain.point(of.nominal[:3, 3])
 
     def poses(
         self, of: Tool, states: States, nominal: tuple[Floats, Floats], std: bool
@@ -376,14 +367,16 @@ class Calibration:
         known = covariance = None
         if std:
             known = self._by_parameters(of, states, prediction)
-            scatter = self.scatter.covariance(of.model.cell, prediction.situation.chain, position)
-            covariance = known + scatter + self.misfit * np.eye(3)
+            turn, chain = of.base[:3, :3], prediction.situation.chain
+            at = (position - of.base[:3, 3]) @ turn
+            scatter = self.scatter.covariance(of.model.cell, chain, at)
+            covariance = turn @ (known + scatter) @ turn.T + self.misfit * np.eye(3)
             known = np.sqrt(np.trace(known, axis1=1, axis2=2))
         outside = tuple(self.measured.outside(states, known))
         return ToolPoses(position, rotation, nominal[1], nominal[0], covariance, outside)
 
     def _by_parameters(self, of: Tool, states: States, prediction: Prediction) -> Floats:
-        """(N, 3, 3) κ J C Jᵀ of the position, base axes, m²."""
+        """(N, 3, 3) κ J C Jᵀ of the position, axes of the chain, m²."""
         spread = self._spread(of, prediction)
         if self.mode == "deflection":
             unloaded = replace(states, wrench=np.zeros((len(states), 6)))
@@ -391,7 +384,7 @@ class Calibration:
         return spread @ np.swapaxes(spread, 1, 2)
 
     def _spread(self, of: Tool, prediction: Prediction) -> Floats:
-        """(N, 3, K) J R of the position, base axes."""
+        """(N, 3, K) J R of the position, axes of the chain."""
         jacobian = of.model.jacobian(prediction, of.theta, 3)
         jacobian = np.swapaxes(prediction.observation.axes, 1, 2) @ jacobian
         return np.asarray(jacobian @ self.root[of.kept])

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from hilcal.calibration.compensation import MOST_TURN, TOLERANCE
-from hilcal.calibration.tool import Tool
+from hilcal.calibration.tool import Tool, in_chain
 from hilcal.data.readings import States
 from hilcal.data.whitening import Mode
 from hilcal.effects.protocol import FRAME_ROLES, Effect, Situation
@@ -44,7 +44,7 @@ class Compiled:
         load: where the load acts, and all weights.
         laws: constants and compliances.
         tables: of what depends on one angle, or one torque.
-        tool: (4, 4) T_flange_tool.
+        tool: where it is on the flange, and where the base is.
         nominal: the same laws with nothing in them, of the nominal arm.
         reach: m.
         mode: kind of readings that the model was fitted to.
@@ -54,38 +54,40 @@ class Compiled:
     load: tuple[Any, ...]
     laws: tuple[Floats, ...]
     tables: tuple[Any, ...]
-    tool: Floats
+    tool: Tool
     nominal: tuple[tuple[Floats, ...], tuple[Any, ...]]
     reach: float
     mode: Mode
 
     def compensate(
-        self, q: Floats, wrench: Floats, rotation: Floats | None, position: Floats | None
+        self, q: Floats, wrench: Floats, goal: tuple[Floats, Floats] | None
     ) -> tuple[Floats, Floats]:
         """Joint values (N, n) and residuals (N, 2), m and rad.
 
         Args:
             q: (N, n) joint values, rad.
             wrench: (N, 6) at the load point, base axes.
-            rotation: (N, 3, 3) wanted orientations; those of q where None.
-            position: (N, 3) wanted positions, m.
+            goal: (N, 3, 3) wanted orientations and (N, 3) positions, m, base axes; those that the
+                nominal arm (for deflections: the unloaded arm) has at q where None.
         """
         from hilcal.calibration.kernel import invert_all
 
         count = len(q)
         out, left = np.empty_like(q), np.zeros((count, 2))
-        if rotation is None or position is None:
-            rotation, position = np.empty((count, 3, 3)), np.empty((count, 3))
-            still = self.mode == "deflection"
+        still = self.mode == "deflection"
+        rotation, position = goal or (np.empty((count, 3, 3)), np.empty((count, 3)))
+        if goal is None:
             laws, tables = (self.laws, self.tables) if still else self.nominal
-            nothing = np.zeros((count, 6))
+            tool, nothing = self.tool.pose if still else self.tool.nominal, np.zeros((count, 6))
             invert_all(
-                self.arm, self.load, laws, tables, self.tool, self.reach, MOST_TURN, TOLERANCE,
+                self.arm, self.load, laws, tables, _c(tool), self.reach, MOST_TURN, TOLERANCE,
                 q, nothing, rotation, position, False, out, left,
             )  # fmt: skip
+        if goal is not None or not still:
+            rotation, position = in_chain(self.tool, rotation, position)
         invert_all(
-            self.arm, self.load, self.laws, self.tables, self.tool, self.reach, MOST_TURN,
-            TOLERANCE, q, wrench, rotation, position, True, out, left,
+            self.arm, self.load, self.laws, self.tables, _c(self.tool.pose), self.reach, MOST_TURN,
+            TOLERANCE, q, wrench, _c(rotation), _c(position), True, out, left,
         )  # fmt: skip
         return out, left
 
@@ -126,7 +128,7 @@ def compiled(tool: Tool, mode: Mode) -> Compiled | None:
     bare = _Form.empty(arm.n)
     nominal = bare.laws(), bare.tables()
     reach = float(arm.reach)
-    return Compiled(links, load, form.laws(), form.tables(), _c(tool.pose), nominal, reach, mode)
+    return Compiled(links, load, form.laws(), form.tables(), tool, nominal, reach, mode)
 
 
 @dataclass(slots=True, eq=False)

@@ -5,7 +5,8 @@ of another length or angle) goes into the constant transforms:
 
     L_k' = L_k exp(ξ_k) Rz(dq_{k+1}),      L_n' = L_n exp(ξ_n)
 
-Everything else (compliances, waves of gears, temperature) cannot, and is named.
+The frames that were fitted along go into the two ends, see `tool`. Everything else (compliances,
+waves of gears, temperature) cannot, and is named.
 """
 
 from dataclasses import dataclass, replace
@@ -13,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilcal.calibration.calibration import Calibration
+from hilcal.calibration.tool import ends
 from hilcal.data.readings import States
 from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.errors import CannotAnswerError, InputError
@@ -76,6 +78,8 @@ def corrected(calibration: Calibration) -> Corrected:
         links[k] = links[k] @ se3.matrix(*se3.exp(twist[k]))
         if k < arm.n:
             links[k] = links[k] @ se3.matrix(se3.rotation(np.array([0.0, 0.0, dq[k]])), np.zeros(3))
+    base, behind = ends(model, calibration.theta)
+    links[0], links[-1] = base @ links[0], links[-1] @ behind
     return Corrected(replace(arm, links=links), tuple(within), tuple(beyond))
 
 

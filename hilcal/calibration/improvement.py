@@ -200,7 +200,6 @@ def _errors(
     wanted = 0.0 * position
     if calibration.mode == "absolute":
         wanted = calibration.nominal(of, replace(goal, target=None))[1]
-    axes = prediction.observation.axes
-    moved = np.einsum("nij,nj->ni", axes, position - wanted)
+    moved = (position - wanted) @ calibration.base_in_tracker()[:3, :3].T
     total = p.of_reading(prediction, w)
     return raw + w.raw(moved), total, w.covariance

@@ -2,8 +2,11 @@
 
     T_base_tool = exp(base) T_base_flange(q, w) T_flange_tool
 
-The frames that were fitted along (effects of the roles "registration" and "target") describe where
-base and target are; they are part of T_sensor_base and T_flange_tool, and no error of the arm. What
+Base axes are those in which the nominal arm fits the readings best, where the registration was
+estimated: `Cell.registration`. A fit that knows the geometry, too, moves them along with the first
+link (both mean the same to every reading), so the frames that were fitted along (effects of the
+roles "registration" and "target") are part of the arm here: the one before the first joint, the
+other, the tracked target as fitted over the target as registered, behind the flange. What
 instruments do (fields "station" and "scale") is no motion of the tool.
 """
 
@@ -27,14 +30,20 @@ class Tool:
         model: whose target is the tool; without effects that place another target.
         theta: (P,) its parameters.
         kept: (P,) which of the parameters of the fitted model they are.
-        pose: (4, 4) T_flange_tool, with what the fit knows of it.
+        nominal: (4, 4) T_flange_tool of the nominal arm.
+        pose: (4, 4) the same of the fitted arm, with what the fit knows of it.
+        base: (4, 4) from the axes of the chain to those of the base, constant effects alone.
+        frames: effects that say where the base is, with their parameters.
         moving: effects that move base or target and are no frames, with their parameters.
     """
 
     model: Model
     theta: Floats
     kept: Ints
+    nominal: Floats
     pose: Floats
+    base: Floats
+    frames: tuple[tuple[Effect, slice], ...]
     moving: tuple[tuple[Effect, slice], ...]
 
 
@@ -47,15 +56,39 @@ def tool_of(model: Model, theta: Floats, pose: Floats | None) -> Tool:
         pose: (4, 4) T_flange_tool; the (first) tracked target where None.
     """
     every = np.arange(model.size)
+    base, behind = ends(model, theta)
     if pose is None:
-        return Tool(model, theta, every, _fitted_target(model, theta), _moving(model, theta))
+        nominal = model.cell.all_targets[0]
+        frames, moving = _base_frames(model), _moving(model, theta)
+        return Tool(model, theta, every, nominal, behind @ nominal, base, frames, moving)
     named = [e for e in model.effects if e.role != "target"]
     parts = [every[s] for e, s in zip(model.effects, model.slices(), strict=True) if e in named]
     kept = np.concatenate([every[:0], *parts])
     cell = replace(model.cell, targets=None, target_names=(), targets_known=())
-    cell = replace(cell, target=pose, target_known=True)
+    cell = replace(cell, target=behind @ pose, target_known=True)
     own = replace(model, cell=cell, effects=tuple(named))
-    return Tool(own, theta[kept], kept, pose, _moving(own, theta[kept]))
+    frames, moving = _base_frames(own), _moving(own, theta[kept])
+    return Tool(own, theta[kept], kept, pose, behind @ pose, base, frames, moving)
+
+
+def ends(model: Model, theta: Floats) -> tuple[Floats, Floats]:
+    """Return what the fitted frames move: (4, 4) before the first joint, (4, 4) behind the flange.
+
+    Args:
+        model: the fitted model.
+        theta: (P,) its parameters.
+    """
+    situation = model.predict(_one(model.cell), theta).situation
+    base, target = np.zeros(6), model.cell.all_targets[0].copy()
+    for e, mine in zip(model.effects, model.slices(), strict=True):
+        d = e.deviation(theta[mine], situation)
+        if e.role == "registration" and d.base is not None:
+            base = base + d.base[0]
+        if e.role == "target" and d.target is not None:
+            target[:3, 3] += d.target[0, :3]
+            target[:3, :3] = se3.rotation(d.target[0, 3:]) @ target[:3, :3]
+    behind = target @ se3.inverse(model.cell.all_targets[0])
+    return se3.matrix(*se3.exp(base)), np.asarray(behind)
 
 
 def tool_poses(tool: Tool, prediction: Prediction) -> tuple[Floats, Floats]:
@@ -67,11 +100,19 @@ def tool_poses(tool: Tool, prediction: Prediction) -> tuple[Floats, Floats]:
     position = chain.point(offset if len(own) > 1 else offset[0])
     turned = se3.product(flange, se3.rotation(own[:, 3:])) if own.any() else flange
     rotation = se3.product(turned, tool.pose[:3, :3])
+    if not any(d.base is not None for d in moved):
+        r, p = tool.base[:3, :3], tool.base[:3, 3]
+        return se3.product(r, rotation), p + se3.apply(r, position)
+    moved += [e.deviation(tool.theta[mine], s) for e, mine in tool.frames]
     base = [d.base for d in moved if d.base is not None]
-    if base:
-        r, p = se3.exp(sum(base[1:], base[0]))
-        rotation, position = se3.product(r, rotation), p + se3.apply(r, position)
-    return rotation, position
+    r, p = se3.exp(sum(base[1:], base[0]))
+    return se3.product(r, rotation), p + se3.apply(r, position)
+
+
+def in_chain(tool: Tool, rotation: Floats, position: Floats) -> tuple[Floats, Floats]:
+    """Poses (N, 3, 3) and (N, 3) in the axes of the fitted chain, from those in base axes."""
+    turn = tool.base[:3, :3].T
+    return se3.product(turn, rotation), se3.apply(turn, position - tool.base[:3, 3])
 
 
 def one_of_each(cell: Cell) -> States:
@@ -100,17 +141,10 @@ def _moving(model: Model, theta: Floats) -> tuple[tuple[Effect, slice], ...]:
     )
 
 
-def _fitted_target(model: Model, theta: Floats) -> Floats:
-    """(4, 4) the (first) target with what effects of the role "target" know of it."""
-    pose = model.cell.all_targets[0].copy()
-    situation = model.predict(_one(model.cell), theta).situation
-    for e, mine in zip(model.effects, model.slices(), strict=True):
-        if e.role == "target":
-            moved = e.deviation(theta[mine], situation).target
-            if moved is not None:
-                pose[:3, 3] += moved[0, :3]
-                pose[:3, :3] = se3.rotation(moved[0, 3:]) @ pose[:3, :3]
-    return np.asarray(pose)
+def _base_frames(model: Model) -> tuple[tuple[Effect, slice], ...]:
+    """Effects that say where the base is, with where their parameters are."""
+    pairs = zip(model.effects, model.slices(), strict=True)
+    return tuple((e, mine) for e, mine in pairs if e.role == "registration")
 
 
 def _one(cell: Cell) -> States:

@@ -56,9 +56,9 @@ def achieved(c: Calibration, effect: str, seed: int, states: States, goal: Float
     scattered = states.q + rng.standard_normal(states.q.shape) * world.joint_std
     read = world.sight(replace(states, q=scattered)).value(3)
     prediction = c.model.predict(states, c.theta)
-    axes = prediction.observation.axes
     position = tool_poses(c._tracked, prediction)[1]
-    wanted = prediction.observation.position + np.einsum("nij,nj->ni", axes, goal - position)
+    base = c.base_in_tracker()[:3, :3]
+    wanted = prediction.observation.position + (goal - position) @ base.T
     return np.asarray(read - wanted)
 
 
