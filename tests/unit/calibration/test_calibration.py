@@ -78,6 +78,30 @@ def test_the_world_is_where_it_was_asked_to_be(effect: str) -> None:
     assert np.sqrt(np.mean(np.sum(after**2, axis=1) / k.after.std_m[good] ** 2)) < 1.2
 
 
+@pytest.mark.parametrize("effect", ["link_geometry", "encoder_offset"])
+def test_the_base_is_where_the_nominal_arm_fits_best(effect: str) -> None:
+    """Moving the base along with the first link changes no reading, and no correction either."""
+    c, r = calibrated(effect), campaign(effect, "absolute", 0, poses=POSES).readings
+    base = c.base_in_tracker()
+    seen = (r.value[:, :3] - base[:3, 3]) @ base[:3, :3]
+    p = c.predict(r.states.q, r.states.wrench)
+    np.testing.assert_allclose(p.position, seen, atol=2e-4)
+    shifted = replace(c, theta=c.theta + moved_along(c))
+    again = shifted.predict(r.states.q, r.states.wrench)
+    np.testing.assert_allclose(again.position, p.position, atol=5e-6)  # loads pull elsewhere
+    np.testing.assert_array_equal(again.nominal_position, p.nominal_position)
+
+
+def moved_along(c: Calibration) -> Floats:
+    """Parameters that turn the base one way and the first link, or joint, the other."""
+    names = [f"{e.name}.{p.name}" for e in c.model.effects for p in e.parameters]
+    out = np.zeros(len(names))
+    out[names.index("base_frame.rz")] = 2e-3
+    other = "link_geometry.link0.rz" if "link_geometry.link0.rz" in names else "encoder_offset.j1"
+    out[names.index(other)] = -2e-3
+    return out
+
+
 def test_deflections_are_compensated_to_the_unloaded_arm() -> None:
     c, states = calibrated("joint_tilt_compliance", "deflection"), fresh()
     k = c.compensate(states.q, states.wrench)
