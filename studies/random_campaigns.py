@@ -240,6 +240,8 @@ def rehearse(config: CellConfig, choice: str, seed: int, n_poses: int = POSES) -
     Raises:
         InputError: an unknown choice; lists the valid ones. No loads in the configuration.
     """
+    if not config.loads:
+        raise InputError("the cell has no [[loads]]; such a campaign needs at least one")
     rng = np.random.default_rng(seed)
     visits: list[CampaignStates] = []
 

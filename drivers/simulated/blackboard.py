@@ -83,11 +83,18 @@ class Blackboard:
         }
 
     @classmethod
-    def create(cls, path: Path, scale: float) -> "Blackboard":
-        """Make the file and start the world's clock; `scale` is world seconds per real second."""
+    def create(cls, path: Path, scale: float, begun: float = 0.0) -> "Blackboard":
+        """Make the file and start the world's clock.
+
+        Args:
+            path: the file.
+            scale: world seconds per real second.
+            begun: world time that it starts at, s.
+        """
         path.write_bytes(bytes(SIZE))
         board = cls(path)
-        board.write("world", start_ns=time.monotonic_ns(), scale=scale)
+        start = time.monotonic_ns() - round(1e9 * begun / scale)
+        board.write("world", start_ns=start, scale=scale)
         return board
 
     @classmethod

@@ -67,6 +67,7 @@ class SimulatedCell:
         seed: int,
         *,
         base_dir: Path | None = None,
+        begun: float = 0.0,
     ) -> Self:
         """Start every device of the cell, and return when all of them are ready.
 
@@ -76,6 +77,7 @@ class SimulatedCell:
             directory: a directory for this cell alone; made where it is missing.
             seed: of everything random.
             base_dir: directory that a robot's file path in `config` is relative to.
+            begun: world time at the start, s: over 0 where the world was there before.
 
         Raises:
             InputError: a cell that cannot be simulated.
@@ -87,7 +89,7 @@ class SimulatedCell:
             for name in _STALE:
                 (directory / name).unlink(missing_ok=True)
             write_world(directory / "world.json", world, config, base_dir)
-            board = open_board(directory, config.simulation.clock)
+            board = open_board(directory, config.simulation.clock, begun)
         except OSError as error:
             raise InputError(
                 f"simulated cell: {directory} cannot be used ({error}); "

@@ -69,7 +69,11 @@ def read_plan(s: SimulationCase, plan: Plan, seed: Sequence[int], begun: float =
 
 @contextmanager
 def simulated_cell(
-    secret: SimulationCase, seed: int, base_dir: Path, directory: Path | None = None
+    secret: SimulationCase,
+    seed: int,
+    base_dir: Path,
+    directory: Path | None = None,
+    begun: float = 0.0,
 ) -> Iterator[SimulatedCell]:
     """Run the simulated devices of a cell; they end with the block.
 
@@ -78,6 +82,7 @@ def simulated_cell(
         seed: of the devices' noise.
         base_dir: directory that a robot's file path is relative to.
         directory: where the devices meet; a temporary one if None.
+        begun: world time at the start, s.
 
     Raises:
         DeviceError: a device did not start.
@@ -85,6 +90,6 @@ def simulated_cell(
     with tempfile.TemporaryDirectory(prefix="hilcal-") as made:
         where = directory or Path(made)
         with SimulatedCell.start(
-            secret.world, secret.config, where, seed, base_dir=base_dir
+            secret.world, secret.config, where, seed, base_dir=base_dir, begun=begun
         ) as cell:
             yield cell

@@ -104,11 +104,16 @@ def as_told(config: CellConfig, choice: str, catalogue: Catalogue | None = None)
     """Return the configuration that the program is given when an effect is hidden.
 
     Raises:
-        InputError: an unknown choice; lists the valid ones. No loads in the configuration.
+        InputError: an unknown choice; lists the valid ones. An effect that loads show, in a cell
+            without any.
     """
     check_choice(choice, catalogue)
-    if not config.loads:
-        raise InputError("the cell has no [[loads]]; a rehearsal needs at least one")
+    if not config.loads and choice in DEFLECTION_EFFECTS:
+        shown = ", ".join((*(e for e in choices() if e not in DEFLECTION_EFFECTS), NOTHING))
+        raise InputError(
+            f"the cell has no [[loads]]; {choice}, which loads show, needs at least one; valid to "
+            f"hide: {shown}"
+        )
     if choice != "base_frame":
         return config
     known = {"base_xyz_m": REGISTRATION_XYZ, "base_rotvec_rad": REGISTRATION_ROTVEC}
@@ -135,19 +140,21 @@ def simulation_case(
         catalogue: has the effects of a user's own.
 
     Raises:
-        InputError: an unknown choice; lists the valid ones. No loads in the configuration.
+        InputError: an unknown choice; lists the valid ones. An effect that loads show, in a cell
+            without any.
     """
     config = as_told(config, choice, catalogue)
     hidden = choice
     if choice == RANDOM:  # a wrong registration shows only where one is believed
-        hidden = str(rng.choice([e for e in choices() if e != "base_frame"]))
+        unseen = () if config.loads else DEFLECTION_EFFECTS
+        hidden = str(rng.choice([e for e in choices() if e not in ("base_frame", *unseen)]))
     cell = cell_from_config(config)
     v = visit(cell)
     own = None
     if catalogue is not None and hidden in own_choices(catalogue):
         own = own_law(catalogue, hidden, cell, v.states)
     loaded = choice in DEFLECTION_EFFECTS if own is None else own.effect.elastic
-    mode: Mode = "deflection" if loaded else "absolute"
+    mode: Mode = "deflection" if loaded and _paired(v) else "absolute"
     joint_std = config.repeatability.per_joint(cell.arm.n)
     world = nothing_hidden(cell, rng, noise=noise, joint_std=joint_std)
     strength = 0.0
@@ -161,6 +168,13 @@ def simulation_case(
             what, cell, v.states, strength, mode, rng, world=world, pose=v.pose, cycle=v.cycle
         )
     return SimulationCase(config, cell, mode, world, hidden, strength)
+
+
+def _paired(v: CampaignStates) -> bool:
+    """Whether every loaded state has an unloaded one of its pose and cycle."""
+    keys = list(zip(v.pose.tolist(), v.cycle.tolist(), strict=True))
+    unloaded = {key for key, load in zip(keys, v.load.tolist(), strict=True) if load == 0}
+    return bool(unloaded) and all(key in unloaded for key in keys)
 
 
 def simulate(

@@ -31,12 +31,12 @@ OPS = ("hang", "mistake", "push", "swing", "state", "log", "die")
 _POLL = 0.0025  # s, real time between two looks at the arm
 
 
-def open_board(directory: Path, scale: float) -> Blackboard:
+def open_board(directory: Path, scale: float, begun: float = 0.0) -> Blackboard:
     """Return the blackboard of a cell; the first who asks makes it, whole or not at all."""
     path = directory / "world.bin"
     if not path.exists():
         new = path.with_name("world.bin.new")
-        board = Blackboard.create(new, scale)
+        board = Blackboard.create(new, scale, begun)
         new.replace(path)  # the mapping goes with the file
         return board
     return Blackboard.attach(path)

@@ -30,6 +30,7 @@ def load(place: str) -> Callable[..., Any]:
 
 SECTIONS = {
     "Try it": ("demo", "simulate"),
+    "All in one": ("calibrate",),
     "Prepare": ("init", "config", "check", "plan"),
     "Measure": ("run", "import", "info"),
     "Fit, and find what is missing": (
@@ -43,6 +44,10 @@ SECTIONS = {
 COMMANDS = {
     "demo": Command(
         "demo:demo", "Rehearse the whole story on a simulated cell, through real drivers and wires."
+    ),
+    "calibrate": Command(
+        "calibrating:calibrate",
+        "Plan, measure, fit, measure what is in doubt, validate, correct, and measure the gain.",
     ),
     "simulate": Command(
         "simulating:simulate",

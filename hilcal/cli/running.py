@@ -219,10 +219,12 @@ def measure(
     cell: Cell,
     campaign: CampaignFile,
     goal: GoalRule | None = None,
+    epoch: float | None = None,
 ) -> int:
     """Measure what is missing in a campaign; returns how many readings it then holds.
 
-    With a goal it is only as much as that needs; nothing where it is met already.
+    With a goal it is only as much as that needs; nothing where it is met already. The campaign's
+    time counts from `epoch`, a time of day in s, where that is given.
 
     Raises:
         DeviceError: a device failed; the arm stands, and what was measured is stored.
@@ -246,7 +248,7 @@ def measure(
         log.event("devices", {"answers": [answer_json(answer) for answer in answers]})
         clock = Clock(config.simulation.clock)
         live = LiveModel(cell, config)
-        run_plan(rig, cell, config, log.plan, log, clock, watcher, live=live, goal=goal)
+        run_plan(rig, cell, config, log.plan, log, clock, watcher, live, goal=goal, epoch=epoch)
     return campaign.n_readings
 
 

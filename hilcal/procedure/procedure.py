@@ -30,7 +30,6 @@ from hilcal.data.plan import REFERENCE, Plan, read_plan
 from hilcal.data.procedure_log import ENTRY, ProcedureLog, entry
 from hilcal.data.purpose import CALIBRATION, CORRECTED, PURPOSE, VALIDATION
 from hilcal.data.readings import Readings
-from hilcal.data.records import content_hash
 from hilcal.data.revision import RevisionRecord
 from hilcal.data.run_log import PLAN, RunLog, check_same_cell, create_run
 from hilcal.data.same_readings import already
@@ -201,7 +200,7 @@ class Procedure:
             ]
             ProcedureLog(o.file).append(
                 REFINED,
-                {"readings_sha256": content_hash(o.readings), "verdict": found.verdict},
+                {"readings_sha256": o.file.data_hash(), "verdict": found.verdict},
                 revisions=records,
             )
         self._found[:] = [found]

@@ -4,6 +4,7 @@ Here the readings are drawn in the simulated world; `test_readme_on_devices` dri
 commands over wires.
 """
 
+import shlex
 import tomllib
 from itertools import pairwise
 from pathlib import Path
@@ -29,6 +30,7 @@ from hilcal.data.table import write_table
 from hilcal.plan.planner import Request, make
 from tests.support import readme
 from tests.support.cli_cases import Outcome, run
+from tests.support.paths import ROOT
 
 Capsys = pytest.CaptureFixture[str]
 FEW = "candidates = 60\nagainst = []\n"
@@ -51,6 +53,17 @@ def test_every_command_is_one_of_the_program() -> None:
     used = {words[0] for words in readme.commands()}
     assert used <= set(COMMANDS)
     assert {"check", "plan", "run", "import", "identify", "refine", "next", "validate"} <= used
+
+
+def test_the_one_command_is_as_the_readme_says(tmp_path: Path, capsys: Capsys) -> None:
+    section = (ROOT / "README.md").read_text().split("\n## A real campaign by one command\n")[1]
+    lines = [x.strip() for x in section.split("\n## ")[0].splitlines() if x.startswith("    ")]
+    assert len(lines) == 3
+    shown = run(capsys, "calibrate", "--help").out
+    for line in lines:
+        words = shlex.split(line, comments=True)
+        assert words[:2] == ["hilcal", "calibrate"]
+        assert all(w in shown for w in words if w.startswith("--"))
 
 
 def test_every_command_in_order(

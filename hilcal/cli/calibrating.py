@@ -1,0 +1,385 @@
+"""`calibrate`: the operator's one command, from the plan to the measured improvement."""
+
+import shlex
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from drivers.simulated.rehearsal import NOTHING, as_told
+from hilcal.acquire.connect import connect
+from hilcal.cell import Cell, cell_from_config
+from hilcal.cli.asking import agreed, somebody_there
+from hilcal.cli.effects_from import EffectsFrom, catalogue_with
+from hilcal.cli.living_cell import LivingCell
+from hilcal.cli.plan_output import POSES
+from hilcal.cli.planning import CellFile, read_cell, refuse_unready
+from hilcal.cli.refining import Row
+from hilcal.cli.rehearsing import to_the_end
+from hilcal.cli.running import measure
+from hilcal.cli.terminal import Json, Terminal, terminal
+from hilcal.config import CellConfig
+from hilcal.data.campaign_file import CampaignFile, may_write
+from hilcal.data.durations import parse_duration
+from hilcal.data.lengths import parse_length
+from hilcal.data.procedure_log import ProcedureLog
+from hilcal.data.run_log import RunLog
+from hilcal.data.whitening import Mode
+from hilcal.effects.catalogue import Catalogue
+from hilcal.errors import CannotAnswerError, HilcalError, InputError, LimitError, StoppedError
+from hilcal.plan.nominal_model import check_effects
+from hilcal.procedure.decision import Decision
+from hilcal.procedure.procedure import Procedure, continued
+from hilcal.procedure.state import DECIDED, REFINED, VALIDATED, Settings, Step
+from hilcal.refine import Refinement
+from hilcal.report import text_calibrate, text_refine
+from hilcal.report.progress import working
+from hilcal.report.text_plan import plan_facts
+
+VALIDATION = 20
+"""Poses of a validation campaign; a choice: their mean error is known to a tenth of itself."""
+LONGEST = "2 h"
+"""How long measuring may last; a choice."""
+
+
+def calibrate(
+    cell: CellFile,
+    output: Annotated[
+        Path,
+        typer.Option(
+            "-o",
+            "--output",
+            metavar="RUN.hilcal",
+            help="The campaign file; RUN.validation.hilcal and RUN.corrected.hilcal go beside it.",
+        ),
+    ],
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with what RUN.hilcal holds, after any stop.")
+    ] = False,
+    goal: Annotated[
+        str | None,
+        typer.Option(
+            "--goal",
+            metavar="LENGTH",
+            help='The error that is wanted, e.g. "0.1 mm": it is measured on until 95 % of points '
+            "are predicted to be within it after compensation, as far as that can be had.",
+        ),
+    ] = None,
+    limit: Annotated[
+        str | None,
+        typer.Option(
+            "--limit",
+            metavar="LENGTH",
+            help="The largest error allowed at the corrected targets, as measured; exit 5 where it "
+            "is not kept.",
+        ),
+    ] = None,
+    max_time: Annotated[
+        str | None,
+        typer.Option(
+            "--max-time",
+            metavar="TIME",
+            help=f'The longest that measuring to fit may take in all, "{LONGEST}" unless given.',
+        ),
+    ] = None,
+    poses: Annotated[
+        int | None, typer.Option("--poses", help=f"Size of the plan, {POSES} unless given.")
+    ] = None,
+    validation: Annotated[
+        int | None,
+        typer.Option(
+            "--validation", help=f"Poses of the validation campaign, {VALIDATION} unless given."
+        ),
+    ] = None,
+    rehearse: Annotated[
+        bool, typer.Option("--rehearse", help="In one simulated cell, from the first to the last.")
+    ] = False,
+    yes: Annotated[
+        bool, typer.Option("--yes", "-y", help="Do not ask before the arm moves; for scripts.")
+    ] = False,
+    effects_from: EffectsFrom = None,
+    as_json: Json = False,
+) -> None:
+    """Plan, measure, fit, measure what is in doubt, validate, correct, and measure the gain."""
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
+    config, numbers = read_cell(cell)
+    asked = _asked(goal, limit, max_time, poses, validation)
+    on = ["hilcal", "calibrate", str(cell), "-o", str(output)]
+    more = ["--rehearse"] * rehearse + ["--yes"] * yes
+    for path in effects_from or ():
+        more += ["--effects-from", str(path)]
+    told = _Told(t, shlex.join([*on, "--resume", *more]), shlex.join([*on, *more]))
+    p = _procedure(cell, output, resume, rehearse, config, numbers, catalogue, asked, told)
+    if not (yes or rehearse or somebody_there(t)) and p.next().kind != "done":
+        raise InputError(
+            "nobody can be asked before the arm moves; give --yes, or run it at a terminal"
+        )
+    with told.how_to_go_on(p), ExitStack() as stack:
+        _Operator(t, p, stack, rehearse, yes).to_the_end()
+        with working(t.progress) as say:
+            found = p.compare(say)
+    limit_m = p.settings.limit_m
+    t.show(text_calibrate.heading(Step("compare", output)))
+    t.show(text_calibrate.improvement_report(found, limit_m))
+    files = p.files
+    t.show(
+        f"\nThe calibration is in {output}, its test in {files.validation.name} and "
+        f"{files.corrected.name}. Correct your points and programs with:"
+    )
+    t.command(shlex.join(["hilcal", "compensate", str(output), "POINTS"]))
+    failed: HilcalError | None = None
+    if limit_m is not None and found.over(limit_m):
+        words = text_calibrate.failure(found, limit_m)
+        undecided = limit_m < found.everything.noise_m
+        failed = CannotAnswerError(words) if undecided else LimitError(words)
+    t.document({**_document(p), "improvement": found.to_dict(), "limit_m": limit_m}, failed)
+
+
+def _asked(
+    goal: str | None,
+    limit: str | None,
+    max_time: str | None,
+    poses: int | None,
+    validation: int | None,
+) -> dict[str, Any]:
+    """Return the settings that options give.
+
+    Raises:
+        InputError: no length, no duration, or no number of poses.
+    """
+    for name, count in (("--poses", poses), ("--validation", validation)):
+        if count is not None and count < 1:
+            raise InputError(f"{name} {count}; valid: a whole number from 1")
+    asked = {
+        "goal_m": None if goal is None else parse_length(goal, "--goal"),
+        "limit_m": None if limit is None else parse_length(limit, "--limit"),
+        "max_time_s": None if max_time is None else parse_duration(max_time, "--max-time"),
+        "poses": poses,
+        "validation": validation,
+    }
+    return {key: value for key, value in asked.items() if value is not None}
+
+
+@dataclass(frozen=True, slots=True)
+class _Told:
+    """How to go on.
+
+    Attributes:
+        t: where people are told.
+        on: the command that goes on.
+        again: the command that begins.
+    """
+
+    t: Terminal
+    on: str
+    again: str
+
+    @contextmanager
+    def how_to_go_on(self, p: Procedure) -> Iterator[None]:
+        """Let whatever ends the command early say what is safe, and the line that goes on."""
+
+        def safe() -> str:
+            if not p.run.exists():
+                return f"nothing has been measured; begin again with: {self.again}"
+            return f"everything measured so far is safe; go on with: {self.on}"
+
+        try:
+            yield
+        except KeyboardInterrupt:
+            raise StoppedError(f"interrupted; {safe()}") from None
+        except (InputError, LimitError):
+            raise
+        except HilcalError as error:
+            words = str(error).rstrip(".")
+            raise type(error)(f"{words}; {safe()}") from error
+
+
+def _procedure(
+    path: Path,
+    output: Path,
+    resume: bool,
+    rehearse: bool,
+    config: CellConfig,
+    cell: Cell,
+    catalogue: Catalogue,
+    asked: dict[str, Any],
+    told: _Told,
+) -> Procedure:
+    """Begin a calibration, or take it up from its file.
+
+    Raises:
+        InputError: the file is there and nobody asked to resume, or it is of something else.
+    """
+    hide = (config.simulation.hide or NOTHING) if rehearse else None
+    base_dir = path.absolute().parent
+    if rehearse:
+        config = as_told(config, hide or NOTHING, catalogue)
+        cell = cell_from_config(config, base_dir)
+    if not output.exists():
+        may_write(output, False)
+        check_effects(cell, config, catalogue)
+        if resume:
+            told.t.notice(f"{output} is not there yet: the calibration begins")
+        kind: Mode = config.planning.readings if config.loads else "absolute"
+        seed = config.simulation.seed
+        usual = Settings(POSES, VALIDATION, parse_duration(LONGEST, "--max-time"), seed=seed)
+        settings = replace(usual, readings=kind, hide=hide, **asked)
+        return Procedure(output, cell, config, base_dir, catalogue, settings)
+    p = continued(output, cell, config, catalogue)
+    if (p.settings.hide is not None) != rehearse:
+        what = "no rehearsal; leave --rehearse out" if rehearse else "a rehearsal; give --rehearse"
+        raise InputError(f"{output}: its calibration is {what}")
+    if not resume:
+        raise InputError(
+            f"{output}: a calibration is there already, {text_calibrate.standing(p.next())}; go on "
+            f"with: {told.on}"
+        )
+    p = replace(p, settings=replace(p.settings, **asked))
+    with CampaignFile.open(output) as campaign:
+        p.resume(campaign)
+    told.t.notice(f"{output}: a calibration, {text_calibrate.standing(p.next())}")
+    return p
+
+
+class _Operator:
+    """Does one step after the other, and asks before the arm moves."""
+
+    def __init__(
+        self, t: Terminal, p: Procedure, stack: ExitStack, rehearse: bool, yes: bool
+    ) -> None:
+        """Nothing is connected yet."""
+        self._t, self._p, self._stack = t, p, stack
+        self._rehearse, self._yes = rehearse, yes
+        self._clock = p.config.simulation.clock if rehearse else 1.0
+        self._living: LivingCell | None = None
+        self._ready = False
+
+    def to_the_end(self) -> None:
+        """Do all steps that are left but the comparison.
+
+        Raises:
+            StoppedError: somebody does not want the arm to move.
+        """
+        while (step := self._p.next()).kind not in ("done", "compare"):
+            self._t.show(text_calibrate.heading(step, self._clock))
+            if step.moves:
+                self._moving(step)
+            else:
+                self._computing(step)
+
+    def _moving(self, step: Step) -> None:
+        """Ask, and measure what is missing of a plan."""
+        self._check()
+        if not self._yes and somebody_there(self._t):
+            what = "The simulated arm will move." if self._rehearse else "The arm will move."
+            if not agreed(self._t, f"Measure now? {what}"):
+                raise StoppedError("not measured, nothing has moved")
+        config = self._config()
+
+        def work(campaign: CampaignFile, epoch: float | None) -> None:
+            measure(self._t, config, self._p.cell, campaign, epoch=epoch)
+
+        def whole() -> None:
+            self._p.measure(step, work)
+
+        if self._rehearse:
+            to_the_end(self._t, whole, lambda: _count(step.path))
+        else:
+            whole()
+
+    def _config(self) -> CellConfig:
+        """Return the configuration that leads to the devices; starts simulated ones."""
+        if not self._rehearse:
+            return self._p.config
+        if self._living is None:
+            with working(self._t.progress) as say:
+                say("starting the simulated devices")
+                self._living = self._stack.enter_context(LivingCell.of(self._p))
+        return self._living.config
+
+    def _check(self) -> None:
+        """Ask every device once whether it is ready; nothing moves."""
+        if self._ready or self._rehearse:
+            return
+        with working(self._t.progress) as say:
+            say("connecting to every device")
+            rig, answers = connect(self._p.config)
+            if rig is not None:
+                rig.close()
+        for a in answers:
+            name = "no answer" if a.report is None else a.report.name
+            self._t.show(f"{a.device}: {name}, {'; '.join(a.problems) or 'ready'}")
+        refuse_unready(answers)
+        self._ready = True
+
+    def _computing(self, step: Step) -> None:
+        """Do a step in which nothing moves, and say what came of it."""
+        p, t = self._p, self._t
+        if step.kind == "plan":
+            with working(t.progress) as say:
+                made = p.plan(say)
+            t.show(plan_facts(made.summary))
+            p.begin(made.plan, p.config)
+            return
+        steps: dict[str, Callable[..., Any]] = {
+            "refine": p.refine,
+            "decide": p.decide,
+            "plan_validation": p.plan_validation,
+            "validate": p.validate,
+            "correct": p.correct,
+        }
+        with working(t.progress) as say:
+            found = steps[step.kind](say)
+        self._say(step.kind, found)
+
+    def _say(self, kind: str, found: Any) -> None:
+        t = self._t
+        if kind == "refine":
+            _say_refined(t, self._p, found)
+        elif kind == "decide":
+            decided: Decision = found
+            goal = self._p.settings.goal_m
+            t.show(text_calibrate.decision_report(decided, goal, self._clock))
+        elif kind == "validate":
+            t.show(text_calibrate.validation_lines(found))
+
+
+def _say_refined(t: Terminal, p: Procedure, found: Refinement) -> None:
+    """Show the revisions and the verdict."""
+    with CampaignFile.open(p.run, read_only=True) as campaign:
+        refined = ProcedureLog(campaign).last(REFINED) or {"revisions": []}
+    rows = [
+        Row(number, s.fit, s.diagnosis.verdict, s.added, s.removed)
+        for number, s in zip(refined["revisions"], found.steps, strict=True)
+    ]
+    t.show(text_refine.revisions_table([r.shown for r in rows]))
+    t.show([text_refine.key(), text_refine.verdict_line(found.diagnosis), ""])
+
+
+def _count(path: Path) -> int:
+    with CampaignFile.open(path, read_only=True) as campaign:
+        return campaign.n_readings
+
+
+def _document(p: Procedure) -> dict[str, object]:
+    """Return what the files hold of a calibration, for JSON."""
+    with CampaignFile.open(p.run, read_only=True) as campaign:
+        log, run = ProcedureLog(campaign), RunLog(campaign)
+        refined, validated = log.last(REFINED) or {}, log.last(VALIDATED) or {}
+        decisions = [entry for entry in log.entries() if entry["kind"] == DECIDED]
+        readings, plans = campaign.n_readings, len(run.plans)
+    return {
+        "campaign": str(p.run),
+        "validation_campaign": str(p.files.validation),
+        "corrected_campaign": str(p.files.corrected),
+        "rehearsed": p.settings.hide is not None,
+        "readings": readings,
+        "plans": plans,
+        "revision": refined.get("revisions", [None])[-1],
+        "verdict": refined.get("verdict"),
+        "decisions": decisions,
+        "validation": {k: v for k, v in validated.items() if k not in ("kind", "utc")},
+    }

@@ -1,0 +1,121 @@
+"""`calibrate`: refusals, and what is said of a calibration that is there."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.support.calibrate_process import CELL
+from tests.support.cli_cases import ok, refused, run
+from tests.support.procedure_cases import Drawn, drawn, small
+
+Capsys = pytest.CaptureFixture[str]
+
+
+@pytest.fixture
+def cell(tmp_path: Path) -> Path:
+    path = tmp_path / "cell.toml"
+    path.write_text(CELL, encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def there(tmp_path_factory: pytest.TempPathFactory) -> Drawn:
+    """A calibration that is complete, of the cell in `cell.toml` beside it."""
+    path = tmp_path_factory.mktemp("run")
+    from hilcal.config.write import to_toml
+
+    config = small(1)
+    (path / "cell.toml").write_text(to_toml(config), encoding="utf-8")
+    d = drawn(path / "run.hilcal", config=config, poses=4, validation=4)
+    d.to_the_end()
+    return d
+
+
+def test_nothing_moves_where_nobody_can_be_asked(cell: Path, capsys: Capsys) -> None:
+    out = cell.with_name("run.hilcal")
+    line = refused(capsys, 2, "calibrate", cell, "-o", out)
+    assert "give --yes" in line
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "said"),
+    [
+        ("--goal", "0.1", "has no unit"),
+        ("--limit", "much", "is not understood"),
+        ("--max-time", "2 days", 'valid: a number over 0 in s, min, h, e.g. "90 min"'),
+        ("--poses", "0", "valid: a whole number from 1"),
+        ("--validation", "0", "valid: a whole number from 1"),
+    ],
+)
+def test_bad_options(cell: Path, capsys: Capsys, option: str, value: str, said: str) -> None:
+    line = refused(
+        capsys, 2, "calibrate", cell, "-o", cell.with_name("run.hilcal"), "--yes", option, value
+    )
+    assert said in line
+
+
+def test_the_plain_command_says_what_is_there(there: Drawn, capsys: Capsys) -> None:
+    path = there.procedure.run
+    line = refused(capsys, 2, "calibrate", path.with_name("cell.toml"), "-o", path, "--yes")
+    assert "a calibration is there already, it is complete; go on with: hilcal calibrate" in line
+    assert line.endswith("--resume --yes")
+
+
+def test_a_complete_one_is_told_again(there: Drawn, capsys: Capsys) -> None:
+    path = there.procedure.run
+    command = ("calibrate", path.with_name("cell.toml"), "-o", path, "--resume")
+    told = ok(capsys, *command)
+    words = " ".join(told.out.split())
+    assert "At the corrected joint targets the arm is off by" in words
+    assert "4 points" in words
+    d = ok(capsys, *command, "--json").document
+    error = d["improvement"]["error"]
+    assert error["after"]["rms_m"] < 0.2 * error["before"]["rms_m"]
+    assert d["improvement"]["readings"] == "deflection"
+    assert (d["verdict"], d["plans"], d["rehearsed"]) == ("adequate", 1, False)
+
+
+def test_a_limit_is_judged_by_what_was_measured(there: Drawn, capsys: Capsys) -> None:
+    path = there.procedure.run
+    command = ("calibrate", path.with_name("cell.toml"), "-o", path, "--resume")
+    assert "PASSED" in ok(capsys, *command, "--limit", "1 mm").out
+    over = run(capsys, *command, "--limit", "1 um")
+    assert over.code == 4  # noise alone is more
+    assert "noise alone is" in over.err
+    noise = ok(capsys, *command, "--limit", "1 mm", "--json").document["improvement"]["error"]
+    between = 0.5e6 * (noise["noise_m"] + noise["after"]["max_m"])
+    if noise["after"]["max_m"] > noise["noise_m"]:
+        found = run(capsys, *command, "--limit", f"{between:.2f} um")
+        assert found.code == 5
+        assert "are over the limit of" in found.err
+
+
+def test_what_fits_refuses_a_validation_campaign(there: Drawn, capsys: Capsys) -> None:
+    path = there.procedure.files.validation
+    for command in ("identify", "refine", "diagnose"):
+        line = refused(capsys, 2, command, path)
+        assert "a validation campaign of run.hilcal" in line
+        assert "--fit-validation" in line
+    assert "never fitted" in ok(capsys, "validate", there.procedure.run, path).out
+    kept = path.read_bytes()
+    try:
+        told = ok(capsys, "identify", path, "--fit-validation")
+        assert "A VALIDATION CAMPAIGN IS FITTED" in told.err
+        assert ok(capsys, "diagnose", path).code == 0
+    finally:
+        path.write_bytes(kept)
+
+
+def test_another_campaign_is_no_calibration(there: Drawn, cell: Path, capsys: Capsys) -> None:
+    path = there.procedure.files.validation
+    line = refused(
+        capsys, 2, "calibrate", path.with_name("cell.toml"), "-o", path, "--resume", "--yes"
+    )
+    assert "not a campaign of hilcal calibrate" in line
+
+
+def test_a_rehearsal_goes_on_as_one(there: Drawn, capsys: Capsys) -> None:
+    path = there.procedure.run
+    command = ("calibrate", path.with_name("cell.toml"), "-o", path, "--resume", "--rehearse")
+    assert "no rehearsal; leave --rehearse out" in refused(capsys, 2, *command)

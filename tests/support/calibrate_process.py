@@ -1,0 +1,149 @@
+"""One `hilcal calibrate --rehearse` in a process of its own, to be killed."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+
+from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.run_log import RunLog
+from hilcal.procedure.state import Files
+
+ROOT = Path(__file__).resolve().parents[2]
+CELL = """\
+[robot]
+model = "ur10e"
+[tool]
+target_m = [0.06, 0.02, 0.12]
+load_point_m = [0.10, 0.0, 0.15]
+mass_kg = 0.8
+com_m = [0.01, 0.0, 0.06]
+[repeatability]
+joint_std_rad = 1e-5
+[[loads]]
+name = "pull x"
+force_N = [80.0, 0.0, 0.0]
+moment_Nm = [0.0, 6.0, 6.0]
+[operator.options]
+hand_s = 2.0
+[motion]
+speed_rad_s = 1.0
+acceleration_rad_s2 = 2.0
+[acquire]
+samples = 3
+[limits]
+workspace_min_m = [-1.6, -1.6, 0.05]
+[planning]
+candidates = 40
+against = []
+[simulation]
+seed = 4
+clock = 40.0
+"""
+"""A tiny cell without a force sensor; its world goes forty times faster than a clock."""
+SIZE = ("--poses", "4", "--validation", "3")
+LONGEST = 120.0
+"""A calibration that is not killed takes a fifth of this, s."""
+
+
+class Calibration:
+    """Starts `calibrate` in a session of its own, as often as it takes."""
+
+    def __init__(self, directory: Path) -> None:
+        """Write the cell; nothing is started."""
+        self.toml, self.run = directory / "cell.toml", directory / "run.hilcal"
+        self.log = directory / "calibrate.log"
+        self.toml.write_text(CELL, encoding="utf-8")
+        self._family: set[int] = set()
+
+    def start(self) -> "subprocess.Popen[bytes]":
+        """Start it, with --resume in any case: without a campaign it begins."""
+        command = [sys.executable, "-m", "hilcal", "calibrate", self.toml, "-o", self.run]
+        environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+        with self.log.open("ab") as log:
+            return subprocess.Popen(
+                [*map(str, command), "--rehearse", "--resume", "--json", *SIZE],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+                env=environment,
+            )
+
+    def killed_after(self, seconds: float) -> bool:
+        """Start it, and kill its process group so long after; False where it ended before."""
+        process = self.start()
+        end = time.monotonic() + seconds
+        while time.monotonic() < end and process.poll() is None:
+            self._look(process.pid)
+            time.sleep(0.02)
+        self._look(process.pid)
+        ended = process.poll() is not None
+        if not ended:
+            os.killpg(process.pid, signal.SIGKILL)
+        code = process.wait()
+        assert ended or code == -signal.SIGKILL
+        assert code <= 0, self.words
+        assert self.left_behind() == []
+        return not ended
+
+    def finish(self) -> None:
+        """Let it go on to its end."""
+        process = self.start()
+        assert process.wait(LONGEST) == 0, self.words
+
+    @property
+    def words(self) -> str:
+        """What it has said."""
+        return self.log.read_text(encoding="utf-8", errors="replace")[-4000:]
+
+    def left_behind(self) -> list[str]:
+        """Return its processes that still run, after a moment."""
+        end = time.monotonic() + 5.0
+        while True:
+            names = [name for pid in self._family if (name := _alive(pid))]
+            if not names or time.monotonic() > end:
+                return names
+            time.sleep(0.02)
+
+    def every_reading_once(self) -> int:
+        """Check that each step of each plan was measured once; returns the number of readings."""
+        files, count = Files(self.run), 0
+        for path in (files.run, files.validation, files.corrected):
+            with CampaignFile.open(path, read_only=True) as campaign:
+                log = RunLog(campaign)
+                steps = [tuple(d["step"].values()) for d in log.details()]
+                assert len(steps) == len(set(steps)) == campaign.n_readings
+                assert log.done() == frozenset(log.plan.steps)
+                assert len(log.plan.steps) == campaign.n_readings
+                count += campaign.n_readings
+        return count
+
+    def sound(self) -> None:
+        """Check that what is there can be read."""
+        files = Files(self.run)
+        for path in (files.run, files.validation, files.corrected):
+            if path.exists():
+                with CampaignFile.open(path, read_only=True) as campaign:
+                    assert len(RunLog(campaign).details()) == campaign.n_readings
+
+    def _look(self, pid: int) -> None:
+        try:
+            children = psutil.Process(pid).children(recursive=True)
+        except psutil.Error:
+            return
+        self._family |= {pid, *(child.pid for child in children)}
+
+
+def _alive(pid: int) -> str:
+    try:
+        process = psutil.Process(pid)
+        if process.status() == psutil.STATUS_ZOMBIE:
+            return ""
+        return " ".join(process.cmdline())
+    except psutil.Error:
+        return ""

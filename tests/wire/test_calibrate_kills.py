@@ -1,0 +1,50 @@
+"""`calibrate --rehearse`, killed at random moments: it finishes, with every reading once."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.procedure_log import ProcedureLog
+from hilcal.procedure.state import IMPROVED, next_step
+from tests.support.calibrate_process import Calibration
+
+MOMENTS = int(os.environ.get("HILCAL_KILLS", "50"))
+EACH = 10
+"""Kills of one calibration."""
+LONGEST = 14.0
+"""A moment is drawn up to here, s: so long a start, its devices and some steps take."""
+
+
+def finished(c: Calibration) -> None:
+    assert next_step(c.run).kind == "done"
+    c.every_reading_once()
+    with CampaignFile.open(c.run, read_only=True) as campaign:
+        found = ProcedureLog(campaign).last(IMPROVED)
+    assert found is not None
+    error = found["error"]
+    assert error["after"]["rms_m"] < 0.3 * error["before"]["rms_m"]
+
+
+@pytest.mark.slow
+def test_killed_at_fifty_random_moments(tmp_path: Path) -> None:
+    seed = int(np.random.SeedSequence().generate_state(1)[0])
+    print(f"seed {seed}")
+    rng = np.random.default_rng(seed)
+    kills = campaigns = 0
+    while kills < MOMENTS:
+        campaigns += 1
+        directory = tmp_path / str(campaigns)
+        directory.mkdir()
+        c = Calibration(directory)
+        for _ in range(min(EACH, MOMENTS - kills)):
+            if not c.killed_after(float(rng.uniform(0.0, LONGEST))):
+                break  # it has come to its end
+            kills += 1
+            c.sound()
+        c.finish()
+        assert c.left_behind() == []
+        finished(c)
+    print(f"{kills} kills of {campaigns} calibrations")
