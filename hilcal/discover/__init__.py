@@ -1,0 +1,1 @@
+"""Laws in readable form for what no effect of the catalogue explains."""

@@ -1,0 +1,265 @@
+"""The amplitude of a law: products of functions of recorded quantities, to a stated complexity.
+
+A function of one quantity has the complexity of its shape, a sum of two joints one more; a product
+has the sum of its factors'. All products of at most `MOST_FACTORS` factors of different quantities
+up to the complexity `MOST` are tried.
+
+What a law costs for the search that found it is the logarithm of the number of candidates of its
+complexity, and log 2 for each unit of complexity: simple laws are few, and pay little.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import log
+
+import numpy as np
+
+from hilcal.discover import shapes
+from hilcal.discover.shapes import Numbers, Shape
+from hilcal.discover.variables import Variable
+from hilcal.effects.protocol import Situation
+from hilcal.types import Floats, Ints
+
+MOST = 3
+"""Complexity of a product; a choice, by the number of candidates (about 10⁶ with all sites)."""
+MOST_FACTORS = 2
+"""Factors of a product; a choice, likewise."""
+HARMONICS = 4
+"""Multiples of an angle; as in the diagnosis."""
+FLAT = 1e-3
+"""Amplitudes whose spread is a smaller share of their size are a constant; a choice."""
+
+
+@dataclass(frozen=True, slots=True)
+class Factor:
+    """A function of one quantity."""
+
+    variable: Variable
+    shape: Shape
+    numbers: Numbers = ()
+
+    @property
+    def cost(self) -> int:
+        """Complexity."""
+        return self.shape.cost + (self.variable.kind == "sum")
+
+    def values(self, s: Situation) -> Floats:
+        """(N,) of the states."""
+        return self.shape.value(self.variable.read(s), self.numbers)
+
+    @property
+    def power(self) -> float:
+        """Power of the variable's unit that the factor has."""
+        return self.shape.power(self.numbers)
+
+
+@dataclass(frozen=True)
+class Amplitude:
+    """A product of factors; the empty product is 1."""
+
+    factors: tuple[Factor, ...]
+
+    @cached_property
+    def cost(self) -> int:
+        """Complexity."""
+        return sum(f.cost for f in self.factors)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the quantities that it depends on."""
+        return tuple(dict.fromkeys(n for f in self.factors for n in f.variable.names))
+
+    @property
+    def elastic(self) -> bool:
+        """Whether it depends on transmitted wrenches."""
+        return any(f.variable.slot is not None for f in self.factors)
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Columns of the readings that it needs."""
+        return tuple(dict.fromkeys(f.variable.need for f in self.factors if f.variable.need))
+
+    def values(self, s: Situation) -> Floats:
+        """(N,) of the states."""
+        out = np.ones(len(s.angle))
+        for f in self.factors:
+            out = out * f.values(s)
+        return out
+
+    def unit(self) -> str:
+        """Unit of the product; "1" where it has none."""
+        powers: dict[str, float] = {}
+        for f in self.factors:
+            if f.power and f.variable.unit != "1":
+                powers[f.variable.unit] = powers.get(f.variable.unit, 0.0) + f.power
+        return "·".join(_raised(u, p) for u, p in powers.items()) or "1"
+
+    def of_joint(self, old: int, new: int, known: list[Variable]) -> "Amplitude | None":
+        """Return the same law of another joint's own quantities; None where it has none."""
+        out = []
+        for f in self.factors:
+            v = f.variable
+            if v.joint == old and v.kind != "sum":
+                same = [w for w in known if w.kind == v.kind and w.joint == new and _alike(w, v)]
+                if not same:
+                    return None
+                f = replace(f, variable=same[0])
+            out.append(f)
+        return Amplitude(tuple(out))
+
+
+def _alike(a: Variable, b: Variable) -> bool:
+    return a.slot is None or b.slot is None or a.slot[1] == b.slot[1]
+
+
+def _raised(unit: str, power: float) -> str:
+    if power == 1:
+        return unit
+    return f"({unit})^{power:g}" if "·" in unit else f"{unit}^{power:g}"
+
+
+@dataclass(frozen=True, eq=False)
+class Grammar:
+    """All amplitudes that are tried, and their values.
+
+    Attributes:
+        known: the quantities.
+        amplitudes: the products.
+        values: (F, N) their values, single precision, each with root mean square 1.
+        size: (F,) what they were divided by.
+        cost: (F,) complexities.
+        partner: (F,) the amplitude with sine for cosine in its first periodic factor; −1 for none.
+    """
+
+    known: list[Variable]
+    amplitudes: tuple[Amplitude, ...]
+    values: Floats
+    size: Floats
+    cost: Ints
+    partner: Ints
+
+    def place(self, amplitude: Amplitude) -> int | None:
+        """Return the index of an amplitude; None where it is not tried."""
+        return self._places.get(_key(amplitude))
+
+    @cached_property
+    def _places(self) -> dict[frozenset[tuple[str, str, Numbers]], int]:
+        return {_key(a): k for k, a in enumerate(self.amplitudes)}
+
+    def price(self, sites: int) -> Floats:
+        """(F,) log of the number of candidates of the same complexity, and of 2 per unit of it."""
+        count = np.bincount(self.cost) * sites
+        return np.log(count[self.cost]) + log(2.0) * self.cost
+
+
+def _key(a: Amplitude) -> frozenset[tuple[str, str, Numbers]]:
+    return frozenset((f.variable.symbol, f.shape.name, f.numbers) for f in a.factors)
+
+
+def grammar(known: list[Variable], s: Situation) -> Grammar:
+    """Return all products of the functions of the quantities."""
+    singles = [f for v in known for f in _factors(v, v.read(s))]
+    value = np.array([f.values(s) for f in singles]).reshape(len(singles), -1)
+    cost = np.array([f.cost for f in singles])
+    pairs = [(-1, -1)] + [(i, -1) for i in range(len(singles)) if cost[i] <= MOST]
+    for i in range(len(singles)):
+        for k in range(i + 1, len(singles)):
+            if cost[i] + cost[k] <= MOST and _different(singles[i], singles[k]):
+                pairs.append((i, k))
+    value = np.vstack([value, np.ones(value.shape[1])])
+    index = np.array(pairs)
+    products = value[index[:, 0]] * value[index[:, 1]]
+    size = np.sqrt(np.mean(products**2, axis=1))
+    kept = np.flatnonzero(size > 0)
+    amplitudes = tuple(
+        Amplitude(tuple(singles[i] for i in pairs[k] if i >= 0)) for k in kept.tolist()
+    )
+    place = {pair: at for at, pair in enumerate(tuple(pairs[k]) for k in kept.tolist())}
+    turned = _turned(singles)
+    partner = np.array([_partner(pairs[k], turned, place) for k in kept.tolist()])
+    return Grammar(
+        known,
+        amplitudes,
+        (products[kept] / size[kept, None]).astype(np.float32),
+        size[kept],
+        np.array([a.cost for a in amplitudes]),
+        partner,
+    )
+
+
+def _different(a: Factor, b: Factor) -> bool:
+    """Whether two factors are of different quantities."""
+    return not set(a.variable.names) & set(b.variable.names) or (
+        a.variable.kind == "load" and a.variable.symbol != b.variable.symbol
+    )
+
+
+def _turned(singles: list[Factor]) -> dict[int, int]:
+    """Sine by cosine of the same quantity."""
+    place = {(id(f.variable), f.shape.name, f.numbers): k for k, f in enumerate(singles)}
+    return {
+        k: place[id(f.variable), "sin", f.numbers]
+        for k, f in enumerate(singles)
+        if f.shape.name == "cos"
+    }
+
+
+def _partner(
+    pair: tuple[int, int], turned: dict[int, int], place: dict[tuple[int, int], int]
+) -> int:
+    for at, k in enumerate(pair):
+        if k in turned:
+            other = [*pair]
+            other[at] = turned[k]
+            low, high = sorted(other, key=lambda i: (i < 0, i))
+            return place.get((low, high), -1)
+    return -1
+
+
+def _factors(v: Variable, x: Floats) -> list[Factor]:
+    """Return the functions of one quantity, with starting values of their numbers."""
+    middle = float(np.median(np.abs(x[x != 0]))) if np.any(x) else 1.0
+    round_off = _round(0.01 * middle)
+    linear = Factor(v, shapes.LINEAR)
+    if v.kind in ("angle", "sum"):
+        most = HARMONICS if v.kind == "angle" else 1
+        waves = [
+            Factor(v, f, (float(k),)) for k in range(1, most + 1) for f in (shapes.COS, shapes.SIN)
+        ]
+        return [linear, *waves] if v.kind == "angle" else waves
+    if v.kind == "side":
+        return [linear]
+    whole = [Factor(v, shapes.EVEN, (2.0, 0.0))]
+    if v.kind in ("torque", "force", "load"):
+        signed = x.min() < 0 < x.max()
+        if not signed:
+            return [linear, *whole, Factor(v, shapes.ODD, (0.5, round_off))]
+        out = [linear, Factor(v, shapes.PLUS), Factor(v, shapes.MINUS)]
+        out.append(Factor(v, shapes.SATURATION, (_round(0.05 * middle),)))
+        if v.kind == "torque":
+            out += [Factor(v, shapes.SATURATION, (_round(middle),))]
+            out += [Factor(v, shapes.EVEN, (1.0, 0.0)), *whole]
+            out += [Factor(v, shapes.ODD, (p, 0.0)) for p in (2.0, 3.0)]
+            out.append(Factor(v, shapes.ODD, (0.5, round_off)))
+        return out
+    if v.kind == "gravity":
+        return [linear, Factor(v, shapes.EVEN, (1.0, 0.0)), *whole]
+    if v.kind == "temperature":
+        return [linear, *whole, Factor(v, shapes.EVEN, (1.0, 0.0)), Factor(v, shapes.PLUS)]
+    if v.kind == "place":
+        return [linear, *whole]
+    last = float(x.max())
+    out = [linear, *whole, Factor(v, shapes.ODD, (0.5, 0.0)), Factor(v, shapes.LOG)]
+    out += [Factor(v, shapes.RELAXATION, (_round(k * last),)) for k in (0.03, 0.1, 0.3)]
+    if v.kind == "time":
+        out += [
+            Factor(v, shapes.STEP, (_round(a * last), _round(w * last)))
+            for a in (0.15, 0.3, 0.5, 0.7, 0.85)
+            for w in (0.02, 0.1)
+        ]
+    return out
+
+
+def _round(x: float) -> float:
+    """Two digits."""
+    return float(f"{x:.2g}")

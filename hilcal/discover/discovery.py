@@ -1,0 +1,276 @@
+"""`discover`: laws for what no effect of the catalogue explains, or silence.
+
+1. Where the stated noise explains the residual, there is nothing to explain.
+2. All candidates are screened, and laws of one, two and three terms chosen (`search`).
+3. The catalogue is given the same chance: its effects are added by algebra as long as they are
+   significant. Where they explain the readings as well as the law, at odds of 20 : 1, the answer is
+   the catalogue, and no law is proposed; nor is one that an effect of it describes.
+4. The search is repeated without each fold of poses. A law is proposed only where the laws so found
+   predict the poses left out.
+5. Free numbers are refined, and the law is refitted as an effect in the exact model.
+6. What a generic regression predicts of the misfit says how much could be explained at all.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.stats import chi2
+
+from hilcal.diagnose.effect_ranking import FALSE_ALARM, catalogue_columns
+from hilcal.diagnose.noise_verdict import MISFIT_ALARM, PREDICTABLE
+from hilcal.diagnose.residual_regression import residual_regression
+from hilcal.discover.folds import FoldSearch, search_by_folds, stability
+from hilcal.discover.law import (
+    Coefficient,
+    Form,
+    Law,
+    Resemblance,
+    form_of,
+)
+from hilcal.discover.refit import exact, refine
+from hilcal.discover.screen import Screen, screen
+from hilcal.discover.search import LEAST, MOST_TERMS, SAME, Problem, Selection, search
+from hilcal.discover.write_effect import source_of_form
+from hilcal.errors import HilcalError, InputError
+from hilcal.identify.fit import Fit
+from hilcal.identify.linearisation import left_out_by_pose, linearise
+from hilcal.regression import forward_selection as selection
+from hilcal.regression.evidence import score_family
+from hilcal.regression.forward_selection import families_beside
+from hilcal.types import Floats
+
+Reason = Literal["law", "adequate", "catalogue", "no_law", "unpredictable"]
+"""Why there are laws, or none:
+
+- law: at least one is proposed;
+- adequate: the stated noise explains the residual;
+- catalogue: effects of the catalogue explain it as well;
+- no_law: something predicts it, but no law of this complexity does;
+- unpredictable: nothing recorded predicts it.
+"""
+MOST_TOGETHER = 6
+LEAST_SHARE = 0.1
+"""Share of the misfit on poses left out that a law must explain, searched for without them."""
+NEAR = 0.7
+"""Cosine from which an effect of the catalogue is named as resembling; a choice."""
+
+
+@dataclass(frozen=True, eq=False)
+class Discovery:
+    """What the search for laws came to.
+
+    Attributes:
+        fit: the fit whose misfit it explains.
+        reason: why there are laws, or none.
+        laws: simplest first of those that predict as well as any.
+        attainable: share of the misfit that anything recorded predicts on poses left out.
+        searched_share: that of the laws that the search without each pose finds.
+        catalogue: effects of the catalogue that explain the misfit, where they do.
+        candidates: number of candidates that were tried.
+        after: the fit with the first law.
+        source: of the effects in `laws`, as a Python file.
+    """
+
+    fit: Fit
+    reason: Reason
+    laws: tuple[Law, ...] = ()
+    attainable: float = 0.0
+    searched_share: float = 0.0
+    catalogue: tuple[str, ...] = ()
+    candidates: int = 0
+    after: Fit | None = None
+    source: str = ""
+
+
+def discover(
+    fit: Fit, say: Callable[[str], None] = lambda text: None, name: str = "found"
+) -> Discovery:
+    """Search laws for what a fit leaves unexplained.
+
+    Args:
+        fit: a gc-scaled fit.
+        say: takes progress, one line each.
+        name: of the effect that is proposed.
+
+    Raises:
+        InputError: a fit whose residual is not whitened.
+    """
+    if fit.scaling != "gc":
+        raise InputError(f"scaling {fit.scaling!r}: laws are searched in a fit scaled by gc")
+    if float(chi2.sf(fit.chi2, fit.dof)) >= MISFIT_ALARM:
+        return Discovery(fit, "adequate")
+    linear = linearise(fit)
+    say("forming all candidates")
+    found = screen(linear)
+    say(f"searching among {found.candidates} candidates")
+    problem = Problem(found)
+    selections = search(problem)
+    if not selections:
+        return _silent(fit, found, say, 0.0)
+    best = max(selections, key=lambda s: s.total)
+    say("comparing with the catalogue")
+    chain, total, columns = _catalogue(fit)
+    near = _resembling(problem, best, columns)
+    if total > best.total - LEAST or (near and near[0].cosine >= SAME):
+        names = tuple(chain) or (near[0].effect,)
+        return Discovery(fit, "catalogue", catalogue=names, candidates=found.candidates)
+    say("repeating the search without each fold of poses")
+    folds = search_by_folds(found, MOST_TERMS)
+    if not folds.sure or folds.share < LEAST_SHARE:
+        return _silent(fit, found, say, folds.share)
+    return _laws(fit, problem, selections, folds, columns, say, name)
+
+
+def _silent(fit: Fit, found: Screen, say: Callable[[str], None], searched: float) -> Discovery:
+    say("asking what is predictable at all")
+    share = residual_regression(found.linear).share
+    reason: Reason = "no_law" if share > PREDICTABLE else "unpredictable"
+    return Discovery(
+        fit, reason, attainable=share, searched_share=searched, candidates=found.candidates
+    )
+
+
+_Columns = tuple[Floats, dict[str, slice]]
+
+
+def _catalogue(fit: Fit) -> tuple[list[str], float, _Columns]:
+    """Effects that explain the misfit together, their evidence less the choice, and columns."""
+    linear = linearise(fit)
+    x, columns, most = catalogue_columns(fit)
+    families = families_beside(linear.information(x), linear.residual, fit.dof, x, columns, most)
+    tested = max(len(families.columns), 1)
+    names: list[str] = []
+    total = 0.0
+    for step in selection.forward_selection(families, MOST_TOGETHER):
+        if step.score.log_evidence <= 0 or step.score.p_value * tested >= FALSE_ALARM:
+            break
+        names.append(step.name)
+        total += step.score.log_evidence - float(np.log(tested))
+    return names, total, (x, columns)
+
+
+def curve(problem: Problem, s: Selection) -> Floats:
+    """(R,) what a law explains of the residual, the model projected out."""
+    x = np.hstack([problem.columns(t) for t in s.terms])
+    free = problem.model.project_out(x)
+    step = np.linalg.lstsq(free, problem.residual, rcond=1e-8)[0]
+    return np.asarray(free @ step)
+
+
+def _resembling(
+    problem: Problem, s: Selection, catalogue: _Columns
+) -> tuple[Resemblance, ...]:
+    """Effects whose columns are near what a law explains, the nearest first."""
+    x, columns = catalogue
+    own = curve(problem, s)
+    size = max(float(np.linalg.norm(own)), 1e-300)
+    out = []
+    for effect, part in columns.items():
+        free = problem.model.project_out(x[:, part])
+        u, sv, _ = np.linalg.svd(free, full_matrices=False)
+        u = u[:, sv > 1e-6 * sv.max(initial=1e-300)]
+        out.append(Resemblance(effect, float(np.linalg.norm(u.T @ own)) / size))
+    return tuple(sorted(out, key=lambda r: -r.cosine))
+
+
+def _laws(
+    fit: Fit,
+    problem: Problem,
+    selections: list[Selection],
+    folds: FoldSearch,
+    catalogue: _Columns,
+    say: Callable[[str], None],
+    name: str,
+) -> Discovery:
+    """Refit the laws, and order them."""
+    found = problem.screen
+    before = left_out_by_pose(fit)
+    rank = fit.whitening.rank
+    misfit = max(float(before.sum()) - rank, 3.0 * np.sqrt(2.0 * rank))
+    made: list[tuple[Law, Fit, Floats, str]] = []
+    for s in selections:
+        own = name if not made else f"{name}_{len(made) + 1}"
+        form = refine(found, form_of(found, s.terms))
+        say(f"refitting with {form.text()}")
+        try:
+            after, coefficients, _ = exact(fit, form, own)
+        except HilcalError:
+            continue
+        left = left_out_by_pose(after)
+        share = float(np.clip((before.sum() - left.sum()) / misfit, -1.0, 1.0))
+        law = _law(problem, s, form, own, coefficients, share, after, folds, catalogue)
+        evidence = (
+            f"It explains {100 * share:.0f} % of the misfit on poses left out; p-value "
+            f"{law.p_value:.1g}, the search\npaid for."
+        )
+        source = source_of_form(form, own, coefficients, evidence, f"{name}.py")
+        made.append((law, after, left, source))
+    if not made:
+        return _silent(fit, found, say, folds.share)
+    best = min(range(len(made)), key=lambda k: float(made[k][2].sum()))
+    kept = [k for k in range(len(made)) if _as_good(made[k][2], made[best][2])]
+    say("asking what is predictable at all")
+    attainable = residual_regression(found.linear).share
+    laws = tuple(made[k][0] for k in kept)
+    return Discovery(
+        fit,
+        "law",
+        laws,
+        float(np.clip(max(attainable, folds.share, laws[0].holdout_share), 0.0, 1.0)),
+        folds.share,
+        (),
+        found.candidates,
+        made[kept[0]][1],
+        made[kept[0]][3],
+    )
+
+
+def _as_good(left: Floats, best: Floats) -> bool:
+    """Whether poses left out are predicted as well, to within one standard error."""
+    more = left - best
+    return float(more.mean()) <= float(np.std(more)) / np.sqrt(max(len(more) - 1, 1))
+
+
+def _law(
+    problem: Problem,
+    s: Selection,
+    form: Form,
+    name: str,
+    coefficients: tuple[Coefficient, ...],
+    share: float,
+    after: Fit,
+    folds: FoldSearch,
+    catalogue: _Columns,
+) -> Law:
+    linear = problem.screen.linear
+    x = np.hstack([problem.columns(t) for t in s.terms])
+    score = score_family(linear.information(x), x.T @ linear.residual, linear.rss, linear.fit.dof)
+    price = sum(t.price for t in s.terms)
+    p_value = float(np.exp(min(np.log(max(score.p_value, 1e-300)) + price, 0.0)))
+    near = tuple(r for r in _resembling(problem, s, catalogue) if r.cosine >= NEAR)
+    situation = linear.fit.solution.prediction.situation
+    known = {f.variable.symbol: f.variable for p in form.parts for f in p.amplitude.factors}
+    ranges = []
+    for symbol, v in known.items():
+        values = v.read(situation)
+        ranges.append((symbol, float(values.min()), float(values.max()), v.unit))
+    others = []
+    for c in s.near:
+        text = form_of(problem.screen, (c.term,)).text()
+        if c.odds > s.odds[0] - LEAST and c.term not in s.terms:
+            others.append(text)
+    return Law(
+        name=name,
+        form=form,
+        parameters=coefficients,
+        p_value=p_value,
+        odds=s.total,
+        holdout_share=share,
+        left=after.variance_factor,
+        stability=stability(problem.screen, folds, curve(problem, s)),
+        alternatives=tuple(dict.fromkeys(others)),
+        resembles=near[:3],
+        ranges=tuple(ranges),
+    )

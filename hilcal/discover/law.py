@@ -1,0 +1,220 @@
+"""A law in readable form: where it acts, its formula, its parameters, what speaks for it."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hilcal.discover.amplitudes import Amplitude
+from hilcal.discover.screen import Screen
+from hilcal.discover.search import Term
+from hilcal.discover.sites import ORDINARY, Site
+from hilcal.effects.protocol import Situation
+from hilcal.types import Floats
+
+LETTERS = "abcdefghklmnoprsuvwxyz"
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """One product of a law: coefficient × amplitude, at one site."""
+
+    site: Site
+    amplitude: Amplitude
+    coefficient: int
+
+
+@dataclass(frozen=True, slots=True)
+class Form:
+    """A law without its numbers.
+
+    Attributes:
+        parts: its products.
+    """
+
+    parts: tuple[Part, ...]
+
+    @property
+    def count(self) -> int:
+        """Number of coefficients."""
+        return 1 + max(p.coefficient for p in self.parts)
+
+    @property
+    def elastic(self) -> bool:
+        """Whether it depends on transmitted wrenches."""
+        return any(p.amplitude.elastic for p in self.parts)
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Columns of the readings that it needs."""
+        return tuple(dict.fromkeys(n for p in self.parts for n in p.amplitude.needs))
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """What it depends on, as the diagnosis calls it."""
+        return tuple(dict.fromkeys(n for p in self.parts for n in p.amplitude.names))
+
+    @property
+    def acts_on(self) -> tuple[str, ...]:
+        """Where it acts."""
+        return tuple(dict.fromkeys(p.site.words for p in self.parts))
+
+    @property
+    def complexity(self) -> int:
+        """Coefficients, and complexity of the amplitudes that they multiply."""
+        return self.count + sum(p.amplitude.cost for p in self.parts)
+
+    def unit(self, coefficient: int) -> str:
+        """Unit of a coefficient."""
+        part = next(p for p in self.parts if p.coefficient == coefficient)
+        inner = part.amplitude.unit()
+        if inner == "1":
+            return part.site.unit
+        wrapped = f"({inner})" if "·" in inner or "^" in inner else inner
+        return f"{part.site.unit}/{wrapped}"
+
+    def text(self) -> str:
+        """Return the formula as plain text, one equation per site."""
+        return "; ".join(
+            f"{symbol} = {' + '.join(terms)}"
+            for symbol, terms in self._equations(lambda s: s.symbol, _amplitude_text).items()
+        )
+
+    def latex(self) -> str:
+        """Return the formula in LaTeX."""
+        return r",\quad ".join(
+            f"{symbol} = {' + '.join(terms)}"
+            for symbol, terms in self._equations(lambda s: s.latex, _amplitude_latex).items()
+        )
+
+    def _equations(self, symbol, write) -> dict[str, list[str]]:  # type: ignore[no-untyped-def]
+        out: dict[str, list[str]] = {}
+        for p in self.parts:
+            out.setdefault(symbol(p.site), []).append(write(LETTERS[p.coefficient], p.amplitude))
+        return out
+
+    def columns(self, screen: Screen, s: Situation) -> Floats:
+        """(R, P) whitened columns by ordinary motions, at the fit of a screen."""
+        w = screen.linear.fit.whitening
+        raw = np.zeros((*screen.motion.shape[:2], self.count))
+        place = {site: k for k, site in enumerate(screen.sites)}
+        for p in self.parts:
+            by = p.amplitude.values(s)[:, None]
+            raw[:, :, p.coefficient] += screen.motion[:, :, place[p.site]] * by
+        return w.whiten_readings(raw)
+
+
+def _numbers(numbers: tuple[float, ...]) -> list[str]:
+    return [f"{x:g}" for x in numbers]
+
+
+def _amplitude_text(letter: str, a: Amplitude) -> str:
+    pieces = [letter]
+    pieces += [f.shape.text(f.variable.symbol, _numbers(f.numbers)) for f in a.factors]
+    return "·".join(pieces)
+
+
+def _amplitude_latex(letter: str, a: Amplitude) -> str:
+    pieces = [letter]
+    pieces += [f.shape.latex(f.variable.latex, _numbers(f.numbers)) for f in a.factors]
+    return r"\,".join(pieces)
+
+
+def form_of(screen: Screen, terms: tuple[Term, ...]) -> Form:
+    """Return the law of chosen terms."""
+    parts: list[Part] = []
+    count = 0
+    for t in terms:
+        for k, (site, amplitude) in enumerate(t.parts):
+            at = count if t.common else count + k
+            parts.append(Part(screen.sites[site], screen.grammar.amplitudes[amplitude], at))
+        count += 1 if t.common else len(t.parts)
+    return Form(tuple(parts))
+
+
+def with_numbers(form: Form, numbers: dict[tuple[int, int], tuple[float, ...]]) -> Form:
+    """Return a law with other numbers in its functions, by part and factor."""
+    parts = []
+    for k, p in enumerate(form.parts):
+        factors = tuple(
+            replace(f, numbers=numbers.get((k, i), f.numbers))
+            for i, f in enumerate(p.amplitude.factors)
+        )
+        parts.append(replace(p, amplitude=Amplitude(factors)))
+    return Form(tuple(parts))
+
+
+def ordinary(form: Form) -> Floats:
+    """(P,) motions that one unit of the whitened columns' coefficients stands for."""
+    out = np.ones(form.count)
+    for p in form.parts:
+        out[p.coefficient] = ORDINARY[p.site.unit]
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class Coefficient:
+    """A parameter of a law."""
+
+    name: str
+    value: float
+    std: float
+    unit: str
+
+
+@dataclass(frozen=True, slots=True)
+class Resemblance:
+    """An effect of the catalogue, and how near a law is to what it can describe.
+
+    Attributes:
+        effect: its name.
+        cosine: of the angle between the law and the effect's columns, the model projected out.
+    """
+
+    effect: str
+    cosine: float
+
+
+@dataclass(frozen=True, eq=False)
+class Law:
+    """A law that the readings speak for.
+
+    Attributes:
+        name: of its effect.
+        form: where it acts, and how.
+        parameters: its coefficients.
+        p_value: of the joint test of its columns, times the number of candidates that were tried.
+        odds: logarithm of the odds against no law, the search paid for.
+        holdout_share: share of the misfit that it explains on poses left out.
+        left: variance factor that is left.
+        stability: share of the resampled searches that find the same.
+        alternatives: formulas that these readings do not tell from it, at odds of 20 : 1.
+        resembles: effects of the catalogue that are near, the nearest first.
+        ranges: least and largest of each quantity in the readings.
+    """
+
+    name: str
+    form: Form
+    parameters: tuple[Coefficient, ...]
+    p_value: float
+    odds: float
+    holdout_share: float
+    left: float
+    stability: float
+    alternatives: tuple[str, ...]
+    resembles: tuple[Resemblance, ...]
+    ranges: tuple[tuple[str, float, float, str], ...]
+
+    @property
+    def formula(self) -> str:
+        """The formula as plain text."""
+        return self.form.text()
+
+    @property
+    def acts_on(self) -> tuple[str, ...]:
+        """Where it acts."""
+        return self.form.acts_on
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """What it depends on."""
+        return self.form.variables

@@ -1,0 +1,162 @@
+"""A law refined and refitted: free exponents and scales, then the exact model.
+
+Numbers in the functions of a law, as an exponent or a saturation, are taken from a coarse grid by
+the search. They are refined where the sum of squares that the law leaves is least, its coefficients
+and the model's projected out. A refined number is kept where it gains more evidence than a number
+costs, else the one of the grid, which is simpler.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.optimize import minimize
+
+from hilcal.discover.law import Coefficient, Form, ordinary, with_numbers
+from hilcal.discover.screen import Screen
+from hilcal.discover.write_effect import effect_class, source_of_form
+from hilcal.effects.protocol import Situation
+from hilcal.errors import CannotAnswerError
+from hilcal.identify.fit import Fit, fit
+from hilcal.types import Floats
+
+WORTH = 3.0
+"""Gain in log likelihood that a refined number needs, beside ½ ln ν; 20 : 1."""
+DIGITS = 3
+RANGE = 30.0
+"""Factor by which a refined number may differ from that of the grid; a choice."""
+
+
+def refine(screen: Screen, form: Form) -> Form:
+    """Return the law with its free numbers refined, where the readings ask for it."""
+    linear = screen.linear
+    s = linear.fit.solution.prediction.situation
+    free = _free(form)
+    if not free:
+        return form
+    begin = np.array([value for _, _, value in free])
+    best = left_by(screen, form, s)
+
+    def at(x: Floats) -> Form:
+        return _with(form, free, begin * np.exp(x))
+
+    def objective(x: Floats) -> float:
+        if np.any(np.abs(x) > np.log(RANGE)):
+            return best * 10
+        return left_by(screen, at(x), s)
+
+    found = minimize(
+        objective, np.zeros(len(begin)), method="Nelder-Mead",
+        options={"maxfev": 60 * len(begin), "xatol": 1e-3, "fatol": 1e-3,
+                 "initial_simplex": _simplex(len(begin))},
+    )  # fmt: skip
+    refined = _with(form, free, [float(f"{v:.{DIGITS}g}") for v in begin * np.exp(found.x)])
+    after = left_by(screen, refined, s)
+    dof = linear.fit.dof
+    gain = 0.5 * dof * np.log(best / max(after, 1e-300))
+    return refined if gain > len(begin) * (0.5 * np.log(dof)) + WORTH else form
+
+
+def _simplex(count: int) -> Floats:
+    return np.vstack([np.zeros(count), 0.3 * np.eye(count)])
+
+
+def _free(form: Form) -> list[tuple[list[tuple[int, int]], int, float]]:
+    """Places (part, factor) of each free number, its index there, and its value.
+
+    The same function of the same quantity in several products has one number.
+    """
+    groups: dict[tuple[str, str, tuple[float, ...]], list[tuple[int, int]]] = {}
+    for k, p in enumerate(form.parts):
+        for i, f in enumerate(p.amplitude.factors):
+            if f.shape.free:
+                key = f.variable.symbol, f.shape.name, f.numbers
+                groups.setdefault(key, []).append((k, i))
+    out = []
+    for (_, _, numbers), places in groups.items():
+        k, i = places[0]
+        for number in form.parts[k].amplitude.factors[i].shape.free:
+            if numbers[number] > 0:
+                out.append((places, number, numbers[number]))
+    return out
+
+
+def _with(form: Form, free: list[tuple[list[tuple[int, int]], int, float]], values) -> Form:  # type: ignore[no-untyped-def]
+    numbers: dict[tuple[int, int], tuple[float, ...]] = {}
+    for (places, number, _), value in zip(free, values, strict=True):
+        for k, i in places:
+            old = numbers.get((k, i), form.parts[k].amplitude.factors[i].numbers)
+            numbers[k, i] = (*old[:number], float(value), *old[number + 1 :])
+    return with_numbers(form, numbers)
+
+
+def left_by(screen: Screen, form: Form, s: Situation) -> float:
+    """Sum of squares that a law leaves, by algebra."""
+    linear = screen.linear
+    x = form.columns(screen, s)
+    if not np.isfinite(x).all():
+        return 10 * linear.rss
+    information, slope = linear.information(x), x.T @ linear.residual
+    step = np.linalg.lstsq(information, slope, rcond=1e-10)[0]
+    return linear.rss - float(slope @ step)
+
+
+def exact(before: Fit, form: Form, name: str) -> tuple[Fit, tuple[Coefficient, ...], str]:
+    """Refit the model with the law as an effect.
+
+    Returns:
+        The fit, the coefficients, and the source of the effect.
+
+    Raises:
+        CannotAnswerError: the model finds no equilibrium with the law.
+    """
+    s = before.solution.prediction.situation
+    rough = tuple(
+        Coefficient("", float(v), 0.0, "") for v in _by_algebra(before, form)
+    )
+    named = tuple(
+        replace(c, name=letter) for c, letter in zip(rough, _letters(form), strict=True)
+    )
+    source = source_of_form(form, name, named)
+    kind = effect_class(source, name)
+    effect = kind(before.model.cell, s.states)
+    model = replace(
+        before.model,
+        effects=(*before.model.effects, effect),
+    )
+    start = np.concatenate([before.theta, np.zeros(form.count)])
+    after = fit(model, before.readings, before.mode, before.scaling, start)
+    rows = model.slices()[-1]
+    std = after.uncertainty.std[rows]
+    found = tuple(
+        Coefficient(letter, float(value), float(error), form.unit(k))
+        for k, (letter, value, error) in enumerate(
+            zip(_letters(form), after.theta[rows], std, strict=True)
+        )
+    )
+    if not all(np.isfinite(c.std) for c in found):
+        raise CannotAnswerError("the readings do not determine the law")
+    return after, found, source
+
+
+def _letters(form: Form) -> list[str]:
+    from hilcal.discover.law import LETTERS
+
+    return list(LETTERS[: form.count])
+
+
+def _by_algebra(before: Fit, form: Form) -> Floats:
+    """(P,) coefficients at the linearisation."""
+    from hilcal.discover.sites import site_motions
+
+    sites, motion = site_motions(before)
+    s, w = before.solution.prediction.situation, before.whitening
+    raw = np.zeros((*motion.shape[:2], form.count))
+    for p in form.parts:
+        raw[:, :, p.coefficient] += (
+            motion[:, :, sites.index(p.site)] * p.amplitude.values(s)[:, None]
+        )
+    x = w.whiten_readings(raw)
+    projection = before.solution.projection()
+    slope = x.T @ before.solution.projected_residual()
+    step = np.linalg.lstsq(projection.information(x), slope, rcond=1e-10)[0]
+    return np.asarray(step * ordinary(form))

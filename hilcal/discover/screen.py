@@ -1,0 +1,137 @@
+"""All candidates at once: every site times every amplitude, whitened and projected off the model.
+
+The column of site s and amplitude a is linear in a: x = T_s a with T_s (R, N) the whitened motion
+of each reading by an ordinary motion of the site. So for all amplitudes A (F, N) of a site
+
+    xᵀ v  = A (T_sᵀ v),        xᵀ M x = diag(A Q_s Aᵀ),    Q_s = T_sᵀ M T_s (N, N)
+
+and no column is formed: a million candidates take seconds. Many readings are thinned to whole poses
+for this; what is short-listed is scored on all of them.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from hilcal.discover.amplitudes import Grammar, grammar
+from hilcal.discover.sites import Site, site_motions
+from hilcal.discover.variables import variables
+from hilcal.identify.fit import Fit
+from hilcal.identify.linearisation import Linearisation
+from hilcal.regression.projection import projection
+from hilcal.types import Bools, Floats, Ints
+
+MOST_READINGS = 400
+"""Readings that the screening uses at most; a choice, by time: it takes their square."""
+SEEN = 1e-3
+"""Share of a column's square beside the model below which it counts as explained by the model; a
+choice, above what single precision leaves of a difference."""
+LEAST_MOTION = 1e-8
+"""Square of a column that is rounding, in units of the noise."""
+
+
+@dataclass(frozen=True, eq=False)
+class Screen:
+    """All candidates beside a model.
+
+    Attributes:
+        linear: the fit as a linear problem.
+        grammar: amplitudes.
+        sites: where they act.
+        motion: (N, m, S) motion of each reading by an ordinary motion of each site.
+        rows: (R,) which of the whitened rows the screening uses.
+        readings: (K,) which of the fitted readings it uses.
+        form: (S, R', K) T_s of these rows and readings, single precision.
+        square: (S, F) xᵀ M x; zero where the model explains a column.
+        across: (S, F) xᵀ M x' with the partner of each amplitude.
+        pose: (R,) pose of each row.
+    """
+
+    linear: Linearisation
+    grammar: Grammar
+    sites: tuple[Site, ...]
+    motion: Floats
+    rows: Bools
+    readings: Ints
+    form: Floats
+    square: Floats
+    across: Floats
+    pose: Ints
+
+    @property
+    def price(self) -> Floats:
+        """(F,) what the search costs a candidate, see `amplitudes`."""
+        return self.grammar.price(len(self.sites))
+
+    @property
+    def candidates(self) -> int:
+        """Number of candidates that the model does not explain."""
+        return int(np.count_nonzero(self.square))
+
+    def inner(self, v: Floats) -> Floats:
+        """(S, F) xᵀ v of all candidates, v (R,)."""
+        by_reading = np.einsum("srn,r->sn", self.form, v[self.rows].astype(np.float32))
+        return np.asarray(by_reading @ self.grammar.values[:, self.readings].T, dtype=float)
+
+    def column(self, site: int, amplitude: int) -> Floats:
+        """(R,) whitened column of one candidate."""
+        return self.columns([(site, amplitude)])[:, 0]
+
+    def columns(self, which: list[tuple[int, int]]) -> Floats:
+        """(R, P) whitened columns of candidates (site, amplitude)."""
+        if not which:
+            return np.zeros((len(self.linear.residual), 0))
+        w = self.linear.fit.whitening
+        site, amplitude = np.array(which).T
+        raw = self.motion[:, :, site] * self.grammar.values[amplitude].T[:, None, :]
+        return w.whiten_readings(raw)
+
+
+def screen(linear: Linearisation) -> Screen:
+    """Prepare the search beside a fit."""
+    fit = linear.fit
+    situation = fit.solution.prediction.situation
+    words = grammar(variables(situation), situation)
+    places, motion = site_motions(fit)
+    w = fit.whitening
+    rows, readings = _thinned(fit)
+    own = projection(linear.rows[rows], linear.projection.ridge)
+    form = np.empty((len(places), int(rows.sum()), len(readings)), dtype=np.float32)
+    square = np.empty((len(places), len(words.size)))
+    across = np.zeros_like(square)
+    a = words.values[:, readings]
+    has = np.flatnonzero(words.partner >= 0)
+    elastic = np.array([x.elastic for x in words.amplitudes])
+    for k in range(len(places)):
+        spread = np.zeros((len(motion), w.m, len(readings)))
+        spread[readings, :, np.arange(len(readings))] = motion[readings, :, k]
+        t = w.whiten_readings(spread)[rows]
+        form[k] = t
+        free = own.information(t).astype(np.float32)
+        lifted = a @ free
+        square[k] = np.einsum("fn,fn->f", lifted, a)
+        across[k, has] = np.einsum("fn,fn->f", lifted[has], a[words.partner[has]])
+        # Readings of different poses do not mix: the products are in small blocks.
+        whole = np.einsum("nf,nf->f", csr_array((t.T @ t).astype(np.float32)) @ a.T, a.T)
+        square[k, square[k] < SEEN * whole + LEAST_MOTION] = 0.0
+        for kind in (False, True):
+            if not places[k].takes(kind):
+                square[k, elastic == kind] = 0.0
+    return Screen(
+        linear, words, places, motion, rows, readings, form, square, across,
+        w.rows_of(fit.pose),
+    )  # fmt: skip
+
+
+def _thinned(fit: Fit) -> tuple[Bools, Ints]:
+    """Return the rows (R,) and readings (K,) that are used: whole poses, at random."""
+    w, kept = fit.whitening, fit.readings[~fit.outlier]
+    if len(kept) <= MOST_READINGS:
+        return np.ones(w.m * len(w), dtype=np.bool_), np.arange(len(kept))
+    group = kept.pose
+    order = np.random.default_rng(20261122).permutation(int(group.max()) + 1)
+    count = np.cumsum(np.bincount(group, minlength=len(order))[order])
+    chosen = order[: max(int(np.searchsorted(count, MOST_READINGS)), 1)]
+    mine = np.isin(group, chosen)
+    return w.rows_of(mine[w.reading]), np.flatnonzero(mine)

@@ -1,0 +1,177 @@
+"""Functions of one recorded quantity from which laws are made, each with its derivative.
+
+    linear      x
+    cos, sin    cos k x, sin k x
+    odd, even   sign(x) |x|^p, |x|^p, rounded off at zero where p < 1
+    plus, minus max(x, 0), max(−x, 0)
+    saturation  tanh(x/x0), which for a small x0 is the sign of x
+    log         log10(1 + x/unit)
+    approach    1 − exp(−x/T)
+    step        tanh((x − x0)/w)
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilcal.types import Floats
+
+Numbers = tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """A function f(x; p) of one quantity.
+
+    Attributes:
+        name: e.g. "saturation".
+        cost: its complexity.
+        value: f.
+        slope: ∂f/∂x.
+        code: f as Python, of the name of x and the numbers p as Python.
+        slope_code: ∂f/∂x likewise.
+        text: f as text, likewise.
+        latex: f in LaTeX, likewise.
+        power: p of the unit of x that f has.
+        free: which of the numbers p a refinement may change.
+    """
+
+    name: str
+    cost: int
+    value: Callable[[Floats, Numbers], Floats]
+    slope: Callable[[Floats, Numbers], Floats]
+    code: Callable[[str, list[str]], str]
+    slope_code: Callable[[str, list[str]], str]
+    text: Callable[[str, list[str]], str]
+    latex: Callable[[str, list[str]], str]
+    power: Callable[[Numbers], float] = lambda p: 0.0
+    free: tuple[int, ...] = ()
+
+    @property
+    def rank(self) -> int:
+        """Order in which equally good functions are shown: smaller is simpler."""
+        return {"linear": 0, "minus": 3, "even": 2}.get(self.name, 1)
+
+
+def _times(k: str, x: str) -> str:
+    return x if k in ("1", "1.0") else f"{k}·{x}"
+
+
+def _by(k: str, x: str) -> str:
+    return x if k in ("1", "1.0") else f"{k} * {x}"
+
+
+LINEAR = Shape(
+    "linear", 1,
+    lambda x, p: x,
+    lambda x, p: np.ones_like(x),
+    lambda x, p: x,
+    lambda x, p: f"np.ones_like({x})",
+    lambda x, p: x,
+    lambda x, p: x,
+    lambda p: 1.0,
+)  # fmt: skip
+COS = Shape(
+    "cos", 1,
+    lambda x, p: np.cos(p[0] * x),
+    lambda x, p: -p[0] * np.sin(p[0] * x),
+    lambda x, p: f"np.cos({_by(p[0], x)})",
+    lambda x, p: f"-{p[0]} * np.sin({_by(p[0], x)})",
+    lambda x, p: f"cos({_times(p[0], x)})",
+    lambda x, p: rf"\cos({_latex_times(p[0], x)})",
+)  # fmt: skip
+SIN = Shape(
+    "sin", 1,
+    lambda x, p: np.sin(p[0] * x),
+    lambda x, p: p[0] * np.cos(p[0] * x),
+    lambda x, p: f"np.sin({_by(p[0], x)})",
+    lambda x, p: f"{p[0]} * np.cos({_by(p[0], x)})",
+    lambda x, p: f"sin({_times(p[0], x)})",
+    lambda x, p: rf"\sin({_latex_times(p[0], x)})",
+)  # fmt: skip
+ODD = Shape(
+    "odd", 2,
+    lambda x, p: x * (x**2 + p[1] ** 2) ** ((p[0] - 1) / 2),
+    lambda x, p: (x**2 + p[1] ** 2) ** ((p[0] - 3) / 2) * (p[0] * x**2 + p[1] ** 2),
+    lambda x, p: f"{x} * ({x}**2 + {p[1]}**2) ** (({p[0]} - 1) / 2)",
+    lambda x, p: f"({x}**2 + {p[1]}**2) ** (({p[0]} - 3) / 2) * ({p[0]} * {x}**2 + {p[1]}**2)",
+    lambda x, p: f"sign({x})·|{x}|^{p[0]}",
+    lambda x, p: rf"\operatorname{{sign}}({x})\,|{x}|^{{{p[0]}}}",
+    lambda p: p[0],
+    (0,),
+)  # fmt: skip
+EVEN = Shape(
+    "even", 2,
+    lambda x, p: (x**2 + p[1] ** 2) ** (p[0] / 2),
+    lambda x, p: p[0] * x * (x**2 + p[1] ** 2) ** (p[0] / 2 - 1),
+    lambda x, p: f"({x}**2 + {p[1]}**2) ** ({p[0]} / 2)",
+    lambda x, p: f"{p[0]} * {x} * ({x}**2 + {p[1]}**2) ** ({p[0]} / 2 - 1)",
+    lambda x, p: f"|{x}|" if p[0] in ("1", "1.0") else f"|{x}|^{p[0]}",
+    lambda x, p: f"|{x}|" if p[0] in ("1", "1.0") else rf"|{x}|^{{{p[0]}}}",
+    lambda p: p[0],
+    (0,),
+)  # fmt: skip
+PLUS = Shape(
+    "plus", 2,
+    lambda x, p: np.maximum(x, 0.0),
+    lambda x, p: np.where(x > 0, 1.0, 0.0),
+    lambda x, p: f"np.maximum({x}, 0.0)",
+    lambda x, p: f"np.where({x} > 0, 1.0, 0.0)",
+    lambda x, p: f"max({x}, 0)",
+    lambda x, p: rf"\max({x}, 0)",
+    lambda p: 1.0,
+)  # fmt: skip
+MINUS = Shape(
+    "minus", 2,
+    lambda x, p: np.maximum(-x, 0.0),
+    lambda x, p: np.where(x < 0, -1.0, 0.0),
+    lambda x, p: f"np.maximum(-{x}, 0.0)",
+    lambda x, p: f"np.where({x} < 0, -1.0, 0.0)",
+    lambda x, p: f"max(-{x}, 0)",
+    lambda x, p: rf"\max(-{x}, 0)",
+    lambda p: 1.0,
+)  # fmt: skip
+SATURATION = Shape(
+    "saturation", 2,
+    lambda x, p: np.tanh(x / p[0]),
+    lambda x, p: (1 - np.tanh(x / p[0]) ** 2) / p[0],
+    lambda x, p: f"np.tanh({x} / {p[0]})",
+    lambda x, p: f"(1 - np.tanh({x} / {p[0]}) ** 2) / {p[0]}",
+    lambda x, p: f"tanh({x}/{p[0]})",
+    lambda x, p: rf"\tanh({x}/{p[0]})",
+    free=(0,),
+)  # fmt: skip
+LOG = Shape(
+    "log", 1,
+    lambda x, p: np.log10(1.0 + np.maximum(x, 0.0)),
+    lambda x, p: np.where(x > 0, 1.0, 0.0) / np.log(10.0) / (1.0 + np.maximum(x, 0.0)),
+    lambda x, p: f"np.log10(1.0 + np.maximum({x}, 0.0))",
+    lambda x, p: f"np.where({x} > 0, 1.0, 0.0) / np.log(10.0) / (1.0 + np.maximum({x}, 0.0))",
+    lambda x, p: f"log10(1 + {x})",
+    lambda x, p: rf"\log_{{10}}(1 + {x})",
+)  # fmt: skip
+RELAXATION = Shape(
+    "relaxation", 2,
+    lambda x, p: 1.0 - np.exp(-np.maximum(x, 0.0) / p[0]),
+    lambda x, p: np.where(x > 0, 1.0, 0.0) * np.exp(-np.maximum(x, 0.0) / p[0]) / p[0],
+    lambda x, p: f"1.0 - np.exp(-np.maximum({x}, 0.0) / {p[0]})",
+    lambda x, p: f"np.where({x} > 0, 1.0, 0.0) * np.exp(-np.maximum({x}, 0.0) / {p[0]}) / {p[0]}",
+    lambda x, p: f"(1 - exp(-{x}/{p[0]}))",
+    lambda x, p: rf"(1 - e^{{-{x}/{p[0]}}})",
+    free=(0,),
+)  # fmt: skip
+STEP = Shape(
+    "step", 2,
+    lambda x, p: np.tanh((x - p[0]) / p[1]),
+    lambda x, p: (1 - np.tanh((x - p[0]) / p[1]) ** 2) / p[1],
+    lambda x, p: f"np.tanh(({x} - {p[0]}) / {p[1]})",
+    lambda x, p: f"(1 - np.tanh(({x} - {p[0]}) / {p[1]}) ** 2) / {p[1]}",
+    lambda x, p: f"tanh(({x} - {p[0]})/{p[1]})",
+    lambda x, p: rf"\tanh(({x} - {p[0]})/{p[1]})",
+    free=(0, 1),
+)  # fmt: skip
+
+
+def _latex_times(k: str, x: str) -> str:
+    return x if k in ("1", "1.0") else f"{k} {x}"
