@@ -40,6 +40,7 @@ _PLACES = {
     "check_effect": "hilcal.effects.check",
     "compare": "hilcal.compare",
     "diagnose": "hilcal.diagnose.verdict",
+    "discover": "hilcal.discover.discovery",
     "effect": "hilcal.effects.spec",
     "fit": "hilcal.library",
     "installed": "hilcal.effects.catalogue",
@@ -63,6 +64,7 @@ if TYPE_CHECKING:
     from hilcal.diagnose.comparison import Comparison
     from hilcal.diagnose.diagnosis import Diagnosis
     from hilcal.diagnose.verdict import diagnose
+    from hilcal.discover.discovery import discover
     from hilcal.effects.catalogue import Catalogue, installed
     from hilcal.effects.check import check_effect
     from hilcal.effects.protocol import Effect
@@ -92,7 +94,7 @@ def __dir__() -> list[str]:
 
 
 class _Library(ModuleType):
-    """A module in which `diagnose`, `plan` and `refine` are functions, not the subpackages.
+    """A module where `diagnose`, `discover`, `plan` and `refine` are functions, not the subpackages.
 
     Importing a submodule sets it as an attribute of its parent; here names of the library keep
     their meaning. Modules are imported by `from hilcal.plan import planner`; `import

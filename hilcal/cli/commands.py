@@ -34,7 +34,7 @@ SECTIONS = {
     "Prepare": ("init", "config", "check", "plan"),
     "Measure": ("run", "import", "info"),
     "Fit, and find what is missing": (
-        *("identify", "compare", "diagnose", "add", "remove", "refine", "next"),
+        *("identify", "compare", "diagnose", "add", "remove", "refine", "discover", "next"),
     ),
     "Use the result": ("validate", "compensate", "accept", "view", "export"),
     "Look up": ("effects", "study"),
@@ -88,6 +88,10 @@ COMMANDS = {
         "refining:remove", "Take an effect out of the model: error before and after."
     ),
     "refine": Command("refining:refine", "Diagnose and add until the model is adequate."),
+    "discover": Command(
+        "discovering:discover",
+        "Search a law for what no effect explains, and write it as an effect.",
+    ),
     "next": Command(
         "next:next_",
         "Plan the measurements that separate the leading suspects; exit 4 where none are in doubt.",

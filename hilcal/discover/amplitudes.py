@@ -149,7 +149,7 @@ class Grammar:
     def price(self, sites: int) -> Floats:
         """(F,) log of the number of candidates of the same complexity, and of 2 per unit of it."""
         count = np.bincount(self.cost) * sites
-        return np.log(count[self.cost]) + log(2.0) * self.cost
+        return np.asarray(np.log(count[self.cost]) + log(2.0) * self.cost)
 
 
 def _key(a: Amplitude) -> frozenset[tuple[str, str, Numbers]]:
@@ -161,7 +161,9 @@ def grammar(known: list[Variable], s: Situation) -> Grammar:
     singles = [f for v in known for f in _factors(v, v.read(s))]
     value = np.array([f.values(s) for f in singles]).reshape(len(singles), -1)
     cost = np.array([f.cost for f in singles])
-    pairs = [(-1, -1)] + [(i, -1) for i in range(len(singles)) if cost[i] <= MOST]
+    pairs: list[tuple[int, int]] = [(-1, -1)] + [
+        (i, -1) for i in range(len(singles)) if cost[i] <= MOST
+    ]
     for i in range(len(singles)):
         for k in range(i + 1, len(singles)):
             if cost[i] + cost[k] <= MOST and _different(singles[i], singles[k]):
@@ -174,7 +176,7 @@ def grammar(known: list[Variable], s: Situation) -> Grammar:
     amplitudes = tuple(
         Amplitude(tuple(singles[i] for i in pairs[k] if i >= 0)) for k in kept.tolist()
     )
-    place = {pair: at for at, pair in enumerate(tuple(pairs[k]) for k in kept.tolist())}
+    place = {pairs[k]: at for at, k in enumerate(kept.tolist())}
     turned = _turned(singles)
     partner = np.array([_partner(pairs[k], turned, place) for k in kept.tolist()])
     return Grammar(
@@ -219,7 +221,6 @@ def _partner(
 def _factors(v: Variable, x: Floats) -> list[Factor]:
     """Return the functions of one quantity, with starting values of their numbers."""
     middle = float(np.median(np.abs(x[x != 0]))) if np.any(x) else 1.0
-    round_off = _round(0.01 * middle)
     linear = Factor(v, shapes.LINEAR)
     if v.kind in ("angle", "sum"):
         most = HARMONICS if v.kind == "angle" else 1
@@ -229,27 +230,29 @@ def _factors(v: Variable, x: Floats) -> list[Factor]:
         return [linear, *waves] if v.kind == "angle" else waves
     if v.kind == "side":
         return [linear]
-    whole = [Factor(v, shapes.EVEN, (2.0, 0.0))]
-    if v.kind in ("torque", "force", "load"):
-        signed = x.min() < 0 < x.max()
-        if not signed:
-            return [linear, *whole, Factor(v, shapes.ODD, (0.5, round_off))]
+    whole = Factor(v, shapes.EVEN, (2.0, 0.0))
+    if v.kind in ("torque", "force", "load") and x.min() < 0 < x.max():
         out = [linear, Factor(v, shapes.PLUS), Factor(v, shapes.MINUS)]
         out.append(Factor(v, shapes.SATURATION, (_round(0.05 * middle),)))
         if v.kind == "torque":
-            out += [Factor(v, shapes.SATURATION, (_round(middle),))]
-            out += [Factor(v, shapes.EVEN, (1.0, 0.0)), *whole]
+            out.append(Factor(v, shapes.SATURATION, (_round(middle),)))
+            out += [Factor(v, shapes.EVEN, (1.0, 0.0)), whole]
             out += [Factor(v, shapes.ODD, (p, 0.0)) for p in (2.0, 3.0)]
-            out.append(Factor(v, shapes.ODD, (0.5, round_off)))
+            out.append(Factor(v, shapes.ODD, (0.5, _round(0.01 * middle))))
         return out
+    if v.kind in ("torque", "force"):
+        return [linear, whole, Factor(v, shapes.ODD, (0.5, _round(0.01 * middle)))]
     if v.kind == "gravity":
-        return [linear, Factor(v, shapes.EVEN, (1.0, 0.0)), *whole]
+        return [linear, Factor(v, shapes.EVEN, (1.0, 0.0)), whole]
     if v.kind == "temperature":
-        return [linear, *whole, Factor(v, shapes.EVEN, (1.0, 0.0)), Factor(v, shapes.PLUS)]
-    if v.kind == "place":
-        return [linear, *whole]
+        return [linear, whole, Factor(v, shapes.EVEN, (1.0, 0.0)), Factor(v, shapes.PLUS)]
+    if v.kind == "place" and x.min() < 0:
+        return [linear, whole]
+    out = [linear, *(Factor(v, shapes.POWER, (p,)) for p in (0.5, 2.0))]
+    if v.kind not in ("time", "hanging"):
+        return out
     last = float(x.max())
-    out = [linear, *whole, Factor(v, shapes.ODD, (0.5, 0.0)), Factor(v, shapes.LOG)]
+    out.append(Factor(v, shapes.LOG))
     out += [Factor(v, shapes.RELAXATION, (_round(k * last),)) for k in (0.03, 0.1, 0.3)]
     if v.kind == "time":
         out += [

@@ -39,6 +39,7 @@ from hilcal.identify.linearisation import left_out_by_pose, linearise
 from hilcal.regression import forward_selection as selection
 from hilcal.regression.evidence import score_family
 from hilcal.regression.forward_selection import families_beside
+from hilcal.regression.leave_out import left_out_residuals
 from hilcal.types import Floats
 
 Reason = Literal["law", "adequate", "catalogue", "no_law", "unpredictable"]
@@ -159,19 +160,24 @@ def curve(problem: Problem, s: Selection) -> Floats:
     return np.asarray(free @ step)
 
 
-def _resembling(
-    problem: Problem, s: Selection, catalogue: _Columns
-) -> tuple[Resemblance, ...]:
-    """Effects whose columns are near what a law explains, the nearest first."""
+def _resembling(problem: Problem, s: Selection, catalogue: _Columns) -> tuple[Resemblance, ...]:
+    """Effects that describe what a law does, the nearest first.
+
+    An effect is fitted to the law without each fold of poses, and predicts it there: an effect of
+    many parameters describes anything else in few poses.
+    """
     x, columns = catalogue
-    own = curve(problem, s)
-    size = max(float(np.linalg.norm(own)), 1e-300)
+    linear = problem.screen.linear
+    law = np.hstack([problem.columns(t) for t in s.terms])
+    free = problem.model.project_out(law)
+    y = (law @ np.linalg.lstsq(free, problem.residual, rcond=1e-8)[0])[:, None]
+    folds = linear.folds
+    whole = float(np.sum(left_out_residuals(folds, linear.projection, y) ** 2))
     out = []
     for effect, part in columns.items():
-        free = problem.model.project_out(x[:, part])
-        u, sv, _ = np.linalg.svd(free, full_matrices=False)
-        u = u[:, sv > 1e-6 * sv.max(initial=1e-300)]
-        out.append(Resemblance(effect, float(np.linalg.norm(u.T @ own)) / size))
+        left = left_out_residuals(folds, linear.projection, y, x[:, part])
+        share = 1.0 - float(np.sum(left**2)) / max(whole, 1e-300)
+        out.append(Resemblance(effect, float(np.sqrt(max(share, 0.0)))))
     return tuple(sorted(out, key=lambda r: -r.cosine))
 
 
@@ -195,7 +201,7 @@ def _laws(
         form = refine(found, form_of(found, s.terms))
         say(f"refitting with {form.text()}")
         try:
-            after, coefficients, _ = exact(fit, form, own)
+            after, coefficients, _ = exact(found, form, own)
         except HilcalError:
             continue
         left = left_out_by_pose(after)
@@ -230,7 +236,7 @@ def _laws(
 def _as_good(left: Floats, best: Floats) -> bool:
     """Whether poses left out are predicted as well, to within one standard error."""
     more = left - best
-    return float(more.mean()) <= float(np.std(more)) / np.sqrt(max(len(more) - 1, 1))
+    return bool(float(more.mean()) <= float(np.std(more)) / np.sqrt(max(len(more) - 1, 1)))
 
 
 def _law(
@@ -259,7 +265,7 @@ def _law(
     others = []
     for c in s.near:
         text = form_of(problem.screen, (c.term,)).text()
-        if c.odds > s.odds[0] - LEAST and c.term not in s.terms:
+        if len(s.terms) == 1 and c.odds > s.odds[0] - LEAST and c.term not in s.terms:
             others.append(text)
     return Law(
         name=name,

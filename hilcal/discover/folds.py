@@ -1,5 +1,4 @@
-"""The search repeated without some of the poses: what its laws predict of them, and how often it
-finds the same.
+"""The search repeated without some of the poses: its laws predict them, and are the same or not.
 
 The poses that are left out take no part in the choice of a law, nor in its coefficients. What the
 law then explains of their misfit is what the whole procedure may claim.

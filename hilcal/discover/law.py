@@ -1,5 +1,6 @@
 """A law in readable form: where it acts, its formula, its parameters, what speaks for it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -86,7 +87,9 @@ class Form:
             for symbol, terms in self._equations(lambda s: s.latex, _amplitude_latex).items()
         )
 
-    def _equations(self, symbol, write) -> dict[str, list[str]]:  # type: ignore[no-untyped-def]
+    def _equations(
+        self, symbol: Callable[[Site], str], write: Callable[[str, Amplitude], str]
+    ) -> dict[str, list[str]]:
         out: dict[str, list[str]] = {}
         for p in self.parts:
             out.setdefault(symbol(p.site), []).append(write(LETTERS[p.coefficient], p.amplitude))
@@ -167,7 +170,7 @@ class Resemblance:
 
     Attributes:
         effect: its name.
-        cosine: of the angle between the law and the effect's columns, the model projected out.
+        cosine: correlation of the law with what the effect predicts of it on poses left out.
     """
 
     effect: str

@@ -6,12 +6,13 @@ and the model's projected out. A refined number is kept where it gains more evid
 costs, else the one of the grid, which is simpler.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import minimize
 
-from hilcal.discover.law import Coefficient, Form, ordinary, with_numbers
+from hilcal.discover.law import LETTERS, Coefficient, Form, ordinary, with_numbers
 from hilcal.discover.screen import Screen
 from hilcal.discover.write_effect import effect_class, source_of_form
 from hilcal.effects.protocol import Situation
@@ -22,6 +23,8 @@ from hilcal.types import Floats
 WORTH = 3.0
 """Gain in log likelihood that a refined number needs, beside ½ ln ν; 20 : 1."""
 DIGITS = 3
+SPANNED = 1e-10
+"""Directions of a law's columns below this share of the largest are rounding."""
 RANGE = 30.0
 """Factor by which a refined number may differ from that of the grid; a choice."""
 
@@ -41,7 +44,7 @@ def refine(screen: Screen, form: Form) -> Form:
 
     def objective(x: Floats) -> float:
         if np.any(np.abs(x) > np.log(RANGE)):
-            return best * 10
+            return np.inf
         return left_by(screen, at(x), s)
 
     found = minimize(
@@ -60,7 +63,7 @@ def _simplex(count: int) -> Floats:
     return np.vstack([np.zeros(count), 0.3 * np.eye(count)])
 
 
-def _free(form: Form) -> list[tuple[list[tuple[int, int]], int, float]]:
+def _free(form: Form) -> list["_Free"]:
     """Places (part, factor) of each free number, its index there, and its value.
 
     The same function of the same quantity in several products has one number.
@@ -80,7 +83,11 @@ def _free(form: Form) -> list[tuple[list[tuple[int, int]], int, float]]:
     return out
 
 
-def _with(form: Form, free: list[tuple[list[tuple[int, int]], int, float]], values) -> Form:  # type: ignore[no-untyped-def]
+_Free = tuple[list[tuple[int, int]], int, float]
+"""Places (part, factor) of a free number, its index there, its value."""
+
+
+def _with(form: Form, free: list[_Free], values: Sequence[float] | Floats) -> Form:
     numbers: dict[tuple[int, int], tuple[float, ...]] = {}
     for (places, number, _), value in zip(free, values, strict=True):
         for k, i in places:
@@ -90,17 +97,23 @@ def _with(form: Form, free: list[tuple[list[tuple[int, int]], int, float]], valu
 
 
 def left_by(screen: Screen, form: Form, s: Situation) -> float:
-    """Sum of squares that a law leaves, by algebra."""
+    """Sum of squares that a law leaves, by algebra; infinite where it is not finite."""
     linear = screen.linear
     x = form.columns(screen, s)
     if not np.isfinite(x).all():
-        return 10 * linear.rss
-    information, slope = linear.information(x), x.T @ linear.residual
-    step = np.linalg.lstsq(information, slope, rcond=1e-10)[0]
-    return linear.rss - float(slope @ step)
+        return np.inf
+    step = np.linalg.lstsq(linear.information(x), x.T @ linear.residual, rcond=SPANNED)[0]
+    return linear.rss - float(x.T @ linear.residual @ step)
 
 
-def exact(before: Fit, form: Form, name: str) -> tuple[Fit, tuple[Coefficient, ...], str]:
+def by_algebra(screen: Screen, form: Form, s: Situation) -> Floats:
+    """(P,) coefficients at the linearisation, in ordinary motions."""
+    x, linear = form.columns(screen, s), screen.linear
+    step = np.linalg.lstsq(linear.information(x), x.T @ linear.residual, rcond=SPANNED)[0]
+    return np.asarray(step, dtype=float)
+
+
+def exact(screen: Screen, form: Form, name: str) -> tuple[Fit, tuple[Coefficient, ...], str]:
     """Refit the model with the law as an effect.
 
     Returns:
@@ -109,54 +122,24 @@ def exact(before: Fit, form: Form, name: str) -> tuple[Fit, tuple[Coefficient, .
     Raises:
         CannotAnswerError: the model finds no equilibrium with the law.
     """
+    before = screen.linear.fit
     s = before.solution.prediction.situation
-    rough = tuple(
-        Coefficient("", float(v), 0.0, "") for v in _by_algebra(before, form)
-    )
-    named = tuple(
-        replace(c, name=letter) for c, letter in zip(rough, _letters(form), strict=True)
-    )
+    letters = LETTERS[: form.count]
+    step = by_algebra(screen, form, s) * ordinary(form)
+    named = tuple(Coefficient(k, float(v), 0.0, "") for k, v in zip(letters, step, strict=True))
     source = source_of_form(form, name, named)
     kind = effect_class(source, name)
     effect = kind(before.model.cell, s.states)
-    model = replace(
-        before.model,
-        effects=(*before.model.effects, effect),
-    )
+    model = replace(before.model, effects=(*before.model.effects, effect))
     start = np.concatenate([before.theta, np.zeros(form.count)])
     after = fit(model, before.readings, before.mode, before.scaling, start)
     rows = model.slices()[-1]
     std = after.uncertainty.std[rows]
+    values = after.theta[rows]
     found = tuple(
-        Coefficient(letter, float(value), float(error), form.unit(k))
-        for k, (letter, value, error) in enumerate(
-            zip(_letters(form), after.theta[rows], std, strict=True)
-        )
+        Coefficient(letter, float(values[k]), float(std[k]), form.unit(k))
+        for k, letter in enumerate(letters)
     )
     if not all(np.isfinite(c.std) for c in found):
         raise CannotAnswerError("the readings do not determine the law")
     return after, found, source
-
-
-def _letters(form: Form) -> list[str]:
-    from hilcal.discover.law import LETTERS
-
-    return list(LETTERS[: form.count])
-
-
-def _by_algebra(before: Fit, form: Form) -> Floats:
-    """(P,) coefficients at the linearisation."""
-    from hilcal.discover.sites import site_motions
-
-    sites, motion = site_motions(before)
-    s, w = before.solution.prediction.situation, before.whitening
-    raw = np.zeros((*motion.shape[:2], form.count))
-    for p in form.parts:
-        raw[:, :, p.coefficient] += (
-            motion[:, :, sites.index(p.site)] * p.amplitude.values(s)[:, None]
-        )
-    x = w.whiten_readings(raw)
-    projection = before.solution.projection()
-    slope = x.T @ before.solution.projected_residual()
-    step = np.linalg.lstsq(projection.information(x), slope, rcond=1e-10)[0]
-    return np.asarray(step * ordinary(form))

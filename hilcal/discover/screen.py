@@ -27,8 +27,9 @@ MOST_READINGS = 400
 SEEN = 1e-3
 """Share of a column's square beside the model below which it counts as explained by the model; a
 choice, above what single precision leaves of a difference."""
-LEAST_MOTION = 1e-8
-"""Square of a column that is rounding, in units of the noise."""
+LEAST_MOTION = 1e-4
+"""Square of a column that counts as none, in units of the noise: all readings together move by less
+than 0.01 σ at an ordinary motion. As in `regression.evidence`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +98,7 @@ def screen(linear: Linearisation) -> Screen:
     w = fit.whitening
     rows, readings = _thinned(fit)
     own = projection(linear.rows[rows], linear.projection.ridge)
-    form = np.empty((len(places), int(rows.sum()), len(readings)), dtype=np.float32)
+    form: Floats = np.empty((len(places), int(rows.sum()), len(readings)), dtype=np.float32)
     square = np.empty((len(places), len(words.size)))
     across = np.zeros_like(square)
     a = words.values[:, readings]
@@ -113,7 +114,8 @@ def screen(linear: Linearisation) -> Screen:
         square[k] = np.einsum("fn,fn->f", lifted, a)
         across[k, has] = np.einsum("fn,fn->f", lifted[has], a[words.partner[has]])
         # Readings of different poses do not mix: the products are in small blocks.
-        whole = np.einsum("nf,nf->f", csr_array((t.T @ t).astype(np.float32)) @ a.T, a.T)
+        mixed = np.asarray(csr_array((t.T @ t).astype(np.float32)) @ a.T)
+        whole = np.einsum("nf,nf->f", mixed, a.T)
         square[k, square[k] < SEEN * whole + LEAST_MOTION] = 0.0
         for kind in (False, True):
             if not places[k].takes(kind):
@@ -134,4 +136,4 @@ def _thinned(fit: Fit) -> tuple[Bools, Ints]:
     count = np.cumsum(np.bincount(group, minlength=len(order))[order])
     chosen = order[: max(int(np.searchsorted(count, MOST_READINGS)), 1)]
     mine = np.isin(group, chosen)
-    return w.rows_of(mine[w.reading]), np.flatnonzero(mine)
+    return np.repeat(mine[w.reading], w.m), np.flatnonzero(mine)

@@ -11,11 +11,13 @@ candidate of a complexity being as likely as each other.
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
 from hilcal.discover.screen import Screen
 from hilcal.regression.evidence import FamilyScore, score_family
+from hilcal.regression.forward_selection import families_beside
 from hilcal.regression.projection import Projection, projection
 from hilcal.types import Bools, Floats
 
@@ -27,6 +29,8 @@ BEAM = 3
 """First terms with which selections are begun; a choice."""
 MOST_TERMS = 3
 """Terms of a law at most; a choice."""
+MOST_COEFFICIENTS = 8
+"""Coefficients of a law at most; a choice: more is no law that one reads."""
 LEAST = 3.0
 """Logarithm of the odds, the search paid for, that a further term needs: 20 : 1."""
 FALSE_ALARM = 1e-3
@@ -48,6 +52,11 @@ class Term:
     parts: tuple[tuple[int, int], ...]
     price: float
     common: bool = False
+
+    @property
+    def count(self) -> int:
+        """Number of coefficients."""
+        return 1 if self.common else len(self.parts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,8 +302,13 @@ def search(problem: Problem, most: int = MOST_TERMS, beam: int = BEAM) -> list[S
             if not further or further[0].odds < LEAST:
                 break
             more = further[0]
-            s = Selection((*s.terms, more.term), (*s.odds, more.odds), s.near, s.p_value)
-            s = _pruned(problem, s)
+            terms = (*s.terms, more.term)
+            if sum(t.count for t in terms) > MOST_COEFFICIENTS:
+                break
+            grown = _pruned(problem, replace(s, terms=terms, odds=_chain(problem, terms)))
+            if grown.total < s.total + LEAST:
+                break
+            s = grown
             _keep(best, s)
     return [best[k] for k in sorted(best)]
 
@@ -312,11 +326,10 @@ def _ordered(beside: Beside) -> list[Scored]:
 def _simplicity(screen: Screen, t: Term) -> tuple[float, ...]:
     """Coefficients, complexity, and rank of sites and functions, smaller is simpler."""
     amplitudes = [screen.grammar.amplitudes[a] for _, a in t.parts]
-    count = 1 if t.common else len(t.parts)
     cost = max(a.cost for a in amplitudes)
     sites = max(screen.sites[s].rank for s, _ in t.parts)
     functions = max(sum(f.shape.rank for f in a.factors) for a in amplitudes)
-    return count, cost, sites, functions
+    return t.count, cost, sites, functions
 
 
 def _keep(best: dict[int, Selection], s: Selection) -> None:
@@ -369,7 +382,21 @@ def _pruned(problem: Problem, s: Selection) -> Selection:
 
 
 def _chain(problem: Problem, terms: tuple[Term, ...]) -> tuple[float, ...]:
-    """Odds of each term beside those before it."""
-    return tuple(
-        problem.beside(terms[:k]).score([term])[0].odds for k, term in enumerate(terms)
+    """Odds of each term beside those before it, whose coefficients keep their priors.
+
+    So they add up to the odds of the whole law, and compare with those of effects.
+    """
+    x = [problem.columns(t) for t in terms]
+    ends = np.cumsum([0, *(c.shape[1] for c in x)])
+    places = {str(k): slice(int(a), int(b)) for k, (a, b) in enumerate(pairwise(ends))}
+    whole = np.hstack(x)
+    families = families_beside(
+        problem.model.information(whole), problem.residual, problem.dof, whole, places, {}
     )
+    out = []
+    for k, term in enumerate(terms):
+        score = families.scores()[str(k)]
+        out.append(score.log_evidence - term.price)
+        if score.rank:
+            families = families.with_family(str(k), score)
+    return tuple(out)

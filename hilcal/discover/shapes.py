@@ -1,13 +1,13 @@
 """Functions of one recorded quantity from which laws are made, each with its derivative.
 
-    linear      x
-    cos, sin    cos k x, sin k x
-    odd, even   sign(x) |x|^p, |x|^p, rounded off at zero where p < 1
-    plus, minus max(x, 0), max(−x, 0)
-    saturation  tanh(x/x0), which for a small x0 is the sign of x
-    log         log10(1 + x/unit)
-    approach    1 − exp(−x/T)
-    step        tanh((x − x0)/w)
+linear      x
+cos, sin    cos k x, sin k x
+odd, even   sign(x) |x|^p, |x|^p, rounded off at zero where p < 1
+plus, minus max(x, 0), max(−x, 0)
+saturation  tanh(x/x0), which for a small x0 is the sign of x
+log         log10(1 + x/unit)
+approach    1 − exp(−x/T)
+step        tanh((x − x0)/w)
 """
 
 from collections.abc import Callable
@@ -96,8 +96,10 @@ ODD = Shape(
     lambda x, p: (x**2 + p[1] ** 2) ** ((p[0] - 3) / 2) * (p[0] * x**2 + p[1] ** 2),
     lambda x, p: f"{x} * ({x}**2 + {p[1]}**2) ** (({p[0]} - 1) / 2)",
     lambda x, p: f"({x}**2 + {p[1]}**2) ** (({p[0]} - 3) / 2) * ({p[0]} * {x}**2 + {p[1]}**2)",
-    lambda x, p: f"sign({x})·|{x}|^{p[0]}",
-    lambda x, p: rf"\operatorname{{sign}}({x})\,|{x}|^{{{p[0]}}}",
+    lambda x, p: f"{x}^3" if p[0] == "3" else f"sign({x})·|{x}|^{p[0]}",
+    lambda x, p: (
+        f"{x}^3" if p[0] == "3" else rf"\operatorname{{sign}}({x})\,|{x}|^{{{p[0]}}}"
+    ),
     lambda p: p[0],
     (0,),
 )  # fmt: skip
@@ -107,8 +109,19 @@ EVEN = Shape(
     lambda x, p: p[0] * x * (x**2 + p[1] ** 2) ** (p[0] / 2 - 1),
     lambda x, p: f"({x}**2 + {p[1]}**2) ** ({p[0]} / 2)",
     lambda x, p: f"{p[0]} * {x} * ({x}**2 + {p[1]}**2) ** ({p[0]} / 2 - 1)",
-    lambda x, p: f"|{x}|" if p[0] in ("1", "1.0") else f"|{x}|^{p[0]}",
-    lambda x, p: f"|{x}|" if p[0] in ("1", "1.0") else rf"|{x}|^{{{p[0]}}}",
+    lambda x, p: {"1": f"|{x}|", "2": f"{x}^2"}.get(p[0], f"|{x}|^{p[0]}"),
+    lambda x, p: {"1": f"|{x}|", "2": f"{x}^2"}.get(p[0], f"|{x}|^{{{p[0]}}}"),
+    lambda p: p[0],
+    (0,),
+)  # fmt: skip
+POWER = Shape(
+    "power", 2,
+    lambda x, p: np.maximum(x, 0.0) ** p[0],
+    lambda x, p: p[0] * np.maximum(x, 0.0) ** (p[0] - 1),
+    lambda x, p: f"np.maximum({x}, 0.0) ** {p[0]}",
+    lambda x, p: f"{p[0]} * np.maximum({x}, 0.0) ** ({p[0]} - 1)",
+    lambda x, p: f"{x}^{p[0]}",
+    lambda x, p: f"{x}^{{{p[0]}}}",
     lambda p: p[0],
     (0,),
 )  # fmt: skip

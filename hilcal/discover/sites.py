@@ -142,8 +142,6 @@ def site_motions(fit: Fit) -> tuple[tuple[Site, ...], Floats]:
     cell: Cell = fit.model.cell
     states = fit.solution.prediction.situation.states
     unit = UnitMotions(cell, states)
-    jacobian = fit.model.jacobian_of(
-        (unit,), fit.solution.prediction, fit.theta, fit.whitening.m
-    )
+    jacobian = fit.model.jacobian_of((unit,), fit.solution.prediction, fit.theta, fit.whitening.m)
     scale = np.array([p.scale for p in unit.parameters])
     return unit.sites, jacobian * scale

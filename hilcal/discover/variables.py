@@ -48,15 +48,9 @@ class Variable:
     joint: int = -1
 
 
-def variables(s: Situation, order: bool = False) -> list[Variable]:
-    """Return all quantities that vary over the states of a situation.
-
-    Args:
-        s: the fitted states.
-        order: unused where the readings state the time.
-    """
-    out = [v for v in _all(s) if _varies(v.read(s))]
-    return out
+def variables(s: Situation) -> list[Variable]:
+    """Return all quantities that vary over the states of a situation."""
+    return [v for v in _all(s) if _varies(v.read(s))]
 
 
 def _varies(x: Floats) -> bool:
@@ -127,7 +121,7 @@ def _wrenches(n: int) -> list[Variable]:
 
 def _loads() -> list[Variable]:
     out = []
-    for first, letter, word, unit in ((0, "f", "force", "N"), (3, "m", "moment", "N·m")):
+    for first, letter, unit in ((0, "f", "N"), (3, "m", "N·m")):
         norm = f"np.linalg.norm(s.states.wrench[:, {first}:{first + 3}], axis=1)"
         out.append(
             Variable(

@@ -1,14 +1,18 @@
-'''A law as a file with one effect, commented, that every command takes by `--effects-from`.'''
+"""A law as a file with one effect, commented, that every command takes by `--effects-from`."""
 
 import hashlib
 import sys
+from collections.abc import Iterator, Sequence
 from types import ModuleType
 
 import numpy as np
 
-from hilcal.discover.law import LETTERS, Coefficient, Form
+from hilcal.discover.amplitudes import Factor
+from hilcal.discover.law import LETTERS, Coefficient, Form, Part
 from hilcal.effects.protocol import Effect
 
+USUAL = 1e-4
+"""Ordinary magnitude of a coefficient that nothing is known of, SI; a choice."""
 _HEAD = '''"""`{name}`: {formula}
 
 Proposed by `hilcal discover`; change it as you like. Every command takes it:
@@ -51,17 +55,22 @@ class {class_name}(Effect):
 '''
 _RESPONSE = '''
     def response(self, theta: Floats, s: Situation, change: Floats) -> Response:
-        """Change of the deviation by changes (N, P, n + 1, 6) of the wrenches, by the chain rule."""
-        count, _, slots, _ = change.shape
+        """Change of the deviation by changes (N, P, n + 1, 6) of the wrenches: the chain rule."""
+        slots = change.shape[2]
         dq = np.zeros((len(s.angle), change.shape[1], slots - 1))
         twist = np.zeros((len(s.angle), change.shape[1], slots, 6))
 {body}
         return Response(dq=dq, twist=twist)
 '''
+_FLOATS = "from hilcal.types import Floats\n"
 
 
 def source_of_form(
-    form: Form, name: str, found: tuple[Coefficient, ...] = (), evidence: str = "", file: str = "F.py"
+    form: Form,
+    name: str,
+    found: tuple[Coefficient, ...] = (),
+    evidence: str = "Nothing is stated of its evidence.",
+    file: str = "F.py",
 ) -> str:
     """Return the Python file of a law.
 
@@ -72,43 +81,27 @@ def source_of_form(
         evidence: what speaks for it, in lines.
         file: the file's own name.
     """
-    scales = {c.name: _one_digit(abs(c.value)) for c in found}
-    attributes = []
-    if form.elastic:
-        attributes.append("    elastic = True")
+    attributes = ["    elastic = True\n"] if form.elastic else []
     if form.needs:
-        attributes.append(f"    needs = ({', '.join(repr(n) for n in form.needs)},)".replace("'", '"'))
-    parameters = []
-    for k in range(form.count):
-        where = ", ".join(dict.fromkeys(p.site.words for p in form.parts if p.coefficient == k))
-        letter = LETTERS[k]
-        parameters.append(
-            f'            Parameter("{letter}", "{form.unit(k)}", {scales.get(letter, 1e-4)!r}, '
-            f'"{where}"),'
-        )
-    values, columns = [], []
-    for k, p in enumerate(form.parts):
-        values.append(f"        by_{k} = {_product(p.amplitude.factors)}")
-        columns.append(f"            {_columns(k, p)},")
+        needs = "".join(f'"{n}", ' for n in form.needs).rstrip()
+        attributes.append(f"    needs = ({needs})\n")
     source = _HEAD.format(
         name=name,
         formula=form.text(),
         file=file,
-        evidence=evidence or "Nothing is stated of its evidence.",
+        evidence=evidence,
         imports=", Response" if form.elastic else "",
         class_name=class_name(name),
-        attributes="".join(f"{a}\n" for a in attributes),
-        parameters="\n".join(parameters),
-        values="\n".join(values),
-        columns="\n".join(columns),
+        attributes="".join(attributes),
+        parameters="\n".join(_parameters(form, found)),
+        values="\n".join(
+            f"        by_{k} = {_product(p.amplitude.factors)}" for k, p in enumerate(form.parts)
+        ),
+        columns="\n".join(f"            {_columns(k, p)}," for k, p in enumerate(form.parts)),
     )
-    if form.elastic:
-        source += _RESPONSE.format(body="\n".join(_responses(form))).replace(
-            "        count, _, slots, _ = change.shape\n", "        slots = change.shape[2]\n"
-        )
-    else:
-        source = source.replace("from hilcal.types import Floats\n", "")
-    return source
+    if not form.elastic:
+        return source.replace(_FLOATS, "")
+    return source + _RESPONSE.format(body="\n".join(_responses(form)))
 
 
 def class_name(name: str) -> str:
@@ -130,17 +123,26 @@ def effect_class(source: str, name: str) -> type[Effect]:
     return found
 
 
-def _factor(f) -> str:  # type: ignore[no-untyped-def]
-    return str(f.shape.code(f.variable.code, [repr(x) for x in f.numbers]))
+def _parameters(form: Form, found: tuple[Coefficient, ...]) -> Iterator[str]:
+    scales = {c.name: _one_digit(abs(c.value)) for c in found}
+    for k, letter in enumerate(LETTERS[: form.count]):
+        where = ", ".join(dict.fromkeys(p.site.words for p in form.parts if p.coefficient == k))
+        scale = scales.get(letter, USUAL)
+        yield f'            Parameter("{letter}", "{form.unit(k)}", {scale!r}, "{where}"),'
 
 
-def _product(factors) -> str:  # type: ignore[no-untyped-def]
+def _product(factors: Sequence[Factor]) -> str:
     if not factors:
         return "np.ones(len(s.angle))"
-    return " * ".join(f"({_factor(f)})" if len(factors) > 1 else _factor(f) for f in factors)
+    parts = [f.shape.code(f.variable.code, _numbers(f)) for f in factors]
+    return parts[0] if len(parts) == 1 else " * ".join(f"({part})" for part in parts)
 
 
-def _columns(k: int, p) -> str:  # type: ignore[no-untyped-def]
+def _numbers(f: Factor) -> list[str]:
+    return [repr(x) for x in f.numbers]
+
+
+def _columns(k: int, p: Part) -> str:
     index = f"np.array([{p.coefficient}]), np.array([{p.site.element}])"
     if p.site.field in ("dq", "scale"):
         return f'Columns("{p.site.field}", {index}, by_{k}[:, None])'
@@ -148,31 +150,23 @@ def _columns(k: int, p) -> str:  # type: ignore[no-untyped-def]
     return f'Columns("{p.site.field}", {index}, by_{k}[:, None, None] * np.array({axis}))'
 
 
-def _responses(form: Form) -> list[str]:
-    out = []
+def _responses(form: Form) -> Iterator[str]:
+    """Yield the lines that add what each wrench component does to each part."""
     for p in form.parts:
-        for i, f in enumerate(p.amplitude.factors):
+        factors = p.amplitude.factors
+        for i, f in enumerate(factors):
             if f.variable.slot is None:
                 continue
-            others = [g for k, g in enumerate(p.amplitude.factors) if k != i]
-            slope = f.shape.slope_code(f.variable.code, [repr(x) for x in f.numbers])
-            if others:
-                slope = f"({slope}) * {_product(others)}" if len(others) == 1 else (
-                    f"({slope}) * ({_product(others)})"
-                )
-                if len(others) == 1:
-                    slope = f"({f.shape.slope_code(f.variable.code, [repr(x) for x in f.numbers])})"
-                    slope += f" * ({_product(others)})"
+            slope = f"({f.shape.slope_code(f.variable.code, _numbers(f))})"
+            if len(factors) > 1:
+                slope += f" * ({_product([*factors[:i], *factors[i + 1 :]])})"
             slot, component = f.variable.slot
-            to = (
-                f"dq[:, :, {p.site.element}]"
-                if p.site.field == "dq"
-                else f"twist[:, :, {p.site.element}, {p.site.axis}]"
-            )
-            out.append(f"        slope = theta[{p.coefficient}] * ({slope})")
-            out.append(f"        {to} += slope[:, None] * change[:, :, {slot}, {component}]")
-    return out
+            to = f"dq[:, :, {p.site.element}]"
+            if p.site.field != "dq":
+                to = f"twist[:, :, {p.site.element}, {p.site.axis}]"
+            yield f"        slope = theta[{p.coefficient}] * {slope}"
+            yield f"        {to} += slope[:, None] * change[:, :, {slot}, {component}]"
 
 
 def _one_digit(x: float) -> float:
-    return float(f"{x:.0e}") if x > 0 and np.isfinite(x) else 1e-4
+    return float(f"{x:.0e}") if x > 0 and np.isfinite(x) else USUAL

@@ -56,7 +56,7 @@ def test_a_shell_completes_commands_and_options(
         monkeypatch.setenv("COMP_CWORD", str(word))
         return ok(capsys).out.split()
 
-    assert completed("hilcal di", 1) == ["diagnose"]
+    assert completed("hilcal di", 1) == ["diagnose", "discover"]
     assert {"demo", "run", "refine"} <= set(completed("hilcal ", 1))
     assert completed("hilcal run --re", 2) == ["--resume", "--rehearse"]
     assert completed("hilcal effects ", 2) == ["new"]

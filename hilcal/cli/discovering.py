@@ -1,0 +1,75 @@
+"""`discover`: laws in readable form for what the catalogue does not explain."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hilcal.campaign import Campaign
+from hilcal.cli.effects_from import EffectsFrom, catalogue_with
+from hilcal.cli.files import check_options, fit_of, wanted_effects
+from hilcal.cli.terminal import Json, Revision, Run, terminal
+from hilcal.discover.discovery import discover as search
+from hilcal.effects.check import NAME
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.identify.baseline import with_effects
+from hilcal.identify.fit import fit
+from hilcal.report import text
+from hilcal.report.progress import working
+from hilcal.report.text_discover import discovery_report, silence, to_json
+
+
+def discover(
+    run: Run,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="F.py", help="The effect, to be edited.")
+    ],
+    against: Annotated[
+        str | None,
+        typer.Option(
+            "--against",
+            metavar="A,B",
+            help="Beside these effects instead of those of the revision in use.",
+        ),
+    ] = None,
+    revision: Revision = None,
+    effects_from: EffectsFrom = None,
+    as_json: Json = False,
+) -> None:
+    """Search a law for what no effect explains, and write it as an effect."""
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
+    wanted = wanted_effects(against, catalogue)
+    name = output.stem
+    if output.suffix != ".py" or not NAME.fullmatch(name) or name in catalogue.names:
+        raise InputError(
+            f"-o {output}: the effect is called after its file; valid: lower-case letters, digits "
+            "and _, a letter first, .py at the end, and no name of the catalogue"
+        )
+    if wanted is not None and revision is not None:
+        raise InputError("--against and --revision: give one of them")
+    if not output.absolute().parent.is_dir():
+        raise InputError(f"-o {output}: no folder {output.absolute().parent}; make it first")
+    with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
+        number: int | None = None
+        if wanted is None:
+            number, found = fit_of(t, o, say, revision)
+        else:
+            check_options(o, wanted)
+            model = with_effects(o.cell, o.readings, o.mode(), wanted, wanted, catalogue)
+            say(f"fitting {text.model_name(model.names)}")
+            found = fit(model, o.readings, o.mode())
+        d = search(found, say, name)
+    document = {"revision": number, **to_json(d), "written": None}
+    t.show(discovery_report(d))
+    if not d.laws:
+        t.document(document, CannotAnswerError(silence(d)))
+    try:
+        output.write_text(d.source, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{output}: cannot be written ({error.strerror})") from None
+    t.show(
+        f"\n{output} has the first law as the effect {name}. Add it, and judge the model with it:"
+    )
+    t.command(f"hilcal add {run} {name} --effects-from {output}")
+    t.command(f"hilcal diagnose {run} --effects-from {output}")
+    t.document({**document, "written": str(output)})

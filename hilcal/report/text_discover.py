@@ -1,0 +1,119 @@
+"""Laws that the readings speak for, in words, for people and as JSON."""
+
+from collections.abc import Iterator
+
+from rich.console import RenderableType
+from rich.text import Text
+
+from hilcal.discover.discovery import Discovery
+from hilcal.discover.law import Coefficient, Law
+from hilcal.report import numbers, text
+
+FEW = 3
+
+
+def discovery_report(d: Discovery) -> Iterator[RenderableType]:
+    """Yield what was found, or why nothing is proposed."""
+    yield text.heading(f"Laws for what {text.model_name(d.fit.model.names)} leaves unexplained")
+    if not d.laws:
+        yield numbers.sentence(silence(d))
+        return
+    yield (
+        f"{d.candidates} candidates were tried. Searched for without them, laws explain "
+        f"{numbers.percent(d.searched_share)} of the misfit on poses left out."
+    )
+    for k, law in enumerate(d.laws):
+        yield ""
+        yield from _law(law, d, first=k == 0)
+
+
+def silence(d: Discovery) -> str:
+    """Say why no law is proposed."""
+    tried = f"{d.candidates} candidates were tried"
+    if d.reason == "adequate":
+        return (
+            f"no law: the stated noise explains the residual (variance factor "
+            f"{d.fit.variance_factor:.2f}), so there is nothing to explain"
+        )
+    if d.reason == "catalogue":
+        return (
+            f"no law: {tried}, and none explains the misfit better than effects of the catalogue "
+            f"do ({numbers.names(d.catalogue)}); hilcal refine adds them"
+        )
+    if d.reason == "no_law":
+        return (
+            f"no law: {numbers.percent(d.attainable)} of the misfit is predictable on poses left "
+            f"out, but {tried}, and no law of this size predicts it; measure more poses, or record "
+            "what else may matter"
+        )
+    return f"no law: {tried}, and nothing recorded predicts the misfit on poses left out"
+
+
+def _law(law: Law, d: Discovery, first: bool) -> Iterator[RenderableType]:
+    yield Text(law.formula, style="bold green" if first else "bold")
+    yield f"  acts on      {', '.join(law.acts_on)}"
+    yield f"  depends on   {', '.join(law.variables) or 'nothing: a constant'}"
+    for c in law.parameters:
+        yield f"  {c.name:<12} {coefficient(c)}"
+    told = f"  explains     {numbers.percent(law.holdout_share)} of the misfit on poses left out"
+    if d.attainable > 0:
+        told += f", {numbers.percent(min(law.holdout_share / d.attainable, 1.0))} of what can be"
+    yield told
+    yield f"  left         variance factor {law.left:.2f}, before {d.fit.variance_factor:.2f}"
+    yield f"  chance       {numbers.p_equals(law.p_value)}, the search paid for"
+    yield f"  found again  in {numbers.percent(law.stability)} of the searches without some poses"
+    if law.alternatives:
+        yield f"  or           {'; or '.join(law.alternatives[:FEW])}: not told apart here"
+    near = [f"{r.effect} (cosine {r.cosine:.2f})" for r in law.resembles[:FEW]]
+    if near:
+        yield f"  resembles    {', '.join(near)}"
+    seen = [
+        f"{symbol} {numbers.digits(low)} to {numbers.digits(high)}{'' if u == '1' else f' {u}'}"
+        for symbol, low, high, u in law.ranges
+    ]
+    if seen:
+        yield f"  seen for     {', '.join(seen)}; nothing is known outside"
+
+
+def coefficient(c: Coefficient) -> str:
+    """Write a coefficient with its standard uncertainty, in a unit for people."""
+    unit, factor = numbers.unit_for(c.unit, [c.value])
+    value, std = numbers.with_std(factor * c.value, factor * c.std)
+    return f"{value} ± {std} {'' if unit == '1' else unit}".rstrip()
+
+
+def to_json(d: Discovery) -> dict[str, object]:
+    """Return the document of `discover`."""
+    return {
+        "model": list(d.fit.model.names),
+        "reason": d.reason,
+        "attainable_share": d.attainable,
+        "searched_share": d.searched_share,
+        "candidates": d.candidates,
+        "catalogue": list(d.catalogue),
+        "laws": [law_json(law) for law in d.laws],
+    }
+
+
+def law_json(law: Law) -> dict[str, object]:
+    """Return a law as JSON."""
+    return {
+        "name": law.name,
+        "formula": law.formula,
+        "latex": law.form.latex(),
+        "acts_on": list(law.acts_on),
+        "variables": list(law.variables),
+        "parameters": [
+            {"name": c.name, "value": c.value, "std": c.std, "unit": c.unit} for c in law.parameters
+        ],
+        "holdout_share": law.holdout_share,
+        "p_value": law.p_value,
+        "variance_factor": law.left,
+        "stability": law.stability,
+        "alternatives": list(law.alternatives),
+        "resembles": [{"effect": r.effect, "cosine": r.cosine} for r in law.resembles],
+        "ranges": [
+            {"quantity": symbol, "min": low, "max": high, "unit": unit}
+            for symbol, low, high, unit in law.ranges
+        ],
+    }

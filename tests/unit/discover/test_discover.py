@@ -1,0 +1,220 @@
+"""Laws searched, and none where nothing is hidden; mechanics that the model does not know."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from drivers.simulated.injected_effects import nothing_hidden
+from drivers.simulated.rehearsal import measurement_noise, simulate
+from hilcal.cell import cell_from_config
+from hilcal.config import load_config
+from hilcal.data.readings import Readings
+from hilcal.discover import shapes
+from hilcal.discover.amplitudes import Amplitude, Factor
+from hilcal.discover.discovery import Discovery, discover
+from hilcal.discover.law import Form, Part
+from hilcal.discover.screen import Screen, screen
+from hilcal.discover.search import Problem, Term, search
+from hilcal.discover.sites import sites
+from hilcal.discover.variables import variables
+from hilcal.discover.write_effect import effect_class, source_of_form
+from hilcal.effects.check import check_effect
+from hilcal.effects.example import example_cell, example_situation, example_states
+from hilcal.identify.baseline import baseline
+from hilcal.identify.fit import Fit, fit
+from hilcal.identify.linearisation import effect_columns, linearise
+from hilcal.report.text_discover import discovery_report, silence, to_json
+from hilcal.robot.catalogue import configs_dir
+from studies.random_campaigns import dead_weights, rehearsal_states
+from studies.unmodelled_laws import law_named, shift
+
+LAW = "compliance by another joint"
+
+
+@cache
+def campaign(law: str = "", stated: float = 1.0, seed: int = 4) -> Fit:
+    """Deflections of 14 poses under two weights, with a law that no effect describes."""
+    config = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
+    cell = cell_from_config(config)
+    rng = np.random.default_rng(seed)
+    loads = dead_weights((4.0, 8.0), cell.gravity)
+    states, pose, load, cycle = rehearsal_states(
+        cell, 14, loads, rng, approach=False, temperatures=False
+    )
+    states = replace(states, load_time=None)
+    std = config.repeatability.per_joint(cell.arm.n)
+    world = nothing_hidden(cell, rng, noise=measurement_noise(config), joint_std=std)
+    names = ("none", *(name for name, _ in loads))
+    readings: Readings = simulate(world, states, pose, load, cycle, names, rng)
+    value = readings.value
+    if law:
+        value = value + shift(law_named(law), world, states, 6.0, "deflection", pose, cycle)
+    readings = replace(readings, value=value, covariance=stated**2 * readings.covariance)
+    return fit(baseline(cell, readings, "deflection"), readings, "deflection")
+
+
+@cache
+def found() -> Discovery:
+    return discover(campaign(LAW), name="bent")
+
+
+def test_a_law_outside_of_the_catalogue_is_found_with_its_site_and_variables() -> None:
+    law = found().laws[0]
+    assert found().reason == "law"
+    assert law.formula == "dq_3 = a·cos(q_4)·τ_3"
+    assert law.acts_on == ("joint 3",)
+    assert set(law.variables) == {"joint 4 angle", "joint 3 torque"}
+    assert law.parameters[0].unit == "rad/(N·m)"
+    assert law.p_value < 1e-6
+    assert law.holdout_share > 0.8
+
+
+def test_what_is_written_is_an_effect_that_lowers_the_error() -> None:
+    d, before = found(), campaign(LAW)
+    kind = effect_class(d.source, "bent")
+    check_effect(kind)
+    model = before.model + kind(before.model.cell, before.readings.states)
+    after = fit(model, before.readings, before.mode)
+    assert after.holdout.rms_m < 0.6 * before.holdout.rms_m
+    assert after.variance_factor == pytest.approx(d.laws[0].left, rel=1e-3)
+    assert after.parameters["bent.a"].value == pytest.approx(
+        d.laws[0].parameters[0].value, rel=1e-4
+    )
+
+
+def test_the_same_readings_give_the_same_answer() -> None:
+    first, second = (search(Problem(screen(linearise(campaign(LAW))))) for _ in range(2))
+    assert [s.terms for s in first] == [s.terms for s in second]
+    assert [s.odds for s in first] == [s.odds for s in second]
+
+
+@pytest.mark.parametrize("stated", [0.5, 2.0])
+def test_noise_that_is_misjudged_is_no_law(stated: float) -> None:
+    d = discover(campaign(stated=stated))
+    assert d.laws == ()
+    assert d.reason in ("adequate", "unpredictable", "catalogue", "no_law")
+    assert silence(d).startswith("no law")
+
+
+def test_nothing_is_searched_where_the_noise_explains_the_residual() -> None:
+    d = discover(campaign())
+    assert (d.reason, d.candidates) == ("adequate", 0)
+
+
+@cache
+def screened() -> Screen:
+    return screen(linearise(campaign(LAW)))
+
+
+def test_screening_is_what_the_columns_themselves_give() -> None:
+    s = screened()
+    problem = Problem(s)
+    rng = np.random.default_rng(0)
+    seen = np.argwhere(s.square > 0)
+    for site, amplitude in rng.choice(seen, 40, replace=False).tolist():
+        x = problem.columns(Term(((site, amplitude),), 0.0))
+        size2 = float(s.linear.information(x)[0, 0])
+        assert s.square[site, amplitude] == pytest.approx(
+            size2, rel=1e-2, abs=1e-4 * float(np.sum(x**2))
+        )
+        slope = float(x[:, 0] @ problem.residual)
+        size = np.linalg.norm(x) * np.linalg.norm(problem.residual)
+        assert problem.slope[site, amplitude] == pytest.approx(slope, abs=1e-4 * size)
+
+
+def test_candidates_beside_a_term_are_those_of_the_model_with_it() -> None:
+    s = screened()
+    problem = Problem(s)
+    seen = np.argwhere(s.square > 0)
+    (one, two) = np.random.default_rng(1).choice(seen, 2, replace=False).tolist()
+    first, second = (Term((tuple(k),), 0.0) for k in (one, two))
+    beside = problem.beside([first])
+    x, y = problem.columns(first)[:, 0], problem.columns(second)[:, 0]
+    mx = s.linear.project_out(x)
+    left = float(y @ s.linear.project_out(y)) - float(y @ mx) ** 2 / float(x @ mx)
+    assert beside._square[tuple(two)] == pytest.approx(left, rel=2e-2)
+    score = beside.score([second])[0].score
+    assert 0 <= score.gain <= problem.rss
+
+
+def test_columns_of_the_written_effect_are_those_of_the_search() -> None:
+    s, f = screened(), campaign(LAW)
+    situation = f.solution.prediction.situation
+    rng = np.random.default_rng(2)
+    for site, amplitude in rng.choice(np.argwhere(s.square > 0), 6, replace=False).tolist():
+        form = Form((Part(s.sites[site], s.grammar.amplitudes[amplitude], 0),))
+        kind = effect_class(source_of_form(form, "tried"), "tried")
+        effect = kind(f.model.cell, situation.states)
+        own = effect_columns(f, effect)
+        assert own.white / own.scale == pytest.approx(
+            form.columns(s, situation) / unit_motion(form), rel=1e-6, abs=1e-6 * np.ptp(own.white)
+        )
+
+
+def unit_motion(form: Form) -> float:
+    return {"rad": 1e-4, "m": 1e-4, "1": 1e-5}[form.parts[0].site.unit]
+
+
+def test_what_is_told_of_a_law_names_all_that_speaks_for_it() -> None:
+    told = "\n".join(str(part) for part in discovery_report(found()))
+    assert "dq_3 = a·cos(q_4)·τ_3" in told
+    assert "acts on      joint 3" in told
+    assert "µrad/(N·m)" in told
+    (law,) = to_json(found())["laws"][:1]  # type: ignore[index]
+    asked = ("name", "formula", "acts_on", "parameters", "holdout_share", "p_value", "variables")
+    assert {*asked} <= {*law}
+    assert law["latex"] == r"\delta q_3 = a\,\cos(q_4)\,\tau_3"
+
+
+def test_every_function_is_an_effect_with_its_derivative() -> None:
+    cell = example_cell()
+    s = example_situation(cell, example_states(cell))
+    known = {v.kind: v for v in variables(s)}
+    torque, angle, side = known["torque"], known["angle"], known["side"]
+    made = [
+        Factor(torque, shapes.LINEAR),
+        Factor(torque, shapes.ODD, (2.0, 0.0)),
+        Factor(torque, shapes.ODD, (0.5, 0.3)),
+        Factor(torque, shapes.EVEN, (1.0, 0.0)),
+        Factor(torque, shapes.EVEN, (1.7, 0.0)),
+        Factor(torque, shapes.PLUS),
+        Factor(torque, shapes.MINUS),
+        Factor(torque, shapes.SATURATION, (20.0,)),
+        Factor(torque, shapes.SIN, (0.05,)),
+        Factor(torque, shapes.COS, (0.05,)),
+    ]
+    places = sites(cell.arm.n)
+    for k, factor in enumerate(made):
+        other = Factor(angle, shapes.COS, (2.0,)) if k % 2 else Factor(side, shapes.LINEAR)
+        site = places[(5 * k) % 18]
+        if not site.takes(True):
+            site = places[0]
+        form = Form(
+            (Part(site, Amplitude((factor, other)), 0), Part(places[1], Amplitude((factor,)), 1))
+        )
+        check_effect(effect_class(source_of_form(form, "tried"), "tried"))
+
+
+def test_every_quantity_reads_the_same_in_the_written_effect() -> None:
+    cell = example_cell()
+    s = example_situation(cell, example_states(cell))
+    for v in variables(s):
+        read = eval(v.code, {"s": s, "np": np})
+        assert np.allclose(read, v.read(s), rtol=1e-12, atol=0), v.names
+
+
+def test_every_coefficient_has_a_unit() -> None:
+    s = screened()
+    by = {a.names: a for a in s.grammar.amplitudes}
+    assert (
+        Form((Part(s.sites[0], by["joint 2 torque", "joint 3 torque"], 0),))
+        .unit(0)
+        .startswith("rad/(")
+    )
+    for amplitude in s.grammar.amplitudes[:: len(s.grammar.amplitudes) // 200]:
+        form = Form((Part(s.sites[0], amplitude, 0),))
+        assert form.unit(0).startswith("rad")
+        assert form.text().startswith("dq_1 = a")
+        assert form.latex()
