@@ -90,6 +90,12 @@ def discover(
 ) -> Discovery:
     """Search laws for what a fit leaves unexplained.
 
+    >>> with hc.Campaign.open(RUN) as run:
+    ...     found = hc.fit(hc.baseline(run.cell, run.readings), run.readings)
+    >>> d = hc.discover(found)
+    >>> d.reason, d.catalogue
+    ('catalogue', ('joint_tilt_compliance',))
+
     Args:
         fit: a gc-scaled fit.
         say: takes progress, one line each.

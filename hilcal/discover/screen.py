@@ -12,7 +12,6 @@ for this; what is short-listed is scored on all of them.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from hilcal.discover.amplitudes import Grammar, grammar
 from hilcal.discover.sites import Site, site_motions
@@ -24,9 +23,9 @@ from hilcal.types import Bools, Floats, Ints
 
 MOST_READINGS = 400
 """Readings that the screening uses at most; a choice, by time: it takes their square."""
-SEEN = 1e-3
-"""Share of a column's square beside the model below which it counts as explained by the model; a
-choice, above what single precision leaves of a difference."""
+SEEN = 1e-4
+"""Share that must be left of a column's square, of what the readings move each by itself. Less is
+explained by the model, or cancels in deflections, and single precision does not resolve it."""
 LEAST_MOTION = 1e-4
 """Square of a column that counts as none, in units of the noise: all readings together move by less
 than 0.01 σ at an ordinary motion. As in `regression.evidence`."""
@@ -102,6 +101,7 @@ def screen(linear: Linearisation) -> Screen:
     square = np.empty((len(places), len(words.size)))
     across = np.zeros_like(square)
     a = words.values[:, readings]
+    squares = a**2
     has = np.flatnonzero(words.partner >= 0)
     elastic = np.array([x.elastic for x in words.amplitudes])
     for k in range(len(places)):
@@ -113,10 +113,8 @@ def screen(linear: Linearisation) -> Screen:
         lifted = a @ free
         square[k] = np.einsum("fn,fn->f", lifted, a)
         across[k, has] = np.einsum("fn,fn->f", lifted[has], a[words.partner[has]])
-        # Readings of different poses do not mix: the products are in small blocks.
-        mixed = np.asarray(csr_array((t.T @ t).astype(np.float32)) @ a.T)
-        whole = np.einsum("nf,nf->f", mixed, a.T)
-        square[k, square[k] < SEEN * whole + LEAST_MOTION] = 0.0
+        seen = SEEN * (squares @ np.sum(t**2, axis=0).astype(np.float32)) + LEAST_MOTION
+        square[k, square[k] < seen] = 0.0
         for kind in (False, True):
             if not places[k].takes(kind):
                 square[k, elastic == kind] = 0.0

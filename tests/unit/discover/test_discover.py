@@ -115,12 +115,10 @@ def test_screening_is_what_the_columns_themselves_give() -> None:
     seen = np.argwhere(s.square > 0)
     for site, amplitude in rng.choice(seen, 40, replace=False).tolist():
         x = problem.columns(Term(((site, amplitude),), 0.0))
-        size2 = float(s.linear.information(x)[0, 0])
-        assert s.square[site, amplitude] == pytest.approx(
-            size2, rel=1e-2, abs=1e-4 * float(np.sum(x**2))
-        )
+        exact = float(s.linear.information(x)[0, 0])
+        assert s.square[site, amplitude] == pytest.approx(exact, rel=2e-2)
         slope = float(x[:, 0] @ problem.residual)
-        size = np.linalg.norm(x) * np.linalg.norm(problem.residual)
+        size = float(np.linalg.norm(x) * np.linalg.norm(problem.residual))
         assert problem.slope[site, amplitude] == pytest.approx(slope, abs=1e-4 * size)
 
 
