@@ -94,7 +94,7 @@ def __dir__() -> list[str]:
 
 
 class _Library(ModuleType):
-    """A module where `diagnose`, `discover`, `plan` and `refine` are functions, not the subpackages.
+    """A module where `diagnose`, `discover`, `plan`, `refine` are functions, not the subpackages.
 
     Importing a submodule sets it as an attribute of its parent; here names of the library keep
     their meaning. Modules are imported by `from hilcal.plan import planner`; `import
