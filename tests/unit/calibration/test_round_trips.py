@@ -1,0 +1,205 @@
+"""What is handed over says the same at the other end: random arms, models, loads and branches."""
+
+import json
+import re
+import warnings
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+import hilcal as hc
+from hilcal.calibration.calibration import Calibration
+from hilcal.calibration.dh_table import CONVENTIONS, dh_rows, flange_poses, to_toml
+from hilcal.calibration.handover import UR_JOINTS, ur_kinematics, urdf
+from hilcal.calibration.measured import Measured
+from hilcal.calibration.scatter import Scatter
+from hilcal.calibration.storage import from_json, to_json
+from hilcal.calibration.tool import one_of_each
+from hilcal.model import Model
+from hilcal.robot import se3
+from hilcal.robot.arm import Arm
+from hilcal.robot.catalogue import load_arm, robot_names
+from hilcal.robot.chain import evaluate, joint_jacobian
+from hilcal.types import Floats
+from tests.support.campaigns import cell_of
+
+ROUND = settings(max_examples=10, deadline=None, derandomize=True)
+SEEDS = st.integers(0, 2**32 - 1)
+ARMS = st.sampled_from(robot_names())
+NM = 1e-9
+EFFECTS = [e.name for e in hc.installed().effects]
+
+
+def moved_arm(name: str, seed: int, size: float) -> Arm:
+    """An arm of the catalogue with links that are displaced and turned."""
+    rng, arm = np.random.default_rng(seed), load_arm(name)
+    moved = se3.matrix(*se3.exp(size * rng.standard_normal((arm.n + 1, 6))))
+    return replace(arm, links=arm.links @ moved)
+
+
+def flanges(arm: Arm, q: Floats) -> Floats:
+    chain = evaluate(arm, q)
+    return se3.matrix(chain.rotation[-1], chain.position[-1])
+
+
+def joints(seed: int, count: int = 10) -> Floats:
+    return np.random.default_rng(seed).uniform(-3, 3, (count, 6))
+
+
+@ROUND
+@given(ARMS, SEEDS, st.sampled_from([0.0, 1e-6, 1e-3, 0.3]))
+def test_pinocchio_has_the_urdf_s_flange_to_a_nanometre(name: str, seed: int, size: float) -> None:
+    arm, q = moved_arm(name, seed, size), joints(seed)
+    model = pin.buildModelFromXML(urdf(arm).partition("\n")[2])
+    data, frame = model.createData(), model.getFrameId("tool0")
+    for row, expected in zip(q, flanges(arm, q), strict=True):
+        pin.framesForwardKinematics(model, data, row)
+        np.testing.assert_allclose(data.oMf[frame].homogeneous, expected, atol=NM)
+
+
+@pytest.mark.parametrize("pitch", [np.pi / 2, -np.pi / 2, np.pi / 2 - 1e-8, np.pi / 2 - 1e-5])
+def test_a_urdf_is_exact_where_roll_and_yaw_are_one(pitch: float) -> None:
+    arm = load_arm("ur5e")
+    links = arm.links.copy()
+    links[2, :3, :3] = Rotation.from_euler("xyz", [0.4, pitch, -1.1]).as_matrix()
+    arm, q = replace(arm, links=links), joints(1)
+    with warnings.catch_warnings(action="error"):
+        model = pin.buildModelFromXML(urdf(arm).partition("\n")[2])
+    data, frame = model.createData(), model.getFrameId("tool0")
+    for row, expected in zip(q, flanges(arm, q), strict=True):
+        pin.framesForwardKinematics(model, data, row)
+        np.testing.assert_allclose(data.oMf[frame].homogeneous, expected, atol=NM)
+
+
+@ROUND
+@given(ARMS, SEEDS, st.sampled_from([0.0, 1e-9, 1e-3, 0.03]))
+def test_ur_s_file_and_its_tool_are_the_arm_to_a_nanometre(
+    name: str, seed: int, size: float
+) -> None:
+    arm, q = moved_arm(name, seed, size), joints(seed)
+    text, rest = ur_kinematics(load_arm(name), arm, "by a test")
+    place = np.broadcast_to(np.eye(4), (len(q), 4, 4))
+    for k, joint in enumerate(UR_JOINTS):
+        block = text.split(f"  {joint}:\n")[1]
+        found = re.findall(r"^ {4}\w+: (\S+)$", block, re.MULTILINE)[:6]
+        # YAML 1.1 takes a number without a point for text, where it has an exponent
+        assert all(re.fullmatch(r"-?\d+(\.\d+(e[-+]\d+)?)?", number) for number in found)
+        six = np.array(found, dtype=float)
+        turn = Rotation.from_euler("xyz", six[3:]).as_matrix()
+        spun = Rotation.from_euler("z", q[:, k, None]).as_matrix()
+        place = place @ se3.matrix(turn, six[:3]) @ se3.matrix(spun, np.zeros((len(q), 3)))
+    np.testing.assert_allclose(place @ rest, flanges(arm, q), atol=NM)
+    assert abs(rest[2, 3]) < 1e-15  # what can be moved before the last joint is there
+    assert abs(rest[1, 0] - rest[0, 1]) < 1e-12
+
+
+@ROUND
+@given(ARMS, SEEDS, st.sampled_from([0.0, 1e-12, 1e-7, 1e-3, 0.3]), st.sampled_from(CONVENTIONS))
+def test_a_dh_table_is_the_arm_to_what_it_states(
+    tmp_path_factory, name: str, seed: int, size: float, convention
+) -> None:
+    arm, q = moved_arm(name, seed, size), joints(seed)
+    rows, there = dh_rows(arm, convention), flanges(arm, q)
+    assert rows.disagreement < NM
+    np.testing.assert_allclose(flange_poses(rows, q), there, atol=NM)
+    alone = flange_poses(rows, q, whole=False)
+    off = np.linalg.norm((alone - there)[:, :3, 3], axis=1)
+    assert off.max() <= 1.2 * rows.table_moves + NM
+    path = tmp_path_factory.mktemp("dh") / "arm.toml"
+    path.write_text(to_toml(rows, arm, "made"), encoding="utf-8")
+    again = load_arm(str(path))
+    np.testing.assert_allclose(flanges(again, q), there, atol=NM)
+    for part in ("com", "position"):
+        a, b = (getattr(evaluate(x, q), part) for x in (again, arm))
+        np.testing.assert_allclose(a[-1], b[-1], atol=NM)
+    np.testing.assert_allclose(evaluate(again, q).com, evaluate(arm, q).com, atol=NM)
+    np.testing.assert_allclose(again.q_max, arm.q_max, rtol=1e-12)
+    np.testing.assert_array_equal(again.torque_max, arm.torque_max)
+
+
+@cache
+def model_of(names: tuple[str, ...], target_known: bool) -> Model:
+    cell, known = cell_of(target_known=target_known), hc.installed()
+    return Model(cell, tuple(known.make(name, cell, one_of_each(cell)) for name in names), known)
+
+
+def random_calibration(names: tuple[str, ...], seed: int) -> Calibration:
+    """A model with parameters of ordinary size, which nobody fitted."""
+    rng = np.random.default_rng(seed)
+    model = model_of(names, "target_offset" not in names)
+    scale = np.array([p.scale for e in model.effects for p in e.parameters])
+    theta = 0.3 * scale * rng.standard_normal(len(scale))
+    soft = [p.unit.startswith("rad/(N") for e in model.effects for p in e.parameters]
+    theta = np.where(soft, np.abs(theta), theta)
+    return Calibration(
+        model=model,
+        theta=theta,
+        mode="absolute",
+        root=1e-2 * np.diag(scale),
+        misfit=1e-12,
+        scatter=Scatter(np.full(6, 1e-5), 0.0, known=True),
+        measured=Measured((), 1.0),
+        loads={"5kg": np.array([0.0, 0.0, -49.0, 0.0, 0.0, 0.0])},
+        source={"campaign": "made"},
+    )
+
+
+def surroundings(rng: np.random.Generator, count: int) -> dict[str, Floats]:
+    return {
+        "time": rng.uniform(0, 3600, count),
+        "load_time": rng.uniform(0, 600, count),
+        "air_temperature": rng.uniform(18, 26, count),
+        "joint_temperature": rng.uniform(20, 40, (count, 6)),
+        "approach": np.sign(rng.standard_normal((count, 6))),
+    }
+
+
+def regular(c: Calibration, q: Floats) -> Floats:
+    """Joint values away from singular poses, in whatever branch they are."""
+    chain, arm = evaluate(c.model.cell.arm, q), c.model.cell.arm
+    jacobian = joint_jacobian(chain, chain.position[-1])
+    jacobian[:, :3] /= arm.reach
+    values = np.linalg.svd(jacobian, compute_uv=False)
+    return q[values[:, -1] > 0.02 * values[:, 0]]
+
+
+@pytest.mark.parametrize("effect", EFFECTS)
+def test_predicting_what_was_inverted_is_the_target_to_a_nanometre(effect: str) -> None:
+    names = tuple(dict.fromkeys(("base_frame", "joint_compliance", effect)))
+    seed = EFFECTS.index(effect)
+    c, rng = random_calibration(names, seed), np.random.default_rng(seed)
+    q = regular(c, rng.uniform(-2.8, 2.8, (40, 6)))
+    wrench = np.hstack([rng.uniform(-80, 80, (len(q), 3)), rng.uniform(-5, 5, (len(q), 3))])
+    recorded = surroundings(rng, len(q))
+    k = c.compensate(q, wrench, recorded=recorded, std=False)
+    assert k.inverse.solved.all()
+    again = c.predict(k.q, wrench, recorded=recorded, std=False)
+    nominal = evaluate(c.model.cell.arm, q)
+    wanted = nominal.point(c.tool_pose()[:3, 3])
+    np.testing.assert_allclose(again.position, wanted, atol=NM)
+    turn = nominal.rotation[-1] @ c.tool_pose()[:3, :3]
+    np.testing.assert_allclose(again.rotation, turn, atol=NM)
+    assert np.abs(k.q - q).max() < 0.5  # the branch is that of the given joints
+
+
+@ROUND
+@given(SEEDS, st.lists(st.sampled_from(EFFECTS), min_size=1, max_size=4, unique=True))
+def test_a_calibration_file_says_the_same_in_every_bit(seed: int, names: list[str]) -> None:
+    c, rng = random_calibration(tuple(names), seed), np.random.default_rng(seed)
+    again = from_json(json.loads(json.dumps(to_json(c), allow_nan=False)))
+    q = regular(c, rng.uniform(-2.8, 2.8, (12, 6)))
+    wrench = np.hstack([rng.uniform(-80, 80, (len(q), 3)), np.zeros((len(q), 3))])
+    recorded = surroundings(rng, len(q))
+    a, b = (x.predict(q, wrench, recorded=recorded) for x in (c, again))
+    np.testing.assert_array_equal(a.position, b.position)
+    np.testing.assert_array_equal(a.rotation, b.rotation)
+    np.testing.assert_allclose(a.std_m, b.std_m, rtol=1e-5)
+    np.testing.assert_array_equal(c.loads["5kg"], again.loads["5kg"])
+    a, b = (x.compensate(q, wrench, recorded=recorded, std=False) for x in (c, again))
+    np.testing.assert_array_equal(a.q, b.q)
