@@ -23,6 +23,7 @@ from scipy.stats import chi2
 
 from hilcal.calibration.compensation import Inverse, Pose, invert, singular
 from hilcal.calibration.compiled import Compiled, compiled
+from hilcal.calibration.learnt import Learnt
 from hilcal.calibration.measured import Measured
 from hilcal.calibration.poses import ToolPoses
 from hilcal.calibration.scatter import Scatter, scatter_of
@@ -34,7 +35,7 @@ from hilcal.diagnose.noise_verdict import MISFIT_ALARM
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit
-from hilcal.identify.predictive import parameter_factor, predictive
+from hilcal.identify.predictive import open_prior, parameter_factor, predictive
 from hilcal.model import Model, Prediction
 from hilcal.robot import se3
 from hilcal.robot.chain import evaluate
@@ -115,25 +116,27 @@ class Calibration:
         model: the fitted model.
         theta: (P,) its parameters.
         mode: kind of readings that it was fitted to.
-        root: (P, K) R with κ C = R Rᵀ.
+        root: (P, K) R with κ C = R Rᵀ; None where it is computed when needed, from `learnt`.
         misfit: s², m².
         scatter: the arm's scatter.
         measured: where the fitted readings lie.
         loads: (6,) wrench at the load point, base axes, by the name of a load of the cell.
         source: what it is from, for people.
         sensor: where the force sensor stands; None without one.
+        learnt: what the covariance follows from, where it does.
     """
 
     model: Model
     theta: Floats
     mode: Mode
-    root: Floats
+    root: Floats | None
     misfit: float
     scatter: Scatter
     measured: Measured
     loads: Mapping[str, Floats]
     source: Mapping[str, Any]
     sensor: SensorMount | None = None
+    learnt: Learnt | None = None
     _tracked: Tool = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -155,7 +158,8 @@ class Calibration:
             raise InputError(f"a calibration needs scaling gc, this fit has {found.scaling}")
         used, model = found.readings[~found.outlier], found.model
         left_out = found.holdout.rms_sigma
-        p = predictive(model, found.theta, found.solution.prior, used, found.mode, left_out)
+        prior = found.solution.prior
+        p = predictive(model, found.theta, prior, used, found.mode, left_out)
         values, vectors = np.linalg.eigh(p.covariance)
         noise = np.trace(found.whitening.covariance[:, :3, :3], axis1=1, axis2=2)
         misfits = float(chi2.sf(found.chi2, found.dof)) < MISFIT_ALARM
@@ -175,6 +179,7 @@ class Calibration:
             loads={load.name: load.wrench(model.cell.gravity) for load in loads},
             source=dict(source or {}),
             sensor=SensorMount.of(model.cell),
+            learnt=Learnt(used, open_prior(model, found.theta, prior), p.noise, kappa),
         )
 
     @classmethod
@@ -375,6 +380,14 @@ class Calibration:
         outside = tuple(self.measured.outside(states, known))
         return ToolPoses(position, rotation, nominal[1], nominal[0], covariance, outside)
 
+    @cached_property
+    def covariance_root(self) -> Floats:
+        """(P, K) R with κ C = R Rᵀ."""
+        if self.root is not None:
+            return self.root
+        assert self.learnt is not None  # noqa: S101  (one of both is there)
+        return self.learnt.root(self.model, self.theta, self.mode)
+
     def _by_parameters(self, of: Tool, states: States, prediction: Prediction) -> Floats:
         """(N, 3, 3) κ J C Jᵀ of the position, axes of the chain, m²."""
         spread = self._spread(of, prediction)
@@ -387,4 +400,4 @@ class Calibration:
         """(N, 3, K) J R of the position, axes of the chain."""
         jacobian = of.model.jacobian(prediction, of.theta, 3)
         jacobian = np.swapaxes(prediction.observation.axes, 1, 2) @ jacobian
-        return np.asarray(jacobian @ self.root[of.kept])
+        return np.asarray(jacobian @ self.covariance_root[of.kept])

@@ -1,7 +1,9 @@
 """A calibration as one JSON file: everything that predicting and compensating needs.
 
-The covariance factor is stored as 32-bit floats, each row scaled by its parameter's standard
-deviation; everything else as decimal numbers, exactly.
+The covariance is stored in the smaller of two forms: its factor, as 32-bit floats, each row scaled
+by its parameter's standard deviation; or what it follows from (`learnt`), where that gives the same
+standard deviations at fitted states to `AGREES`, which is tried before it is written. Everything
+else is decimal numbers, exactly.
 """
 
 import base64
@@ -15,6 +17,7 @@ import numpy as np
 
 from hilcal import __version__
 from hilcal.calibration.calibration import Calibration
+from hilcal.calibration.learnt import Learnt
 from hilcal.calibration.measured import Measured
 from hilcal.calibration.scatter import Scatter
 from hilcal.calibration.sensed import SensorMount
@@ -27,7 +30,13 @@ from hilcal.model import Model
 from hilcal.robot.arm import Arm
 from hilcal.types import Floats
 
-FORMAT, VERSION = "hilcal-calibration", 1
+FORMAT, VERSION = "hilcal-calibration", 2
+BY_FACTOR = 1
+"""Version of a file with the factor of the covariance, which earlier programs read."""
+AGREES = 5e-3
+"""Share by which a standard deviation may change where the small form is written; a choice."""
+TRIED = 40
+"""Fitted states at which that is tried."""
 _CELL = ("target", "load_point", "tool_mass", "tool_com", "gravity", "registration", "targets")
 
 
@@ -65,11 +74,15 @@ def read(path: Path, catalogue: Catalogue | None = None) -> Calibration:
 def to_json(c: Calibration) -> dict[str, object]:
     """Return a calibration as JSON, SI."""
     cell = c.model.cell
-    std = np.sqrt(np.einsum("pk,pk->p", c.root, c.root))
-    scaled = c.root / np.where(std > 0, std, 1.0)[:, None]
+    std, small = np.sqrt(np.einsum("pk,pk->p", c.covariance_root, c.covariance_root)), _small(c)
+    known: dict[str, object] = {"learnt": small}
+    if small is None:
+        scaled = c.covariance_root / np.where(std > 0, std, 1.0)[:, None]
+        text = base64.b64encode(scaled.astype("<f4").tobytes()).decode("ascii")
+        known = {"covariance_root": text}
     return {
         "format": FORMAT,
-        "version": VERSION,
+        "version": BY_FACTOR if small is None else VERSION,
         "hilcal": __version__,
         "source": dict(c.source),
         "readings": c.mode,
@@ -84,7 +97,7 @@ def to_json(c: Calibration) -> dict[str, object]:
         "parameters": [f"{e.name}.{p.name}" for e in c.model.effects for p in e.parameters],
         "theta": c.theta.tolist(),
         "std": std.tolist(),
-        "covariance_root": base64.b64encode(scaled.astype("<f4").tobytes()).decode("ascii"),
+        **known,
         "misfit_m2": c.misfit,
         "scatter": c.scatter.to_json(),
         "measured": c.measured.to_json(),
@@ -101,10 +114,10 @@ def from_json(content: Mapping[str, Any], catalogue: Catalogue | None = None) ->
     """
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise InputError(f'no calibration; valid: a JSON document with "format": "{FORMAT}"')
-    if content["version"] != VERSION:
+    if content["version"] not in (BY_FACTOR, VERSION):
         raise InputError(
             f"a calibration of version {content['version']}, written by hilcal "
-            f"{content['hilcal']}; this program reads version {VERSION}"
+            f"{content['hilcal']}; this program reads versions {BY_FACTOR} and {VERSION}"
         )
     known = catalogue or installed()
     cell = _cell(content["cell"], _arm(content["arm"]))
@@ -123,12 +136,18 @@ def from_json(content: Mapping[str, Any], catalogue: Catalogue | None = None) ->
             f"written by hilcal {content['hilcal']}, whose effects have other parameters"
         )
     theta, std = (np.array(content[k], dtype=float) for k in ("theta", "std"))
-    root = np.frombuffer(base64.b64decode(content["covariance_root"]), dtype="<f4")
+    root = learnt = None
+    if "learnt" in content:
+        learnt = Learnt.from_json(content["learnt"])
+    else:
+        flat = np.frombuffer(base64.b64decode(content["covariance_root"]), dtype="<f4")
+        root = flat.reshape(len(std), -1).astype(float) * std[:, None]
     return Calibration(
         model=model,
         theta=theta,
         mode=MODES[MODES.index(content["readings"])],
-        root=root.reshape(len(std), -1).astype(float) * std[:, None],
+        root=root,
+        learnt=learnt,
         misfit=float(content["misfit_m2"]),
         scatter=Scatter.from_json(content["scatter"]),
         measured=Measured.from_json(content["measured"]),
@@ -136,6 +155,23 @@ def from_json(content: Mapping[str, Any], catalogue: Catalogue | None = None) ->
         source=content["source"],
         sensor=SensorMount.from_json(content.get("force_sensor")),
     )
+
+
+def _small(c: Calibration) -> dict[str, object] | None:
+    """What the covariance follows from, as JSON; None where that is no smaller, or not the same."""
+    if c.learnt is None:
+        return None
+    small = c.learnt.to_json()
+    if c.root is None:
+        return small
+    if len(json.dumps(small)) > 4 * c.root.size * 4 / 3:
+        return None
+    states = c.learnt.readings.states
+    states = states[:: max(len(states) // TRIED, 1)]
+    jacobian = c.model.jacobian(c.model.predict(states, c.theta), c.theta, 3)
+    again = Learnt.from_json(small).root(c.model, c.theta, c.mode)
+    stated, found = (np.linalg.norm(jacobian @ root, axis=(1, 2)) for root in (c.root, again))
+    return small if np.all(np.abs(found - stated) <= AGREES * stated) else None
 
 
 def _arm(content: Mapping[str, Any]) -> Arm:
