@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import typer
 
 from hilcal.cli import application, execute
+from studies.change_command import change
 from studies.compensation_command import compensation
 from studies.descriptions_command import descriptions
 from studies.diagnosis_command import diagnosis
@@ -28,6 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     app.command("scaling")(scaling)
     app.command("real")(real)
     app.command("compensation")(compensation)
+    app.command("change")(change)
     app.command("results")(results)
     app.callback()(_group)
     execute(lambda: app, "studies", sys.argv[1:] if arguments is None else arguments)

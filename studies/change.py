@@ -2,8 +2,9 @@
 
 The world is the simulated cell with its own mechanics: links off by tenths of a millimetre, joint
 zeros, compliances, transmission errors of six harmonics. Campaign A, of ordinary size, is fitted
-once for each arm; the few readings of B are drawn anew for each case, with other poses, loads, time
-and temperatures, and another place of the tracker where it was set up anew.
+once for each arm; the few readings of B are drawn anew for each case: other poses, loads, time and
+temperatures, and another place of the tracker where it was set up anew. Some arms have more that
+the first model of A does not: what its own readings ask for is added, as `compare` does.
 """
 
 from collections.abc import Sequence
@@ -19,12 +20,15 @@ from drivers.simulated.world import World, stand
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
 from hilcal.data.readings import Readings
-from hilcal.diagnose.change import Changes, find_changes
+from hilcal.diagnose.change import LEVEL, POWER, STATED_DOF, Changes, find_changes
+from hilcal.diagnose.change_candidates import EFFECTS
+from hilcal.diagnose.completed import completed
 from hilcal.errors import HilcalError
 from hilcal.identify.baseline import with_effects
 from hilcal.identify.earlier import Earlier, earlier_fit
 from hilcal.identify.fit import fit
 from hilcal.identify.remeasured import setting
+from hilcal.regression.power import noncentrality_of_power
 from hilcal.types import Floats
 from studies.random_campaigns import rehearsal_states
 from studies.study_cases import with_study_loads
@@ -33,6 +37,8 @@ Repair = Literal["nothing", "zero", "compliance", "zero and compliance", "gearbo
 REPAIRS: tuple[Repair, ...] = ("zero", "compliance", "zero and compliance", "gearbox")
 POSES_A = 40
 READINGS_B = 15
+WARMER = 5.0
+"""By how much it is warmer in some later campaigns, K."""
 GEOMETRY = ("link_geometry", "transmission_error", "joint_compliance")
 ZERO_RAD = (0.3e-3, 5e-3)
 """How far a repair moves a joint's zero: mastered with a gauge, or to a mark; log-uniform."""
@@ -46,7 +52,8 @@ class StudiedArm:
         robot: name of the arm.
         cell: as configured.
         world: the truth.
-        loads: names and wrenches (6,).
+        loads: names and wrenches (6,) of that campaign.
+        others: loads that it had not.
         earlier: what the fit of its campaign states.
     """
 
@@ -54,6 +61,7 @@ class StudiedArm:
     cell: Cell
     world: World
     loads: Sequence[tuple[str, Floats]]
+    others: Sequence[tuple[str, Floats]]
     earlier: Earlier
 
 
@@ -69,12 +77,16 @@ class Case:
         seed: of the case.
         size_rad: by how much the zero was moved.
         factor: what the compliance was multiplied by.
+        other: whether B has loads that A had not, and is 5 K warmer.
         moved_m: rms displacement of the target that the change makes in the readings of B, m.
-        absorbed: share of its (whitened) effect that the tracker's new place absorbs.
+        strength: the same beside what the tracker's place and A's uncertainty absorb, in σ of all
+            readings together: the root of the non-centrality of a test that knows its shape.
+        limit: strength from which a change of one parameter is claimed in nine cases of ten.
         parts: what the program names: the first change; empty where none.
         others: parts of further changes.
         same_as: parts that it cannot tell from the first.
         z: (estimated − true)/standard deviation of the zero and of the compliance, where found.
+        of_arm: whether a change of the arm itself is named.
         explained: whether what is left is scatter.
         failure: why there is no answer.
     """
@@ -86,12 +98,15 @@ class Case:
     seed: int
     size_rad: float = 0.0
     factor: float = 1.0
+    other: bool = False
     moved_m: float = 0.0
-    absorbed: float = 0.0
+    strength: float = 0.0
+    limit: float = 0.0
     parts: str = ""
     others: tuple[str, ...] = ()
     same_as: tuple[str, ...] = ()
     z: tuple[float, ...] = ()
+    of_arm: bool = False
     explained: bool = True
     failure: str = ""
 
@@ -100,15 +115,23 @@ class Case:
         """Whether the joint is named, and it alone."""
         return self.parts == f"joint {self.joint}" and not self.others
 
+    @property
+    def visible(self) -> bool:
+        """Whether the change is larger than what the program states that it can show."""
+        return self.strength > self.limit
 
-def studied_arm(config: CellConfig, robot: str, seed: int, poses: int = POSES_A) -> StudiedArm:
+
+def studied_arm(
+    config: CellConfig, robot: str, seed: int, poses: int = POSES_A, more: Sequence[str] = ()
+) -> StudiedArm:
     """Measure an arm with all its errors, and fit what a refinement would end with.
 
     Args:
         config: the cell; robot and loads are replaced.
         robot: name of the arm.
         seed: of everything random.
-        poses: of the campaign, each unloaded and under two loads.
+        poses: of the campaign, each unloaded and under three loads.
+        more: further effects of the arm.
     """
     rng = np.random.default_rng([seed, 20261122])
     own, loads = with_study_loads(config, robot)
@@ -118,13 +141,13 @@ def studied_arm(config: CellConfig, robot: str, seed: int, poses: int = POSES_A)
     world = nothing_hidden(cell, rng, noise=noise, joint_std=joints)
     draw = Draw(cell.arm, world.physics.joint_compliance, typical_torque(cell.arm))
     physics = world.physics
-    for name in ("link_geometry", "encoder_offset", "transmission_error"):
+    for name in ("link_geometry", "encoder_offset", "transmission_error", *more):
         physics = physics.with_effect(name, draw.effect(name, rng))
     world = replace(world, physics=physics)
     readings = measured(world, chosen, poses, rng)
     model = with_effects(cell, readings, "absolute", GEOMETRY)
-    found = fit(model, readings, "absolute")
-    return StudiedArm(robot, cell, world, chosen, earlier_fit(found))
+    found, _ = completed(fit(model, readings, "absolute"), EFFECTS)
+    return StudiedArm(robot, cell, world, chosen, loads[2:4], earlier_fit(found))
 
 
 def measured(
@@ -137,20 +160,55 @@ def measured(
 
 
 def remeasured(
-    world: World, loads: Sequence[tuple[str, Floats]], count: int, rng: np.random.Generator
+    world: World,
+    loads: Sequence[tuple[str, Floats]],
+    count: int,
+    rng: np.random.Generator,
+    warmer: float = 0.0,
 ) -> Readings:
-    """Measure so many poses, each under one of the loads or none, drawn at random."""
+    """Measure so many poses, each under one of the loads or none, drawn at random.
+
+    Args:
+        world: the truth.
+        loads: names and wrenches (6,).
+        count: number of readings.
+        rng: generator.
+        warmer: by how much it is than the study's usual temperatures, K.
+    """
     pulls = [(name, float(rng.uniform(0.5, 1.0)) * wrench) for name, wrench in loads]
     states, pose, load, cycle = rehearsal_states(world.cell, count, pulls, rng)
     each = np.arange(count) * (1 + len(pulls)) + rng.integers(0, 1 + len(pulls), count)
+    if states.air_temperature is not None and states.joint_temperature is not None:
+        states = replace(
+            states,
+            air_temperature=states.air_temperature + warmer,
+            joint_temperature=states.joint_temperature + warmer,
+        )
     names = ("none", *(name for name, _ in pulls))
     return simulate(world, states[each], pose[each], load[each], cycle[each], names, rng)
 
 
 def case(
-    arm: StudiedArm, repair: Repair, joint: int, anew: bool, seed: int, count: int = READINGS_B
+    arm: StudiedArm,
+    repair: Repair,
+    joint: int,
+    anew: bool,
+    seed: int,
+    *,
+    other: bool = False,
+    count: int = READINGS_B,
 ) -> Case:
-    """Repair an arm, measure it again, and compare."""
+    """Repair an arm, measure it again, and compare.
+
+    Args:
+        arm: the arm and its earlier campaign.
+        repair: what is done.
+        joint: number of the joint, from 1; 0 for nothing.
+        anew: whether the tracker is set up anew.
+        seed: of everything random.
+        other: whether B has loads that A had not, and is 5 K warmer.
+        count: number of readings.
+    """
     rng = np.random.default_rng([seed, joint, len(repair), anew])
     world, k = arm.world, joint - 1
     if anew:
@@ -165,31 +223,41 @@ def case(
     if repair in ("compliance", "zero and compliance"):
         factor = float(rng.choice([0.5, 2.0]))
     if repair == "gearbox":
-        other = Draw(arm.cell.arm, physics.joint_compliance, typical_torque(arm.cell.arm))
+        drawn = Draw(arm.cell.arm, physics.joint_compliance, typical_torque(arm.cell.arm))
         waves = physics.transmission_error.copy()
-        waves[k] = other.effect("transmission_error", rng)[k]
+        waves[k] = drawn.effect("transmission_error", rng)[k]
         physics = physics.with_effect("transmission_error", waves)
         factor = float(joint_compliance(arm.cell.arm, rng)[k] / physics.joint_compliance[k])
     compliance = physics.joint_compliance.copy()
     compliance[k] *= factor if joint else 1.0
     change = float(compliance[k] - physics.joint_compliance[k]) if joint else 0.0
     changed = replace(world, physics=physics.with_effect("joint_compliance", compliance))
-    readings = remeasured(changed, arm.loads, count, rng)
+    loads, warmer = (arm.others, WARMER) if other else (arm.loads, 0.0)
+    readings = remeasured(changed, loads, count, rng, warmer)
     moved = changed.sight(readings.states).position - world.sight(readings.states).position
-    asked = Case(
-        arm.robot, repair, joint, anew, seed, size, factor,
-        float(np.sqrt(np.mean(np.sum(moved**2, axis=1)))),
-    )  # fmt: skip
+    rms = float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
+    asked = Case(arm.robot, repair, joint, anew, seed, size, factor, other, rms)
     try:
         found = find_changes(setting(arm.earlier, readings, anew=anew))
     except HilcalError as error:
         return replace(asked, failure=str(error))
-    return judged(asked, found, change)
+    return judged(asked, found, moved, change)
 
 
-def judged(asked: Case, found: Changes, change: float) -> Case:
-    """Return the case with what the program says."""
-    first = found.found[0] if found.found else None
+def judged(asked: Case, found: Changes, moved: Floats, change: float) -> Case:
+    """Return the case with what the program says.
+
+    Args:
+        asked: the case.
+        found: what the program found.
+        moved: (N, 3) by how much the change moves the target in each reading, m.
+        change: of the joint's compliance, rad/(N·m).
+    """
+    before, first = found.before, found.found[0] if found.found else None
+    w = before.setting.w
+    x = w.whiten(w.raw(moved)[:, :, None])[:, 0] / np.sqrt(before.setting.earlier.noise)
+    level = LEVEL / found.tested
+    wanted = noncentrality_of_power(1, before.dof + STATED_DOF - 1, level, POWER)
     truth = {"encoder_offset": asked.size_rad, "joint_compliance": change}
     z = tuple(
         (s.value - truth[c.candidate.effect]) / s.std
@@ -199,6 +267,8 @@ def judged(asked: Case, found: Changes, change: float) -> Case:
     )
     return replace(
         asked,
+        strength=float(np.sqrt(max(x @ before.projection.project_out(x), 0.0))),
+        limit=float(np.sqrt(wanted)),
         parts="" if first is None else first.candidate.part,
         others=tuple(
             c.candidate.part
@@ -206,6 +276,7 @@ def judged(asked: Case, found: Changes, change: float) -> Case:
             if first is not None and c.candidate.part != first.candidate.part
         ),
         same_as=() if first is None else first.parts[1:],
+        of_arm=any(c.candidate.of_arm for c in found.found),
         z=z,
         explained=found.explained,
     )

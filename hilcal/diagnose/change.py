@@ -39,6 +39,9 @@ STATED_DOF = 20.0
 to a sixth, since another day and another place differ. A choice."""
 TRIED = 5
 """Candidates with most evidence in the linearisation that are fitted exactly; a choice."""
+TAKEN_APART = 2
+"""Joints for which zero and compliance are tried together: those of the first candidates."""
+REPAIRED = ("encoder_offset", "joint_compliance")
 MOST = 4
 """Most changes that are looked for; more is another arm. A choice."""
 ABSORBED = 1e-4
@@ -126,7 +129,7 @@ class Changes:
         after: with the changes.
         found: the changes, strongest first.
         limits: smallest changes that would have been claimed, of candidates with one parameter.
-        tested: number of candidates that the readings can show.
+        tested: number of candidates that the readings can show, and of joints.
         hidden: candidates that they cannot show: the frames absorb them.
         unexplained: p-value of what is left after the changes as scatter.
         scatter: rms of what is left over that which the earlier fit states.
@@ -185,18 +188,18 @@ def find_changes(
     now, tested = before, 0
     steps: list[_Step] = []
     hidden: tuple[Candidate, ...] = ()
-    for _ in range(MOST):
+    while len(steps) < MOST:
         say("testing what may have changed" if not steps else "testing what else may have changed")
         scored = [_score(now, c) for c in known if all(c is not s[0] for s in steps)]
         seen = [s for s in scored if s.shown]
         if not steps:
-            tested = len(seen)
+            tested = len(seen) + at.model.cell.arm.n
             hidden = tuple(s.candidate for s in scored if not s.shown)
         step = _best(now, [s[0] for s in steps], seen, tested)
         if step is None:
             break
-        now, taken = step[0], step[1:]
-        steps.append(taken)
+        now = step[0]
+        steps += step[1]
     after, kept = _needed(now, steps, tested)
     left = after.rss / after.dof if after.dof > 0 else 1.0
     return Changes(
@@ -233,20 +236,20 @@ def _score(now: Remeasured, candidate: Candidate) -> _Scored:
 
 def _best(
     now: Remeasured, taken: Sequence[Candidate], seen: Sequence[_Scored], tested: int
-) -> tuple[Remeasured, Candidate, float, float, tuple[Candidate, ...]] | None:
+) -> tuple[Remeasured, list[_Step]] | None:
     """Return the minimum with one more change, and the change; None where none is sure."""
     order = sorted(seen, key=lambda s: -s.score.log_evidence)
     if not order or min(s.score.p_value for s in order) * tested >= LEVEL:
         return None
-    tried: list[tuple[float, float, Remeasured, Candidate]] = []
-    for s in order[:TRIED]:
-        moving = [c.moving for c in (*taken, s.candidate)]
+    tried: list[tuple[float, float, Remeasured, tuple[Candidate, ...]]] = []
+    for mine in _trials([s.candidate for s in order]):
+        moving = [c.moving for c in (*taken, *mine)]
         try:
             after = remeasure(now.setting, moving, now)
         except CannotAnswerError:
             continue
-        evidence, p_value = _exact(now, after, len(s.candidate.parameters))
-        tried.append((evidence, p_value, after, s.candidate))
+        evidence, p_value = _exact(now, after, sum(len(c.parameters) for c in mine))
+        tried.append((evidence, p_value, after, mine))
     tried.sort(key=lambda t: -t[0])
     sure = [t for t in tried if t[1] * tested < LEVEL and t[0] > 0.0]
     if not sure:
@@ -254,11 +257,28 @@ def _best(
     most = sure[0][0]
     equal = [t for t in sure if most - t[0] < SAME_EVIDENCE]
     # Of those that explain the readings alike, the one with fewest parameters.
-    evidence, p_value, after, best = min(equal, key=lambda t: len(t[3].parameters))
-    rivals = [(t[3], t[0]) for t in tried if t[3] is not best]
+    evidence, p_value, after, best = min(equal, key=lambda t: sum(len(c.parameters) for c in t[3]))
+    rivals = [(c, t[0]) for t in tried for c in t[3]]
     rivals += [(s.candidate, s.score.log_evidence) for s in order[TRIED:]]
-    same = tuple(c for c, e in rivals if most - e < SAME_EVIDENCE)
-    return after, best, min(p_value * tested, 1.0), evidence, same
+    same = {
+        c.name: c for c, e in rivals if most - e < SAME_EVIDENCE and all(c is not b for b in best)
+    }
+    chance = min(p_value * tested, 1.0)
+    return after, [(c, chance, evidence, tuple(same.values())) for c in best]
+
+
+def _trials(order: Sequence[Candidate]) -> list[tuple[Candidate, ...]]:
+    """Return what is fitted exactly: the first candidates, and what a repair changes together.
+
+    A joint that was taken apart has another zero and another compliance. Fitted one after the
+    other, either of them, or a family of waves, would first take the part of both.
+    """
+    out: list[tuple[Candidate, ...]] = [(c,) for c in order[:TRIED]]
+    for joint in list(dict.fromkeys(c.joint for c in order[:TRIED] if c.joint))[:TAKEN_APART]:
+        pair = [c for c in order if c.joint == joint and c.effect in REPAIRED]
+        if len(pair) == len(REPAIRED):
+            out.append((pair[0], pair[1]))
+    return out
 
 
 def _exact(before: Remeasured, after: Remeasured, count: int) -> tuple[float, float]:

@@ -2,27 +2,36 @@
 
 An effect that is on the arm all the time and not in the earlier model is found in later readings as
 well as in the earlier ones. Before later readings are judged, the effects of the candidates are
-scored beside the earlier fit on its own readings, and those that have evidence are added.
+scored beside the earlier fit on its own readings, and those that have evidence are added. What is
+left then and is no stated noise is taken as scatter of the joints, or of the target
+(`identify.arm_scatter`): it has another shape than the tracker's noise, which is far smaller along
+the beam than across it, and as a multiple of that noise it would look like a change.
 """
 
 from collections.abc import Callable, Collection
 
+from scipy.stats import chi2
+
 from hilcal.diagnose.effect_ranking import SAME_EVIDENCE
 from hilcal.diagnose.stepwise import add
 from hilcal.errors import HilcalError
+from hilcal.identify.arm_scatter import estimate_arm_scatter, with_arm_scatter
 from hilcal.identify.fit import Fit
+from hilcal.identify.fit import fit as solve
 from hilcal.identify.linearisation import effect_columns, linearise
 
 LEVEL = 0.01
 """Level of the test, over all effects together; a choice."""
-MOST = 3
+MOST = 2
 """Most effects that are added. A choice: an earlier model that lacks more is no calibration."""
+MISFIT = 0.01
+"""p-value of χ² below which what is left is more than the stated noise; a choice."""
 
 
 def completed(
     fit: Fit, names: Collection[str], say: Callable[[str], None] = lambda text: None
 ) -> tuple[Fit, tuple[str, ...]]:
-    """Return the fit with the effects that its own readings ask for, and their names.
+    """Return the fit with the effects that its own readings ask for and its scatter; their names.
 
     Args:
         fit: a gc-scaled fit.
@@ -40,7 +49,20 @@ def completed(
         except HilcalError:
             break
         added.append(wanted)
-    return fit, tuple(added)
+    return _with_scatter(fit, say), tuple(added)
+
+
+def _with_scatter(fit: Fit, say: Callable[[str], None]) -> Fit:
+    """Return the fit with the arm's scatter in its covariance, where that states less than is."""
+    if fit.readings.arm_scatter is not None or chi2.sf(fit.chi2, fit.dof) > MISFIT:
+        return fit
+    say("estimating the scatter of the earlier readings")
+    scatter = estimate_arm_scatter(fit)
+    if scatter is None:
+        return fit
+    readings = with_arm_scatter(fit.model.cell, fit.readings, scatter)
+    say("fitting the earlier readings with it")
+    return solve(fit.model, readings, fit.mode, start=fit.theta)
 
 
 def _most_wanted(fit: Fit, names: Collection[str]) -> str | None:

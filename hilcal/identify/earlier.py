@@ -75,6 +75,8 @@ def _shared(fit: Fit, knows: Predictive, kept: Readings) -> float:
     in a pose c is 0.
     """
     w, m = fit.whitening, fit.whitening.m
+    if len(np.unique(fit.pose)) == len(fit.pose):
+        return 0.0
     off = fit.left_out[:, :3]
     tau = np.sqrt(np.trace(w.covariance[:, :3, :3], axis1=1, axis2=2))
     at = np.empty(len(kept), dtype=np.int64)

@@ -1,0 +1,141 @@
+"""`python -m studies change`: how often 15 readings name the joint that was repaired."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from hilcal.cli.demo import CELL
+from hilcal.cli.terminal import Json, terminal
+from hilcal.config import load_config
+from hilcal.report import text
+from hilcal.report.numbers import length
+from hilcal.report.progress import counting
+from hilcal.robot.catalogue import configs_dir
+from studies.change import READINGS_B, REPAIRS, Case, StudiedArm, case, studied_arm
+from studies.records import Figure, Keep, keep
+
+ARMS: tuple[tuple[str, tuple[str, ...]], ...] = (
+    ("ur10e", ()),
+    ("ur3e", ()),
+    ("ur5e", ("hysteresis", "joint_tilt_compliance")),
+    ("ur10e", ("thermal_growth", "backlash")),
+)
+"""Robots, and what they have beside geometry, transmission errors and joint compliance."""
+WILSON = 1.959964
+"""Half of a 95 % interval, in standard deviations."""
+
+
+def change(
+    seeds: Annotated[int, typer.Option("--seeds", help="Repairs.")] = 100,
+    nothing: Annotated[int, typer.Option("--nothing", help="Comparisons without any.")] = 200,
+    readings: Annotated[
+        int, typer.Option("--readings", help="Of the later campaign.")
+    ] = READINGS_B,
+    first_seed: Annotated[int, typer.Option("--first-seed", help="Seeds count from here.")] = 0,
+    keep_file: Keep = None,
+    as_json: Json = False,
+) -> None:
+    """Repair a joint of simulated arms, measure a few readings, and ask what has changed."""
+    t = terminal(as_json)
+    config = load_config(configs_dir() / "cells" / CELL)
+    cases: list[Case] = []
+    with counting(t.progress, "comparisons", seeds + nothing) as advance:
+        arms = [studied_arm(config, robot, k, more=more) for k, (robot, more) in enumerate(ARMS)]
+        for k in range(seeds):
+            cases.append(_repaired(arms, k, first_seed, readings))
+            advance(1)
+        for k in range(nothing):
+            arm, seed = arms[k % len(arms)], first_seed + 10_000 + k
+            anew, other = k // 4 % 2 == 1, k // 8 % 2 == 1
+            cases.append(case(arm, "nothing", 0, anew, seed, other=other, count=readings))
+            advance(1)
+    figures = figures_of(cases)
+    out = text.table("what", "measured", "required", left=(0, 1, 2))
+    for f in figures:
+        out.add_row(f.what, f.measured, f.required)
+    t.show(out)
+    t.document({"cases": [asdict(c) for c in cases]})
+    keep(keep_file, f"What has changed on an arm, by {readings} readings", figures)
+
+
+def _repaired(arms: Sequence[StudiedArm], k: int, first: int, count: int) -> Case:
+    """Return the k-th repair: kinds, arms, joints and setups in turn, all combined."""
+    arm, repair = arms[k % len(arms)], REPAIRS[k // len(arms) % len(REPAIRS)]
+    rng = np.random.default_rng([first + k, 5])
+    joint, anew = int(rng.integers(1, arm.cell.arm.n + 1)), bool(rng.integers(2))
+    return case(arm, repair, joint, anew, first + k, count=count)
+
+
+def figures_of(cases: Sequence[Case]) -> list[Figure]:
+    """Return what was counted."""
+    quiet = [c for c in cases if c.repair == "nothing"]
+    repaired = [c for c in cases if c.repair != "nothing"]
+    visible = [c for c in repaired if c.visible]
+    out = []
+    if repaired:
+        out += [
+            _rate("repaired joint named, and no other part", repaired, [c.found for c in repaired]),
+            _rate(
+                "the same, where the change is larger than the program states that it can show",
+                visible,
+                [c.found for c in visible],
+                0.95,
+            ),
+        ]
+        for kind in REPAIRS:
+            mine = [c for c in repaired if c.repair == kind]
+            out.append(_rate(f"… of all: {kind}", mine, [c.found for c in mine]))
+        for anew in (False, True):
+            mine = [c for c in visible if c.anew == anew]
+            words = "set up anew" if anew else "where it was"
+            out.append(_rate(f"… of those, tracker {words}", mine, [c.found for c in mine]))
+        wrong = [bool(c.parts) and c.parts != f"joint {c.joint}" for c in repaired]
+        out.append(_rate("another part than the joint is named first", repaired, wrong))
+        missed = [c for c in repaired if not c.found and not c.visible]
+        if missed:
+            most = max(c.moved_m for c in missed)
+            out.append(
+                Figure(
+                    "changes that these readings cannot show: number, largest motion of the target",
+                    f"{len(missed)}, {length(most)} (a new place of the tracker absorbs a zero of "
+                    "joint 1)",
+                )
+            )
+        alone = [c for c in repaired if c.repair != "gearbox"]
+        z = np.array([x for c in alone for x in c.z])
+        if len(z):
+            inside = np.abs(z) < WILSON
+            out += [
+                _rate("true zero or compliance in its 95 % (no gearbox)", list(z), list(inside)),
+                Figure("error of the size over its std, rms", f"{np.sqrt(np.mean(z**2)):.2f}"),
+            ]
+    if quiet:
+        silent = [not c.parts and c.explained and not c.failure for c in quiet]
+        out.append(_rate("without a change nothing is claimed", quiet, silent, 0.98))
+        arm = [not c.of_arm and not c.failure for c in quiet]
+        out.append(_rate("… no change of the arm itself", quiet, arm))
+        for other in (False, True):
+            mine = [c for c in quiet if c.other == other]
+            words = "other loads, 5 K warmer" if other else "loads and temperature as before"
+            silent = [not c.parts and c.explained and not c.failure for c in mine]
+            out.append(_rate(f"… {words}: nothing is claimed", mine, silent))
+    return out
+
+
+def _rate(
+    what: str, of: Sequence[object], hits: Iterable[bool], least: float | None = None
+) -> Figure:
+    """Return a share with its 95 % interval by Wilson."""
+    count, hit = len(of), sum(hits)
+    if not count:
+        return Figure(what, "no case")
+    share, z2 = hit / count, WILSON**2
+    middle = (share + z2 / (2 * count)) / (1 + z2 / count)
+    half = WILSON * np.sqrt(share * (1 - share) / count + z2 / (4 * count**2)) / (1 + z2 / count)
+    words = f"{hit} of {count} ({100 * (middle - half):.0f} to {100 * (middle + half):.0f} %)"
+    if least is None:
+        return Figure(what, words)
+    return Figure(what, words, f"{100 * least:g} %", share >= least)
