@@ -1,7 +1,7 @@
 """`calibrate`: the operator's one command, from the plan to the measured improvement."""
 
 import shlex
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -324,15 +324,8 @@ class _Operator:
             t.show(plan_facts(made.summary))
             p.begin(made.plan, p.config)
             return
-        steps: dict[str, Callable[..., Any]] = {
-            "refine": p.refine,
-            "decide": p.decide,
-            "plan_validation": p.plan_validation,
-            "validate": p.validate,
-            "correct": p.correct,
-        }
         with working(t.progress) as say:
-            found = steps[step.kind](say)
+            found = p.compute(step, say)
         self._say(step.kind, found)
 
     def _say(self, kind: str, found: Any) -> None:

@@ -1,6 +1,8 @@
 """`demo`: the whole story on a simulated cell with a hidden effect."""
 
-from dataclasses import asdict
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -8,22 +10,29 @@ import numpy as np
 import typer
 
 from drivers.simulated.rehearsal import NOTHING, RANDOM, Rehearsal, check_choice
+from hilcal.calibration.improvement import Improvement
+from hilcal.campaign import Campaign
 from hilcal.cli.doubting import CAMPAIGNS, Doubted, doubted, doubtful_case
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import check_record, finish, record_story
-from hilcal.cli.plan_output import POSES
-from hilcal.cli.put_to_use import put_to_use, said
 from hilcal.cli.refining import Row, revisions_json
-from hilcal.cli.rehearsing import RehearsalSettings, first_plan, in_process, on_devices
+from hilcal.cli.rehearsing import (
+    Measured,
+    RehearsalSettings,
+    first_plan,
+    in_process,
+    on_devices,
+)
 from hilcal.cli.terminal import Json, Record, Terminal, terminal
 from hilcal.config import load_config
-from hilcal.data.campaign_file import CampaignFile, may_write
-from hilcal.data.records import content_hash
-from hilcal.errors import InputError
+from hilcal.data.campaign_file import may_write
+from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.baseline import baseline
+from hilcal.procedure.procedure import Measure, Procedure
+from hilcal.procedure.state import Files, Settings
 from hilcal.refine import Refinement
 from hilcal.refine import refine as refine_model
-from hilcal.report import numbers, text, text_demo, text_refine
+from hilcal.report import numbers, text, text_calibrate, text_demo, text_refine
 from hilcal.report.build_story import Chapter
 from hilcal.report.diagnosis_document import to_json
 from hilcal.report.progress import working
@@ -32,6 +41,10 @@ from hilcal.revisions import to_record
 from hilcal.robot.catalogue import configs_dir
 
 CELL = "demo_ur10e.toml"
+POSES = 15
+"""Of the plan; a choice: with validation and corrected run all of it takes three minutes."""
+VALIDATION = 10
+"""Poses of the validation campaign; a choice for the same reason."""
 
 
 def demo(
@@ -44,6 +57,9 @@ def demo(
         typer.Option("-o", "--output", metavar="RUN.hilcal", help="The campaign file to make."),
     ] = Path("demo.hilcal"),
     poses: Annotated[int, typer.Option("--poses", help="See hilcal plan.")] = POSES,
+    validation: Annotated[
+        int, typer.Option("--validation", help="Poses at which the corrected arm is measured.")
+    ] = VALIDATION,
     without_devices: Annotated[
         bool,
         typer.Option("--without-devices", help="Draw the readings at once, through no wire."),
@@ -62,76 +78,46 @@ def demo(
     """Rehearse the whole story on a simulated cell, through real drivers and wires."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     check_record(record)
-    path = configs_dir() / "cells" / CELL
-    config = load_config(path)
+    config = load_config(configs_dir() / "cells" / CELL)
     number = config.simulation.seed if seed is None else seed
     if number < 0:
         raise InputError(f"--seed {number}; valid: a whole number, 0 or more")
     wanted = hide or config.simulation.hide
     check_choice(wanted or RANDOM, catalogue)
-    may_write(output, True)  # before the planning, which takes a while
-    there = output.exists()
-    told = RehearsalSettings(config, wanted or RANDOM, number, output, path.parent, catalogue)
-    doubt: Doubted | None = None
-    measured = in_process if without_devices else on_devices
-    tries = 0
-    while True:
+    files = Files(output)
+    for path in (output, files.validation, files.corrected):
+        may_write(path, True)  # before the planning, which takes a while
+    told = RehearsalSettings(
+        config, wanted or RANDOM, number, output, configs_dir() / "cells", catalogue
+    )
+    asked = _Asked(wanted or RANDOM, poses, without_devices, ambiguous)
+    with _campaign(t, told, asked) as (m, r, doubt):
         with working(t.progress) as say:
-            if ambiguous:
-                hidden = None if wanted == RANDOM else wanted
-                told, plan, another = doubtful_case(told, hidden, say, tries)
-            else:
-                plan = first_plan(told, config, poses, say)
-        with measured(t, told, plan) as (r, further):
-            if there:
-                t.notice(f"{output} existed and is replaced")
-            there = False
-            _introduce(t, r, wanted or RANDOM, number)
-            if not ambiguous:
-                break
-            doubt = doubted(t, r, number, plan, poses, catalogue)
-            if doubt.plan is not None:
-                r = further(doubt.plan)
-                new = len(r.readings) - doubt.readings
-                t.show(f"\n{new} readings were added. All {len(r.readings)} together:\n")
-                break
-            tries += 1
-            if not another or tries == CAMPAIGNS:
-                t.show("These readings leave no doubt; another --seed or --hide may.\n")
-                break
-            t.show("These readings leave no doubt: another arm is measured.\n")
-    hashed = content_hash(r.readings)
-    with working(t.progress) as say:
-        model = baseline(r.cell, r.readings, r.mode, catalogue)
-        found = refine_model(model, r.readings, r.mode, say)
-        for step in found.steps:
-            finish(step.fit, say)
-    with CampaignFile.open(output) as campaign:
-        if doubt is not None and doubt.plan is not None:
-            first = to_json(doubt.diagnosis)
-            campaign.append_revision(to_record(doubt.fit, first, None, doubt.hashed))
-        numbered = [
-            campaign.append_revision(
-                to_record(s.fit, to_json(s.diagnosis), s.added, hashed, s.removed)
-            )
-            for s in found.steps
+            model = baseline(r.cell, r.readings, r.mode, catalogue)
+            found = refine_model(model, r.readings, r.mode, say)
+            for step in found.steps:
+                finish(step.fit, say)
+        settings = Settings(poses, validation, seed=number, readings=r.mode, hide=told.choice)
+        p = Procedure(output, r.cell, r.config, told.base_dir, catalogue, settings)
+        with Campaign.open(output, catalogue) as o:
+            if doubt is not None and doubt.plan is not None:
+                first = to_json(doubt.diagnosis)
+                o.file.append_revision(to_record(doubt.fit, first, None, doubt.hashed))
+            p.resume(o.file)
+            numbered = p.keep(o, found)
+        rows: list[Row] = [
+            Row(k, s.fit, s.diagnosis.verdict, s.added, s.removed)
+            for k, s in zip(numbered, found.steps, strict=True)
         ]
-    rows: list[Row] = [
-        Row(k, s.fit, s.diagnosis.verdict, s.added, s.removed)
-        for k, s in zip(numbered, found.steps, strict=True)
-    ]
-    for row, s in zip(rows, found.steps, strict=True):
-        t.show(text_demo.step_report(row.number, row.shown[1], s.diagnosis))
-    t.show(text.heading("The error, revision by revision"))
-    t.show([text_refine.revisions_table([r.shown for r in rows]), text_refine.key()])
-    truth = text_demo.compared(found.steps[-1].fit, r.world.truth)
-    if truth:
-        t.show([text.heading("What was found against what is true"), *text_demo.truth_table(truth)])
-    with working(t.progress) as say:
-        say("correcting joint values, and asking the simulated arm where they lead")
-        improved = put_to_use(r, found.steps[-1].fit, number)
-    if improved is not None:
-        t.show([text.heading("Put to use"), *said(improved, r.mode == "deflection"), ""])
+        for row, s in zip(rows, found.steps, strict=True):
+            t.show(text_demo.step_report(row.number, row.shown[1], s.diagnosis))
+        t.show(text.heading("The error, revision by revision"))
+        t.show([text_refine.revisions_table([r.shown for r in rows]), text_refine.key()])
+        truth = text_demo.compared(found.steps[-1].fit, r.world.truth)
+        if truth:
+            t.show(text.heading("What was found against what is true"))
+            t.show([*text_demo.truth_table(truth)])
+        improved = _put_to_use(t, p, m.measure)
     ok, words = _judge(r, found)
     t.show([text_refine.verdict_line(found.diagnosis), "", text.heading(words)])
     if r.world.own is not None:
@@ -161,10 +147,101 @@ def demo(
             "revisions": revisions_json(rows),
             "parameters": [asdict(p) for p in truth],
             "truth": r.world.truth,
-            "compensation": None if improved is None else asdict(improved),
+            "compensation": None if improved is None else _improvement_json(improved),
             "diagnoses": [to_json(s.diagnosis) for s in found.steps],
         }
     )
+
+
+@dataclass(frozen=True, slots=True)
+class _Asked:
+    """What the demo was asked for.
+
+    Attributes:
+        wanted: an effect that is hidden, "random" or "nothing".
+        poses: size of the plan.
+        without_devices: whether readings are drawn.
+        ambiguous: whether the first campaign has to leave a doubt.
+    """
+
+    wanted: str
+    poses: int
+    without_devices: bool
+    ambiguous: bool
+
+
+@contextmanager
+def _campaign(
+    t: Terminal, told: RehearsalSettings, asked: _Asked
+) -> Iterator[tuple[Measured, Rehearsal, Doubted | None]]:
+    """Measure a campaign; the cell is there as long as the block lasts.
+
+    With `ambiguous`, arms are measured until one leaves a doubt, and then what settles it.
+    """
+    measured = in_process if asked.without_devices else on_devices
+    there, first = told.output.exists(), told
+    for tries in range(1, CAMPAIGNS + 1):
+        another = False
+        with working(t.progress) as say:
+            if asked.ambiguous:
+                hidden = None if asked.wanted == RANDOM else asked.wanted
+                told, plan, another = doubtful_case(first, hidden, say, tries - 1)
+            else:
+                plan = first_plan(told, told.config, asked.poses, say)
+        for path in (Files(told.output).validation, Files(told.output).corrected):
+            path.unlink(missing_ok=True)
+        with measured(t, told, plan) as m:
+            if there and tries == 1:
+                t.notice(f"{told.output} existed and is replaced")
+            r = m.rehearsal
+            _introduce(t, r, asked.wanted, first.seed)
+            if not asked.ambiguous:
+                yield m, r, None
+                return
+            doubt = doubted(t, r, first.seed, plan, asked.poses, told.catalogue)
+            if doubt.plan is not None:
+                r = m.further(doubt.plan)
+                new = len(r.readings) - doubt.readings
+                t.show(f"\n{new} readings were added. All {len(r.readings)} together:\n")
+                yield m, r, doubt
+                return
+            if not another or tries == CAMPAIGNS:
+                t.show("These readings leave no doubt; another --seed or --hide may.\n")
+                yield m, r, doubt
+                return
+        t.show("These readings leave no doubt: another arm is measured.\n")
+
+
+def _put_to_use(t: Terminal, p: Procedure, measure: Measure) -> Improvement | None:
+    """Move the simulated arm to corrected targets, and say what its tracker measures there."""
+    t.show(text.heading("Put to use"))
+    try:
+        p.stop()
+        while (step := p.next()).kind not in ("compare", "done"):
+            if step.moves:
+                p.measure(step, measure)
+                continue
+            with working(t.progress) as say:
+                p.compute(step, say)
+        improved = p.compare()
+    except CannotAnswerError as error:
+        t.show(f"{error}\n")
+        return None
+    t.show([*text_calibrate.improvement_report(improved, None), ""])
+    return improved
+
+
+def _improvement_json(found: Improvement) -> dict[str, object]:
+    """Return the error before and after, measured, for JSON."""
+    e = found.everything
+    return {
+        "points": e.count,
+        "before_m": e.before.mean_m,
+        "after_m": e.after.mean_m,
+        "stated_m": e.band_m,
+        "inside": e.inside,
+        "measured": found.to_dict(),
+    }
 
 
 def _introduce(t: Terminal, r: Rehearsal, choice: str, seed: int) -> None:

@@ -26,6 +26,7 @@ from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import DeviceError
 from hilcal.identify.full_covariance import campaign_readings
 from hilcal.plan.checked_plan import refuse
+from hilcal.procedure.procedure import Measure
 from hilcal.report.progress import Say, counting, working
 from hilcal.report.text_demo import NEWCOMER
 
@@ -55,8 +56,19 @@ class RehearsalSettings:
     catalogue: Catalogue
 
 
-Further = Callable[[Plan], Rehearsal]
-"""Measures one further plan in the same cell, into the same campaign; returns all readings."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Measured:
+    """A first campaign, in a simulated cell that is still there.
+
+    Attributes:
+        rehearsal: the cell, and all readings.
+        further: measures one further plan, into the same campaign; returns all readings.
+        measure: measures what is missing of another campaign, in the same cell.
+    """
+
+    rehearsal: Rehearsal
+    further: Callable[[Plan], Rehearsal]
+    measure: Measure
 
 
 def first_plan(told: RehearsalSettings, config: CellConfig, poses: int, say: Say) -> Plan:
@@ -76,9 +88,7 @@ def first_plan(told: RehearsalSettings, config: CellConfig, poses: int, say: Say
 
 
 @contextmanager
-def on_devices(
-    t: Terminal, told: RehearsalSettings, plan: Plan
-) -> Iterator[tuple[Rehearsal, Further]]:
+def on_devices(t: Terminal, told: RehearsalSettings, plan: Plan) -> Iterator[Measured]:
     """Run a plan on simulated devices; they stay for further plans as long as the block lasts.
 
     The drivers are the real ones; what they talk to are the simulated devices of one world, each
@@ -97,12 +107,15 @@ def on_devices(
         made = create_run(told.output, there.config, told.base_dir, plan, True)
         campaign = stack.enter_context(made)
 
-        def measured() -> Rehearsal:
+        def missing(of: CampaignFile, epoch: float | None = None) -> None:
             to_the_end(
                 t,
-                lambda: measure(t, there.config, secret.cell, campaign),
-                lambda: campaign.n_readings,
+                lambda: measure(t, there.config, secret.cell, of, epoch=epoch),
+                lambda: of.n_readings,
             )
+
+        def measured() -> Rehearsal:
+            missing(campaign)
             readings = campaign_readings(campaign, secret.cell, there.config)
             return _rehearsal(secret, there.config, readings)
 
@@ -111,13 +124,11 @@ def on_devices(
             log.append(log.with_new_names(more))
             return measured()
 
-        yield measured(), further
+        yield Measured(measured(), further, missing)
 
 
 @contextmanager
-def in_process(
-    t: Terminal, told: RehearsalSettings, plan: Plan
-) -> Iterator[tuple[Rehearsal, Further]]:
+def in_process(t: Terminal, told: RehearsalSettings, plan: Plan) -> Iterator[Measured]:
     """Draw the readings of a plan from the simulated world without any device.
 
     They are written bit by bit, as a real campaign grows.
@@ -136,11 +147,23 @@ def in_process(
             return _rehearsal(secret, secret.config, campaign.readings())
 
         def further(more: Plan) -> Rehearsal:
-            time = campaign.readings().states.time
-            last = 0.0 if time is None else float(time.max())
+            last = last_time(campaign.readings())
             return measured(with_new_names(more, plan, 2), 2, last + BREAK)
 
-        yield measured(plan, 1, 0.0), further
+        def missing(of: CampaignFile, epoch: float | None = None) -> None:
+            log, number = RunLog(of), len(of.path.name)
+            begun = last_time(campaign.readings()) + number * BREAK
+            drawn = read_plan(secret, log.plan, [told.seed, number], begun).readings
+            for k, step in enumerate(log.plan.steps):
+                log.record(drawn[slice(k, k + 1)], step, {"drawn": True})
+
+        yield Measured(measured(plan, 1, 0.0), further, missing)
+
+
+def last_time(readings: Readings) -> float:
+    """Return when the last reading was taken, s; 0 where that is not known."""
+    time = readings.states.time
+    return 0.0 if time is None else float(time.max())
 
 
 def to_the_end(t: Terminal, work: Callable[[], object], done: Callable[[], int]) -> None:

@@ -18,7 +18,7 @@ from hilcal.plan.checked_plan import refuse
 from hilcal.plan.feasible import REASONS, Space
 from hilcal.plan.run_order import Chosen, Ordering, order_plan
 from hilcal.procedure.expected import expected_states
-from hilcal.procedure.validation_plan import DRAWS, RECORDED
+from hilcal.procedure.validation_plan import DRAWS, RECORDED, fewer_returns
 from hilcal.report.text_compensate import refusals
 from hilcal.robot import se3
 from hilcal.types import Bools, Floats, Ints
@@ -147,9 +147,10 @@ def _ordered(
     names = [of.names[k] for k in keep]
     chosen = [Chosen(of.names[k], (of.loads[k],)) for k in keep]
     how = Ordering(repeats=0, draws=DRAWS)
-    return order_plan(
+    plan = order_plan(
         space.cell, config, names, q[keep], reference, chosen, space.passable, rng, how
     ).plan
+    return fewer_returns(plan, space, config)
 
 
 def _compensated(

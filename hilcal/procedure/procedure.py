@@ -139,14 +139,22 @@ class Procedure:
         Raises:
             InputError: it cannot be written, or is there already.
         """
+        self.check_files()
+        first = entry(BEGUN, {"settings": self.settings.to_json()})
+        more = {COVERS: covers, ENTRY.format(1): first}
+        create_run(self.run, config, self.base_dir, plan, source=_SOURCE, more=more).close()
+
+    def check_files(self) -> None:
+        """Refuse files of another calibration where those of this one will be.
+
+        Raises:
+            InputError: one is there.
+        """
         for path in (self.files.validation, self.files.corrected):
             if path.exists():
                 raise InputError(
                     f"{path}: the file exists, and {self.run} does not; rename or move it away"
                 )
-        first = entry(BEGUN, {"settings": self.settings.to_json()})
-        more = {COVERS: covers, ENTRY.format(1): first}
-        create_run(self.run, config, self.base_dir, plan, source=_SOURCE, more=more).close()
 
     def resume(self, campaign: CampaignFile) -> None:
         """Keep what is asked for in the log of the campaign.
@@ -176,9 +184,9 @@ class Procedure:
             return campaign.n_readings
 
     def _epoch(self) -> float | None:
-        """Return the time of day that the campaign's time counts from, s."""
+        """Return the time of day that the campaign's time counts from, s; None where not known."""
         with CampaignFile.open(self.run, read_only=True) as campaign:
-            details = RunLog(campaign).details()
+            details = RunLog(campaign).details() if campaign.about(PLAN) is not None else []
         return float(details[0]["epoch_wall_s"]) if details else None
 
     # fitting
@@ -195,16 +203,21 @@ class Procedure:
             model = baseline(o.cell, o.readings, mode, o.catalogue)
             found = refine(model, o.readings, mode, say)
             say("computing standard uncertainties")
-            records = [
-                o.record(step.fit, step.diagnosis, step.added, step.removed) for step in found.steps
-            ]
-            ProcedureLog(o.file).append(
-                REFINED,
-                {"readings_sha256": o.file.data_hash(), "verdict": found.verdict},
-                revisions=records,
-            )
-        self._found[:] = [found]
+            self.keep(o, found)
         return found
+
+    def keep(self, o: Campaign, found: Refinement) -> tuple[int, ...]:
+        """Store the revisions of a refinement; returns their numbers.
+
+        Raises:
+            InputError: it is of other readings than those of the campaign.
+        """
+        records = [
+            o.record(step.fit, step.diagnosis, step.added, step.removed) for step in found.steps
+        ]
+        content = {"readings_sha256": o.file.data_hash(), "verdict": found.verdict}
+        self._found[:] = [found]
+        return ProcedureLog(o.file).append(REFINED, content, revisions=records)
 
     def decide(self, say: Say = lambda words: None) -> Decision:
         """Decide whether to measure more; a further plan is in the campaign then."""
@@ -230,6 +243,23 @@ class Procedure:
                 log.append(DECIDED, {"action": STOP, **content})
         return found
 
+    def stop(self) -> None:
+        """Measure no further plan: the last refinement is what will be tested."""
+        with CampaignFile.open(self.run) as campaign:
+            ProcedureLog(campaign).append(DECIDED, {"action": STOP, "reason": "asked"})
+
+    def compute(self, step: Step, say: Say = lambda words: None) -> object:
+        """Do a step after the first in which nothing moves; returns what came of it."""
+        steps: dict[str, Callable[[Say], object]] = {
+            "refine": self.refine,
+            "decide": self.decide,
+            "plan_validation": self.plan_validation,
+            "validate": self.validate,
+            "correct": self.correct,
+            "compare": self.compare,
+        }
+        return steps[step.kind](say)
+
     def predicted(self) -> PredictedError:
         """Predict the error after compensation with the model as it is."""
         with Campaign.open(self.run, self.catalogue, read_only=True) as o:
@@ -252,7 +282,7 @@ class Procedure:
                 self.config,
                 calibration,
                 o.fitted_readings(record),
-                _reference(RunLog(o.file).plans[0]),
+                _reference_of(o.file),
                 self.settings.validation,
                 self._rng(_VALIDATION),
                 say,
@@ -444,6 +474,12 @@ def continued(run: Path, cell: Cell, config: CellConfig, catalogue: Catalogue) -
         check_same_cell(campaign, config)
         settings, base_dir = settings_of(campaign), Path(campaign.base_dir)
     return Procedure(run, cell, config, base_dir, catalogue, settings)
+
+
+def _reference_of(file: CampaignFile) -> Floats | None:
+    """Return the joints (n,) of a campaign's reference pose; None where it has no plan."""
+    text = file.about(PLAN)
+    return None if text is None else _reference(read_plan(text, f"{file.path}, its plan"))
 
 
 def _reference(plan: Plan) -> Floats | None:

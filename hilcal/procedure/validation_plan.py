@@ -9,13 +9,14 @@ from hilcal.acquire.dry_run import dry_run
 from hilcal.calibration.calibration import Calibration
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.data.plan import UNLOADED, Plan
+from hilcal.data.plan import REFERENCE, UNLOADED, Plan
 from hilcal.data.readings import Readings, States
 from hilcal.errors import CannotAnswerError
 from hilcal.plan.checked_plan import refuse
 from hilcal.plan.draw import draw
 from hilcal.plan.feasible import Space
 from hilcal.plan.run_order import Chosen, Ordering, order_plan
+from hilcal.plan.timing import pace, timeline
 from hilcal.types import Bools, Floats
 
 Say = Callable[[str], None]
@@ -98,8 +99,29 @@ def validation_plan(
     plan = order_plan(
         space.cell, own, list(names.values()), q, base, chosen, space.passable, rng, how
     ).plan
+    plan = fewer_returns(plan, space, own)
     refuse(dry_run(cell, config, plan), "the validation plan")
     return replace(plan, about={**plan.about, "purpose": "validation"})
+
+
+def fewer_returns(plan: Plan, space: Space, config: CellConfig) -> Plan:
+    """Return the plan without readings at the reference pose where a load is changed.
+
+    The arm goes there all the same. The first and the last one stay, which measure the drift of a
+    campaign that takes minutes.
+    """
+    steps = plan.steps
+    kept = [
+        s
+        for k, s in enumerate(steps)
+        if s.pose != REFERENCE
+        or k in (0, len(steps) - 1)
+        or steps[k - 1].load == s.load == steps[k + 1].load
+    ]
+    made = replace(plan, steps=tuple(kept))
+    margin = config.limits.joint_margin_rad
+    lasts = timeline(made, space.cell.arm, margin, pace(config))[0]
+    return replace(made, about={**plan.about, "duration_s": lasts.about()})
 
 
 def _loads(calibration: Calibration, fitted: Readings) -> tuple[str, ...]:
