@@ -258,17 +258,27 @@ class Calibration:
             given = np.broadcast_to(np.asarray(wanted, dtype=float), (len(states), 4, 4))
             goal = np.array(given[:, :3, :3]), np.array(given[:, :3, 3])
         fast = self._compiled if of is self._tracked else compiled(of, self.mode)
-        if fast is not None:
-            found, left = fast.compensate(states.q, states.wrench, goal)
+        if isinstance(fast, Compiled):
+            found, left = fast.compensate(states, goal)
             inverse = Inverse(found, left[:, 0], left[:, 1])
         else:
             inverse = self._invert(of, states, goal or self.nominal(of, states))
         return Compensation(inverse, self, of, states, goal, std)
 
     @cached_property
-    def _compiled(self) -> Compiled | None:
+    def _compiled(self) -> Compiled | tuple[str, ...]:
         """The model for the compiled kernel, with the tracked target as the tool."""
         return compiled(self._tracked, self.mode)
+
+    def without_kernel(self, tool: Floats | None = None) -> tuple[str, ...]:
+        """Names of what the compiled kernel has no form for: some hundred times slower with it.
+
+        Args:
+            tool: as for `predict`.
+        """
+        of = self._tool(tool)
+        found = self._compiled if of is self._tracked else compiled(of, self.mode)
+        return () if isinstance(found, Compiled) else found
 
     def _invert(self, of: Tool, states: States, goal: tuple[Floats, Floats]) -> Inverse:
         def poses(at: Floats, points: Ints) -> Pose:

@@ -3,10 +3,12 @@
 What an effect does is found by asking it, not by its name: its deviation at random states and
 wrenches is compared with
 
-    dq_j = a_j + T_j(q_j) + Σ_i L_ji q_i + c_j · w_j + G_j(τ_j),      ξ_k = b_k + C_k w_k
+    dq_j = a_j + T_j(q_j) + Σ_i L_ji q_i + c_j · w_j + (s_j + P_j(q_j)) τ_j + G_j(τ_j)
+    ξ_k = b_k + Q_k q + C_k w_k
 
-(tables T, G by cubic splines). An effect of another form, or that needs more than joint values and
-wrench, is not compiled; the model is then evaluated as everywhere else, some hundred times slower.
+(tables T, P, G by cubic splines). An effect that needs times, temperatures or sides of approach
+gives a, b and s of each point, see `by_point`. One of another form is not compiled; the model is
+then evaluated as everywhere else, some hundred times slower.
 """
 
 from dataclasses import dataclass, replace
@@ -48,6 +50,8 @@ class Compiled:
         nominal: the same laws with nothing in them, of the nominal arm.
         reach: m.
         mode: kind of readings that the model was fitted to.
+        by_point: effects that need times, temperatures or sides of approach, with their parameters.
+        one: a state, for these effects.
     """
 
     arm: tuple[Floats, ...]
@@ -58,77 +62,102 @@ class Compiled:
     nominal: tuple[tuple[Floats, ...], tuple[Any, ...]]
     reach: float
     mode: Mode
+    by_point: tuple[tuple[Effect, Floats], ...]
+    one: Situation
 
     def compensate(
-        self, q: Floats, wrench: Floats, goal: tuple[Floats, Floats] | None
+        self, states: States, goal: tuple[Floats, Floats] | None
     ) -> tuple[Floats, Floats]:
         """Joint values (N, n) and residuals (N, 2), m and rad.
 
         Args:
-            q: (N, n) joint values, rad.
-            wrench: (N, 6) at the load point, base axes.
+            states: N points, with what the effects need.
             goal: (N, 3, 3) wanted orientations and (N, 3) positions, m, base axes; those that the
                 nominal arm (for deflections: the unloaded arm) has at q where None.
         """
         from hilcal.calibration.kernel import invert_all
 
-        count = len(q)
+        q, wrench, count = states.q, states.wrench, len(states)
+        own = self._own(states)
         out, left = np.empty_like(q), np.zeros((count, 2))
         still = self.mode == "deflection"
         rotation, position = goal or (np.empty((count, 3, 3)), np.empty((count, 3)))
         if goal is None:
             laws, tables = (self.laws, self.tables) if still else self.nominal
             tool, nothing = self.tool.pose if still else self.tool.nominal, np.zeros((count, 6))
+            none = own if still else _nothing(q.shape[1])
             invert_all(
-                self.arm, self.load, laws, tables, _c(tool), self.reach, MOST_TURN, TOLERANCE,
+                self.arm, self.load, laws, tables, none, _c(tool), self.reach, MOST_TURN, TOLERANCE,
                 q, nothing, rotation, position, False, out, left,
             )  # fmt: skip
         if goal is not None or not still:
             rotation, position = in_chain(self.tool, rotation, position)
         invert_all(
-            self.arm, self.load, self.laws, self.tables, _c(self.tool.pose), self.reach, MOST_TURN,
-            TOLERANCE, q, wrench, _c(rotation), _c(position), True, out, left,
+            self.arm, self.load, self.laws, self.tables, own, _c(self.tool.pose), self.reach,
+            MOST_TURN, TOLERANCE, q, wrench, _c(rotation), _c(position), True, out, left,
         )  # fmt: skip
         return out, left
 
+    def _own(self, states: States) -> tuple[Floats, Floats, Floats]:
+        """Displacements (N, n), twists (N, n + 1, 6) and compliances (N, n) of the points."""
+        own = _nothing(states.q.shape[1])
+        if not self.by_point:
+            return own
+        s = self.one if len(states) == 1 else _repeated(self.one, len(states))
+        s = replace(s, states=states, angle=states.q)
+        dq, twist, soft = own
+        for e, theta in self.by_point:
+            d = e.deviation(theta, s)
+            if e.elastic:
+                soft = soft if d.dq is None else soft + d.dq
+                continue
+            dq = dq if d.dq is None else dq + d.dq
+            twist = twist if d.twist is None else twist + d.twist
+        return _c(dq), _c(twist), _c(soft)
 
-def compiled(tool: Tool, mode: Mode) -> Compiled | None:
-    """Return a model for the kernel; None where it has another form, or numba is absent."""
+
+def compiled(tool: Tool, mode: Mode) -> Compiled | tuple[str, ...]:
+    """Return a model for the kernel; the names of what it has no form for where there is such."""
     try:
         import numba  # noqa: F401
     except ImportError:
-        return None
+        return ("numba, which is not installed",)
     model = tool.model
     arm, cell = model.cell.arm, model.cell
-    if arm.n != 6 or arm.drive is not None or arm.coupling is not None or tool.moving:
-        return None
-    situation = _situation(tool)
-    if situation is None:
-        return None
-    form = _Form.empty(arm.n)
+    if arm.n != 6 or arm.drive is not None or arm.coupling is not None:
+        return (f"{arm.name}'s joints (not six, or coupled)",)
+    if tool.moving:
+        return tuple(e.name for e, _ in tool.moving)
+    s, form = _situation(tool), _Form.empty(arm.n)
     first_moment, point = np.zeros((arm.n, 3)), cell.load_point
+    by_point: list[tuple[Effect, Floats]] = []
     for e, mine in zip(model.effects, model.slices(), strict=True):
         theta = tool.theta[mine]
-        if e.role in FRAME_ROLES:
+        if e.role in FRAME_ROLES or not theta.any():
             continue
-        if e.needs or e.wrench_change(theta, situation) is not None:
-            return None
         change = e.load_change(theta)
         if change is not None:
             point = point if change.point is None else point + change.point
             moments = change.first_moment
             first_moment = first_moment if moments is None else first_moment + moments
-        elif theta.any() and not form.take(e, theta, situation):
-            return None
+        elif e.needs and _by_point(e, theta, s):
+            by_point.append((e, theta))
+        elif not form.take(e, theta, s):
+            return (e.name,)
     load = (
         _c(point), float(cell.tool_mass), _c(cell.tool_com), _c(cell.gravity), _c(arm.masses),
-        first_moment,
+        first_moment, form.gain, form.bias,
     )  # fmt: skip
     links = (_c(arm.links[:, :3, :3]), _c(arm.links[:, :3, 3]), _c(arm.coms))
     bare = _Form.empty(arm.n)
     nominal = bare.laws(), bare.tables()
-    reach = float(arm.reach)
-    return Compiled(links, load, form.laws(), form.tables(), tool, nominal, reach, mode)
+    unit = np.zeros_like(s.wrench[:1])
+    unit[..., 5] = 1.0
+    one = replace(_repeated(s, 1), wrench=unit)
+    return Compiled(
+        links, load, form.laws(), form.tables(), tool, nominal, float(arm.reach), mode,
+        tuple(by_point), one,
+    )  # fmt: skip
 
 
 @dataclass(slots=True, eq=False)
@@ -143,34 +172,47 @@ class _Form:
     by_angle: Floats
     by_torque: Floats
     torque: Floats
+    by_values: Floats
+    soft: Floats
+    gain: Floats
+    bias: Floats
 
     @classmethod
     def empty(cls, n: int) -> "_Form":
         return cls(
             np.zeros(n), np.zeros((n, n)), np.zeros((n, 6)), np.zeros((n + 1, 6)),
             np.zeros((n + 1, 6, 6)), np.zeros((0, NODES)), np.zeros((0, TORQUE_NODES)), np.ones(n),
+            np.zeros((0, 6, n)), np.zeros((0, NODES)), np.zeros((0, 6)), np.zeros(6),
         )  # fmt: skip
 
     def laws(self) -> tuple[Floats, ...]:
-        return self.a, self.linear, self.by_wrench, self.b, self.compliance
+        return self.a, self.linear, self.by_wrench, self.b, self.compliance, self.by_values
 
     def tables(self) -> tuple[Any, ...]:
         angle = np.linspace(-TURN, TURN, NODES)
         steps = 2 * self.torque / (TORQUE_NODES - 1)
-        slopes = np.zeros_like(self.by_angle)
-        if len(self.by_angle):
-            slopes = CubicSpline(angle, self.by_angle, axis=1)(angle, 1)
+        slopes, soft_slopes = (
+            CubicSpline(angle, x, axis=1)(angle, 1) if len(x) else np.zeros_like(x)
+            for x in (self.by_angle, self.soft)
+        )
         torque_slopes = np.zeros_like(self.by_torque)
         for j, values in enumerate(self.by_torque):
             grid = np.linspace(-self.torque[j], self.torque[j], TORQUE_NODES)
             torque_slopes[j] = CubicSpline(grid, values)(grid, 1)
         return (
             self.by_angle, _c(slopes), -TURN, float(angle[1] - angle[0]),
-            self.by_torque, torque_slopes, -self.torque, steps,
+            self.by_torque, torque_slopes, -self.torque, steps, self.soft, _c(soft_slopes),
         )  # fmt: skip
 
     def take(self, e: Effect, theta: Floats, s: Situation) -> bool:
         """Add an effect; False where it has another form."""
+        if e.wrench_change(theta, s) is not None:
+            return self._sensed(e, theta, s)
+        found = e.deviation(theta, s)
+        if all(x is None for x in (found.dq, found.twist, found.base, found.target)):
+            return True  # what instruments do moves no tool
+        if e.needs:
+            return False
         return self._elastic(e, theta, s) if e.elastic else self._rigid(e, theta, s)
 
     def _elastic(self, e: Effect, theta: Floats, s: Situation) -> bool:
@@ -193,7 +235,40 @@ class _Form:
             self.by_wrench += by_wrench
             self.compliance += compliance
             return True
-        return found.twist is None and self._by_torque(e, theta, s, found)
+        if found.twist is not None or found.dq is None:
+            return False
+        return self._soft(e, theta, s, found.dq) or self._by_torque(e, theta, s, found)
+
+    def _sensed(self, e: Effect, theta: Floats, s: Situation) -> bool:
+        """Take what a force sensor on the flange adds: R (bias + gain Rᵀ w)."""
+        change, r = e.wrench_change(theta, s), s.chain.rotation[-1]
+        if change is None:
+            return False
+        w, y = (
+            np.einsum("nij,nki->nkj", r, x.reshape(-1, 2, 3)).reshape(-1, 6)
+            for x in (s.states.wrench, change)
+        )
+        rows = np.hstack([w, np.ones((TRIALS, 1))])
+        solved = np.linalg.lstsq(rows, y, rcond=None)[0]
+        if np.abs(rows @ solved - y).max() > 1e3 * EXACT * max(np.abs(y).max(), 1.0):
+            return False
+        self.gain = _c(solved[:-1].T + (self.gain if len(self.gain) else 0.0))
+        self.bias = self.bias + solved[-1]
+        return True
+
+    def _soft(self, e: Effect, theta: Floats, s: Situation, dq: Floats) -> bool:
+        """Take compliances of joints that depend on the joint's own angle."""
+        angle, n = np.linspace(-TURN, TURN, NODES), s.angle.shape[1]
+        unit = np.zeros_like(s.wrench)
+        unit[:, :n, 5] = 1.0
+        parts = np.array_split(angle, 16)
+        own = np.concatenate([_at(e, theta, replace(s, wrench=unit), part) for part in parts])
+        waves = CubicSpline(angle, own)
+        here = np.stack([waves(s.angle[:, j])[:, j] for j in range(n)], axis=1)
+        if not _same(Deviation(dq=dq), here * s.wrench[:, :n, 5], None):
+            return False
+        self.soft = _c(own.T + (self.soft if len(self.soft) else 0.0))
+        return True
 
     def _by_torque(self, e: Effect, theta: Floats, s: Situation, found: Deviation) -> bool:
         """Take displacements that depend on the joint's own torque alone."""
@@ -221,12 +296,18 @@ class _Form:
             return False
         twist = np.zeros(self.b.shape) if found.twist is None else found.twist[0]
         n = s.angle.shape[1]
-        if found.dq is None:
-            if not _same(
-                found, np.zeros((TRIALS, n)), np.broadcast_to(twist, (TRIALS, *twist.shape))
-            ):
+        if found.dq is None and found.twist is not None:
+            rows = np.hstack([s.values, np.ones((TRIALS, 1))])
+            flat = np.broadcast_to(found.twist, (TRIALS, *twist.shape)).reshape(TRIALS, -1)
+            solved = np.linalg.lstsq(rows, flat, rcond=None)[0]
+            if np.ptp(flat, axis=0).max() <= EXACT:
+                solved[:-1], solved[-1] = 0.0, flat[0]
+            if np.abs(rows @ solved - flat).max() > EXACT:
                 return False
-            self.b += twist
+            self.b += solved[-1].reshape(twist.shape)
+            if solved[:-1].any():
+                by_values = np.moveaxis(solved[:-1].reshape(n, *twist.shape), 0, -1)
+                self.by_values = _c(by_values + (self.by_values if len(self.by_values) else 0.0))
             return True
         angle = np.linspace(-TURN, TURN, NODES)
         own = np.concatenate([_at(e, theta, s, part) for part in np.array_split(angle, 16)])
@@ -257,18 +338,48 @@ def _at(e: Effect, theta: Floats, s: Situation, angle: Floats) -> Floats:
     return np.zeros_like(q) if found is None else found
 
 
-def _situation(tool: Tool) -> Situation | None:
-    """Return random states, and random wrenches through their slots."""
+def _by_point(e: Effect, theta: Floats, s: Situation) -> bool:
+    """Whether an effect is a constant, or a compliance of joints, once its columns are known."""
+    turned = np.roll(s.angle, 1, axis=0)
+    other = replace(s, states=replace(s.states, q=turned), angle=turned)
+    n = s.angle.shape[1]
+    unit, found = np.zeros_like(s.wrench), e.deviation(theta, s)
+    unit[..., 5] = 1.0
+    if e.elastic:
+        here, there = (e.deviation(theta, replace(x, wrench=unit)) for x in (s, other))
+        if found.twist is not None or here.dq is None or there.dq is None or not _only(found):
+            return False
+        return _same(there, here.dq, None) and _same(found, here.dq * s.wrench[:, :n, 5], None)
+    if not _only(found) or (found.dq is None and found.twist is None):
+        return False
+    dq = np.zeros((TRIALS, n)) if found.dq is None else found.dq
+    return _same(e.deviation(theta, other), dq, found.twist)
+
+
+def _nothing(n: int) -> tuple[Floats, Floats, Floats]:
+    """Return what points have where no effect gives them anything of their own."""
+    return np.zeros((1, n)), np.zeros((1, n + 1, 6)), np.zeros((1, n))
+
+
+def _situation(tool: Tool) -> Situation:
+    """Return random states with every column, and random wrenches through their slots."""
     arm, rng = tool.model.cell.arm, np.random.default_rng(20250307)
-    states = States(rng.uniform(-3, 3, (TRIALS, arm.n)), np.zeros((TRIALS, 6)))
-    if not all(e.computable(states) for e in tool.model.effects):
-        return None
+    states = States(
+        rng.uniform(-3, 3, (TRIALS, arm.n)),
+        np.zeros((TRIALS, 6)),
+        time=rng.uniform(0.0, 1e4, TRIALS),
+        load_time=rng.uniform(0.0, 1e3, TRIALS),
+        air_temperature=rng.uniform(15.0, 30.0, TRIALS),
+        joint_temperature=rng.uniform(15.0, 50.0, (TRIALS, arm.n)),
+        approach=np.sign(rng.standard_normal((TRIALS, arm.n))),
+    )
     situation = tool.model.predict(states, np.zeros_like(tool.theta)).situation
     limit = np.where(np.isfinite(arm.torque_max), arm.torque_max, 100.0)
     wrench = rng.standard_normal((TRIALS, arm.n + 1, 6)) * np.append(limit, limit[-1])[:, None]
     wrench *= 10.0 ** rng.uniform(-4, 0, (TRIALS, 1, 1))  # laws may turn where torques are small
     compliance = tool.model._compliance(tool.theta)
-    return replace(situation, wrench=wrench, compliance=compliance)
+    loads = replace(situation.states, wrench=100.0 * rng.standard_normal((TRIALS, 6)))
+    return replace(situation, states=loads, wrench=wrench, compliance=compliance)
 
 
 def _repeated(s: Situation, count: int) -> Situation:
@@ -301,6 +412,6 @@ def _same(d: Deviation, dq: Floats, twist: Floats | None) -> bool:
     return bool(np.abs(a).max() <= 1e3 * EXACT * size and np.abs(b).max(initial=0.0) <= EXACT)
 
 
-def _c(x: Floats) -> Floats:
+def _c(x: Floats | np.ndarray) -> Floats:
     """Return a copy of one layout: others, and those that are read-only, would be compiled anew."""
     return np.array(x, dtype=float, order="C")

@@ -3,9 +3,11 @@
 The same equations as `robot.chain`, `robot.statics` and `compensation`, for models whose effects
 `compiled` could bring into the form
 
-    dq_j = a_j + T_j(q_j) + Σ_i L_ji q_i + c_j · w_j + G_j(τ_j),      ξ_k = b_k + C_k w_k
+    dq_j = a_j + T_j(q_j) + Σ_i L_ji q_i + c_j · w_j + (s_j + P_j(q_j)) τ_j + G_j(τ_j)
+    ξ_k = b_k + Q_k q + C_k w_k
 
-w_k the wrench through slot k. Chain, wrenches and Newton step are iterated together: each is about
+w_k the wrench through slot k, τ_j the torque about joint j; a, b and s may differ from point to
+point. Chain, wrenches and Newton step are iterated together: each is about
 10³ times closer after every round. Machine code is made by numba when a process first needs it.
 """
 
@@ -132,6 +134,24 @@ def _chain(
 
 
 @njit(cache=True)
+def _add_sensed(
+    gain: Floats, bias: Floats, r: Floats, applied: Floats, f: Floats, t: Floats
+) -> None:
+    """Add R (bias + gain Rᵀ w) to force and moment, R the flange's orientation."""
+    for k in range(6):
+        here = bias[k]
+        for j in range(6):
+            block = 3 * (j // 3)
+            for i in range(3):
+                here += gain[k, j] * r[i, j - block] * applied[block + i]
+        for i in range(3):
+            if k < 3:
+                f[i] += r[i, k] * here
+            else:
+                t[i] += r[i, k - 3] * here
+
+
+@njit(cache=True)
 def _wrenches(
     load: Any,
     applied: Floats,
@@ -143,18 +163,22 @@ def _wrenches(
     scratch: Floats,
 ) -> None:
     """Write the wrench (n + 1, 6) through each slot, slot axes."""
-    point, tool_mass, tool_com, gravity, masses, moments = load
+    point, tool_mass, tool_com, gravity, masses, moments, gain, bias = load
     n = len(com)
     f, t, lever, weight = scratch[0, 0], scratch[0, 1], scratch[0, 2], scratch[1, 0]
     for i in range(3):
-        lever[i] = 0.0
+        f[i] = applied[i]
         t[i] = applied[3 + i]
+    if len(gain) > 0:
+        _add_sensed(gain, bias, rotation[n], applied, f, t)
+    for i in range(3):
+        lever[i] = 0.0
     _add_turned(rotation[n], point, lever)
-    _add_cross(lever, applied[:3], t)
+    _add_cross(lever, f, t)
     for i in range(3):
         lever[i] = 0.0
         weight[i] = tool_mass * gravity[i]
-        f[i] = applied[i] + weight[i]
+        f[i] += weight[i]
     _add_turned(rotation[n], tool_com, lever)
     _add_cross(lever, weight, t)
     for k in range(n, -1, -1):
@@ -176,10 +200,17 @@ def _wrenches(
 
 @njit(cache=True)
 def _deviations(
-    laws: Arrays, tables: Any, q: Floats, wrench: Floats, dq: Floats, twist: Floats
+    laws: Arrays,
+    tables: Any,
+    own: tuple[Floats, Floats, Floats],
+    q: Floats,
+    wrench: Floats,
+    dq: Floats,
+    twist: Floats,
 ) -> float:
     """Write the deviations; returns their largest change."""
-    a, linear, by_wrench, b, compliance = laws
+    a, linear, by_wrench, b, compliance, by_values = laws
+    own_dq, own_twist, own_soft = own
     (
         by_angle,
         angle_slopes,
@@ -189,16 +220,21 @@ def _deviations(
         torque_slopes,
         torque_low,
         torque_step,
+        soft,
+        soft_slopes,
     ) = tables
     n, change = len(q), 0.0
     for j in range(n):
-        new = a[j]
+        new = a[j] + own_dq[j] + own_soft[j] * wrench[j, 5]
         for i in range(n):
             new += linear[j, i] * q[i]
         for e in range(6):
             new += by_wrench[j, e] * wrench[j, e]
         if len(by_angle) > 0:
             new += _interpolate(q[j], angle_low, angle_step, by_angle[j], angle_slopes[j])
+        if len(soft) > 0:
+            here = _interpolate(q[j], angle_low, angle_step, soft[j], soft_slopes[j])
+            new += here * wrench[j, 5]
         if len(by_torque) > 0:
             new += _interpolate(
                 wrench[j, 5], torque_low[j], torque_step[j], by_torque[j], torque_slopes[j]
@@ -207,7 +243,10 @@ def _deviations(
         dq[j] = new
     for k in range(n + 1):
         for e in range(6):
-            new = b[k, e]
+            new = b[k, e] + own_twist[k, e]
+            if len(by_values) > 0:
+                for i in range(n):
+                    new += by_values[k, e, i] * q[i]
             for f in range(6):
                 new += compliance[k, e, f] * wrench[k, f]
             change = max(change, abs(new - twist[k, e]))
@@ -267,6 +306,7 @@ def invert_all(
     load: Any,
     laws: Arrays,
     tables: Any,
+    own: tuple[Floats, Floats, Floats],
     tool: Floats,
     reach: float,
     most_turn: float,
@@ -286,6 +326,8 @@ def invert_all(
         load: where the load acts, and all weights.
         laws: constants and compliances of the deviations.
         tables: of what depends on one angle, or one torque.
+        own: displacements (K, n), twists (K, n + 1, 6) and compliances (K, n) of the points, K
+            each its own; the last ones are those of all further points.
         tool: (4, 4) T_flange_tool.
         reach: of the arm, m.
         most_turn: largest step of a joint, rad.
@@ -307,6 +349,11 @@ def invert_all(
     p, lever, column = np.empty(3), np.empty(3), np.empty(3)
     for point in range(count):
         at[:] = q[point]
+        mine = (
+            own[0][min(point, len(own[0]) - 1)],
+            own[1][min(point, len(own[1]) - 1)],
+            own[2][min(point, len(own[2]) - 1)],
+        )
         dq[:] = 0.0
         twist[:] = 0.0
         for _ in range(ROUNDS):
@@ -315,7 +362,7 @@ def invert_all(
             p[:] = position[n]
             _add_turned(rotation[n], tool[:3, 3], p)
             _wrenches(load, applied[point], rotation, position, body, com, wrench, scratch)
-            change = _deviations(laws, tables, at, wrench, dq, twist)
+            change = _deviations(laws, tables, mine, at, wrench, dq, twist)
             if not newton:
                 rotations[point] = r
                 positions[point] = p

@@ -117,6 +117,11 @@ def compensate(
         sensed = task.points.sensed
         acting = given if sensed is None else calibration.load_wrench(q, sensed)
         found = calibration.compensate(q, acting, tool=task.tool, recorded=task.points.recorded)
+    slow = calibration.without_kernel(task.tool)
+    if slow:
+        t.notice(
+            f"note: {', '.join(slow)} has no compiled form: a point takes 25 to 60 ms, not 0.1 ms"
+        )
     refused = text_compensate.refusals(found, outside)
     _refuse(points, task.points.names, refused, found)
     document = text_compensate.document(calibration, task.points.names, found, refused)

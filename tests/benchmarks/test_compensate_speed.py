@@ -33,7 +33,13 @@ def shortest(work: Callable[[], object], times: int = 1) -> float:
     return min(out)
 
 
-@pytest.mark.parametrize("effect", ["joint_tilt_compliance", "transmission_error"])
+EFFECTS = [
+    *("joint_tilt_compliance", "transmission_error", "periodic_joint_compliance"),
+    *("joint_coupling", "hysteresis", "creep"),
+]
+
+
+@pytest.mark.parametrize("effect", EFFECTS)
 def test_compensation(effect: str, benchmark: Any, claim: Claim) -> None:
     c = campaign(effect, "absolute", 0, poses=24)
     model = baseline(c.cell, c.readings, "absolute")
@@ -42,13 +48,17 @@ def test_compensation(effect: str, benchmark: Any, claim: Claim) -> None:
     states = plan(40, 5000).states
     rows = np.arange(POINTS) % len(states)
     q, wrench = states.q[rows], states.wrench[rows]
-    found = calibration.compensate(q, wrench)  # the kernel is compiled here
+    columns = {k: getattr(states, k) for k in ("load_time", "approach")}
+    recorded = {k: v[rows] for k, v in columns.items() if v is not None}
+    first = {k: v[0] for k, v in recorded.items()}
+    assert calibration.without_kernel() == ()
+    found = calibration.compensate(q, wrench, recorded=recorded)  # the kernel is compiled here
     assert found.inverse.solved.mean() > 0.95
-    one = shortest(lambda: calibration.compensate(q[0], wrench[0]), 500)
-    many = shortest(lambda: calibration.compensate(q, wrench))
+    one = shortest(lambda: calibration.compensate(q[0], wrench[0], recorded=first), 500)
+    many = shortest(lambda: calibration.compensate(q, wrench, recorded=recorded))
     chain = shortest(lambda: evaluate(calibration.model.cell.arm, q))
     claim(f"one compensation, {effect}", f"{1e6 * one:.0f} µs", "200 µs")
     claim(f"{POINTS} compensations, {effect}", f"{many:.3f} s", "0.2 s")
     claim(f"the same over one evaluation of {POINTS} chains", f"{many / chain:.2f}", "no limit")
     benchmark.extra_info["over one chain"] = many / chain
-    benchmark.pedantic(lambda: calibration.compensate(q, wrench), rounds=ROUNDS)
+    benchmark.pedantic(lambda: calibration.compensate(q, wrench, recorded=recorded), rounds=ROUNDS)

@@ -15,12 +15,14 @@ from scipy.spatial.transform import Rotation
 
 import hilcal as hc
 from hilcal.calibration.calibration import Calibration
+from hilcal.calibration.compiled import Compiled, compiled
 from hilcal.calibration.dh_table import CONVENTIONS, dh_rows, flange_poses, to_toml
 from hilcal.calibration.handover import UR_JOINTS, ur_kinematics, urdf
 from hilcal.calibration.measured import Measured
 from hilcal.calibration.scatter import Scatter
 from hilcal.calibration.storage import from_json, to_json
 from hilcal.calibration.tool import one_of_each
+from hilcal.effects.protocol import Columns, Parameter, Situation
 from hilcal.model import Model
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
@@ -177,6 +179,7 @@ def test_predicting_what_was_inverted_is_the_target_to_a_nanometre(effect: str) 
     q = regular(c, rng.uniform(-2.8, 2.8, (40, 6)))
     wrench = np.hstack([rng.uniform(-80, 80, (len(q), 3)), rng.uniform(-5, 5, (len(q), 3))])
     recorded = surroundings(rng, len(q))
+    assert isinstance(compiled(c._tracked, "absolute"), Compiled)
     k = c.compensate(q, wrench, recorded=recorded, std=False)
     assert k.inverse.solved.all()
     again = c.predict(k.q, wrench, recorded=recorded, std=False)
@@ -203,3 +206,33 @@ def test_a_calibration_file_says_the_same_in_every_bit(seed: int, names: list[st
     np.testing.assert_array_equal(c.loads["5kg"], again.loads["5kg"])
     a, b = (x.compensate(q, wrench, recorded=recorded, std=False) for x in (c, again))
     np.testing.assert_array_equal(a.q, b.q)
+
+
+class Sagging(hc.Effect):
+    """dq_2 = k cos(q_2 + q_3): an angle of two joints, which the kernel has no form for."""
+
+    name = "sagging"
+    summary = "dq_2 = k cos(q_2 + q_3)"
+    plausible = 10.0
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return (Parameter("k", "rad", 1e-4),)
+
+    def columns(self, s: Situation) -> tuple[Columns, ...]:
+        wave = np.cos(s.angle[:, 1] + s.angle[:, 2])
+        return (Columns("dq", np.zeros(1, dtype=int), np.ones(1, dtype=int), wave[:, None]),)
+
+
+def test_an_effect_without_a_compiled_form_is_named_and_inverted_all_the_same() -> None:
+    c = random_calibration(("base_frame", "joint_compliance"), 3)
+    model = replace(
+        c.model, effects=(*c.model.effects, Sagging(c.model.cell, one_of_each(c.model.cell)))
+    )
+    mine = replace(c, model=model, theta=np.append(c.theta, 2e-3), root=np.zeros((model.size, 1)))
+    assert c.without_kernel() == ()
+    assert mine.without_kernel() == ("sagging",)
+    q = regular(c, joints(5))
+    k = mine.compensate(q, std=False)
+    wanted = evaluate(c.model.cell.arm, q).point(c.tool_pose()[:3, 3])
+    np.testing.assert_allclose(mine.predict(k.q, std=False).position, wanted, atol=NM)
