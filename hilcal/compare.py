@@ -7,6 +7,7 @@ import numpy as np
 from hilcal.campaign import Campaign
 from hilcal.config import CellConfig
 from hilcal.data.readings import Readings
+from hilcal.data.revision import RevisionRecord
 from hilcal.data.same_readings import never_fitted
 from hilcal.diagnose.change import find_changes
 from hilcal.diagnose.change_candidates import EFFECTS
@@ -16,6 +17,8 @@ from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.description_words import refuse_misdescribed
 from hilcal.identify.earlier import earlier_fit
 from hilcal.identify.fit import Fit
+from hilcal.identify.parameter_differences import Differences, parameter_differences
+from hilcal.identify.posterior import Posterior
 from hilcal.identify.registration import register
 from hilcal.identify.remeasured import setting
 from hilcal.revisions import mode_of
@@ -80,7 +83,21 @@ def compare(
         tool=_other_keys(run.config, later.config),
         today=error_today(at, changes, drawing),
         changes=changes,
+        differences=None if record is None else _differences(fit, later, record, say),
     )
+
+
+def _differences(
+    fit: Fit, later: Campaign, record: RevisionRecord, say: Callable[[str], None]
+) -> Differences | None:
+    """Compare the parameters of both fits; None where they are tied, or there is nothing to."""
+    if record.options.get("prior"):
+        return None
+    say("comparing the parameters of both fits")
+    try:
+        return parameter_differences(Posterior.of(fit), Posterior.of(later.restore(record)))
+    except (CannotAnswerError, InputError):
+        return None
 
 
 def _unseen(run: Campaign, later: Campaign, fit: Fit, number: int | None) -> tuple[Readings, int]:

@@ -10,6 +10,7 @@ from hilcal.diagnose.change import Changes
 from hilcal.identify.errors import error_block
 from hilcal.identify.extrapolation import Extrapolation, extrapolation
 from hilcal.identify.fit import Fit
+from hilcal.identify.parameter_differences import Differences
 from hilcal.identify.remeasured import Setting, beside_frames, frames_alone, remeasure
 from hilcal.identify.validation import Validation
 
@@ -62,6 +63,8 @@ class Comparison:
         tool: keys of [tool] that are configured otherwise.
         today: the error of the earlier calibration.
         changes: what has changed.
+        differences: parameters of both fits, where the later campaign has one of its own that no
+            prior ties to the earlier one; else None.
     """
 
     number: int | None
@@ -76,6 +79,7 @@ class Comparison:
     tool: tuple[str, ...]
     today: Today
     changes: Changes
+    differences: Differences | None = None
 
     @property
     def another_arm(self) -> bool:

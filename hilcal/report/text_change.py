@@ -1,12 +1,14 @@
 """What `compare A B` says: the error of the earlier calibration today, and what has changed."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 
 from rich.console import RenderableType
 
 from hilcal.diagnose.change import LEVEL, POWER, Change, Limit, Size
 from hilcal.diagnose.change_candidates import Candidate
 from hilcal.diagnose.comparison import Comparison
+from hilcal.identify.parameter_differences import Differences
 from hilcal.report import numbers, text
 
 JOINT_WORDS = {
@@ -43,6 +45,8 @@ SEEN = ("encoder_offset", "joint_compliance", "hysteresis", "backlash")
 """Changes of joints whose least visible size is listed."""
 MOST_PARAMETERS = 6
 """Parameters of a change that are listed."""
+MOST_ROWS = 12
+"""Parameters of both fits that are listed."""
 CLEAR = 2.0
 """Standard deviations from which one of several parameters of a change is listed."""
 
@@ -69,6 +73,7 @@ def comparison_report(c: Comparison, earlier: str, later: str) -> Iterator[Rende
     yield from _today(c, earlier)
     yield ""
     yield from _changes(c)
+    yield from _parameters(c.differences)
     yield ""
     yield f"Next: {next_step(c, earlier)}"
 
@@ -241,6 +246,38 @@ def _limits(c: Comparison) -> Iterator[RenderableType]:
         yield f"Not to be seen: {numbers.names(absorbed)}; {frames}, estimated anew, absorbs it."
 
 
+def _parameters(d: Differences | None) -> Iterator[RenderableType]:
+    """Yield the parameters of both fits, those that differ most first."""
+    if d is None:
+        return
+    yield ""
+    yield text.heading("Both campaigns' own fits, as far as they can be compared")
+    told = sorted((r for r in d.rows if r.z is not None), key=lambda r: -abs(r.z or 0.0))
+    if told:
+        out = text.table("parameter", "before", "after", "by", "±", "unit", "σ", left=(0, 5))
+        for r in told[:MOST_ROWS]:
+            std = r.std or 0.0
+            unit, factor = numbers.unit_for(r.unit, [r.before, r.after, r.difference])
+            by, error = numbers.with_std(factor * r.difference, factor * std)
+            places = len(error.partition(".")[2])
+            sizes = (f"{factor * v:.{places}f}" for v in (r.before, r.after))
+            out.add_row(r.name, *sizes, by, error, unit, f"{abs(r.z or 0.0):.1f}")
+        yield out
+        if len(told) > MOST_ROWS:
+            yield f"{len(told) - MOST_ROWS} more differ less."
+    for e in d.effects:
+        chance = numbers.p_equals(e.p_value)
+        yield f"{e.effect}, as a whole: χ² {e.chi2:.0f} of {e.rank} ({chance})."
+    open_ = sum(r.z is None for r in d.rows)
+    if open_:
+        yield (
+            f"{open_} cannot be compared one by one: frames absorb them, or a campaign tells "
+            "nothing of them."
+        )
+    if d.apart:
+        yield f"Not in both, or with other options: {numbers.names(d.apart)}."
+
+
 def _least(limit: Limit | None) -> str:
     if limit is None or limit.size == float("inf"):
         return "-"
@@ -307,8 +344,17 @@ def to_json(c: Comparison, earlier: str, later: str) -> dict[str, object]:
             for limit in found.limits
         ],
         "not_to_be_seen": [h.name for h in found.hidden],
+        "parameters": None if c.differences is None else _parameters_json(c.differences),
         "next": next_step(c, earlier),
         "next_command": next_command(c, earlier, later),
+    }
+
+
+def _parameters_json(d: Differences) -> dict[str, object]:
+    return {
+        "rows": [{**asdict(r), "z": r.z} for r in d.rows],
+        "effects": [asdict(e) for e in d.effects],
+        "not_in_both": list(d.apart),
     }
 
 

@@ -13,7 +13,7 @@ from hilcal.config import CellConfig, load_config
 from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.readings import Readings
 from hilcal.robot.catalogue import configs_dir
-from studies.change import StudiedArm, remeasured, studied_arm
+from studies.change import StudiedArm, measured, remeasured, studied_arm
 from studies.study_cases import with_study_loads
 from tests.support.cli_cases import ok, refused
 
@@ -87,6 +87,22 @@ def test_a_repaired_joint_is_named_and_without_a_repair_nothing_is(
     assert "as if it had been set up anew" in words
     assert "Next: recalibrate joint 3" in words
     assert words.rstrip().endswith(f"hilcal refine {repaired}")
+
+
+def test_a_later_campaign_with_a_fit_of_its_own_is_put_beside_the_earlier_one(
+    site: Site, capsys: Capsys
+) -> None:
+    rng = np.random.default_rng(9)
+    path = site.store("whole.hilcal", measured(site.arm.world, site.arm.loads, 20, rng))
+    with hc.Campaign.open(path) as run:
+        model = hc.baseline(run.cell, run.readings, readings="absolute")
+        run.append(hc.fit(model + hc.effect("link_geometry"), run.readings, readings="absolute"))
+    d = ok(capsys, "compare", site.earlier, path, "--same-setup", "--json").document
+    rows = {r["name"]: r for r in d["parameters"]["rows"]}
+    assert abs(rows["joint_compliance.j2"]["z"]) < 5
+    assert d["parameters"]["not_in_both"] == ["transmission_error"]
+    words = ok(capsys, "compare", site.earlier, path, "--same-setup").out
+    assert "joint_compliance, as a whole" in words
 
 
 def test_what_cannot_be_compared_is_refused_in_one_line(site: Site, capsys: Capsys) -> None:
