@@ -8,6 +8,7 @@ import typer
 from hilcal.cli import application, execute
 from studies.change_command import change
 from studies.compensation_command import compensation
+from studies.corrected import corrected
 from studies.descriptions_command import descriptions
 from studies.diagnosis_command import diagnosis
 from studies.plans_command import plans
@@ -30,6 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     app.command("real")(real)
     app.command("compensation")(compensation)
     app.command("change")(change)
+    app.command("corrected")(corrected)
     app.command("results")(results)
     app.callback()(_group)
     execute(lambda: app, "studies", sys.argv[1:] if arguments is None else arguments)

@@ -118,7 +118,7 @@ def calibrate(
             "nobody can be asked before the arm moves; give --yes, or run it at a terminal"
         )
     with told.how_to_go_on(p), ExitStack() as stack:
-        _Operator(t, p, stack, rehearse, yes).to_the_end()
+        Operator(t, p, stack, rehearse, yes).to_the_end()
         with working(t.progress) as say:
             found = p.compare(say)
     limit_m = p.settings.limit_m
@@ -244,7 +244,7 @@ def _procedure(
     return p
 
 
-class _Operator:
+class Operator:
     """Does one step after the other, and asks before the arm moves."""
 
     def __init__(

@@ -1,6 +1,6 @@
 """The run at corrected joint targets: its plan, and its readings beside those of the validation."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -110,10 +110,12 @@ def corrected_plan(
     say("correcting joint values")
     of = points_of(validation, calibration.mode)
     space, last = Space(cell, config), validation.states[slice(len(validation) - 1, None)]
-    left: dict[str, str] = {}
-    keep = np.arange(len(of.rows))
     q = validation.states.q[of.rows]
-    while len(keep):
+    left = {of.names[k]: why for k, why in _blocked(space, q, reference, of.loads).items()}
+    while True:
+        keep = np.array([k for k, name in enumerate(of.names) if name not in left], dtype=int)
+        if not len(keep):
+            break
         plan = _ordered(space, config, of, keep, q, reference, rng)
         order = np.array([of.names.index(s.pose) for s in plan.steps if s.pose != REFERENCE])
         wrenches = {of.names[k]: validation.states.wrench[of.rows[k]] for k in keep}
@@ -121,7 +123,8 @@ def corrected_plan(
         states = expected_states(plan, cell.arm, config, wrench, last, begun)
         mine = states[np.array([s.pose != REFERENCE for s in plan.steps])]
         found = _compensated(calibration, mine, validation, of, order)
-        bad = _refused(space, found, reference, [of.loads[k] for k in order])
+        bad = {k: why for k, why in enumerate(refusals(found, allowed_outside=True)) if why}
+        bad = _blocked(space, found.q, reference, [of.loads[k] for k in order]) | bad
         if not bad:
             say("checking every motion in a dry run")
             told = _told(of, order, found)
@@ -129,7 +132,6 @@ def corrected_plan(
             refuse(dry_run(cell, config, made), "the run at corrected targets")
             return made
         left |= {of.names[order[k]]: why for k, why in bad.items()}
-        keep = np.array([k for k in keep if of.names[k] not in left], dtype=int)
     words = "; ".join(f"{name}: {why}" for name, why in list(left.items())[:3])
     raise CannotAnswerError(f"no validation pose can be corrected: {words}")
 
@@ -169,22 +171,18 @@ def _compensated(
     return calibration.compensate(nominal, states.wrench, wanted=wanted, recorded=columns)
 
 
-def _refused(
-    space: Space, found: Compensation, reference: Floats, loads: list[str]
-) -> dict[int, str]:
-    """Say which points cannot be taken at their corrected joint values, and why."""
-    out = {k: why for k, why in enumerate(refusals(found, allowed_outside=True)) if why}
+def _blocked(space: Space, q: Floats, reference: Floats, loads: Sequence[str]) -> dict[int, str]:
+    """Say which joint values (K, n) the cell does not allow under their loads, and why."""
+    out: dict[int, str] = {}
     names = np.array(loads)
     for load in dict.fromkeys(loads):
         mine = np.flatnonzero(names == load)
-        clear: Bools = space.passable(reference, found.q[mine], load)
-        for reason, kept in space.reasons(found.q[mine], load).items():
+        for reason, kept in space.reasons(q[mine], load).items():
             for k in mine[~kept]:
-                out.setdefault(int(k), f"not allowed when corrected: {REASONS[reason][1]}")
+                out.setdefault(int(k), f"not allowed: {REASONS[reason][1]}")
+        clear: Bools = space.passable(reference, q[mine], load)
         for k in mine[~clear]:
-            out.setdefault(
-                int(k), "no clear motion from the reference pose to its corrected joints"
-            )
+            out.setdefault(int(k), "no clear motion to it from the reference pose")
     return out
 
 

@@ -286,6 +286,7 @@ class Procedure:
                 self.settings.validation,
                 self._rng(_VALIDATION),
                 say,
+                under_load=self.settings.under_load,
             )
             self._create(self.files.validation, VALIDATION, plan, o)
         return plan
@@ -408,6 +409,15 @@ class Procedure:
                 content = {"revision": record.number, "readings_sha256": moved.data_hash()}
                 log.append(IMPROVED, {**content, **found.to_dict()})
         return found
+
+    def record(self) -> RevisionRecord:
+        """Return the revision that the last refinement ended with.
+
+        Raises:
+            InputError: there is none.
+        """
+        with Campaign.open(self.run, self.catalogue, read_only=True) as o:
+            return self._record(o)
 
     # what the steps share
 

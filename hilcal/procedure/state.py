@@ -56,6 +56,7 @@ class Settings:
         seed: of everything random.
         readings: kind of readings that is fitted.
         hide: what a rehearsal hides in its simulated cell; None on real devices.
+        under_load: whether the model is tested under loads alone, where there are any.
     """
 
     poses: int = 20
@@ -66,6 +67,7 @@ class Settings:
     seed: int = 0
     readings: Mode = "deflection"
     hide: str | None = None
+    under_load: bool = False
 
     def to_json(self) -> dict[str, Any]:
         """Return it as JSON."""

@@ -41,6 +41,8 @@ def validation_plan(
     count: int,
     rng: np.random.Generator,
     say: Say = lambda words: None,
+    *,
+    under_load: bool = False,
 ) -> Plan:
     """Choose poses at random, the loads in turn, and put them in order.
 
@@ -59,12 +61,13 @@ def validation_plan(
         count: poses that are wanted; fewer where the cell leaves fewer.
         rng: generator.
         say: takes progress, one line each.
+        under_load: leave out the unloaded arm, where there are loads.
 
     Raises:
         CannotAnswerError: no pose is left.
     """
     say("drawing poses within what was measured")
-    loads = _loads(calibration, fitted)
+    loads = _loads(calibration, fitted, under_load)
     hung = [load for load in config.loads if load.name in loads]
     own = config.model_copy(update={"loads": tuple(hung)})
     space = Space(_within(cell, config, fitted.states.q), own)
@@ -124,11 +127,13 @@ def fewer_returns(plan: Plan, space: Space, config: CellConfig) -> Plan:
     return replace(made, about={**plan.about, "duration_s": lasts.about()})
 
 
-def _loads(calibration: Calibration, fitted: Readings) -> tuple[str, ...]:
+def _loads(calibration: Calibration, fitted: Readings, under_load: bool) -> tuple[str, ...]:
     """Names of the loads under which the model is tested: those that it was fitted under."""
     used = [fitted.load_names[k] for k in dict.fromkeys(fitted.load.tolist())]
     hung = tuple(name for name in used if name != UNLOADED and name in calibration.loads)
-    return hung if calibration.mode == "deflection" else (UNLOADED, *hung)
+    if calibration.mode == "deflection" or (hung and under_load):
+        return hung
+    return (UNLOADED, *hung)
 
 
 def _within(cell: Cell, config: CellConfig, q: Floats) -> Cell:

@@ -1,0 +1,87 @@
+"""Cells as other laboratories have them: the same steps lead to the end, or say why not."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from hilcal.config import CellConfig, load_config
+from hilcal.config.cell import Target, Tool
+from hilcal.config.planning import Obstacle
+from hilcal.data.campaign_file import CampaignFile
+from hilcal.robot.catalogue import configs_dir
+from tests.support.procedure_cases import drawn, small
+
+
+def weights() -> CellConfig:
+    loads = load_config(configs_dir() / "cells" / "demo_ur10e.toml").loads
+    hung = tuple(load for load in loads if load.mass_kg)
+    return small().model_copy(update={"loads": hung, "force_sensor": None})
+
+
+def in_base_axes() -> CellConfig:
+    config = small()
+    tracker = config.tracker.model_copy(update={"frame": "base"})
+    return config.model_copy(update={"tracker": tracker})
+
+
+def two_targets() -> CellConfig:
+    targets = (
+        Target(name="A", target_m=(0.06, 0.02, 0.12)),
+        Target(name="B", target_m=(-0.06, 0.02, 0.12)),
+    )
+    tool = Tool(
+        load_point_m=(0.1, 0.0, 0.15), mass_kg=0.8, com_m=(0.01, 0.0, 0.06), targets=targets
+    )
+    return small().model_copy(update={"tool": tool})
+
+
+@pytest.mark.parametrize(
+    ("config", "poses", "readings"),
+    [
+        pytest.param(small(0), 14, "absolute", id="no loads", marks=pytest.mark.slow),
+        pytest.param(small(1), 6, "deflection", id="one load", marks=pytest.mark.slow),
+        pytest.param(weights(), 6, "deflection", id="dead weights", marks=pytest.mark.slow),
+        pytest.param(in_base_axes(), 6, "absolute", id="base axes"),
+        pytest.param(two_targets(), 5, "deflection", id="two targets", marks=pytest.mark.slow),
+    ],
+)
+def test_the_error_falls(config: CellConfig, poses: int, readings, tmp_path: Path) -> None:
+    d = drawn(tmp_path / "run.hilcal", config=config, poses=poses, readings=readings)
+    found = d.to_the_end()
+    error = found.everything
+    assert error.count == 5
+    assert error.before.rms_m > 8 * error.after.rms_m
+    assert error.inside >= 3
+    assert found.mode == readings
+    assert ({"none"} == set(found.loads)) == (config.loads == ())
+
+
+def test_points_in_the_way_of_something_are_left_out_by_name(tmp_path: Path) -> None:
+    d = drawn(tmp_path / "run.hilcal", config=in_base_axes(), poses=6, readings="absolute")
+    while (step := d.procedure.next()).kind != "correct":
+        d.do(step)
+    with CampaignFile.open(d.procedure.files.validation) as test:
+        r = test.readings()
+    (first,) = [k for k in range(len(r)) if r.pose_names[r.pose[k]] == "v1"]
+    x, y, z = r.value[first].tolist()
+    crate = Obstacle(name="crate", center_m=(x, y, z), size_m=(0.1, 0.1, 0.1))
+    config = d.procedure.config.model_copy(update={"obstacles": (crate,)})
+    d = replace(d, procedure=replace(d.procedure, config=config))
+    found = d.to_the_end()
+    left = dict(found.left_out)
+    assert "v1" in {name.split(" ")[0] for name in left}
+    assert all("[[obstacles]]" in why or "no clear motion" in why for why in left.values())
+    assert found.everything.count == 5 - len(left) > 0
+
+
+@pytest.mark.slow
+def test_tight_joint_limits_leave_few_poses(tmp_path: Path) -> None:
+    config = small()
+    limits = config.limits.model_copy(update={"joint_margin_rad": 1.6})
+    planning = config.planning.model_copy(update={"singularity": 0.0, "candidates": 40})
+    config = config.model_copy(update={"limits": limits, "planning": planning})
+    d = drawn(tmp_path / "run.hilcal", config=config, poses=5, validation=12)
+    error = d.to_the_end().everything
+    assert 1 <= error.count <= 12
+    assert error.before.rms_m > 5 * error.after.rms_m
