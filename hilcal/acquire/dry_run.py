@@ -254,9 +254,10 @@ def _unchecked(cell: Cell, config: CellConfig) -> tuple[str, ...]:
 
 def _remarks(plan: Plan) -> tuple[str, ...]:
     out = []
+    tests = "purpose" in plan.about  # of a model: what it is compared with may be in another file
     unloaded = {(s.pose, s.cycle) for s in plan.steps if s.load == UNLOADED}
     lacking = [s for s in plan.steps if (s.pose, s.cycle) not in unloaded]
-    if lacking:
+    if lacking and not tests:
         first = Step(lacking[0].pose, UNLOADED, lacking[0].cycle)
         out.append(
             f"{len(lacking)} loaded readings have no unloaded one of the same pose and cycle, "

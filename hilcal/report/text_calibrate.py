@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from hilcal.procedure.state import Step
 
 TITLES: Mapping[str, str] = {
-    "plan": "Plan",
+    "plan": "Choose a plan",
     "measure": "Measure",
     "refine": "Fit, and find what is missing",
     "decide": "Is more to be measured?",
@@ -59,6 +59,7 @@ def heading(step: "Step", clock: float = 1.0) -> Iterator[RenderableType]:
         step: the step.
         clock: cell seconds per real second.
     """
+    yield ""
     yield text.heading(TITLES[step.kind])
     if not step.moves:
         yield f"{DOES[step.kind]}: {LASTING[step.kind]}.\n"
@@ -159,17 +160,15 @@ def goal_words(mode: str) -> str:
 def improvement_report(found: Improvement, limit_m: float | None) -> Iterator[RenderableType]:
     """Yield the error before and after the correction, as measured, and whether a limit is kept."""
     every = found.everything
-    out = text.table(
-        *("load", "points", "before: mean", "rms", "max", "after: mean", "rms", "max"),
-        *("noise", "95 % within", "inside"),
-    )
+    out = text.table("load", "error", "mean", "rms", "max", "95 % within", "inside", left=(0, 1))
     for part in (*found.by_load, *(() if len(found.by_load) == 1 else (every,))):
-        out.add_row(*_cells(part))
+        for row in _rows(part):
+            out.add_row(*row)
     yield out
     yield Text(
-        f"{goal_words(found.mode)} noise: what the tracker's noise and the arm's repeatability "
-        "alone would leave, rms; 95 % within: the largest distance that was predicted for 95 % of "
-        "such readings, noise included; inside: points within their own.\n",
+        f"{goal_words(found.mode)} noise alone: what the tracker's noise and the arm's "
+        "repeatability would leave; 95 % within: the largest distance that was predicted for 95 % "
+        "of such readings, noise included; inside: points within their own.\n",
         style="dim",
     )
     yield summary(found)
@@ -196,14 +195,17 @@ def summary(found: Improvement) -> str:
     )
 
 
-def _cells(part: Improved) -> tuple[str, ...]:
+def _rows(part: Improved) -> Iterator[tuple[str, ...]]:
+    """Yield before, after and noise of some points."""
     name = "unloaded" if part.name == UNLOADED else part.name
-    sizes = (
-        numbers.length(x) for s in (part.before, part.after) for x in (s.mean_m, s.rms_m, s.max_m)
+    before, after = (
+        tuple(numbers.length(x) for x in (s.mean_m, s.rms_m, s.max_m))
+        for s in (part.before, part.after)
     )
-    inside = f"{part.inside} of {part.count}"
-    more = (numbers.length(part.noise_m), numbers.length(part.band_m), inside)
-    return (name, str(part.count), *sizes, *more)
+    band, inside = numbers.length(part.band_m), f"{part.inside} of {part.count}"
+    yield (name, "before", *before, "", "")
+    yield ("", "after", *after, band, inside)
+    yield ("", "noise alone", "", numbers.length(part.noise_m), "", "", "")
 
 
 def _limit_words(found: Improvement, limit_m: float) -> str:

@@ -119,3 +119,25 @@ def test_a_rehearsal_goes_on_as_one(there: Drawn, capsys: Capsys) -> None:
     path = there.procedure.run
     command = ("calibrate", path.with_name("cell.toml"), "-o", path, "--resume", "--rehearse")
     assert "no rehearsal; leave --rehearse out" in refused(capsys, 2, *command)
+
+
+def test_devices_that_are_not_there_end_it_with_the_line_that_goes_on(
+    tmp_path: Path, capsys: Capsys
+) -> None:
+    path = tmp_path / "cell.toml"
+    text = CELL.replace('model = "ur10e"', 'model = "ur10e"\ndriver = "ur"\nhost = "127.0.0.1"')
+    path.write_text(
+        text.replace("[operator.options]\nhand_s = 2.0\n", "").replace(
+            "[tool]", '[tracker]\ndriver = "geocom"\nport = "nowhere"\n[tool]'
+        ),
+        encoding="utf-8",
+    )
+    out = tmp_path / "run.hilcal"
+    result = run(capsys, "calibrate", path, "-o", out, "--yes", "--poses", "4")
+    assert result.code == 3
+    line = result.err.splitlines()[-1]
+    assert line.startswith("error: tracker: ") or line.startswith("error: arm")
+    assert line.endswith(f"go on with: hilcal calibrate {path} -o {out} --resume --yes")
+    assert "readings:" not in result.out
+    again = refused(capsys, 2, "calibrate", path, "-o", out, "--yes")
+    assert '"Measure" (16 of 16 readings are missing)' in again

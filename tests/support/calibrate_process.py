@@ -79,9 +79,9 @@ class Calibration:
         process = self.start()
         end = time.monotonic() + seconds
         while time.monotonic() < end and process.poll() is None:
-            self._look(process.pid)
+            self.look(process.pid)
             time.sleep(0.02)
-        self._look(process.pid)
+        self.look(process.pid)
         ended = process.poll() is not None
         if not ended:
             os.killpg(process.pid, signal.SIGKILL)
@@ -123,6 +123,15 @@ class Calibration:
                 count += campaign.n_readings
         return count
 
+    def stored(self) -> int:
+        """Return how many readings the campaign holds, each once."""
+        if not self.run.exists():
+            return 0
+        with CampaignFile.open(self.run, read_only=True) as campaign:
+            steps = [tuple(d["step"].values()) for d in RunLog(campaign).details()]
+        assert len(steps) == len(set(steps))
+        return len(steps)
+
     def sound(self) -> None:
         """Check that what is there can be read."""
         files = Files(self.run)
@@ -131,7 +140,8 @@ class Calibration:
                 with CampaignFile.open(path, read_only=True) as campaign:
                     assert len(RunLog(campaign).details()) == campaign.n_readings
 
-    def _look(self, pid: int) -> None:
+    def look(self, pid: int) -> None:
+        """Remember the processes that it has started."""
         try:
             children = psutil.Process(pid).children(recursive=True)
         except psutil.Error:

@@ -1,6 +1,8 @@
 """`calibrate --rehearse`, killed at random moments: it finishes, with every reading once."""
 
 import os
+import signal
+import time
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +28,25 @@ def finished(c: Calibration) -> None:
     assert found is not None
     error = found["error"]
     assert error["after"]["rms_m"] < 0.3 * error["before"]["rms_m"]
+
+
+def test_killed_twice_while_it_measures(tmp_path: Path) -> None:
+    c = Calibration(tmp_path)
+    for wanted in (2, 5):
+        process = c.start()
+        end = time.monotonic() + 120.0
+        while c.stored() < wanted:
+            c.look(process.pid)
+            assert process.poll() is None, c.words
+            assert time.monotonic() < end, c.words
+            time.sleep(0.02)
+        c.look(process.pid)
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        assert c.left_behind() == []
+        c.sound()
+        assert c.stored() >= wanted
+    assert next_step(c.run).kind == "measure"
 
 
 @pytest.mark.slow
