@@ -94,16 +94,7 @@ def figures_of(cases: Sequence[Case]) -> list[Figure]:
             out.append(_rate(f"… of those, tracker {words}", mine, [c.found for c in mine]))
         wrong = [bool(c.parts) and c.parts != f"joint {c.joint}" for c in repaired]
         out.append(_rate("another part than the joint is named first", repaired, wrong))
-        missed = [c for c in repaired if not c.found and not c.visible]
-        if missed:
-            most = max(c.moved_m for c in missed)
-            out.append(
-                Figure(
-                    "changes that these readings cannot show: number, largest motion of the target",
-                    f"{len(missed)}, {length(most)} (a new place of the tracker absorbs a zero of "
-                    "joint 1)",
-                )
-            )
+        out += _missed([c for c in repaired if not c.found])
         alone = [c for c in repaired if c.repair != "gearbox"]
         z = np.array([x for c in alone for x in c.z])
         if len(z):
@@ -123,6 +114,28 @@ def figures_of(cases: Sequence[Case]) -> list[Figure]:
             silent = [not c.parts and c.explained and not c.failure for c in mine]
             out.append(_rate(f"… {words}: nothing is claimed", mine, silent))
     return out
+
+
+def _missed(cases: Sequence[Case]) -> list[Figure]:
+    """Say what these readings cannot show, and what they miss all the same."""
+    hidden = [c for c in cases if not c.visible]
+    turned = [c for c in hidden if c.size_rad and c.joint == 1 and c.anew]
+    small = [c for c in hidden if all(c is not t for t in turned)]
+    rest = len(cases) - len(turned) - len(small)
+    out = [
+        Figure(
+            "not found: zero of joint 1, which a new place of the tracker absorbs", str(len(turned))
+        )
+    ]
+    if small:
+        which = ", ".join(
+            f"{c.repair} of joint {c.joint} ({length(c.moved_m)})"
+            for c in sorted(small, key=lambda c: c.moved_m)
+        )
+        out.append(
+            Figure("not found: smaller than these readings can show (rms at the target)", which)
+        )
+    return [*out, Figure("not found: others", str(rest))]
 
 
 def _rate(

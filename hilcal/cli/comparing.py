@@ -59,7 +59,7 @@ def compare(
             o, there, revision, same_setup=True if same_setup else None, say=say
         )
     name = text.model_name(titles(found.fit.model, found.fit.readings))
-    t.show(text.heading(f"{called(found.number)} of {run.name}: {name}"))
+    t.show(text.heading(f"{run.name}: {called(found.number)} ({name})"))
     t.show(text_change.comparison_report(found, run.name, later.name))
     command = text_change.next_command(found, str(run), str(later))
     if command is not None:

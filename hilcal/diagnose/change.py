@@ -109,7 +109,7 @@ class Limit:
         candidate: name.
         part: of the cell.
         unit: SI.
-        size: in this unit; infinite where these readings cannot show it.
+        size: in this unit; infinite where these readings cannot show any of a plausible size.
         moved_m: rms displacement of the target that it makes in the later readings, m.
     """
 
@@ -258,11 +258,10 @@ def _best(
     equal = [t for t in sure if most - t[0] < SAME_EVIDENCE]
     # Of those that explain the readings alike, the one with fewest parameters.
     evidence, p_value, after, best = min(equal, key=lambda t: sum(len(c.parameters) for c in t[3]))
-    rivals = [(c, t[0]) for t in tried for c in t[3]]
+    others = [t for t in tried if all(c is not b for c in t[3] for b in best)]
+    rivals = [(c, t[0]) for t in others for c in t[3]]
     rivals += [(s.candidate, s.score.log_evidence) for s in order[TRIED:]]
-    same = {
-        c.name: c for c, e in rivals if most - e < SAME_EVIDENCE and all(c is not b for b in best)
-    }
+    same = {c.name: c for c, e in rivals if most - e < SAME_EVIDENCE}
     chance = min(p_value * tested, 1.0)
     return after, [(c, chance, evidence, tuple(same.values())) for c in best]
 
@@ -369,6 +368,7 @@ def _limits(
         if s.shown:
             wanted = noncentrality_of_power(1, dof - 1, LEVEL / max(tested, 1), POWER)
             size = float(np.sqrt(wanted * rss / dof / s.s[0, 0]))
+            size = size if size <= candidate.moving.effect.most() else np.inf
         moved = float(np.sqrt(np.mean(np.sum(s.motion[:, :, 0] ** 2, axis=1))))
         out.append(
             Limit(

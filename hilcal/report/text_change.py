@@ -125,11 +125,12 @@ def _today(c: Comparison, earlier: str) -> Iterator[RenderableType]:
     else:
         yield f"The error is {share}: no more than its uncertainty."
     beyond = t.beyond
-    if beyond.outside.any():
-        where = numbers.few([f"{v.variable}: {v.count}" for v in beyond.variables], 3)
+    # How far the poses are from the measured ones, the expected error counts.
+    ranges = [f"{v.variable} ({v.count})" for v in beyond.variables if v.variable != "leverage"]
+    if ranges:
         yield (
-            f"{int(beyond.outside.sum())} of {len(beyond.outside)} lie outside of what {earlier} "
-            f"measured ({where}): an error there need not be a change."
+            f"Outside of what {earlier} measured: {numbers.few(ranges, 3)}; an error there need "
+            "not be a change."
         )
 
 
@@ -240,10 +241,12 @@ def _limits(c: Comparison) -> Iterator[RenderableType]:
         f"The smallest change that these readings would have shown in {POWER * 10:.0f} cases of "
         f"10; where nothing has changed, a change is claimed once in {1 / LEVEL:.0f}."
     )
-    absorbed = [words_of(h) for h in found.hidden if h.joint and h.effect == "encoder_offset"]
-    if absorbed:
-        frames = "the place of the tracker" if c.anew else "what the earlier fit leaves open"
-        yield f"Not to be seen: {numbers.names(absorbed)}; {frames}, estimated anew, absorbs it."
+    zeros = [p for p, of in by_joint.items() if _least(of.get("encoder_offset")) == "-"]
+    if c.mode == "deflection":
+        yield "Deflections do not show zeros and geometry: these cancel in them."
+    elif zeros:
+        frames = "the place of the tracker, estimated anew," if c.anew else "a frame"
+        yield f"Not to be seen: the zero of {numbers.names(zeros)}; {frames} absorbs it."
 
 
 def _parameters(d: Differences | None) -> Iterator[RenderableType]:

@@ -1,0 +1,51 @@
+"""`studies change`: what it repairs, and what it counts."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from hilcal.config import load_config
+from hilcal.robot.catalogue import configs_dir
+from studies.change import Case, case, studied_arm
+from studies.change_command import figures_of
+
+CONFIG = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
+
+
+def test_a_case_says_how_visible_its_change_was_and_what_was_named() -> None:
+    arm = studied_arm(CONFIG, "ur10e", 0, poses=20)
+    found = case(arm, "zero", 3, True, 7)
+    assert found.found
+    assert found.visible
+    assert 0.3e-3 <= abs(found.size_rad) <= 5e-3
+    assert found.moved_m > 1e-4
+    assert len(found.z) == 1
+    turned = case(arm, "zero", 1, True, 7)
+    assert turned.parts == ""
+    assert not turned.visible
+    assert turned.moved_m > 1e-4  # the tracker's new place absorbs it
+    again = case(arm, "zero", 3, True, 7)
+    assert again.z == found.z
+
+
+def test_figures_count_what_was_found_missed_and_claimed() -> None:
+    good = Case(
+        "ur10e", "zero", 3, False, 1, 1e-3, strength=20.0, limit=5.0, parts="joint 3", z=(1.0,)
+    )
+    small = replace(good, repair="compliance", joint=6, strength=1.0, parts="", z=(), moved_m=6e-6)
+    turned = replace(small, repair="zero", joint=1, anew=True, moved_m=1e-3)
+    also = replace(good, others=("link 2",), z=(4.0,))
+    quiet = Case("ur10e", "nothing", 0, True, 2)
+    claimed = replace(quiet, parts="joint 2", of_arm=True, other=True)
+    figures = {f.what: f for f in figures_of([good, small, turned, also, *[quiet] * 3, claimed])}
+    of = {what: f.measured.split(" (")[0] for what, f in figures.items()}
+    assert of["repaired joint named, and no other part"] == "1 of 4"
+    visible = "the same, where the change is larger than the program states that it can show"
+    assert of[visible] == "1 of 2"
+    assert figures[visible].met is False
+    assert of["not found: zero of joint 1, which a new place of the tracker absorbs"] == "1"
+    small_words = "not found: smaller than these readings can show (rms at the target)"
+    assert figures[small_words].measured == "compliance of joint 6 (6.00 µm)"
+    assert of["not found: others"] == "1"
+    assert of["without a change nothing is claimed"] == "3 of 4"
+    assert np.isclose(float(of["error of the size over its std, rms"]), np.sqrt(8.5), atol=0.01)
