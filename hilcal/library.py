@@ -18,6 +18,8 @@ from hilcal.errors import InputError
 from hilcal.identify import baseline as starting_models
 from hilcal.identify import fit as fits
 from hilcal.identify import posterior_document
+from hilcal.identify.arm_scatter import with_prior_scatter
+from hilcal.identify.carried import CarriedPrior, carried_prior, check_prior
 from hilcal.identify.fit import Fit
 from hilcal.identify.full_covariance import full_readings
 from hilcal.identify.posterior import Posterior
@@ -55,7 +57,11 @@ def read_table(path: str | Path, cell: Cell, mapping: str | Path | None = None) 
 
 
 def baseline(
-    cell: Cell, data: Readings, readings: str | None = None, catalogue: Catalogue | None = None
+    cell: Cell,
+    data: Readings,
+    readings: str | None = None,
+    catalogue: Catalogue | None = None,
+    prior: Posterior | CarriedPrior | None = None,
 ) -> Model:
     """Return the model that every campaign starts from.
 
@@ -72,12 +78,30 @@ def baseline(
         data: what is to be fitted.
         readings: "deflection" or "absolute"; what the data allow where None.
         catalogue: the effects that a model can have; the installed ones where None.
+        prior: what another campaign taught of this arm, from `load_posterior`; its effects are in
+            the model, and fits start from what it knows. `carried_prior` says more of the two.
 
     Raises:
-        InputError: another kind of readings.
+        InputError: another kind of readings, or a prior that is not one of these readings.
         CannotAnswerError: the readings do not determine an unknown frame.
     """
-    return starting_models.baseline(cell, data, _mode(readings, data), catalogue)
+    known = _carried(prior, catalogue)
+    return starting_models.baseline(cell, data, _mode(readings, data), catalogue, known)
+
+
+def _with_prior(model: Model, data: Readings, prior: Posterior | CarriedPrior) -> Model:
+    """Return a model with what another campaign taught of those effects that it has."""
+    carried = _carried(prior, model.catalogue)
+    if carried is not None:
+        check_prior(carried, model.cell.arm, data)
+    return replace(model, prior=carried)
+
+
+def _carried(
+    prior: Posterior | CarriedPrior | None, catalogue: Catalogue | None
+) -> CarriedPrior | None:
+    """Return a posterior as prior, of the same arm."""
+    return carried_prior(prior, catalogue=catalogue) if isinstance(prior, Posterior) else prior
 
 
 def fit(
@@ -85,7 +109,7 @@ def fit(
     data: Readings,
     readings: str | None = None,
     scaling: str = "gc",
-    prior: Floats | None = None,
+    prior: Posterior | CarriedPrior | Floats | None = None,
 ) -> Fit:
     """Fit a model to readings by whitened Gauss-Newton.
 
@@ -103,17 +127,25 @@ def fit(
         data: what was measured.
         readings: "deflection" or "absolute"; what the data allow where None.
         scaling: "none", "gu" or "gc" (whitened by the full covariance).
-        prior: (P,) standard deviations of zero-mean priors, infinite for flat ones, zero for
-            parameters held at zero; where None, those of the effects.
+        prior: what another campaign taught of this arm, for those effects that the model has in
+            common with it (`baseline` adds the others); or (P,) standard deviations of zero-mean
+            priors, infinite for flat ones, zero for parameters held at zero; where None, those of
+            the effects.
 
     Raises:
         InputError: another kind of readings or of scaling, or a deflection without its unloaded
             reading.
         CannotAnswerError: fewer measured elements than identifiable parameters.
     """
+    std: Floats | None = None
+    if isinstance(prior, Posterior | CarriedPrior):
+        model = _with_prior(model, data, prior)
+    else:
+        std = prior
+    data = with_prior_scatter(model, data)
     for known in SCALINGS:
         if scaling == known:
-            return fits.fit(model, data, _mode(readings, data), known, prior=prior)
+            return fits.fit(model, data, _mode(readings, data), known, prior=std)
     raise InputError(f"scaling {scaling!r} is unknown; valid: {', '.join(SCALINGS)}")
 
 
@@ -146,7 +178,12 @@ def load_posterior(path: str | Path, catalogue: Catalogue | None = None) -> Post
         return run.posterior()
 
 
-def refine(model: Model, data: Readings, readings: str | None = None) -> Refinement:
+def refine(
+    model: Model,
+    data: Readings,
+    readings: str | None = None,
+    prior: Posterior | CarriedPrior | None = None,
+) -> Refinement:
     """Fit, diagnose, add the leading suspect, and repeat until the model is adequate.
 
     >>> with hc.Campaign.open(RUN) as run:
@@ -159,11 +196,14 @@ def refine(model: Model, data: Readings, readings: str | None = None) -> Refinem
         model: the model to start from.
         data: what was measured.
         readings: "deflection" or "absolute"; what the data allow where None.
+        prior: as for `fit`.
 
     Raises:
-        InputError: another kind of readings.
+        InputError: another kind of readings, or a prior that is not one of them.
         CannotAnswerError: fewer measured elements than identifiable parameters.
     """
+    if prior is not None:
+        model = _with_prior(model, data, prior)
     return refine_model(model, data, _mode(readings, data))
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate, pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,6 +24,9 @@ from hilcal.robot.deviation import Deviation
 from hilcal.robot.geometric_stiffness import geometric_stiffness
 from hilcal.robot.statics import Load, slot_wrenches
 from hilcal.types import Floats, Ints
+
+if TYPE_CHECKING:  # a value that a model only carries along; fits know what it means
+    from hilcal.identify.carried import CarriedPrior
 
 EQUILIBRIUM_TOLERANCE = 1e-13
 """Motion of the flange that may be missing from the converged equilibrium, m."""
@@ -69,12 +73,15 @@ class Model:
         catalogue: the effects that it could have.
         readings: those that effects are set up for when they are added by name; None where the
             model was made without.
+        prior: what another campaign taught of the arm; None for nothing. It is of those parameters
+            that have the same names.
     """
 
     cell: Cell
     effects: tuple[Effect, ...]
     catalogue: Catalogue = field(default_factory=installed)
     readings: Readings | None = None
+    prior: "CarriedPrior | None" = None
     _slices: tuple[slice, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:

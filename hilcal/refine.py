@@ -12,7 +12,7 @@ from hilcal.diagnose.promise import LEAST_KEPT, kept_by_refit
 from hilcal.diagnose.stepwise import Refits, add, exchange, predicts_better, remove
 from hilcal.diagnose.stepwise_alternatives import Alternative
 from hilcal.diagnose.verdict import NOTHING, judge
-from hilcal.identify.arm_scatter import with_arm_scatter
+from hilcal.identify.arm_scatter import with_arm_scatter, with_prior_scatter
 from hilcal.identify.fit import Fit, fit
 from hilcal.model import Model
 
@@ -91,13 +91,15 @@ def refine(
     it, too.
 
     Args:
-        model: the starting model; its effects are never taken out.
+        model: the starting model; its effects are never taken out. The prior that it carries, with
+            the arm's scatter where that was estimated, is in every fit.
         readings: all readings.
         mode: "deflection" or "absolute".
         say: takes progress, one line each.
         history: how the starting model was reached, where it was not given.
     """
     say(f"fitting {' + '.join(model.names) or 'the bare arm'}")
+    readings = with_prior_scatter(model, readings)
     path = Path(fit(model, readings, mode), say, history)
     changed = True
     while changed:

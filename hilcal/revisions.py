@@ -13,12 +13,14 @@ from hilcal.data.arm_scatter import ArmScatter
 from hilcal.data.readings import Readings
 from hilcal.data.records import content_hash
 from hilcal.data.revision import RevisionRecord
+from hilcal.data.stored_priors import CARRIED
 from hilcal.data.whitening import MODES, SCALINGS, Mode, Scaling
 from hilcal.diagnose.diagnosis import History
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError
 from hilcal.identify import fit_document
 from hilcal.identify.arm_scatter import with_arm_scatter
+from hilcal.identify.carried import CarriedPrior
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.predictive import Predictive, predictive
 from hilcal.model import Model
@@ -75,6 +77,7 @@ def to_record(
             **({} if cell.targets is None else {"targets": cell.targets.tolist()}),
             "outliers": np.flatnonzero(found.outlier).tolist(),
             **({} if scatter is None else {"arm_scatter": scatter.to_json()}),
+            **({} if found.model.prior is None else {CARRIED: found.model.prior.to_json()}),
         },
         result_json=result,
     )
@@ -127,7 +130,9 @@ def restore_model(
     cell = replace(cell.with_targets(targets), registration=np.array(stored["registration"]))
     options, known = record.options["effects"], catalogue or installed()
     effects = (known.make(e, cell, readings.states, options.get(e)) for e in record.effects)
-    model = Model(cell, tuple(effects), known, readings)
+    carried = stored.get(CARRIED)
+    prior = None if carried is None else CarriedPrior.from_json(carried)
+    model = Model(cell, tuple(effects), known, readings, prior)
     names = [f"{e.name}.{p.name}" for e in model.effects for p in e.parameters]
     if names != stored["names"]:
         raise InputError(

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import typer
 
 from hilcal.cli import application, execute
+from studies.carry_command import carry
 from studies.change_command import change
 from studies.compensation_command import compensation
 from studies.corrected import corrected
@@ -29,6 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     app.command("descriptions")(descriptions)
     app.command("scaling")(scaling)
     app.command("real")(real)
+    app.command("carry")(carry)
     app.command("compensation")(compensation)
     app.command("change")(change)
     app.command("corrected")(corrected)

@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from hilcal.data.ranges import Range, ranges_of, variables
 from hilcal.data.readings import States
-from hilcal.identify.extrapolation import FAR, Range, ranges_of, variables
+from hilcal.identify.extrapolation import FAR
 from hilcal.identify.predictive import Predictive
 from hilcal.types import Bools, Floats
 

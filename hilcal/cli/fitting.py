@@ -15,10 +15,12 @@ from hilcal.cli.files import (
     titles,
     wanted_effects,
 )
+from hilcal.cli.prior import Drift, Prior, PriorOf, PriorOptions
 from hilcal.cli.terminal import Json, Run, terminal
 from hilcal.data.purpose import purpose_of, refuse_fitting, release
 from hilcal.data.whitening import Scaling
 from hilcal.effects.written import write_effect
+from hilcal.identify.arm_scatter import with_prior_scatter
 from hilcal.identify.baseline import baseline, with_effects
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.fit_document import to_json
@@ -26,6 +28,7 @@ from hilcal.identify.other_arm import other_arm_of
 from hilcal.report import numbers, text
 from hilcal.report.covariance_words import covariance_words
 from hilcal.report.progress import working
+from hilcal.report.text_prior import prior_lines
 from hilcal.report.text_registration import other_arm_line
 from hilcal.report.text_scalings import scalings_table
 
@@ -56,12 +59,16 @@ def identify(
             help="Release a validation campaign for fitting; its file says so for good.",
         ),
     ] = False,
+    prior: Prior = None,
+    prior_of: PriorOf = "arm",
+    drift: Drift = None,
     effects_from: EffectsFrom = None,
     as_json: Json = False,
 ) -> None:
     """Fit a model to the readings, and keep it as a revision."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     wanted, named = scalings(scaling), wanted_effects(effects, catalogue)
+    known = PriorOptions(prior, prior_of, drift).load(catalogue)
     with Campaign.open(run, catalogue) as o:
         if fit_validation and purpose_of(o.file) is not None:
             release(o.file, "hilcal identify --fit-validation")
@@ -76,16 +83,18 @@ def identify(
         with working(t.progress) as say:
             say("registering")
             if named is None:
-                model = baseline(o.cell, o.readings, mode, catalogue)
+                model = baseline(o.cell, o.readings, mode, catalogue, known)
             else:
-                model = with_effects(o.cell, o.readings, mode, named, named, catalogue)
+                model = with_effects(o.cell, o.readings, mode, named, named, catalogue, known)
+            fitted = with_prior_scatter(model, o.readings)
             for s in wanted:
                 say(f"fitting {text.model_name(titles(model, o.readings))}, scaling {s}")
-                fits[s] = fit(model, o.readings, mode, s)
+                fits[s] = fit(model, fitted, mode, s)
                 finish(fits[s], say)
             kept = fits[wanted[-1]]
             number = o.store(kept, None, None)
     t.show(text.fit_report(kept))
+    t.show(prior_lines(kept))
     t.show(numbers.sentence(covariance_words(o.covariance_parts)))
     t.show(options_line(kept))
     other = other_arm_of(o.cell, o.readings)

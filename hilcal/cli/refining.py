@@ -27,6 +27,7 @@ from hilcal.cli.files import (
     wanted_effects,
 )
 from hilcal.cli.fitting import Readings, options_json, options_line
+from hilcal.cli.prior import Drift, Prior, PriorOf, PriorOptions
 from hilcal.cli.terminal import Json, Record, Revision, Run, terminal
 from hilcal.data.purpose import refuse_fitting
 from hilcal.data.revision import change
@@ -40,6 +41,7 @@ from hilcal.effects.written import read_effects_text, write_effect
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline, with_effects
 from hilcal.identify.fit import Fit
+from hilcal.identify.fit_document import prior_to_json
 from hilcal.identify.frames_document import fit_to_json
 from hilcal.identify.other_arm import other_arm_of
 from hilcal.identify.weight import weight_note
@@ -51,6 +53,7 @@ from hilcal.report import numbers, text, text_refine
 from hilcal.report.build_story import Chapter, build_story
 from hilcal.report.diagnosis_document import suspect_json, to_json
 from hilcal.report.progress import working
+from hilcal.report.text_prior import prior_lines
 from hilcal.report.text_registration import fitted_lines, other_arm_line
 from hilcal.report.text_unknown import curves
 from hilcal.report.verdict_words import message
@@ -219,6 +222,9 @@ def refine(
     revision: Annotated[
         int | None, typer.Option("--revision", metavar="N", help="Start from this revision.")
     ] = None,
+    prior: Prior = None,
+    prior_of: PriorOf = "arm",
+    drift: Drift = None,
     record: Record = None,
     effects_from: EffectsFrom = None,
     as_json: Json = False,
@@ -228,8 +234,10 @@ def refine(
     named = wanted_effects(effects, catalogue)
     check_record(record)
     start = "--revision" if revision is not None else "--from-latest" if from_latest else ""
-    if start and (named is not None or readings is not None or (from_latest and revision)):
+    given = named is not None or readings is not None or prior is not None
+    if start and (given or (from_latest and revision)):
         raise InputError(f"{start} keeps effects and readings; leave out the other options")
+    known = PriorOptions(prior, prior_of, drift).load(catalogue)
     with Campaign.open(run, catalogue) as o:
         refuse_fitting(o.file)
         latest = o.latest() if from_latest else None if not start else o.in_use(revision)
@@ -245,10 +253,10 @@ def refine(
                 model, fitted = restored.model, restored.readings
             elif named is None:
                 say("registering")
-                model = baseline(o.cell, o.readings, mode, catalogue)
+                model = baseline(o.cell, o.readings, mode, catalogue, known)
             else:
                 say("registering")
-                model = with_effects(o.cell, o.readings, mode, named, named, catalogue)
+                model = with_effects(o.cell, o.readings, mode, named, named, catalogue, known)
             how = NOTHING if latest is None else o.history(latest.number)
             found = refine_model(model, fitted, mode, say, how)
             rows: list[Row] = []
@@ -265,6 +273,7 @@ def refine(
         t.show(options_line(rows[-1].fit))
         t.show(text_refine.verdict_line(found.diagnosis))
         t.show([*fitted_lines(found.fit)])
+        t.show(prior_lines(found.fit))
         other = other_arm_of(o.cell, o.readings) if latest is None else None
         if other is not None:
             t.show(other_arm_line(other))
@@ -290,6 +299,7 @@ def refine(
             "message": message(last),
             "rejected": list(found.rejected),
             "frames": fit_to_json(found.fit),
+            **prior_to_json(found.fit),
             "other_arm": None if other is None else other.to_json(),
             "diagnosis": to_json(last),
         }

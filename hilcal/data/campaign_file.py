@@ -16,6 +16,7 @@ from hilcal.data import rows, schema
 from hilcal.data.readings import Readings
 from hilcal.data.records import Layout, content_hash, layout_of
 from hilcal.data.revision import RevisionRecord, from_text, to_text, utc_now
+from hilcal.data.stored_priors import join, split
 from hilcal.errors import InputError
 
 _TARGETS = "targets"
@@ -222,11 +223,16 @@ class CampaignFile:
 
     def insert_revision(self, record: RevisionRecord) -> int:
         """Do the same inside a transaction that the caller has begun."""
+        record, key, posterior = split(record)
         text = to_text(record)
         (last,) = self._connection.execute("SELECT ifnull(max(id), 0) FROM revisions").fetchone()
         number = int(last) + 1
         if record.parent is not None:
             schema.require(self._connection, schema.CHOSEN_REVISION)
+        if key is not None:
+            if key not in self._read_meta():
+                rows.insert_meta(self._connection, key, posterior)
+            schema.require(self._connection, schema.CARRIED_PRIOR)
         row = (number, text, rows.text_crc(str(number), text))
         self._connection.execute("INSERT INTO revisions VALUES (?, ?, ?)", row)
         return number
@@ -266,12 +272,13 @@ class CampaignFile:
         """
         with schema.sqlite_errors(self.path):
             stored = self._connection.execute("SELECT id, content, crc FROM revisions ORDER BY id")
+            meta = self._read_meta()
             records = []
             for expected, (number, text, crc) in enumerate(stored.fetchall(), start=1):
                 try:
                     if number != expected or rows.text_crc(str(number), text) != crc:
                         raise ValueError
-                    records.append(from_text(text, number))
+                    records.append(join(from_text(text, number), meta))
                 except ValueError as e:
                     where = f"damaged at revision {expected}"
                     raise InputError(f"{self.path}: the campaign is {where}") from e

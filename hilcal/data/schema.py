@@ -14,7 +14,10 @@ from pathlib import Path
 from hilcal.errors import DeviceError, InputError
 
 APPLICATION_ID = 0x68696C63  # "hilc"
-VERSION = 4
+VERSION = 5
+CARRIED_PRIOR = 5
+"""Version of a file with a revision that was fitted with a prior of another campaign: programs that
+do not know it would fit without."""
 CHOSEN_REVISION = 4
 """Version of a file with an accepted revision, or one made from another than the one before:
 programs that know neither would go on from the latest one."""

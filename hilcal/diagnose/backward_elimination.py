@@ -29,8 +29,16 @@ class Redundant:
 
 
 def backward_elimination(fit: Fit) -> tuple[Redundant, ...]:
-    """Return the redundant effects of a fit, the least significant first."""
-    judged = [e.name for e in fit.model.effects if e.role == "effect"]
+    """Return the redundant effects of a fit, the least significant first.
+
+    Effects with a carried prior are not judged: other readings than these speak for them.
+    """
+    carried = fit.solution.space.carried(fit.model.size)
+    judged = [
+        e.name
+        for e, mine in zip(fit.model.effects, fit.model.slices(), strict=True)
+        if e.role == "effect" and not carried[mine].any()
+    ]
     if not judged:
         return ()
     x = model_columns(fit)

@@ -54,7 +54,7 @@ def kept_by_step(p: Linearisation, effect: Effect, score: FamilyScore) -> float:
     aim = s.white - of.white @ score.step
     z = p.projection.solve(p.rows.T @ aim - p.projection.ridge * s.coordinates())
     model = replace(fit.model, effects=(*fit.model.effects, effect))
-    theta = [s.theta + s.equations.basis.transform @ z, of.scale * score.step]
+    theta = [s.theta + s.transform @ z, of.scale * score.step]
     linear = float(np.sum((aim - p.rows @ z) ** 2))
     try:
         found = model.predict(s.prediction.situation.states, np.concatenate(theta))

@@ -130,6 +130,14 @@ def _class(kind: type[Effect]) -> None:
             "a number of ordinary magnitudes, more than 0",
             lambda v: isinstance(v, int | float) and not isinstance(v, bool) and v > 0,
         ),
+        *(
+            (
+                key,
+                "a number of ordinary magnitudes, more than 0",
+                lambda v: isinstance(v, int | float) and not isinstance(v, bool) and v > 0,
+            )
+            for key in ("drift", "spread")
+        ),
     )
     for key, valid, good in rules:
         found = getattr(kind, key, None)

@@ -13,6 +13,8 @@ class JointCompliance(PerJoint):
     summary = "dq_j = c_j τ_j: each joint gives way in proportion to its torque"
     plausible = 10.0
     """30 mrad at the rated torque; gears state 1 to 5. A choice."""
+    spread = 0.5
+    """Springs and oil of one type of gear scatter by a third; a choice."""
     elastic = True
     local_response = True
     role = "baseline"

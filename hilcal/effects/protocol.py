@@ -176,6 +176,9 @@ class Effect(ABC):
         of_setup: whether it is of how a campaign was set up (instrument, frames, tool, load,
             force sensor), so that another campaign of the same arm learns it anew. Effects whose
             role is that of a frame are, too.
+        drift: standard deviation by which the parameters of one arm may well have changed from one
+            campaign to the next, in ordinary magnitudes, in a shrunk family in its strengths.
+        spread: standard deviation between arms of one type, likewise.
 
     Attributes:
         coarse: of an effect from `refined`, the name of the one that it is finer than; else empty.
@@ -193,6 +196,11 @@ class Effect(ABC):
     for_missing_weight: ClassVar[bool] = False
     plausible: ClassVar[float] = np.inf
     of_setup: ClassVar[bool] = False
+    drift: ClassVar[float] = 0.1
+    """A tenth of what is ordinary, as wear and warmth make it; a choice. Where an arm was repaired
+    or hit, the readings ask for more."""
+    spread: ClassVar[float] = 1.0
+    """Other arms of the type have parameters of the ordinary magnitude; a choice."""
 
     def __init__(self, cell: Cell, states: States, options: Options | None = None) -> None:
         """Build the effect for a cell and the states at hand.
@@ -296,6 +304,14 @@ class Effect(ABC):
         chosen from the data by the evidence.
         """
         return None
+
+    def pools(self) -> Ints:
+        """(P,) parameters whose groups are about equally strong, by number, from 0.
+
+        For effects with `groups`: what a group may be where the readings did not need it is
+        told by the groups of its pool. All groups make one pool unless overridden.
+        """
+        return np.zeros(len(self.parameters), dtype=np.int64)
 
     def prior_std(self) -> Floats | None:
         """(P,) standard deviations of a fixed zero-mean prior, or None for a flat one."""

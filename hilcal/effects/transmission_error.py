@@ -30,6 +30,8 @@ class TransmissionError(PerJoint):
     summary = "dq_j = Σ a_jk cos k q_j + b_jk sin k q_j: gear and encoder error"
     plausible = 30.0
     """1.5 mrad per harmonic; strain wave gears state 0.3 mrad, spur gears 1 mrad. A choice."""
+    spread = 2.0**0.5
+    """Another gear errs as much, but elsewhere: the difference of two."""
     option_help: ClassVar = {
         **PerJoint.option_help,
         "harmonics": "K, the harmonics tried per joint, 1 to 1000; unless given, one for every "
@@ -68,6 +70,11 @@ class TransmissionError(PerJoint):
     def groups(self) -> Ints:
         """One variance per group of joints and harmonic."""
         return np.repeat(np.arange(len(self.shared.labels) * len(self.harmonics)), 2)
+
+    def pools(self) -> Ints:
+        """One pool per octave of the harmonics: spectra of gears fall with the order."""
+        octave = np.floor(np.log2(self.harmonics)).astype(np.int64)
+        return np.tile(np.repeat(octave, 2), len(self.shared.labels))
 
     def fine(self, states: States) -> Effect | None:
         """As many harmonics as are scored at most, where the poses allow fewer."""

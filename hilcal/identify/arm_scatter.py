@@ -24,6 +24,7 @@ from hilcal.data.readings import Readings
 from hilcal.data.whitening import Whitening, covariance_blocks, whitening
 from hilcal.identify.fit import Fit
 from hilcal.identify.full_covariance import joint_factors
+from hilcal.model import Model
 from hilcal.regression.variance_components import (
     BlockRows,
     VarianceComponents,
@@ -69,6 +70,18 @@ def with_arm_scatter(cell: Cell, readings: Readings, scatter: ArmScatter) -> Rea
         stated=readings.covariance,
         arm_scatter=scatter,
     )
+
+
+def with_prior_scatter(model: Model, readings: Readings) -> Readings:
+    """Return the readings with the arm's scatter as the model's carried prior has it.
+
+    As they are where their covariance has one, where the prior knows of none, and without a prior:
+    an arm's scatter is carried over like its parameters.
+    """
+    scatter = None if model.prior is None else model.prior.posterior.scatter
+    if scatter is None or readings.scatter_stated or readings.arm_scatter is not None:
+        return readings
+    return with_arm_scatter(model.cell, readings, scatter)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,7 +156,8 @@ def estimate_arm_scatter(fit: Fit) -> ArmScatter | None:
 
 def _whitened(fit: Fit) -> _Whitened:
     """Whiten the residual and the columns of a fit in blocks of whole arrivals."""
-    kept, s, live = fit.readings[~fit.outlier], fit.solution, fit.solution.live
+    kept, s = fit.readings[~fit.outlier], fit.solution
+    live = np.flatnonzero(s.estimated)
     if kept.states.target is not None and kept.common is None:
         kept = replace(kept, common=np.zeros((len(kept), kept.m, fit.model.cell.arm.n)))
     chosen = _some_poses(kept, fit.white.size)
@@ -154,7 +168,7 @@ def _whitened(fit: Fit) -> _Whitened:
     white = w.whiten(fit.raw[place[chosen[w.reading]]]).reshape(-1)
     jacobian = fit.model.jacobian(s.prediction, s.theta, w.m, live)[chosen]
     columns = w.whiten(w.raw(jacobian)).reshape(len(white), len(live))
-    rows = columns @ s.equations.basis.transform[live]
+    rows = columns @ s.transform[live]
     return _Whitened(some, w, white + rows @ s.coordinates(), rows)
 
 

@@ -10,6 +10,7 @@ from hilcal.data.whitening import Mode
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.effects.options import Options
 from hilcal.effects.spec import EffectSpec
+from hilcal.identify.carried import CarriedPrior, check_prior
 from hilcal.identify.description_words import refuse_misdescribed
 from hilcal.identify.registration import register
 from hilcal.identify.rigid_frames import TARGET_M, TELL
@@ -22,7 +23,11 @@ middle-sized arm."""
 
 
 def baseline(
-    cell: Cell, readings: Readings, mode: Mode, catalogue: Catalogue | None = None
+    cell: Cell,
+    readings: Readings,
+    mode: Mode,
+    catalogue: Catalogue | None = None,
+    prior: CarriedPrior | None = None,
 ) -> Model:
     """Return the starting model: unknown frames, and joint compliance where a load acts.
 
@@ -34,8 +39,11 @@ def baseline(
         readings: what is to be fitted.
         mode: "deflection" or "absolute".
         catalogue: the effects that a model can have; the installed ones unless given.
+        prior: what another campaign taught; its effects are in the model, too, but for those that
+            need what the readings do not have.
 
     Raises:
+        InputError: a prior of another arm, or of these very readings.
         CannotAnswerError: the readings do not determine an unknown frame.
     """
     known = catalogue or installed()
@@ -43,7 +51,10 @@ def baseline(
     names = [kind.name for kind in known.with_role("baseline") if loaded]
     if loaded and weight_missing(cell, mode) and loads_differ(readings):
         names += [kind.name for kind in known.effects if kind.for_missing_weight]
-    return with_effects(cell, readings, mode, names, catalogue=known)
+    if prior is not None:
+        learnt = [e.name for e in prior.posterior.effects]
+        names += [name for name in learnt if known[name].computable(readings.states)]
+    return with_effects(cell, readings, mode, names, catalogue=known, prior=prior)
 
 
 def with_effects(
@@ -53,6 +64,7 @@ def with_effects(
     names: Iterable[str],
     options: Mapping[str, Options] | None = None,
     catalogue: Catalogue | None = None,
+    prior: CarriedPrior | None = None,
 ) -> Model:
     """Return frames where unknown, and the named effects.
 
@@ -67,16 +79,21 @@ def with_effects(
         names: of the effects.
         options: by name, where they are not the usual ones.
         catalogue: the effects that a model can have; the installed ones unless given.
+        prior: what another campaign taught; effects have its options unless others are given.
 
     Raises:
-        InputError: an unknown effect or option, a bad value, or readings that lack what an
-            effect needs.
+        InputError: an unknown effect or option, a bad value, readings that lack what an
+            effect needs, or a prior of another arm or of these very readings.
         CannotAnswerError: the readings do not determine an unknown frame.
     """
     known, given = catalogue or installed(), options or {}
+    learnt: dict[str, Options] = {}
+    if prior is not None:
+        check_prior(prior, cell.arm, readings)
+        learnt = {e.name: e.options for e in prior.posterior.effects}
     registered = register(cell, readings)
     refuse_misdescribed(registered, readings)
-    model = Model(registered.cell, (), known, readings)
+    model = Model(registered.cell, (), known, readings, prior)
     frames = known.unknown_frames(cell)
     for name in dict.fromkeys((*frames, *names)):
         begun: Options = {}
@@ -85,5 +102,6 @@ def with_effects(
             begun = {"prior_m": length, "prior_rad": length / ARM}
         elif name in frames and known[name].role == "target" and registered.undetermined:
             begun = {"prior_m": TARGET_M, "prior_rad": TELL}
-        model = model + EffectSpec(name, {**begun, **given.get(name, {})})
+        chosen = given.get(name) or learnt.get(name, {})
+        model = model + EffectSpec(name, {**begun, **chosen})
     return model

@@ -8,39 +8,21 @@ that of the noise, (J C Jᵀ) V⁻¹ σ⁻² with the largest eigenvalue, compar
 fitted measurements, each predicted without itself.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.data.readings import Readings, States
+from hilcal.data.ranges import MARGIN, variables
+from hilcal.data.readings import Readings
 from hilcal.data.whitening import Whitening, inverse_root
 from hilcal.identify.errors import ErrorBlock
 from hilcal.identify.predictive import Predictive
 from hilcal.identify.validation import Validation
 from hilcal.types import Bools, Floats
 
-MARGIN = 0.02
-"""Share of the fitted range by which a reading is beyond it; a choice: of two random halves, few
-readings are."""
 FAR = 2.0
 """Leverage from which a reading is outside, in units of that which only one in a hundred of the
 fitted measurements exceeds; a choice."""
-
-
-@dataclass(frozen=True, slots=True)
-class Range:
-    """Values of one variable in the fitted readings; SI."""
-
-    variable: str
-    unit: str
-    low: float
-    high: float
-
-    def beyond(self, values: Floats) -> Bools:
-        """Which values are outside, by more than `MARGIN` of the range."""
-        allowed = MARGIN * (self.high - self.low) + 1e-9 * max(abs(self.low), abs(self.high), 1.0)
-        return np.asarray(np.maximum(values - self.high, self.low - values) > allowed)
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,26 +110,6 @@ def extrapolation(p: Predictive, fitted: Readings, found: Validation) -> Extrapo
         z=np.sqrt(np.mean(white**2, axis=1)),
         inside_error=_error(found.raw, w, ~outside),
         outside_error=_error(found.raw, w, outside),
-    )
-
-
-def variables(s: States) -> Iterator[tuple[str, str, Floats]]:
-    """Yield name, unit, and the values (N,) of what a prediction may extrapolate in."""
-    for j in range(s.q.shape[1]):
-        yield f"joint {j + 1} angle", "rad", s.q[:, j]
-    for name, unit, part in (("force", "N", slice(0, 3)), ("moment", "N·m", slice(3, 6))):
-        yield name, unit, np.linalg.norm(s.wrench[:, part], axis=1)
-    if s.air_temperature is not None:
-        yield "air temperature", "K", s.air_temperature
-    if s.joint_temperature is not None:
-        for j in range(s.joint_temperature.shape[1]):
-            yield f"joint {j + 1} temperature", "K", s.joint_temperature[:, j]
-
-
-def ranges_of(s: States) -> tuple[Range, ...]:
-    """Return the ranges of `variables`."""
-    return tuple(
-        Range(name, unit, float(v.min()), float(v.max())) for name, unit, v in variables(s)
     )
 
 

@@ -11,6 +11,7 @@ from hilcal.data.readings import Readings, States
 from hilcal.data.whitening import Mode, Scaling, Whitening, inverse_root, whitening
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.data_snooping import find_gross_errors
+from hilcal.identify.drift import Conflict, chosen_drift, conflicts
 from hilcal.identify.errors import ErrorBlock, error_block
 from hilcal.identify.estimates import Estimate, Estimates
 from hilcal.identify.folds import distinct_poses, random_folds
@@ -30,6 +31,12 @@ OUTLIER_ROUNDS = 6
 """Most searches for gross errors, each followed by a new fit; a choice, no study set it."""
 MAX_OUTLIER_SHARE = 0.05
 """Most readings that are set aside, as a share; a choice: more is a misfit."""
+
+DRIFT_ROUNDS = 2
+"""Most choices of the drift of a carried prior, each followed by a new fit; a choice: the first is
+at a linearisation that the drift hardly changes."""
+DRIFT_CHANGED = 0.1
+"""Change of a drift, as a share of the largest one, that is worth another fit; a choice."""
 
 _Solved = tuple[Whitening, Solution]
 
@@ -94,6 +101,11 @@ class Fit:
             self.model, kept, self.fitted, self.solution, self.pose, self.chi2, self.dof
         )
 
+    @cached_property
+    def conflicts(self) -> tuple[Conflict, ...]:
+        """How far a carried prior and the readings disagree, worst first; empty without one."""
+        return conflicts(self.model, self.solution, self.whitening)
+
     @property
     def theta(self) -> Floats:
         """(P,) parameters."""
@@ -122,7 +134,7 @@ class Fit:
     @property
     def parameters(self) -> Estimates:
         """The parameters with their standard uncertainties, those of dropped groups left out."""
-        u, kept = self.uncertainty, self.solution.prior != 0
+        u, kept = self.uncertainty, self.solution.estimated
         of = [(f"{e.name}.{p.name}", p.unit) for e in self.model.effects for p in e.parameters]
         return Estimates(
             tuple(
@@ -200,7 +212,8 @@ def fit(
 ) -> Fit:
     """Fit a model to readings.
 
-    `start` and `prior` of an earlier fit reproduce it in few steps.
+    `start` and `prior` of an earlier fit reproduce it in few steps. The prior that the model
+    carries gets the drift that the readings ask for; where `prior` is given it keeps its own.
 
     Gross errors, at most `MAX_OUTLIER_SHARE` of the readings, are set aside: they stay in the file
     and are listed, but are not fitted.
@@ -209,10 +222,26 @@ def fit(
         CannotAnswerError: fewer measured elements than identifiable parameters.
         InputError: from `whitening`, where a deflection lacks its unloaded reading.
     """
+    given = model.prior
+    if given is not None and prior is None:
+        model = replace(model, prior=given.with_drift(None))
     used, solved = _set_aside(model, readings, mode, start, prior)
+    if model.prior is not None and prior is None:
+        for _ in range(DRIFT_ROUNDS):
+            drift = chosen_drift(model, solved[1], solved[0])
+            if _same_drift(model.prior.drift, drift):
+                break
+            model = replace(model, prior=model.prior.with_drift(drift))
+            used, solved = _set_aside(model, readings, mode, solved[1].theta, None)
     if scaling != "gc":
         solved = _solve(model, readings[used], mode, scaling, start, prior)
     return _assemble(model, readings, ~used, mode, scaling, *solved)
+
+
+def _same_drift(before: Floats | None, after: Floats) -> bool:
+    """Whether two drifts (G,) make no difference; None is none at all."""
+    old = np.zeros_like(after) if before is None else before
+    return bool(np.abs(after - old).max() <= DRIFT_CHANGED * after.max(initial=0.0))
 
 
 def _set_aside(

@@ -1,6 +1,7 @@
 """The JSON of a fit."""
 
 from collections.abc import Mapping
+from dataclasses import asdict
 
 import numpy as np
 
@@ -49,7 +50,31 @@ def to_json(fit: Fit) -> dict[str, object]:
         "registration": frames_of_fit(fit)[0].tolist(),
         "frames": fit_to_json(fit),
         "notes": list(notes(fit)),
+        **prior_to_json(fit),
     }
+
+
+def prior_to_json(fit: Fit) -> dict[str, object]:
+    """Key `prior`: where it is from, and how far each part of it and the readings disagree.
+
+    `drift` is a standard deviation in ordinary magnitudes, in shrunk families in their strengths.
+    """
+    prior = fit.model.prior
+    if prior is None:
+        return {}
+    found = [
+        {
+            "effect": c.group.effect,
+            "part": c.group.part,
+            "joint": c.group.joint,
+            "moved_sigma": c.moved_sigma,
+            "p_value": c.p_value,
+            "drift": c.drift,
+        }
+        for c in fit.conflicts
+    ]
+    source = asdict(prior.posterior.source)
+    return {"prior": {"source": source, "relation": prior.relation, "effects": found}}
 
 
 def outliers(fit: Fit) -> list[dict[str, object]]:

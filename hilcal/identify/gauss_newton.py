@@ -1,8 +1,10 @@
 """Whitened Gauss-Newton on the exact chain.
 
-    minimise ‖w(θ)‖² + β ‖θ/σ‖²
+    minimise ‖w(θ)‖² + β ‖y/σ‖²,    θ = m + U y
 
-w (R,) whitened residual, σ prior standard deviations, β the noise factor they are weighed against.
+w (R,) whitened residual, y coordinates in which the prior is independent and about zero, θ itself
+without a carried prior (see `coordinates`), σ their prior standard deviations, β the noise factor
+they are weighed against.
 """
 
 from dataclasses import dataclass, replace
@@ -12,6 +14,7 @@ import numpy as np
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Whitening
 from hilcal.errors import CannotAnswerError
+from hilcal.identify.coordinates import Coordinates, coordinates_of
 from hilcal.identify.priors import prior_of, scales_of
 from hilcal.identify.regularisation import (
     LinearProblem,
@@ -24,7 +27,7 @@ from hilcal.identify.residual import residual
 from hilcal.model import Model, Prediction
 from hilcal.regression.normal_equations import Basis, NormalEquations
 from hilcal.regression.projection import Projection, projection
-from hilcal.types import Floats, Ints
+from hilcal.types import Bools, Floats, Ints
 
 MAX_ITERATIONS = 20
 """Most Gauss-Newton steps; a choice, the tests of convergence allow 8."""
@@ -45,10 +48,12 @@ class Solution:
 
     Attributes:
         theta: (P,) parameters.
-        prior: (P,) prior standard deviations (infinite: flat, zero: held at zero).
+        y: (P,) the same in coordinates in which the prior is independent.
+        space: these coordinates.
+        prior: (P,) prior standard deviations of y (infinite: flat, zero: held at zero).
         beta: noise variance factor that the priors were weighed against.
-        equations: normal equations at the solution, in identifiable coordinates z.
-        live: (L,) indices of the parameters that are not held at zero.
+        equations: normal equations at the solution, in identifiable coordinates z of y.
+        live: (L,) indices of the y that are not held at zero.
         rows: (R, K) whitened derivative of the measurements by z.
         prediction: prediction at the solution.
         raw: (D, m) residual.
@@ -59,6 +64,8 @@ class Solution:
     """
 
     theta: Floats
+    y: Floats
+    space: Coordinates
     prior: Floats
     beta: float
     equations: NormalEquations
@@ -71,6 +78,16 @@ class Solution:
     iterations: int
     converged: bool
 
+    @property
+    def transform(self) -> Floats:
+        """(P, K) change of the parameters by z."""
+        return self.space.transform(self.equations.basis.transform)
+
+    @property
+    def estimated(self) -> Bools:
+        """(P,) parameters that are not held at zero."""
+        return np.asarray((self.prior != 0) | self.space.carried(len(self.theta)))
+
     def projection(self) -> Projection:
         """Return the projection off the columns of the model."""
         ridge = self.beta * self.equations.basis.prior_precision
@@ -78,7 +95,7 @@ class Solution:
 
     def coordinates(self) -> Floats:
         """Return z (K,) of the parameters that have a prior; zero for flat directions."""
-        return _coordinates(self.equations.basis, self.theta, self.prior)
+        return _coordinates(self.equations.basis, self.y, self.prior)
 
     def projected_residual(self) -> Floats:
         """(R,) whitened residual after the model's remaining step: `white` to within that step."""
@@ -87,17 +104,18 @@ class Solution:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Point:
-    """Parameters (P,), the prediction there, and the residual (D, m), also whitened (R,)."""
+    """y (P,), parameters (P,), the prediction there, the residual (D, m), also whitened (R,)."""
 
+    y: Floats
     theta: Floats
     prediction: Prediction
     raw: Floats
     white: Floats
 
     def objective(self, by: Regularisation) -> float:
-        """Return ‖w‖² + β ‖θ/σ‖² over the parameters that have a prior."""
+        """Return ‖w‖² + β ‖y/σ‖² over the y that have a prior."""
         held = np.isfinite(by.prior) & (by.prior > 0)
-        penalty = by.beta * float(np.sum((self.theta[held] / by.prior[held]) ** 2))
+        penalty = by.beta * float(np.sum((self.y[held] / by.prior[held]) ** 2))
         return float(np.sum(self.white**2)) + penalty
 
     def mean_square(self, parameters: int = 0) -> float:
@@ -108,17 +126,23 @@ class _Point:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Problem:
-    """A model, the readings that it is fitted to, and their scaling."""
+    """A model, its coordinates, the readings that it is fitted to, and their scaling."""
 
     model: Model
+    coordinates: Coordinates
     readings: Readings
     w: Whitening
 
-    def at(self, theta: Floats) -> _Point:
-        """Return the point of parameters (P,)."""
+    def at(self, y: Floats) -> _Point:
+        """Return the point of coordinates (P,)."""
+        theta = self.coordinates.theta(y)
         prediction = self.model.predict(self.readings.states, theta)
         raw = residual(self.readings, prediction, self.w)
-        return _Point(theta, prediction, raw, self.w.whiten(raw).reshape(-1))
+        return _Point(y, theta, prediction, raw, self.w.whiten(raw).reshape(-1))
+
+    def columns(self, point: _Point, live: Ints) -> Floats:
+        """Whitened derivative (R, L) by the live coordinates."""
+        return columns_of(self.model, self.coordinates, point.prediction, point.theta, self.w, live)
 
 
 def solve(
@@ -134,21 +158,30 @@ def solve(
         model: robot and effects.
         readings: what was measured.
         w: the scaling.
-        start: (P,) starting parameters, zero unless given.
+        start: (P,) starting parameters; zero unless given, the mean of a carried prior.
         prior: (P,) prior standard deviations to keep as they are; otherwise those of
             shrunk families are chosen by the evidence.
     """
-    problem = _Problem(model, readings, w)
-    point, by, iterations, converged = _minimise(problem, start, prior)
+    coordinates = coordinates_of(model)
+    if len(coordinates.index):
+        theta = coordinates.theta(np.zeros(model.size)) if start is None else start
+        prediction = model.predict(readings.states, theta)
+        a = whitened_jacobian(model, prediction, theta, w, np.arange(model.size))
+        coordinates = coordinates.felt(a)
+    problem = _Problem(model, coordinates, readings, w)
+    y = None if start is None else coordinates.of_theta(start)
+    point, by, iterations, converged = _minimise(problem, y, prior)
     live = np.flatnonzero(by.prior > 0)
-    rows = by.basis.rows(whitened_jacobian(model, point.prediction, point.theta, w, live))
+    rows = by.basis.rows(problem.columns(point, live))
     beta = point.mean_square(len(by.basis.singular)) if w.scaling == "none" else by.beta
     # Formed anew at the solution, so that folds can be taken out of them exactly.
     basis = _all_parameters(by.basis, live, model.size)
-    target = point.white + rows @ _coordinates(basis, point.theta, by.prior)
+    target = point.white + rows @ _coordinates(basis, point.y, by.prior)
     equations = NormalEquations(basis, rows.T @ rows, rows.T @ target)
     return Solution(
         theta=point.theta,
+        y=point.y,
+        space=coordinates,
         prior=by.prior,
         beta=beta,
         equations=equations,
@@ -167,23 +200,24 @@ def _minimise(
     problem: _Problem, start: Floats | None, prior: Floats | None
 ) -> tuple[_Point, Regularisation, int, bool]:
     """Return the minimum, what it was regularised by, the steps, and whether they converged."""
-    model = problem.model
+    model, of = problem.model, problem.coordinates
     sigma, groups = prior_of(model)
     choose = prior is None and bool((groups >= 0).any())
-    sigma = sigma if prior is None else prior
-    theta = np.zeros(model.size) if start is None else start
-    point = problem.at(np.where(sigma > 0, theta, 0.0))
+    sigma, scale = of.prior(sigma if prior is None else prior), of.scales(scales_of(model))
+    y = np.zeros(model.size) if start is None else start
+    point = problem.at(np.where(sigma > 0, y, 0.0))
     by: Regularisation  # set in the first step
     square, settled, converged = np.inf, False, False
     path = Acceleration()
     for iterations in range(1, MAX_ITERATIONS + 1):  # noqa: B007 - reported
         linear = _linearise(problem, point, sigma)
         if not settled:
-            by = regularise(linear, scales_of(model), sigma, groups, choose)
+            by = regularise(linear, scale, sigma, groups, choose)
             sigma = by.prior
         linear = linear.restricted(sigma)
-        by, aim = _step(linear, by, groups)
-        moved = linear.a @ (aim - point.theta)[linear.live]
+        weighed = bool((groups[linear.live] >= 0).any()) or bool(len(of.index))
+        by, aim = _step(linear, by, weighed)
+        moved = linear.a @ (aim - point.y)[linear.live]
         shortcut = path.accelerated(aim, moved) if settled else None
         point = _line_search(problem, point, aim, by, shortcut)
         before, square = square, point.mean_square(len(by.basis.singular))
@@ -205,9 +239,9 @@ def _linearise(problem: _Problem, point: _Point, prior: Floats) -> LinearProblem
     a prior are solved for as a whole, since the prior is about zero.
     """
     w, live = problem.w, np.flatnonzero(prior > 0)
-    a = whitened_jacobian(problem.model, point.prediction, point.theta, w, live)
-    origin = np.where(np.isinf(prior), point.theta, 0.0)
-    target = point.white + a @ (point.theta - origin)[live]
+    a = problem.columns(point, live)
+    origin = np.where(np.isinf(prior), point.y, 0.0)
+    target = point.white + a @ (point.y - origin)[live]
     whitened = w.scaling != "none"
     noise = 1.0 if whitened else point.mean_square()
     return LinearProblem(live, origin, a, a.T @ a, target, w.rank, noise, whitened)
@@ -221,11 +255,31 @@ def whitened_jacobian(
     return w.whiten_readings(jacobian)
 
 
-def _step(linear: LinearProblem, by: Regularisation, groups: Ints) -> tuple[Regularisation, Floats]:
-    """Solve the linear problem for (P,) parameters; shrunk families need the noise factor first."""
+def columns_of(
+    model: Model,
+    coordinates: Coordinates,
+    prediction: Prediction,
+    theta: Floats,
+    w: Whitening,
+    live: Ints,
+) -> Floats:
+    """Whitened derivative (R, L) of the measurements by the live coordinates y."""
+    if not len(coordinates.index):
+        return whitened_jacobian(model, prediction, theta, w, live)
+    needed = np.union1d(live, coordinates.index)
+    found = whitened_jacobian(model, prediction, theta, w, needed)
+    a = np.zeros((len(found), model.size))
+    a[:, needed] = found
+    return coordinates.columns(a)[:, live]
+
+
+def _step(
+    linear: LinearProblem, by: Regularisation, weighed: bool
+) -> tuple[Regularisation, Floats]:
+    """Solve the linear problem for (P,) y; priors that are weighed need the noise factor first."""
     equations = linear.equations(by.basis)
-    if (groups[linear.live] >= 0).any():
-        by = replace(by, beta=noise_factor(linear, equations))
+    if weighed:
+        by = replace(by, beta=noise_factor(linear, equations, by.beta))
     aim = linear.origin.copy()
     aim[linear.live] += by.basis.transform @ equations.solve(by.beta)
     return by, aim
@@ -278,7 +332,7 @@ def _line_search(
                 return trial
         except CannotAnswerError:
             pass
-    begin = np.where(by.prior > 0, point.theta, 0.0)
+    begin = np.where(by.prior > 0, point.y, 0.0)
     for halving in range(HALVINGS):
         share = 0.5**halving
         try:
@@ -290,10 +344,10 @@ def _line_search(
     return problem.at(begin)
 
 
-def _coordinates(basis: Basis, theta: Floats, prior: Floats) -> Floats:
-    """Return z (K,) of the parameters that have a prior; zero for flat directions."""
+def _coordinates(basis: Basis, y: Floats, prior: Floats) -> Floats:
+    """Return z (K,) of the y that have a prior; zero for flat directions."""
     z = np.zeros(len(basis.prior_precision))
-    z[len(basis.singular) :] = theta[basis.held] / prior[basis.held]
+    z[len(basis.singular) :] = y[basis.held] / prior[basis.held]
     return z
 
 

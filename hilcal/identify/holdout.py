@@ -37,9 +37,9 @@ def folds_of(model: Model, solution: Solution, fold: Ints) -> tuple[Fold, ...]:
         solution.projection(),
         solution.white,
         solution.equations,
-        solution.theta,
+        solution.y,
         solution.prior,
-        ordinary(model, solution.theta),
+        ordinary_y(model, solution),
         solution.beta,
         fold,
     )
@@ -53,6 +53,11 @@ def ordinary(model: Model, theta: Floats) -> Floats:
     return out
 
 
+def ordinary_y(model: Model, solution: Solution) -> Floats:
+    """(P,) the same for the coordinates y."""
+    return solution.space.scales(ordinary(model, solution.theta))
+
+
 def changes(model: Model, solution: Solution, fold: Ints, w: Whitening) -> Floats:
     """Return the parameters without each fold minus those with it (F, P).
 
@@ -63,7 +68,7 @@ def changes(model: Model, solution: Solution, fold: Ints, w: Whitening) -> Float
         w: the scaling of the fit.
     """
     steps = [one.step() for one in folds_of(model, solution, w.rows_of(fold))]
-    return np.asarray(np.array(steps) @ solution.equations.basis.transform.T)
+    return np.asarray(np.array(steps) @ solution.transform.T)
 
 
 def leave_out(model: Model, solution: Solution, fold: Ints, w: Whitening) -> Floats:
@@ -108,8 +113,9 @@ def _with_families(
     in_order = np.array_equal(order, np.arange(count))
     rows = solution.rows if in_order else solution.rows[:, order]
     # Flat parameters have the prior about zero of `folds_of`, unshrunk ones their own.
-    per = basis.transform[:, :flat] / ordinary(model, solution.theta)[:, None]
-    own = np.where(basis.flat, solution.theta / ordinary(model, solution.theta), 0.0)
+    magnitude = ordinary_y(model, solution)
+    per = basis.transform[:, :flat] / magnitude[:, None]
+    own = np.where(basis.flat, solution.y / magnitude, 0.0)
     ridge = np.zeros((len(others), len(others)))
     ridge[:flat, :flat] = solution.beta * per.T @ per
     ridge[np.arange(flat, len(others)), np.arange(flat, len(others))] = solution.beta
@@ -127,6 +133,6 @@ def _with_families(
     )
     z = np.empty((len(found), count))
     z[:, order] = found[:, :count]
-    change = (z - coordinates) @ basis.transform.T
+    change = (z - coordinates) @ solution.transform.T
     change[:, dropped] = found[:, count:] * guess
     return np.asarray(change)

@@ -12,6 +12,7 @@ import numpy as np
 from hilcal.effects.protocol import Effect
 from hilcal.identify.fit import Fit
 from hilcal.identify.folds import random_folds
+from hilcal.identify.gauss_newton import columns_of
 from hilcal.identify.holdout import folds_of
 from hilcal.identify.priors import scales_of
 from hilcal.regression.backward_elimination import ReducedModel, eliminate_columns
@@ -170,8 +171,10 @@ class ModelColumns:
     Those of parameters that are held at zero are left out, but for those by which their effect
     would be scored as a suspect.
 
+    A carried prior's are by the coordinates in which it is independent.
+
     Attributes:
-        parameter: (L,) indices of the parameters, ascending.
+        parameter: (L,) indices of the parameters, or coordinates, ascending.
         scale: (L,) ordinary magnitudes, SI.
         white: (R, L) whitened columns.
         gram: (L, L) their products.
@@ -191,11 +194,12 @@ def model_columns(fit: Fit) -> ModelColumns:
     for effect in model.effects:
         names = {p.name for p in effect.for_scoring(states).parameters}
         scored += [p.name in names for p in effect.parameters]
-    parameter = np.flatnonzero((s.prior > 0) | np.array(scored, dtype=np.bool_))
-    scale = scales_of(model)[parameter]
-    jacobian = model.jacobian(s.prediction, s.theta, w.m, parameter)
-    jacobian *= scale
-    white = w.whiten_readings(jacobian)
+    carried = s.space.carried(model.size)
+    kept = (s.prior > 0) | (np.array(scored, dtype=np.bool_) & ~carried)
+    parameter = np.flatnonzero(kept)
+    scale = s.space.scales(scales_of(model))[parameter]
+    white = columns_of(model, s.space, s.prediction, s.theta, w, parameter)
+    white *= scale
     return ModelColumns(parameter, scale, white, white.T @ white)
 
 
@@ -209,7 +213,7 @@ def eliminate_effect(fit: Fit, columns: ModelColumns, effect: str) -> ReducedMod
     """
     mine = fit.model.slices()[fit.model.names.index(effect)]
     index, scale, s = columns.parameter, columns.scale, fit.solution
-    theta, prior = s.theta[index] / scale, s.prior[index] / scale
+    theta, prior = s.y[index] / scale, s.prior[index] / scale
     out = (index >= mine.start) & (index < mine.stop)
     return eliminate_columns(
         columns.white, columns.gram, fit.white, theta, prior, out, s.beta, fit.whitening.rank

@@ -15,27 +15,20 @@ What the readings did not determine has no information: not a large variance, an
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hilcal.data.arm_scatter import ArmScatter
-from hilcal.data.records import content_hash
-from hilcal.data.revision import utc_now
-from hilcal.data.same_readings import prints
+from hilcal.data.ranges import Range
 from hilcal.data.whitening import Mode
-from hilcal.effects.protocol import FRAME_ROLES, Effect
-from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identify.extrapolation import Range, ranges_of
-from hilcal.identify.fit import Fit
-from hilcal.identify.gauss_newton import whitened_jacobian
-from hilcal.identify.predictive import family_prior, parameter_factor, predictive
-from hilcal.identify.priors import scales_of
-from hilcal.identify.uncertainty import NULL_SHARE
-from hilcal.regression.normal_equations import INFORMATION
+from hilcal.regression.normal_equations import INFORMATION, NULL_SHARE
 from hilcal.regression.schur import schur_complement
 from hilcal.types import Floats, Ints
+
+if TYPE_CHECKING:
+    from hilcal.identify.fit import Fit
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +102,7 @@ class Posterior:
     source: Source
 
     @classmethod
-    def of(cls, fit: Fit, source: Source | None = None) -> "Posterior":
+    def of(cls, fit: "Fit", source: Source | None = None) -> "Posterior":
         """Return what a fit taught of its arm.
 
         Args:
@@ -120,41 +113,9 @@ class Posterior:
             InputError: a fit of another scaling than gc.
             CannotAnswerError: a model without any effect of the arm.
         """
-        if fit.scaling != "gc":
-            raise InputError(f"a prior needs a fit with scaling gc, this one has {fit.scaling}")
-        model, cell = fit.model, fit.model.cell
-        learnt = [e for e in model.effects if of_arm(e)]
-        if not learnt:
-            raise CannotAnswerError(
-                f"the model {' + '.join(model.names) or 'of the nominal arm'} has no effect of the "
-                "arm, only of the setup: there is nothing to carry over; run hilcal refine first"
-            )
-        mine = np.concatenate([np.full(len(e.parameters), of_arm(e)) for e in model.effects])
-        interest, scale = np.flatnonzero(mine), scales_of(model)
-        whole, own = _information(fit, scale)
-        found = _determined(schur_complement(whole, interest))
-        scale = scale[interest]
-        used, source = fit.readings[~fit.outlier], source or Source(created=utc_now())
-        return cls(
-            arm=cell.arm.name,
-            links=cell.arm.links,
-            mode=fit.mode,
-            effects=tuple(LearntEffect(e.name, dict(e.options)) for e in learnt),
-            names=tuple(f"{e.name}.{p.name}" for e in learnt for p in e.parameters),
-            units=tuple(p.unit for e in learnt for p in e.parameters),
-            scale=scale,
-            mean=fit.theta[interest],
-            information=found / (scale[:, None] * scale),
-            own_precision=own[interest] / scale**2,
-            scatter=fit.readings.arm_scatter,
-            ranges=ranges_of(used.states),
-            prints=prints(fit.readings),
-            source=replace(
-                source,
-                readings_sha256=content_hash(fit.readings),
-                n_readings=len(fit.readings),
-            ),
-        )
+        from hilcal.identify.learnt import posterior_of
+
+        return posterior_of(fit, source)
 
     def to_json(self) -> dict[str, object]:
         """Return it as JSON, SI, exactly; see `posterior_document`."""
@@ -183,7 +144,7 @@ class Posterior:
         scaled = self.information * (self.scale[:, None] * self.scale)
         some = schur_complement(scaled, parameters)
         mine = self.scale[parameters]
-        return _determined(some) / (mine[:, None] * mine)
+        return determined(some) / (mine[:, None] * mine)
 
     @property
     def std(self) -> Floats:
@@ -195,29 +156,7 @@ class Posterior:
         return np.where(moved <= NULL_SHARE * std, std * self.scale, np.inf)
 
 
-def of_arm(effect: Effect) -> bool:
-    """Whether an effect is of the arm, so that another campaign of it has it, too."""
-    return not (type(effect).of_setup or effect.role in FRAME_ROLES)
-
-
-def _information(fit: Fit, scale: Floats) -> tuple[Floats, Floats]:
-    """M (P, P) and the part of its diagonal by the effects' own priors, in ordinary magnitudes."""
-    model, s = fit.model, fit.solution
-    p = predictive(
-        model, fit.theta, s.prior, fit.readings[~fit.outlier], fit.mode, fit.holdout.rms_sigma
-    )
-    a = whitened_jacobian(model, s.prediction, s.theta, fit.whitening, np.arange(model.size))
-    a *= scale
-    std = family_prior(model, s.prior) / scale
-    with np.errstate(divide="ignore"):
-        own = np.where(std > 0, 1.0 / std**2, np.inf)
-    # Of a family of which nothing is left at all: as ordinary as it starts.
-    own[np.isinf(own)] = 1.0
-    kappa = parameter_factor(p, fit.holdout.rms_sigma)
-    return (a.T @ a / p.noise + np.diag(own)) / kappa, own / kappa
-
-
-def _determined(information: Floats) -> Floats:
+def determined(information: Floats) -> Floats:
     """Information (K, K), in ordinary magnitudes, without directions that are hardly determined.
 
     A fit holds those where they are whose information is below `INFORMATION`², see

@@ -11,9 +11,9 @@ import numpy as np
 
 from hilcal import __version__
 from hilcal.data.arm_scatter import ArmScatter
+from hilcal.data.ranges import Range
 from hilcal.data.whitening import MODES
 from hilcal.errors import InputError
-from hilcal.identify.extrapolation import Range
 from hilcal.identify.posterior import LearntEffect, Posterior, Source
 from hilcal.types import Floats
 

@@ -4,7 +4,8 @@ The posterior of a fit holds the strengths of shrunk families at what the eviden
 the groups that the readings do not need. That says nothing of joint angles that were never
 visited: there the dropped harmonics of a transmission error, too, add up to its size. So
 
-- a group of a shrunk family has at least the family's mean variance as its prior;
+- a group of a shrunk family has at least the mean variance of its pool (of the whole family, or of
+  an octave of harmonics, see `Effect.pools`) as its prior;
 - a parameter without a prior has one about zero of its ordinary magnitude, or the rms of its
   effect's parameters if more, as where poses are left out (see `holdout`);
 
@@ -24,9 +25,9 @@ import numpy as np
 
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode, Whitening, whitening
+from hilcal.identify.coordinates import coordinates_of
 from hilcal.identify.gauss_newton import whitened_jacobian
 from hilcal.identify.holdout import ordinary
-from hilcal.identify.priors import prior_of
 from hilcal.identify.residual import residual
 from hilcal.model import Model, Prediction
 from hilcal.types import Floats, Ints
@@ -82,7 +83,7 @@ def predictive(
         model: the model.
         theta: (P,) its parameters.
         prior: (P,) prior standard deviations of the fit; infinite for flat parameters, zero for
-            groups that were dropped.
+            groups that were dropped. The prior that the model carries takes their place.
         fitted: the readings that it was fitted to, without gross errors.
         mode: "deflection" or "absolute".
         left_out_sigma: rms of the whitened residual on poses left out.
@@ -90,8 +91,10 @@ def predictive(
     w = whitening(fitted, mode, "gc")
     prediction = model.predict(fitted.states, theta)
     white = w.whiten(residual(fitted, prediction, w)).reshape(-1)
-    std = open_prior(model, theta, prior)
-    a = whitened_jacobian(model, prediction, theta, w, np.arange(model.size))
+    of = coordinates_of(model)
+    std = of.prior(open_prior(model, theta, prior))
+    std[np.isinf(std)] = 1.0
+    a = of.columns(whitened_jacobian(model, prediction, theta, w, np.arange(model.size)))
     a *= std
     values, vectors = np.linalg.eigh(a.T @ a)
     values = np.maximum(values, 0.0)
@@ -106,7 +109,7 @@ def predictive(
         shares.append(np.linalg.eigvalsh(part @ np.swapaxes(part, 1, 2)) / noise)
     leverage = np.clip(np.concatenate(shares), 0.0, MOST_LEVERAGE).max(axis=1)
     left_out = _left_out(a, root, w.rows_of(fitted.pose[w.reading]), noise)
-    root *= std[:, None]
+    root = of.transform(root * std[:, None])
     factor = max(1.0, left_out_sigma**2 / (noise + left_out))
     return Predictive(model, theta, root @ root.T, noise, factor, leverage, left_out)
 
@@ -129,12 +132,13 @@ def open_prior(model: Model, theta: Floats, prior: Floats) -> Floats:
 
 
 def family_prior(model: Model, prior: Floats) -> Floats:
-    """Prior standard deviations (P,), those of shrunk families at least the family's mean."""
+    """Prior standard deviations (P,), those of shrunk families at least the mean of their pool."""
     std = prior.copy()
-    groups = prior_of(model)[1]
-    for mine in model.slices():
-        if (groups[mine] >= 0).any():
-            std[mine] = np.maximum(std[mine], np.sqrt(np.mean(prior[mine] ** 2)))
+    for effect, mine in zip(model.effects, model.slices(), strict=True):
+        if effect.groups() is not None:
+            pool = effect.pools()
+            mean = np.bincount(pool, weights=prior[mine] ** 2) / np.maximum(np.bincount(pool), 1)
+            std[mine] = np.maximum(std[mine], np.sqrt(mean)[pool])
     return std
 
 

@@ -10,7 +10,10 @@ FIRST_GUESS = 0.3
 
 
 def prior_of(model: Model) -> tuple[Floats, Ints]:
-    """Starting prior (P,) of a model, and the shrinkage group (P,) of each parameter or −1."""
+    """Starting prior (P,) of a model, and the shrinkage group (P,) of each parameter or −1.
+
+    Parameters with a carried prior have no other one, see `coordinates`.
+    """
     prior, groups, used = [np.zeros(0)], [np.zeros(0, dtype=np.int64)], 0
     for e in model.effects:
         size = len(e.parameters)
@@ -22,7 +25,16 @@ def prior_of(model: Model) -> tuple[Floats, Ints]:
         else:
             prior.append(np.full(size, np.inf) if fixed is None else fixed)
             groups.append(np.full(size, -1))
-    return np.concatenate(prior), np.concatenate(groups)
+    std, group = np.concatenate(prior), np.concatenate(groups)
+    if model.prior is not None:
+        carried = model.prior.index_in(names_of(model))[0]
+        std[carried], group[carried] = np.inf, -1
+    return std, group
+
+
+def names_of(model: Model) -> tuple[str, ...]:
+    """Names of the parameters, "effect.parameter"."""
+    return tuple(f"{e.name}.{p.name}" for e in model.effects for p in e.parameters)
 
 
 def scales_of(model: Model) -> Floats:

@@ -114,9 +114,14 @@ def _attainable_spread(p: LinearProblem, scale: Floats, prior: Floats) -> float:
     return float(np.sqrt(max(rss, 1e-30) / max(p.rank - len(basis.singular), 1)))
 
 
-def noise_factor(p: LinearProblem, equations: NormalEquations) -> float:
-    """Fixed point of β = max(1, RSS(β) / (R − effective parameters)), given the priors."""
-    beta = 1.0
+def noise_factor(p: LinearProblem, equations: NormalEquations, beta: float = 1.0) -> float:
+    """Fixed point of β = max(1, RSS(β) / (R − effective parameters)), given the priors.
+
+    Args:
+        p: the problem.
+        equations: its normal equations.
+        beta: where the iteration starts.
+    """
     for _ in range(NOISE_STEPS):
         root = equations.inverse_root(beta)
         z = root.T @ (root @ equations.rhs)

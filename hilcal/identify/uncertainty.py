@@ -29,11 +29,9 @@ from hilcal.regression.hyperparameter_uncertainty import (
     dropped_group_factors,
     hyperparameter_factors,
 )
+from hilcal.regression.normal_equations import NULL_SHARE
 from hilcal.types import Bools, Floats, Ints
 
-NULL_SHARE = 0.1
-"""Share of its standard uncertainty by which an unidentifiable direction, off by an ordinary
-magnitude, may move an identifiable parameter; a choice, no study set it."""
 LEARNT = 0.7
 """Ratio of posterior to prior standard deviation below which a parameter with a prior is
 identifiable; a choice, no study set it."""
@@ -76,8 +74,9 @@ def uncertainty(
     basis = solution.equations.basis
     scale = scales_of(model)
     spread = solution.equations.inverse(solution.beta)
-    covariance = basis.transform @ spread @ basis.transform.T
-    variance = np.diag(covariance)
+    covariance = solution.transform @ spread @ solution.transform.T
+    variance = np.diag(covariance).copy()
+    variance[solution.space.index] += solution.space.rest / solution.beta
     noise = solution.beta if w.scaling == "none" else 1.0
     formal = np.sqrt(np.maximum(variance, 0.0) * noise)
     misfit = w.scaling != "none" and bool(chi2.sf(total, dof) < MISFIT_CHANCE)
@@ -91,14 +90,15 @@ def uncertainty(
             off = change - change.mean(axis=0)
             jackknife = np.sqrt((count - 1) / count * np.sum(off**2, axis=0))
             std = np.maximum(std, jackknife)
-    identifiable = _identifiable(solution, scale, std)
+    null = _ordinary(solution, basis.null, scale)
+    identifiable = _identifiable(solution, scale, std, null)
     std = std * _hyperparameter_factors(model, w, solution, covariance)
     return Uncertainty(
         np.where(identifiable, std, np.inf),
         formal,
         identifiable,
         misfit,
-        name_directions(model, basis.null),
+        name_directions(model, null),
     )
 
 
@@ -112,19 +112,27 @@ def _hyperparameter_factors(
     if w.scaling == "none" or not len(dropped) or not solution.rows.shape[1]:
         return factor
     columns = whitened_jacobian(model, solution.prediction, solution.theta, w, dropped)
-    transform = solution.equations.basis.transform
+    transform = solution.transform
     return factor * dropped_group_factors(
         transform, solution.projection(), columns, groups[dropped], beta
     )
 
 
-def _identifiable(solution: Solution, scale: Floats, std: Floats) -> Bools:
+def _ordinary(solution: Solution, null: Floats, scale: Floats) -> Floats:
+    """Directions (P, U) in ordinary magnitudes of the parameters, of those of y."""
+    found, index = solution.space.transform(null).copy(), solution.space.index
+    found[index] /= scale[index, None]
+    return found
+
+
+def _identifiable(solution: Solution, scale: Floats, std: Floats, null: Floats) -> Bools:
     """(P,) parameters that unidentifiable directions hardly move, and that the data determine."""
     basis = solution.equations.basis
-    null = scale * np.linalg.norm(basis.null, axis=1)
-    flat = (null <= NULL_SHARE * std) & (std < MEANINGLESS * scale)
+    moved = scale * np.linalg.norm(null, axis=1)
+    flat = (moved <= NULL_SHARE * std) & (std < MEANINGLESS * scale)
     learnt = std < LEARNT * np.where(np.isinf(solution.prior), np.inf, solution.prior)
-    return np.where(basis.flat, flat, learnt & (solution.prior > 0))
+    no_own = basis.flat | solution.space.carried(len(scale))
+    return np.where(no_own, flat, learnt & (solution.prior > 0))
 
 
 def name_directions(model: Model, null: Floats, most: int = 3) -> tuple[str, ...]:

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.identify.uncertainty import LEARNT, MEANINGLESS, NULL_SHARE
+from hilcal.identify.uncertainty import LEARNT, MEANINGLESS
 from hilcal.plan.information import Problem
 from hilcal.plan.prediction_poses import PredictionPoses
-from hilcal.regression.normal_equations import INFORMATION, ROUNDING
+from hilcal.regression.normal_equations import INFORMATION, NULL_SHARE, ROUNDING
 from hilcal.regression.schur import inverse_root
 from hilcal.types import Bools, Floats
 

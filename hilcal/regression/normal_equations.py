@@ -24,6 +24,9 @@ from hilcal.types import Bools, Floats, Ints
 INFORMATION = 0.2
 """In units of the residual's spread: a direction is estimated where five times the ordinary
 magnitude along it would move all data together by one σ."""
+NULL_SHARE = 0.1
+"""Share of its standard uncertainty by which an unidentifiable direction, off by an ordinary
+magnitude, may move an identifiable parameter; a choice, no study set it."""
 ROUNDING = 1e-10
 _ROWS = 4096
 """Rows that are worked on at a time; a choice by memory."""

@@ -236,7 +236,7 @@ def _limits(d: Diagnosis) -> tuple[StoryLimit, ...]:
 
 def story_parameters(fit: Fit) -> tuple[StoryParameter, ...]:
     """Parameters that are not held at zero."""
-    u, prior = fit.uncertainty, fit.solution.prior
+    u, estimated = fit.uncertainty, fit.solution.estimated
     parameters = [(e.name, p) for e in fit.model.effects for p in e.parameters]
     return tuple(
         StoryParameter(
@@ -247,7 +247,7 @@ def story_parameters(fit: Fit) -> tuple[StoryParameter, ...]:
             identifiable=bool(u.identifiable[k]),
         )
         for k, (effect, p) in enumerate(parameters)
-        if prior[k] > 0
+        if estimated[k]
     )
 
 
@@ -269,9 +269,7 @@ def regressor(fit: Fit, suspect: Suspect) -> Regressor | None:
     contribution = w.raw(jacobian @ (scale * suspect.score.step))
     if p.rows.shape[1]:
         z = p.projection.solve(p.rows.T @ w.whiten(contribution).reshape(-1))
-        adapted = fit.model.predict(
-            s.prediction.situation.states, s.theta - s.equations.basis.transform @ z
-        )
+        adapted = fit.model.predict(s.prediction.situation.states, s.theta - s.transform @ z)
         shift = adapted.observation.position - s.prediction.observation.position
         contribution[:, :3] += w.raw(shift)
     c = contribution[:, :3]

@@ -115,7 +115,7 @@ def _parameter_rows(rows: WordTable, fit: Fit, effect: Effect, index: Ints) -> N
 
 def family(fit: Fit, effect: Effect, index: Ints) -> RenderableType:
     """Summarise a family of hundreds of parameters."""
-    theta, live = fit.theta[index], fit.solution.prior[index] > 0
+    theta, live = fit.theta[index], fit.solution.estimated[index]
     units = {p.unit for p in effect.parameters}
     unit, factor = numbers.unit_for(units.pop(), list(theta)) if len(units) == 1 else ("", 1.0)
     lines = [

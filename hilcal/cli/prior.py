@@ -1,0 +1,77 @@
+"""`--prior OTHER.hilcal`: what another campaign of the arm taught, for this one."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hilcal.effects.catalogue import Catalogue
+from hilcal.errors import InputError
+from hilcal.identify.carried import CarriedPrior, carried_prior
+from hilcal.library import load_posterior
+
+Prior = Annotated[
+    Path | None,
+    typer.Option(
+        "--prior",
+        metavar="OTHER.hilcal",
+        help="What another campaign taught of this arm: its file, or the JSON of a posterior.",
+    ),
+]
+PriorOf = Annotated[
+    str,
+    typer.Option(
+        "--prior-of",
+        metavar="KIND",
+        help="Whose campaign that was: arm (the same) or type (another arm of the type).",
+    ),
+]
+Drift = Annotated[
+    str | None,
+    typer.Option(
+        "--drift",
+        metavar="A=X,B=X",
+        help="By how much effects have changed since then, in ordinary magnitudes.",
+    ),
+]
+
+
+@dataclass(frozen=True, slots=True)
+class PriorOptions:
+    """The options as they were given."""
+
+    path: Path | None
+    relation: str
+    drift: str | None
+
+    def load(self, catalogue: Catalogue) -> CarriedPrior | None:
+        """Return the prior; None where none is asked for.
+
+        Raises:
+            InputError: a file or an option that cannot be.
+            CannotAnswerError: a campaign that taught nothing of its arm.
+        """
+        if self.path is None:
+            if self.drift is not None:
+                raise InputError("--drift is of a prior; give --prior OTHER.hilcal as well")
+            return None
+        posterior = load_posterior(self.path, catalogue)
+        try:
+            return carried_prior(posterior, self.relation, _drifts(self.drift), catalogue)
+        except InputError as error:
+            raise InputError(f"--prior {self.path}: {error}") from None
+
+
+def _drifts(text: str | None) -> dict[str, float]:
+    """Read "a=0.1,b=0.2"."""
+    found = {}
+    for part in (text or "").split(","):
+        name, equals, value = (w.strip() for w in part.partition("="))
+        if not part.strip():
+            continue
+        try:
+            found[name] = float(value) if equals else float("nan")
+        except ValueError:
+            raise InputError(f"--drift {part.strip()!r}; valid: EFFECT=NUMBER") from None
+    return found
