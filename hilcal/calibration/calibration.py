@@ -169,7 +169,7 @@ class Calibration:
         readings = 2 if found.mode == "deflection" else 1
         loads = () if model.cell.config is None else model.cell.config.loads
         return cls(
-            model=replace(model, readings=None),
+            model=replace(model, readings=None, prior=None),
             theta=found.theta,
             mode=found.mode,
             root=vectors * np.sqrt(kappa * np.maximum(values, 0.0)),
@@ -179,7 +179,10 @@ class Calibration:
             loads={load.name: load.wrench(model.cell.gravity) for load in loads},
             source=dict(source or {}),
             sensor=SensorMount.of(model.cell),
-            learnt=Learnt(used, open_prior(model, found.theta, prior), p.noise, kappa),
+            # With a carried prior the covariance does not follow from these readings alone.
+            learnt=None
+            if model.prior is not None
+            else Learnt(used, open_prior(model, found.theta, prior), p.noise, kappa),
         )
 
     @classmethod

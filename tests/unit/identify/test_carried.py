@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from hilcal.calibration.calibration import Calibration
 from hilcal.data.records import content_hash
 from hilcal.data.revision import from_text, to_text
 from hilcal.errors import InputError
@@ -154,3 +155,12 @@ def test_refusals() -> None:
     foreign = replace(p, effects=(replace(p.effects[0], name="cable_pull"),))
     with pytest.raises(InputError, match="--effects-from"):
         carried_prior(foreign)
+
+
+def test_a_calibration_is_surer_with_a_prior() -> None:
+    prior = carried_prior(Posterior.of(of_poses(0, 25)))
+    found, alone = Calibration.of(with_prior(prior)), Calibration.of(of_poses(25, 40))
+    q = both().readings.states.q[:20]
+    stated = [c.predict(q).covariance for c in (found, alone)]
+    spread = [np.trace(c, axis1=1, axis2=2).mean() for c in stated if c is not None]
+    assert spread[0] < spread[1]
