@@ -11,6 +11,7 @@ import typer
 
 from drivers.simulated.rehearsal import NOTHING, as_told
 from hilcal.acquire.connect import connect
+from hilcal.acquire.run import HOW_ON
 from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.asking import agreed, somebody_there
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
@@ -189,11 +190,11 @@ class _Told:
         try:
             yield
         except KeyboardInterrupt:
-            raise StoppedError(f"interrupted; {safe()}") from None
+            raise StoppedError(f"interrupted: nothing moves; {safe()}") from None
         except (InputError, LimitError):
             raise
         except HilcalError as error:
-            words = str(error).rstrip(".")
+            words = str(error).removesuffix(HOW_ON).rstrip(". ")
             raise type(error)(f"{words}; {safe()}") from error
 
 
@@ -227,7 +228,9 @@ def _procedure(
         seed = config.simulation.seed
         usual = Settings(POSES, VALIDATION, parse_duration(LONGEST, "--max-time"), seed=seed)
         settings = replace(usual, readings=kind, hide=hide, **asked)
-        return Procedure(output, cell, config, base_dir, catalogue, settings)
+        p = Procedure(output, cell, config, base_dir, catalogue, settings)
+        p.check_files()
+        return p
     p = continued(output, cell, config, catalogue)
     if (p.settings.hide is not None) != rehearse:
         what = "no rehearsal; leave --rehearse out" if rehearse else "a rehearsal; give --rehearse"

@@ -146,6 +146,8 @@ def next_step(run: Path) -> Step:
                 "on with its own commands (hilcal info)"
             )
         decided = log.last(DECIDED)
+        if decided is not None and not files.validation.exists() and _asked_anew(log):
+            return Step("decide", run)
         if decided is None or decided["action"] == MEASURE:
             missing = _missing("measure", campaign)
             if missing is not None:
@@ -170,6 +172,13 @@ def next_step(run: Path) -> Step:
     if missing is not None:
         return missing
     return Step("done" if improved else "compare", run)
+
+
+def _asked_anew(log: ProcedureLog) -> bool:
+    """Whether other settings were asked for since measuring was ended."""
+    kinds = [entry["kind"] for entry in log.entries() if entry["kind"] in (BEGUN, DECIDED)]
+    last = log.last(DECIDED)
+    return kinds[-1] == BEGUN and last is not None and last["action"] == STOP
 
 
 def opened(path: Path, purpose: str, run: Path, *, read_only: bool = True) -> CampaignFile:

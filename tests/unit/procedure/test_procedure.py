@@ -169,3 +169,17 @@ def test_a_goal_within_reach_is_measured_for(tmp_path) -> None:
         log = RunLog(run)
         assert len(log.plans) > 1
         assert len(log.plan.steps) == run.n_readings
+
+
+def test_another_goal_is_decided_anew_before_the_validation(tmp_path) -> None:
+    d = drawn(tmp_path / "run.hilcal", goal_m=5e-6)
+    for _ in range(4):
+        d.do(d.procedure.next())
+    assert d.procedure.next().kind == "plan_validation"
+    settings = replace(d.procedure.settings, goal_m=1.0)
+    d = replace(d, procedure=replace(d.procedure, settings=settings))
+    with CampaignFile.open(d.procedure.run) as run:
+        d.procedure.resume(run)
+    assert d.procedure.next().kind == "decide"
+    assert d.do(d.procedure.next()).reason == "goal_met"
+    assert d.procedure.next().kind == "plan_validation"
