@@ -33,6 +33,7 @@ _PLACES = {
     "InputError": "hilcal.errors",
     "Model": "hilcal.model",
     "Posterior": "hilcal.identify.posterior",
+    "Procedure": "hilcal.procedure.procedure",
     "Readings": "hilcal.data.readings",
     "Refinement": "hilcal.refine",
     "States": "hilcal.data.readings",
@@ -75,6 +76,7 @@ if TYPE_CHECKING:
     from hilcal.identify.table_preview import preview_table
     from hilcal.library import baseline, fit, load_posterior, plan, read_table, refine, view
     from hilcal.model import Model
+    from hilcal.procedure.procedure import Procedure
     from hilcal.refine import Refinement
     from hilcal.validate import validate
 

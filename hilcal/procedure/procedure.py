@@ -15,6 +15,7 @@ the calibration's log; from then on it has to be just this.
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -35,7 +36,7 @@ from hilcal.data.run_log import PLAN, RunLog, check_same_cell, create_run
 from hilcal.data.same_readings import already
 from hilcal.data.whitening import Mode, usual_mode
 from hilcal.diagnose.verdict import diagnose
-from hilcal.effects.catalogue import Catalogue
+from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError
 from hilcal.identify import validation
 from hilcal.identify.acceptance import Acceptance, acceptance
@@ -82,6 +83,10 @@ _FIRST, _FURTHER, _VALIDATION, _CORRECTED = range(4)
 class Procedure:
     """A calibration in a cell.
 
+    >>> p = hc.Procedure.at("new.hilcal", hc.Cell.load(CELL), poses=6)
+    >>> p.next().kind
+    'plan'
+
     Attributes:
         run: the campaign file that is fitted; the others stand beside it.
         cell: the cell as configured.
@@ -98,6 +103,29 @@ class Procedure:
     catalogue: Catalogue
     settings: Settings
     _found: list[Refinement] = field(default_factory=list, repr=False)
+
+    @classmethod
+    def at(
+        cls, run: str | Path, cell: Cell, catalogue: Catalogue | None = None, **asked: Any
+    ) -> "Procedure":
+        """Begin a calibration, or take up the one that a campaign file holds.
+
+        Args:
+            run: the campaign file; the others go beside it.
+            cell: from `Cell.load`.
+            catalogue: the effects that a model can have; the installed ones unless given.
+            **asked: what is asked for, see `Settings`; of a calibration that is there, what it was.
+
+        Raises:
+            InputError: the campaign is of another cell, or not of a calibration.
+        """
+        path, config, known = Path(run), cell.configured(), catalogue or installed()
+        if path.exists():
+            there = continued(path, cell, config, known)
+            return replace(there, settings=replace(there.settings, **asked))
+        readings = config.planning.readings if config.loads else "absolute"
+        usual = Settings(seed=config.simulation.seed, readings=readings)
+        return cls(path, cell, config, Path.cwd(), known, replace(usual, **asked))
 
     @property
     def files(self) -> Files:

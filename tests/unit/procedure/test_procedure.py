@@ -7,6 +7,7 @@ import pytest
 
 import hilcal as hc
 from hilcal.calibration.improvement import Improvement
+from hilcal.config.write import to_toml
 from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.plan import REFERENCE
 from hilcal.data.procedure_log import ProcedureLog
@@ -15,7 +16,9 @@ from hilcal.data.run_log import RunLog
 from hilcal.data.same_readings import already
 from hilcal.errors import InputError
 from hilcal.procedure.state import FROZEN
-from tests.support.procedure_cases import Drawn, KilledError, again, drawn
+from tests.support.paths import ROOT
+from tests.support.procedure_cases import Drawn, KilledError, again, drawn, small
+from tests.unit.test_docs import blocks
 
 ALL = [
     "plan",
@@ -183,3 +186,15 @@ def test_another_goal_is_decided_anew_before_the_validation(tmp_path) -> None:
     assert d.procedure.next().kind == "decide"
     assert d.do(d.procedure.next()).reason == "goal_met"
     assert d.procedure.next().kind == "plan_validation"
+
+
+def test_the_python_of_the_guide_runs_as_it_stands(tmp_path, monkeypatch) -> None:
+    (code,) = blocks(ROOT / "docs" / "how-to" / "calibrate.md")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "CELL.toml").write_text(to_toml(small(1)), encoding="utf-8")
+    known: dict = {}
+    known["measure"] = lambda campaign, epoch: Drawn(known["p"], "nothing").measure(campaign, epoch)
+    exec(code, known)
+    every = known["p"].compare().everything
+    assert every.count == 4
+    assert every.before.rms_m > 5 * every.after.rms_m
