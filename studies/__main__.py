@@ -12,6 +12,7 @@ from studies.compensation_command import compensation
 from studies.corrected import corrected
 from studies.descriptions_command import descriptions
 from studies.diagnosis_command import diagnosis
+from studies.discover_command import discover
 from studies.plans_command import plans
 from studies.real_command import real
 from studies.records import results
@@ -26,6 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run a study; exit codes and messages as those of `hilcal`."""
     app: typer.Typer = application("Evaluate the program itself on simulated campaigns.")
     app.command("diagnosis")(diagnosis)
+    app.command("discover")(discover)
     app.command("plans")(plans)
     app.command("descriptions")(descriptions)
     app.command("scaling")(scaling)

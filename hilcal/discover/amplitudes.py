@@ -146,6 +146,12 @@ class Grammar:
     def _places(self) -> dict[frozenset[tuple[str, str, Numbers]], int]:
         return {_key(a): k for k, a in enumerate(self.amplitudes)}
 
+    def inner(self, k: int) -> list[int]:
+        """Return the amplitudes with one factor less."""
+        factors = self.amplitudes[k].factors
+        less = (Amplitude((*factors[:i], *factors[i + 1 :])) for i in range(len(factors)))
+        return [at for a in less if (at := self.place(a)) is not None]
+
     def price(self, sites: int) -> Floats:
         """(F,) log of the number of candidates of the same complexity, and of 2 per unit of it."""
         count = np.bincount(self.cost) * sites
@@ -236,6 +242,7 @@ def _factors(v: Variable, x: Floats) -> list[Factor]:
         out.append(Factor(v, shapes.SATURATION, (_round(0.05 * middle),)))
         if v.kind == "torque":
             out.append(Factor(v, shapes.SATURATION, (_round(middle),)))
+            out.append(Factor(v, shapes.THRESHOLD, (_round(0.5 * middle),)))
             out += [Factor(v, shapes.EVEN, (1.0, 0.0)), whole]
             out += [Factor(v, shapes.ODD, (p, 0.0)) for p in (2.0, 3.0)]
             out.append(Factor(v, shapes.ODD, (0.5, _round(0.01 * middle))))
@@ -243,7 +250,8 @@ def _factors(v: Variable, x: Floats) -> list[Factor]:
     if v.kind in ("torque", "force"):
         return [linear, whole, Factor(v, shapes.ODD, (0.5, _round(0.01 * middle)))]
     if v.kind == "gravity":
-        return [linear, Factor(v, shapes.EVEN, (1.0, 0.0)), whole]
+        side = Factor(v, shapes.SATURATION, (_round(0.05 * middle),))
+        return [linear, side, Factor(v, shapes.EVEN, (1.0, 0.0)), whole]
     if v.kind == "temperature":
         return [linear, whole, Factor(v, shapes.EVEN, (1.0, 0.0)), Factor(v, shapes.PLUS)]
     if v.kind == "place" and x.min() < 0:

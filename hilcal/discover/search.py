@@ -245,6 +245,10 @@ class Beside:
         ]
         if len(same) > 1:
             yield Term(tuple((k, f) for k in same), price)
+        for inner in screen.grammar.inner(f):
+            # The zero of one factor is free, as that of a temperature.
+            if screen.square[s, inner]:
+                yield Term(((s, f), (s, inner)), price)
         if site.joint < 0:
             return
         amplitude, place = screen.grammar.amplitudes[f], screen.grammar.place

@@ -155,6 +155,17 @@ SATURATION = Shape(
     lambda x, p: rf"\tanh({x}/{p[0]})",
     free=(0,),
 )  # fmt: skip
+THRESHOLD = Shape(
+    "threshold", 2,
+    lambda x, p: np.sign(x) * np.maximum(np.abs(x) - p[0], 0.0),
+    lambda x, p: np.where(np.abs(x) > p[0], 1.0, 0.0),
+    lambda x, p: f"np.sign({x}) * np.maximum(np.abs({x}) - {p[0]}, 0.0)",
+    lambda x, p: f"np.where(np.abs({x}) > {p[0]}, 1.0, 0.0)",
+    lambda x, p: f"beyond({x}, {p[0]})",
+    lambda x, p: rf"\operatorname{{sign}}({x})\max(|{x}| - {p[0]}, 0)",
+    lambda p: 1.0,
+    (0,),
+)  # fmt: skip
 LOG = Shape(
     "log", 1,
     lambda x, p: np.log10(1.0 + np.maximum(x, 0.0)),

@@ -63,7 +63,7 @@ def _all(s: Situation) -> list[Variable]:
         *_angles(n),
         *_wrenches(n),
         *_loads(),
-        *_attitude(),
+        *_attitude(n),
         *_temperatures(s, n),
         *_times(s),
         *_sides(s, n),
@@ -140,20 +140,23 @@ def _loads() -> list[Variable]:
     return out
 
 
-def _attitude() -> list[Variable]:
-    """Direction of gravity in flange axes."""
+def _attitude(n: int) -> list[Variable]:
+    """Direction of gravity along the axes of the joints, and across the flange."""
 
-    def read(s: Situation, c: int) -> Floats:
+    def read(s: Situation, slot: int, c: int) -> Floats:
         down = s.cell.gravity / np.linalg.norm(s.cell.gravity)
-        return np.asarray(s.chain.rotation[-1][:, :, c] @ down)
+        return np.asarray(s.chain.rotation[slot][:, :, c] @ down)
 
+    places = [(k, 2, f"axis of joint {k + 1} to gravity", f"g{k + 1}") for k in range(n)]
+    places += [(n, c, "flange attitude", f"gF_{_AXES[c]}") for c in (0, 1)]
     return [
         Variable(
-            "gravity", ("flange attitude",), f"g_{axis}", f"g_{axis}", "1",
-            f"s.chain.rotation[-1][:, :, {c}] @ (s.cell.gravity / np.linalg.norm(s.cell.gravity))",
-            lambda s, c=c: read(s, c),  # type: ignore[misc]
+            "gravity", (name,), symbol, symbol.replace("g", "g_", 1).replace("_F_", "_"), "1",
+            f"(s.chain.rotation[{k}][:, :, {c}]"
+            " @ (s.cell.gravity / np.linalg.norm(s.cell.gravity)))",
+            lambda s, k=k, c=c: read(s, k, c), joint=k if k < n else -1,  # type: ignore[misc]
         )
-        for c, axis in enumerate(_AXES)
+        for k, c, name, symbol in places
     ]  # fmt: skip
 
 

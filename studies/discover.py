@@ -1,0 +1,181 @@
+"""One case of the study of `discover`: a campaign, the search, and the error at fresh poses."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from zlib import crc32
+
+import numpy as np
+
+from drivers.simulated.injected_effects import hide, nothing_hidden
+from drivers.simulated.rehearsal import measurement_noise, simulate
+from drivers.simulated.world import World
+from hilcal.cell import cell_from_config
+from hilcal.config import CellConfig
+from hilcal.data.readings import Readings, States
+from hilcal.data.whitening import Mode, whitening
+from hilcal.discover.discovery import discover
+from hilcal.discover.law import Law
+from hilcal.errors import InputError
+from hilcal.identify.baseline import baseline
+from hilcal.identify.fit import Fit, fit
+from hilcal.identify.linearisation import linearise
+from hilcal.identify.residual import residual
+from hilcal.types import Floats, Ints
+from studies.foreign_laws import KINDS, Foreign, scene
+from studies.random_campaigns import rehearsal_states
+from studies.study_cases import with_study_loads
+
+POSES = 30
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What is hidden: a law of `KINDS`, an effect of the catalogue, or nothing."""
+
+    robot: str
+    mode: Mode
+    law: str = ""
+    effect: str = ""
+    seed: int = 0
+    strength: float = 3.0
+    stated: float = 1.0
+    poses: int = POSES
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What came of it.
+
+    Attributes:
+        asked: the question.
+        reason: of the search.
+        formula: of the first law; empty for none.
+        truth: the law that was hidden.
+        site: whether the site is right.
+        variables: whether the variables are exactly those.
+        correlation: of what the law explains with what was hidden, the model projected out.
+        before: error at fresh poses over the noise there, of the model alone.
+        after: the same with the first law.
+        p_value: of the first law.
+        impossible: why there is no such campaign.
+    """
+
+    asked: Asked
+    reason: str = ""
+    formula: str = ""
+    truth: str = ""
+    site: bool = False
+    variables: bool = False
+    correlation: float = 0.0
+    before: float = 0.0
+    after: float = 0.0
+    p_value: float = 1.0
+    impossible: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Campaign:
+    """Readings with the law in them, what the law did, and what the noise did, (N, 3)."""
+
+    readings: Readings
+    moved: Floats
+    noise: Floats
+
+
+def run_case(config: CellConfig, asked: Asked) -> Outcome:
+    """Simulate, search, and measure the error at fresh poses."""
+    rng = np.random.default_rng(
+        [
+            asked.seed,
+            *(crc32(w.encode()) for w in (asked.robot, asked.mode, asked.law, asked.effect)),
+        ]
+    )
+    own, loads = with_study_loads(config, asked.robot)
+    cell = cell_from_config(own)
+    world = nothing_hidden(
+        cell, rng, noise=measurement_noise(own), joint_std=own.repeatability.per_joint(cell.arm.n)
+    )
+    law = KINDS[asked.law][1](rng) if asked.law else None
+    made = rehearsal_states(cell, asked.poses, loads, rng)
+    if asked.effect:
+        states, pose, _, cycle = made
+        try:
+            world = hide(
+                asked.effect, cell, states, asked.strength, asked.mode, rng,
+                world=world, pose=pose, cycle=cycle,
+            )  # fmt: skip
+        except InputError as error:
+            return Outcome(asked, impossible=str(error))
+    names = ("none", *(name for name, _ in loads))
+    first = _measured(world, made, names, rng, law, asked.stated)
+    size = 1.0
+    if law is not None:
+        w = whitening(first.readings, asked.mode)
+        white = w.whiten(w.raw(first.moved))
+        size = asked.strength / max(float(np.sqrt(np.mean(white**2))), 1e-12)
+        first = _scaled(first, size)
+    readings = first.readings
+    before = fit(baseline(cell, readings, asked.mode), readings, asked.mode)
+    d = discover(before)
+    out = Outcome(asked, d.reason, truth=asked.effect if law is None else law.words)
+    if law is None or not d.laws or d.after is None:
+        formula = d.laws[0].formula if d.laws else ""
+        return replace(out, formula=formula, p_value=d.laws[0].p_value if d.laws else 1.0)
+    again = rehearsal_states(cell, asked.poses, loads, rng)
+    fresh = _scaled(_measured(world, again, names, rng, law), size)
+    return replace(
+        out,
+        formula=d.laws[0].formula,
+        site=_right_site(law, d.laws[0]),
+        variables=frozenset(d.laws[0].variables) == law.variables,
+        correlation=_correlation(before, d.after, first.moved),
+        before=_error(before, fresh),
+        after=_error(d.after, fresh),
+        p_value=d.laws[0].p_value,
+    )
+
+
+def _measured(
+    world: World,
+    made: tuple[States, Ints, Ints, Ints],
+    names: Sequence[str],
+    rng: np.random.Generator,
+    law: Foreign | None,
+    stated: float = 1.0,
+) -> _Campaign:
+    states, pose, load, cycle = made
+    readings = simulate(world, states, pose, load, cycle, names, rng)
+    s = scene(world, states)
+    moved = np.zeros_like(s.seen) if law is None else law.displaced(s)
+    noise = readings.value - s.seen
+    return _Campaign(replace(readings, covariance=stated**2 * readings.covariance), moved, noise)
+
+
+def _scaled(c: _Campaign, size: float) -> _Campaign:
+    moved = size * c.moved
+    return _Campaign(replace(c.readings, value=c.readings.value + moved), moved, c.noise)
+
+
+def _right_site(law: Foreign, found: Law) -> bool:
+    """Whether all that a law moves is what was hidden, or the same by geometry."""
+    return all(any(words.startswith(site) for site in law.sites) for words in found.acts_on)
+
+
+def _correlation(before: Fit, after: Fit, moved: Floats) -> float:
+    """Correlation of what was hidden with what the law adds, the model projected out."""
+    linear, w = linearise(before), before.whitening
+    truth = linear.project_out(w.whiten(w.raw(moved[~before.outlier])).reshape(-1))
+    effect, theta = after.model.effects[-1], after.theta[after.model.slices()[-1]]
+    jacobian = before.model.jacobian_of((effect,), before.solution.prediction, before.theta, w.m)
+    told = linear.project_out(w.whiten(w.raw(jacobian @ theta)).reshape(-1))
+    size = float(np.linalg.norm(truth) * np.linalg.norm(told))
+    return float(truth @ told) / max(size, 1e-300)
+
+
+def _error(of: Fit, fresh: _Campaign) -> float:
+    """Rms error at fresh readings over that of their noise."""
+    w = whitening(fresh.readings, of.mode)
+    prediction = of.model.predict(fresh.readings.states, of.theta)
+    off = residual(fresh.readings, prediction, w)[:, :3]
+    noise = w.raw(fresh.noise)[:, :3]
+    return float(np.sqrt(np.sum(off**2) / np.sum(noise**2)))

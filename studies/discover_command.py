@@ -1,0 +1,142 @@
+"""`python -m studies discover`: whether a hidden law is found, and none where none is hidden."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict
+from typing import Annotated
+
+import typer
+
+from hilcal.cli.demo import CELL
+from hilcal.cli.terminal import Json, terminal
+from hilcal.config import load_config
+from hilcal.data.whitening import MODES, Mode
+from hilcal.report import text
+from hilcal.report.progress import counting
+from hilcal.robot.catalogue import configs_dir
+from studies.discover import Asked, Outcome, run_case
+from studies.foreign_laws import KINDS
+from studies.records import Figure, Keep, keep
+from studies.study_cases import effects_shown
+
+ROBOTS = ("ur3e", "ur5e", "ur10e")
+FLOOR, SAME = 1.15, 0.98
+"""Error over the noise floor, and correlation of formulas, that the claims ask for."""
+
+
+def discover(
+    law: Annotated[
+        list[str] | None, typer.Option("--law", help="Law to hide; repeatable, all by default.")
+    ] = None,
+    seeds: Annotated[int, typer.Option("--seeds", help="Per law; arms take turns.")] = 3,
+    catalogue: Annotated[
+        int, typer.Option("--catalogue", help="Per effect of the catalogue and kind of readings.")
+    ] = 1,
+    nothing: Annotated[int, typer.Option("--nothing", help="Campaigns that hide nothing.")] = 12,
+    noise: Annotated[
+        int, typer.Option("--noise", help="Of noise stated half, and twice, as large, each.")
+    ] = 6,
+    strength: Annotated[float, typer.Option("--strength", help="Of what is hidden, σ.")] = 3.0,
+    poses: Annotated[int, typer.Option("--poses", help="Each under six loads.")] = 30,
+    first_seed: Annotated[int, typer.Option("--first-seed", help="Seeds count from here.")] = 0,
+    keep_file: Keep = None,
+    as_json: Json = False,
+) -> None:
+    """Hide laws that the catalogue lacks, effects that it has, or nothing, and search a law."""
+    t = terminal(as_json)
+    config = load_config(configs_dir() / "cells" / CELL)
+    asked = [
+        *_laws(law or list(KINDS), seeds, first_seed, strength, poses),
+        *_effects(catalogue, first_seed, strength, poses),
+        *_nothing(nothing, noise, first_seed, poses),
+    ]
+    done: list[Outcome] = []
+    with counting(t.progress, "campaigns", len(asked)) as advance:
+        for a in asked:
+            done.append(run_case(config, a))
+            advance(1)
+    outcomes = [o for o in done if not o.impossible]
+    table = text.table(
+        "hidden", "arm", "site", "variables", "correlation", "fresh error", "law found", left=(0, 6)
+    )
+    for o in outcomes:
+        if o.asked.law or o.formula:
+            right = [("no", "yes")[x] for x in (o.site, o.variables)]
+            error = f"{o.before:.2f} → {o.after:.2f}"
+            found = o.formula or f"({o.reason})"
+            table.add_row(
+                o.truth or "nothing", o.asked.robot, *right, f"{o.correlation:.3f}", error, found
+            )
+    t.show(table)
+    figures = list(claims(outcomes))
+    for f in figures:
+        t.show(f"{f.what}: {f.measured}; required {f.required}")
+    keep(keep_file, "Laws discovered, and none where none is hidden", figures)
+    t.document({"cases": [asdict(o) for o in outcomes], "figures": [asdict(f) for f in figures]})
+
+
+def _laws(
+    names: Sequence[str], seeds: int, first: int, strength: float, poses: int
+) -> Iterator[Asked]:
+    for seed in range(first, first + seeds):
+        for k, name in enumerate(names):
+            robot = ROBOTS[(seed + k) % len(ROBOTS)]
+            mode = _mode(KINDS[name][0])
+            yield Asked(robot, mode, name, seed=seed, strength=strength, poses=poses)
+
+
+def _effects(count: int, first: int, strength: float, poses: int) -> Iterator[Asked]:
+    for seed in range(first, first + count):
+        for mode in MODES:
+            for k, effect in enumerate(e for e in effects_shown(mode) if e != "base_frame"):
+                robot = ROBOTS[(seed + k) % len(ROBOTS)]
+                yield Asked(robot, mode, effect=effect, seed=seed, strength=strength, poses=poses)
+
+
+def _nothing(count: int, noise: int, first: int, poses: int) -> Iterator[Asked]:
+    for stated, several in ((1.0, count), (0.5, noise), (2.0, noise)):
+        for seed in range(first, first + several):
+            robot, mode = ROBOTS[seed % len(ROBOTS)], MODES[seed % len(MODES)]
+            yield Asked(robot, mode, seed=seed, stated=stated, poses=poses)
+
+
+def _mode(name: str) -> Mode:
+    return next(m for m in MODES if m == name)
+
+
+def claims(outcomes: Sequence[Outcome]) -> Iterator[Figure]:
+    """Yield what is claimed of a search, with the counts."""
+    laws = [o for o in outcomes if o.asked.law]
+    of_law: tuple[tuple[str, float, Callable[[Outcome], bool]], ...] = (
+        ("error at fresh poses at most 1.15 times the noise", 0.75, lambda o: 0 < o.after <= FLOOR),
+        ("excess of the error at fresh poses halved", 0.90, _halved),
+        ("site right", 0.90, lambda o: o.site),
+        ("variables right", 0.85, lambda o: o.variables),
+        ("formula equivalent (correlation 0.98)", 0.70, lambda o: o.correlation >= SAME),
+    )
+    for what, least, holds in of_law:
+        yield _figure(what, [holds(o) for o in laws], least)
+    silent = (
+        ("no law where an effect of the catalogue is hidden", lambda o: bool(o.asked.effect)),
+        ("no law where nothing is hidden", lambda o: _bare(o) and o.asked.stated == 1.0),
+        (
+            "no law where the noise is misjudged by two",
+            lambda o: _bare(o) and o.asked.stated != 1.0,
+        ),
+    )
+    for words, mine in silent:
+        least = 1.0 if "misjudged" in words else 0.99
+        yield _figure(words, [not o.formula for o in outcomes if mine(o)], least)
+
+
+def _bare(o: Outcome) -> bool:
+    return not o.asked.law and not o.asked.effect
+
+
+def _halved(o: Outcome) -> bool:
+    return o.after > 0 and o.after - 1.0 <= 0.5 * max(o.before - 1.0, 0.0)
+
+
+def _figure(what: str, held: Sequence[bool], least: float) -> Figure:
+    share = sum(held) / max(len(held), 1)
+    measured = f"{100 * share:.0f} % ({sum(held)} of {len(held)})"
+    return Figure(what, measured, f"{100 * least:g} %", share >= least if held else None)

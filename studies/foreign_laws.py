@@ -1,0 +1,283 @@
+"""Laws of other mechanics for the study of `discover`, drawn at random; the catalogue has none.
+
+Each is a cause with its own few lines of mechanics, computed from where the simulated arm comes to
+rest (Pinocchio): which joint, which side, which level is drawn. It displaces the target; the study
+scales that to so many σ. Several have no exact counterpart among the functions that are searched.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivers.simulated.mechanics import Equilibrium
+from drivers.simulated.world import World
+from hilcal.data.readings import States
+from hilcal.types import Floats
+
+ABSOLUTE, DEFLECTION = "absolute", "deflection"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """Where the arm rests in N states, for a law to look at.
+
+    Attributes:
+        states: the states.
+        rest: equilibrium of the simulated arm.
+        torque: (N, n) at the drives, N·m.
+        place: (N, 3) of the target, base axes, m.
+        seen: (N, 3) of the target, sensor axes, m.
+        by_joint: (N, 3, n) motion of the target by each drive, sensor axes.
+        view: (3, 3) base axes in sensor axes.
+    """
+
+    states: States
+    rest: Equilibrium
+    torque: Floats
+    place: Floats
+    seen: Floats
+    by_joint: Floats
+    view: Floats
+
+    def of_joint(self, j: int, angle: Floats) -> Floats:
+        """(N, 3) displacement by an error (N,) of joint j (from 1), rad."""
+        return np.asarray(self.by_joint[:, :, j - 1] * angle[:, None])
+
+    def in_base(self, shift: Floats) -> Floats:
+        """(N, 3) displacement in sensor axes of one in base axes."""
+        return np.asarray(shift @ self.view.T)
+
+
+def scene(world: World, states: States) -> Scene:
+    """Return where the arm rests."""
+    rest, sight = world.rest(states), world.sight(states)
+    flange = rest.flange
+    place = flange[:, :3, 3] + flange[:, :3, :3] @ world.cell.target[:3, 3]
+    return Scene(
+        states, rest, world.drive_torque(states), place, sight.position, sight.jacobian[:, :3],
+        world.registration[:3, :3],
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Foreign:
+    """A law as it was drawn.
+
+    Attributes:
+        words: the law in one line.
+        displaced: (N, 3) of the target, sensor axes, at any size.
+        sites: words with which a right answer's site begins; several where they are the same.
+        variables: what it depends on.
+    """
+
+    words: str
+    displaced: Callable[[Scene], Floats]
+    sites: tuple[str, ...]
+    variables: frozenset[str]
+
+
+Draw = Callable[[np.random.Generator], Foreign]
+
+
+def _given(values: Floats | None) -> Floats:
+    if values is None:
+        raise ValueError("the study's states record everything")
+    return values
+
+
+def _torque(j: int) -> str:
+    return f"joint {j} torque"
+
+
+def _angle(j: int) -> str:
+    return f"joint {j} angle"
+
+
+def _one_sided(rng: np.random.Generator) -> Foreign:
+    """A bearing that gives way to one side only."""
+    j, side = int(rng.integers(2, 5)), float(rng.choice([-1.0, 1.0]))
+    return Foreign(
+        f"dq_{j} = c max({side:+.0f} tau_{j}, 0)",
+        lambda s: s.of_joint(j, np.maximum(side * s.torque[:, j - 1], 0.0)),
+        (f"joint {j}",), frozenset({_torque(j)}),
+    )  # fmt: skip
+
+
+def _dead_zone(rng: np.random.Generator) -> Foreign:
+    """A joint that gives way where the torque exceeds a preload."""
+    j = int(rng.integers(2, 4))
+
+    def displaced(s: Scene) -> Floats:
+        torque = s.torque[:, j - 1]
+        preload = 0.5 * float(np.median(np.abs(torque)))
+        return s.of_joint(j, np.sign(torque) * np.maximum(np.abs(torque) - preload, 0.0))
+
+    words = f"dq_{j} = c (tau_{j} beyond a preload)"
+    return Foreign(words, displaced, (f"joint {j}",), frozenset({_torque(j)}))
+
+
+def _by_another(rng: np.random.Generator) -> Foreign:
+    """Compliance of a joint that depends on the angle of another."""
+    j = int(rng.integers(2, 4))
+    k = int(rng.choice([4, 5, 6]))
+    turn = float(rng.uniform(0, np.pi))
+
+    def displaced(s: Scene) -> Floats:
+        soft = np.cos((s.states.q[:, k - 1] - turn) / 2) ** 2
+        return s.of_joint(j, s.torque[:, j - 1] * soft)
+
+    words = f"dq_{j} = c tau_{j} cos²((q_{k} - {turn:.1f})/2)"
+    return Foreign(words, displaced, (f"joint {j}",), frozenset({_torque(j), _angle(k)}))
+
+
+def _hose(rng: np.random.Generator) -> Foreign:
+    """A hose along the wrist that pulls joint 5 once joint 6 has taken up its slack."""
+    slack = float(rng.uniform(0.2, 0.8))
+
+    def displaced(s: Scene) -> Floats:
+        turn = s.states.q[:, 5]
+        return s.of_joint(5, np.sign(turn) * np.maximum(np.abs(turn) - slack, 0.0))
+
+    words = f"dq_5 = c (q_6 beyond a slack of {slack:.1f})"
+    return Foreign(words, displaced, ("joint 5",), frozenset({_angle(6)}))
+
+
+def _cable(rng: np.random.Generator) -> Foreign:
+    """A cable that drags to the side a joint came from, with the lever of another."""
+    j, k = int(rng.choice([2, 3])), int(rng.choice([4, 5]))
+
+    def displaced(s: Scene) -> Floats:
+        return s.of_joint(j, _given(s.states.approach)[:, k - 1] * np.cos(s.states.q[:, k - 1]))
+
+    names = frozenset({f"joint {k} approach", _angle(k)})
+    return Foreign(f"dq_{j} = a s_{k} cos q_{k}", displaced, (f"joint {j}",), names)
+
+
+def _warm_base(rng: np.random.Generator) -> Foreign:
+    """A pedestal that tilts with the temperature of the air."""
+    turn = float(rng.uniform(0, 2 * np.pi))
+    axis = np.array([np.cos(turn), np.sin(turn), 0.0])
+
+    def displaced(s: Scene) -> Floats:
+        warm = _given(s.states.air_temperature) - 22.0
+        return s.in_base(warm[:, None] * np.cross(axis, s.place))
+
+    words = f"the base tilts with the air about {turn:.1f} rad"
+    return Foreign(words, displaced, ("base, tilt",), frozenset({"air temperature"}))
+
+
+def _sinking(rng: np.random.Generator) -> Foreign:
+    """A bench that sinks as the arm reaches out."""
+    power = float(rng.choice([2.0, 3.0]))
+
+    def displaced(s: Scene) -> Floats:
+        reach = np.hypot(s.place[:, 0], s.place[:, 1])
+        return s.in_base(reach[:, None] ** power * np.array([0.0, 0.0, -1.0]))
+
+    words = f"the bench sinks with the reach to the power {power:.0f}"
+    return Foreign(words, displaced, ("base", "tracker"), frozenset({"reach"}))
+
+
+def _wear(rng: np.random.Generator) -> Foreign:
+    """A gear that softens in the course of the campaign."""
+    j = int(rng.integers(2, 4))
+
+    def displaced(s: Scene) -> Floats:
+        return s.of_joint(j, s.torque[:, j - 1] * _given(s.states.time) / 3600.0)
+
+    return Foreign(
+        f"dq_{j} = c t tau_{j}", displaced, (f"joint {j}",), frozenset({_torque(j), "time"})
+    )
+
+
+def _stick_slip(rng: np.random.Generator) -> Foreign:
+    """Friction that holds a joint on the side of its last motion, the more the more it carries."""
+    j = int(rng.integers(2, 4))
+
+    def displaced(s: Scene) -> Floats:
+        torque = np.abs(s.torque[:, j - 1])
+        grip = 1.0 - np.exp(-torque / np.median(torque))
+        return s.of_joint(j, _given(s.states.approach)[:, j - 1] * grip)
+
+    names = frozenset({_torque(j), f"joint {j} approach"})
+    return Foreign(
+        f"dq_{j} = a s_{j} (1 - exp(-|tau_{j}|/tau0))", displaced, (f"joint {j}",), names
+    )
+
+
+def _play(rng: np.random.Generator) -> Foreign:
+    """A wrist axis that slides to gravity's side of its play."""
+    j = int(rng.choice([4, 5]))
+
+    def displaced(s: Scene) -> Floats:
+        axis = s.rest.flange[:, :3, :3]
+        # Joint 6 turns about z of the flange; joint 5 lies across it, turned back by q_6.
+        turn = s.states.q[:, 5]  # no more than the frame of joint 6 turns against the flange
+        along = {
+            4: axis[:, :, 2],
+            5: np.sin(turn)[:, None] * axis[:, :, 0] + np.cos(turn)[:, None] * axis[:, :, 1],
+        }[j]
+        side = np.tanh(-along[:, 2] / 0.05)
+        return s.in_base(side[:, None] * along)
+
+    k = {4: 6, 5: 5}[j]
+    return Foreign(
+        f"joint {k} slides along its axis to gravity's side", displaced,
+        (f"joint {k}, play along its axis",) + (("target along z",) if k == 6 else ()),
+        frozenset({f"axis of joint {k} to gravity"}),
+    )  # fmt: skip
+
+
+def _mount(rng: np.random.Generator) -> Foreign:
+    """A target on a mount that bends along one direction of the flange."""
+    c = int(rng.integers(3))
+
+    def displaced(s: Scene) -> Floats:
+        axis = s.rest.flange[:, :3, c]
+        return s.in_base(-axis[:, 2:3] * axis)
+
+    words = f"the target bends along {'xyz'[c]} of the flange with gravity"
+    return Foreign(words, displaced, ("target",), frozenset({"flange attitude"}))
+
+
+def _refraction(rng: np.random.Generator) -> Foreign:
+    """Air of another temperature bends the sight downwards with the square of the distance."""
+
+    def displaced(s: Scene) -> Floats:
+        warm = _given(s.states.air_temperature) - 22.0
+        far = np.sum(s.seen**2, axis=1)
+        return np.outer(warm * far, [0.0, 0.0, 1.0])
+
+    names = frozenset({"air temperature", "distance"})
+    return Foreign("the sight bends by c d² (T - 22)", displaced, ("tracker", "base"), names)
+
+
+def _power(rng: np.random.Generator) -> Foreign:
+    """A gear whose contact gives way with a fractional power of the torque."""
+    j, power = int(rng.integers(2, 4)), float(rng.uniform(1.6, 2.4))
+
+    def displaced(s: Scene) -> Floats:
+        torque = s.torque[:, j - 1]
+        return s.of_joint(j, np.sign(torque) * np.abs(torque) ** power)
+
+    words = f"dq_{j} = c |tau_{j}|^{power:.2f}"
+    return Foreign(words, displaced, (f"joint {j}",), frozenset({_torque(j)}))
+
+
+KINDS: dict[str, tuple[str, Draw]] = {
+    "one-sided compliance": (DEFLECTION, _one_sided),
+    "preload": (DEFLECTION, _dead_zone),
+    "compliance by another joint": (DEFLECTION, _by_another),
+    "hose with slack": (ABSOLUTE, _hose),
+    "cable drag": (ABSOLUTE, _cable),
+    "warm pedestal": (ABSOLUTE, _warm_base),
+    "sinking bench": (ABSOLUTE, _sinking),
+    "wear": (DEFLECTION, _wear),
+    "stick-slip": (DEFLECTION, _stick_slip),
+    "play on gravity's side": (ABSOLUTE, _play),
+    "soft mount": (ABSOLUTE, _mount),
+    "refraction": (ABSOLUTE, _refraction),
+    "fractional power": (DEFLECTION, _power),
+}
+"""Laws by name: the readings that show them, and how one is drawn."""
