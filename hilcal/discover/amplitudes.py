@@ -236,24 +236,25 @@ def _factors(v: Variable, x: Floats) -> list[Factor]:
         return [linear, *waves] if v.kind == "angle" else waves
     if v.kind == "side":
         return [linear]
-    whole = Factor(v, shapes.EVEN, (2.0, 0.0))
+    near = _round(0.01 * middle)
+    whole = Factor(v, shapes.EVEN, (2.0, near))
     if v.kind in ("torque", "force", "load") and x.min() < 0 < x.max():
         out = [linear, Factor(v, shapes.PLUS), Factor(v, shapes.MINUS)]
         out.append(Factor(v, shapes.SATURATION, (_round(0.05 * middle),)))
         if v.kind == "torque":
             out.append(Factor(v, shapes.SATURATION, (_round(middle),)))
             out.append(Factor(v, shapes.THRESHOLD, (_round(0.5 * middle),)))
-            out += [Factor(v, shapes.EVEN, (1.0, 0.0)), whole]
-            out += [Factor(v, shapes.ODD, (p, 0.0)) for p in (2.0, 3.0)]
-            out.append(Factor(v, shapes.ODD, (0.5, _round(0.01 * middle))))
+            out += [Factor(v, shapes.EVEN, (1.0, near)), whole]
+            out += [Factor(v, shapes.ODD, (p, near)) for p in (2.0, 3.0)]
+            out.append(Factor(v, shapes.ODD, (0.5, near)))
         return out
     if v.kind in ("torque", "force"):
-        return [linear, whole, Factor(v, shapes.ODD, (0.5, _round(0.01 * middle)))]
+        return [linear, whole, Factor(v, shapes.ODD, (0.5, near))]
     if v.kind == "gravity":
         side = Factor(v, shapes.SATURATION, (_round(0.05 * middle),))
-        return [linear, side, Factor(v, shapes.EVEN, (1.0, 0.0)), whole]
+        return [linear, side, Factor(v, shapes.EVEN, (1.0, near)), whole]
     if v.kind == "temperature":
-        return [linear, whole, Factor(v, shapes.EVEN, (1.0, 0.0)), Factor(v, shapes.PLUS)]
+        return [linear, whole, Factor(v, shapes.EVEN, (1.0, near)), Factor(v, shapes.PLUS)]
     if v.kind == "place" and x.min() < 0:
         return [linear, whole]
     out = [linear, *(Factor(v, shapes.POWER, (p,)) for p in (0.5, 2.0))]

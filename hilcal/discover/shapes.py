@@ -90,12 +90,50 @@ SIN = Shape(
     lambda x, p: f"sin({_times(p[0], x)})",
     lambda x, p: rf"\sin({_latex_times(p[0], x)})",
 )  # fmt: skip
+
+
+def _root(x: Floats, p: Numbers) -> Floats:
+    """Return |x|; rounded off at zero by p[1] where the exponent p[0] is below 1.
+
+    A slope without limit at zero would have no equilibrium.
+    """
+    return np.hypot(x, p[1]) if p[0] < 1 else np.abs(x)
+
+
+def _root_code(x: str, p: list[str]) -> str:
+    return f"np.hypot({x}, {p[1]})" if float(p[0]) < 1 else f"np.abs({x})"
+
+
+def _even_slope(x: Floats, p: Numbers) -> Floats:
+    root = _root(x, p)
+    return np.asarray(p[0] * x * np.where(root > 0, root, 1.0) ** (p[0] - 2))
+
+
+def _even_slope_code(x: str, p: list[str]) -> str:
+    root = _root_code(x, p)
+    return f"{p[0]} * {x} * np.maximum({root}, 1e-12) ** ({p[0]} - 2)"
+
+
+def _odd_slope(x: Floats, p: Numbers) -> Floats:
+    root = np.maximum(_root(x, p), 1e-12)
+    if p[0] >= 1:
+        return np.asarray(p[0] * root ** (p[0] - 1))
+    return np.asarray(root ** (p[0] - 3) * (p[0] * x**2 + p[1] ** 2))
+
+
+def _odd_slope_code(x: str, p: list[str]) -> str:
+    root = f"np.maximum({_root_code(x, p)}, 1e-12)"
+    if float(p[0]) >= 1:
+        return f"{p[0]} * {root} ** ({p[0]} - 1)"
+    return f"{root} ** ({p[0]} - 3) * ({p[0]} * {x}**2 + {p[1]}**2)"
+
+
 ODD = Shape(
     "odd", 2,
-    lambda x, p: x * (x**2 + p[1] ** 2) ** ((p[0] - 1) / 2),
-    lambda x, p: (x**2 + p[1] ** 2) ** ((p[0] - 3) / 2) * (p[0] * x**2 + p[1] ** 2),
-    lambda x, p: f"{x} * ({x}**2 + {p[1]}**2) ** (({p[0]} - 1) / 2)",
-    lambda x, p: f"({x}**2 + {p[1]}**2) ** (({p[0]} - 3) / 2) * ({p[0]} * {x}**2 + {p[1]}**2)",
+    lambda x, p: x * _root(x, p) ** (p[0] - 1),
+    _odd_slope,
+    lambda x, p: f"{x} * {_root_code(x, p)} ** ({p[0]} - 1)",
+    _odd_slope_code,
     lambda x, p: f"{x}^3" if p[0] == "3" else f"sign({x})·|{x}|^{p[0]}",
     lambda x, p: (
         f"{x}^3" if p[0] == "3" else rf"\operatorname{{sign}}({x})\,|{x}|^{{{p[0]}}}"
@@ -105,10 +143,10 @@ ODD = Shape(
 )  # fmt: skip
 EVEN = Shape(
     "even", 2,
-    lambda x, p: (x**2 + p[1] ** 2) ** (p[0] / 2),
-    lambda x, p: p[0] * x * (x**2 + p[1] ** 2) ** (p[0] / 2 - 1),
-    lambda x, p: f"({x}**2 + {p[1]}**2) ** ({p[0]} / 2)",
-    lambda x, p: f"{p[0]} * {x} * ({x}**2 + {p[1]}**2) ** ({p[0]} / 2 - 1)",
+    lambda x, p: _root(x, p) ** p[0],
+    _even_slope,
+    lambda x, p: f"{_root_code(x, p)} ** {p[0]}",
+    _even_slope_code,
     lambda x, p: {"1": f"|{x}|", "2": f"{x}^2"}.get(p[0], f"|{x}|^{p[0]}"),
     lambda x, p: {"1": f"|{x}|", "2": f"{x}^2"}.get(p[0], f"|{x}|^{{{p[0]}}}"),
     lambda p: p[0],
