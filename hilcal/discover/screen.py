@@ -10,6 +10,7 @@ for this; what is short-listed is scored on all of them.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -59,10 +60,15 @@ class Screen:
     across: Floats
     pose: Ints
 
-    @property
+    @cached_property
     def price(self) -> Floats:
         """(F,) what the search costs a candidate, see `amplitudes`."""
         return self.grammar.price(len(self.sites))
+
+    @cached_property
+    def values(self) -> Floats:
+        """(K, F) amplitudes at the readings of the screening."""
+        return np.ascontiguousarray(self.grammar.values[:, self.readings].T)
 
     @property
     def candidates(self) -> int:
@@ -70,9 +76,9 @@ class Screen:
         return int(np.count_nonzero(self.square))
 
     def inner(self, v: Floats) -> Floats:
-        """(S, F) xᵀ v of all candidates, v (R,)."""
+        """(S, F) xᵀ v of all candidates, v (R,), in single precision."""
         by_reading = np.einsum("srn,r->sn", self.form, v[self.rows].astype(np.float32))
-        return np.asarray(by_reading @ self.grammar.values[:, self.readings].T, dtype=float)
+        return np.asarray(by_reading @ self.values)
 
     def column(self, site: int, amplitude: int) -> Floats:
         """(R,) whitened column of one candidate."""
@@ -98,8 +104,8 @@ def screen(linear: Linearisation) -> Screen:
     rows, readings = _thinned(fit)
     own = projection(linear.rows[rows], linear.projection.ridge)
     form: Floats = np.empty((len(places), int(rows.sum()), len(readings)), dtype=np.float32)
-    square = np.empty((len(places), len(words.size)))
-    across = np.zeros_like(square)
+    square: Floats = np.empty((len(places), len(words.size)), dtype=np.float32)
+    across: Floats = np.zeros_like(square)
     a = words.values[:, readings]
     squares = a**2
     has = np.flatnonzero(words.partner >= 0)

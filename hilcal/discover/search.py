@@ -167,7 +167,7 @@ class Beside:
         self.rss = max(p.rss - float(along @ along), 1e-12 * p.rss)
         self.dof = max(p.dof - int(kept.sum()), 1.0)
         shadows = [p.screen.inner(p.full(u)) for u in self.unit.T]
-        self.slope = p.slope - sum(a * s for a, s in zip(along, shadows, strict=True))
+        self.slope = p.slope - sum(float(a) * s for a, s in zip(along, shadows, strict=True))
         self._square = p._square - sum(s**2 for s in shadows)
         partner = p.screen.grammar.partner
         self._across = p._across - sum(s * s[:, partner] for s in shadows)
