@@ -18,6 +18,7 @@ from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.living_cell import LivingCell
 from hilcal.cli.plan_output import POSES
 from hilcal.cli.planning import CellFile, read_cell, refuse_unready
+from hilcal.cli.prior import Prior, PriorOptions
 from hilcal.cli.refining import Row
 from hilcal.cli.rehearsing import to_the_end
 from hilcal.cli.running import measure
@@ -39,9 +40,12 @@ from hilcal.refine import Refinement
 from hilcal.report import text_calibrate, text_refine
 from hilcal.report.progress import working
 from hilcal.report.text_plan import plan_facts
+from hilcal.report.text_prior import prior_lines
 
 VALIDATION = 20
 """Poses of a validation campaign; a choice: their mean error is known to a tenth of itself."""
+FITTED_LATER = ("plan", "measure", "refine", "decide")
+"""Steps that a fit may follow."""
 LONGEST = "2 h"
 """How long measuring may last; a choice."""
 
@@ -95,6 +99,7 @@ def calibrate(
             "--validation", help=f"Poses of the validation campaign, {VALIDATION} unless given."
         ),
     ] = None,
+    prior: Prior = None,
     rehearse: Annotated[
         bool, typer.Option("--rehearse", help="In one simulated cell, from the first to the last.")
     ] = False,
@@ -108,12 +113,17 @@ def calibrate(
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     config, numbers = read_cell(cell)
     asked = _asked(goal, limit, max_time, poses, validation)
+    if prior is not None:
+        asked["prior"] = str(prior.absolute())
     on = ["hilcal", "calibrate", str(cell), "-o", str(output)]
     more = ["--rehearse"] * rehearse + ["--yes"] * yes
     for path in effects_from or ():
         more += ["--effects-from", str(path)]
     told = _Told(t, shlex.join([*on, "--resume", *more]), shlex.join([*on, *more]))
     p = _procedure(cell, output, resume, rehearse, config, numbers, catalogue, asked, told)
+    if p.settings.prior is not None and p.next().kind in FITTED_LATER:
+        known = PriorOptions(Path(p.settings.prior), "arm", None).load(catalogue)
+        p = replace(p, known=known)
     if not (yes or rehearse or somebody_there(t)) and p.next().kind != "done":
         raise InputError(
             "nobody can be asked before the arm moves; give --yes, or run it at a terminal"
@@ -353,6 +363,7 @@ def _say_refined(t: Terminal, p: Procedure, found: Refinement) -> None:
     ]
     t.show(text_refine.revisions_table([r.shown for r in rows]))
     t.show([text_refine.key(), text_refine.verdict_line(found.diagnosis), ""])
+    t.show(prior_lines(found.fit))
 
 
 def _count(path: Path) -> int:

@@ -42,6 +42,7 @@ from hilcal.identify import validation
 from hilcal.identify.acceptance import Acceptance, acceptance
 from hilcal.identify.arm_scatter import with_arm_scatter
 from hilcal.identify.baseline import baseline
+from hilcal.identify.carried import CarriedPrior
 from hilcal.identify.extrapolation import extrapolation
 from hilcal.identify.full_covariance import full_readings
 from hilcal.plan.checked_plan import CheckedPlan, checked
@@ -94,6 +95,7 @@ class Procedure:
         base_dir: directory that paths in the configuration are relative to.
         catalogue: the effects that a model can have.
         settings: what is asked for.
+        known: the prior of every fit, of `settings.prior`; None without one.
     """
 
     run: Path
@@ -102,6 +104,7 @@ class Procedure:
     base_dir: Path
     catalogue: Catalogue
     settings: Settings
+    known: CarriedPrior | None = None
     _found: list[Refinement] = field(default_factory=list, repr=False)
 
     @classmethod
@@ -228,7 +231,7 @@ class Procedure:
         with Campaign.open(self.run, self.catalogue) as o:
             mode = self._mode(o.readings)
             say("registering")
-            model = baseline(o.cell, o.readings, mode, o.catalogue)
+            model = baseline(o.cell, o.readings, mode, o.catalogue, self.known)
             found = refine(model, o.readings, mode, say)
             say("computing standard uncertainties")
             self.keep(o, found)

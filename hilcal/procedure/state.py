@@ -56,6 +56,7 @@ class Settings:
         seed: of everything random.
         readings: kind of readings that is fitted.
         hide: what a rehearsal hides in its simulated cell; None on real devices.
+        prior: file of the campaign or the posterior that is the prior of every fit; None without.
         under_load: whether the model is tested under loads alone, where there are any.
     """
 
@@ -68,6 +69,7 @@ class Settings:
     readings: Mode = "deflection"
     hide: str | None = None
     under_load: bool = False
+    prior: str | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return it as JSON."""

@@ -15,6 +15,8 @@ from hilcal.data.purpose import purpose_of, release
 from hilcal.data.run_log import RunLog
 from hilcal.data.same_readings import already
 from hilcal.errors import InputError
+from hilcal.identify.carried import carried_prior
+from hilcal.library import load_posterior
 from hilcal.procedure.state import FROZEN
 from tests.support.paths import ROOT
 from tests.support.procedure_cases import Drawn, KilledError, again, drawn, small
@@ -198,3 +200,18 @@ def test_the_python_of_the_guide_runs_as_it_stands(tmp_path, monkeypatch) -> Non
     every = known["p"].compare().everything
     assert every.count == 4
     assert every.before.rms_m > 5 * every.after.rms_m
+
+
+def test_what_an_earlier_calibration_taught_is_the_prior(done, tmp_path) -> None:
+    first = done[0].procedure
+    known = carried_prior(load_posterior(first.run), "arm", {}, first.catalogue)
+    errors = []
+    for name, prior in (("alone", None), ("carried", known)):
+        d = drawn(tmp_path / f"{name}.hilcal", config=small(1), poses=4)
+        d = replace(d, procedure=replace(d.procedure, known=prior))
+        for _ in range(3):
+            d.do(d.procedure.next())
+        errors.append(d.procedure.predicted().now_m)
+        with hc.Campaign.open(d.procedure.run) as o:
+            assert (o.fit().model.prior is None) == (prior is None)
+    assert errors[1] < errors[0]
