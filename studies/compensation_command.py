@@ -36,6 +36,7 @@ WANTED_M = 75e-6
 """Mean error that is to be left; the project's goal for this arm."""
 WANTED_BAND = (0.90, 0.97)
 """Share of poses within their 95 % band that counts as true; the project's goal."""
+FINAL, PLAIN = "as refine ends", "before the arm's scatter was estimated"
 ENVIRONMENT = ("time", "load_time", "air_temperature", "joint_temperature", "approach")
 
 
@@ -45,7 +46,8 @@ class Left:
 
     Attributes:
         split: how the series was split.
-        scatter: whether the arm's scatter was estimated.
+        model: whose calibration it is, `FINAL` or `PLAIN`.
+        scatter: whether it has the arm's scatter, estimated.
         poses: number of poses.
         before_m: mean error of the nominal arm, in the frames of a fit of frames alone.
         mean_m: mean error that is left.
@@ -60,6 +62,7 @@ class Left:
     """
 
     split: str
+    model: str
     scatter: bool
     poses: int
     before_m: float
@@ -100,8 +103,8 @@ def compensation(
                 calibrations = _calibrations(cell, readings[fitted], folder, stem)
                 before = _before(cell, readings[fitted], readings[~fitted])
             found += [
-                _left(name, scatter, c, readings[~fitted], before)
-                for scatter, c in calibrations.items()
+                _left(name, which, c, readings[~fitted], before)
+                for which, c in calibrations.items()
             ]
             t.notice(f"{path.parent.name}, {name}: {time.monotonic() - begun:.0f} s")
         figures += _figures(path.parent.name, found)
@@ -123,20 +126,20 @@ def _halves(count: int, splits: int) -> Iterator[tuple[str, Bools]]:
 
 def _calibrations(
     cell: Cell, readings: Readings, folder: Path | None, stem: str
-) -> Mapping[bool, Calibration]:
-    """Calibrations by whether the arm's scatter was estimated."""
-    paths = {s: folder / f"{stem}{'-scatter' * s}.json" for s in (False, True)} if folder else {}
-    if paths and paths[False].exists():
-        return {s: Calibration.load(p) for s, p in paths.items() if p.exists()}
+) -> Mapping[str, Calibration]:
+    """Calibrations of the last revision, and of the last one without the arm's scatter."""
+    ends = {FINAL: ".json", PLAIN: "-plain.json"}
+    paths = {which: folder / f"{stem}{end}" for which, end in ends.items()} if folder else {}
+    if paths and paths[FINAL].exists():
+        return {which: Calibration.load(p) for which, p in paths.items() if p.exists()}
     path = refine(baseline(cell, readings, "absolute"), readings, "absolute")
-    plain = [s.fit for s in path.steps if s.fit.readings.arm_scatter is None]
-    fits = {False: plain[-1]}
+    fits = {FINAL: path.fit}
     if path.fit.readings.arm_scatter is not None:
-        fits[True] = path.fit
-    found = {s: Calibration.of(f, {"verdict": path.verdict}) for s, f in fits.items()}
-    for s, c in found.items():
-        if paths:
-            c.save(paths[s])
+        fits[PLAIN] = [s.fit for s in path.steps if s.fit.readings.arm_scatter is None][-1]
+    found = {which: Calibration.of(f, {"verdict": path.verdict}) for which, f in fits.items()}
+    for which, path_ in paths.items():
+        if which in found:
+            found[which].save(path_)
     return found
 
 
@@ -147,7 +150,7 @@ def _before(cell: Cell, fitted: Readings, others: Readings) -> Floats:
     return np.asarray(np.linalg.norm(others.value[:, :3] - predicted, axis=1))
 
 
-def _left(name: str, scatter: bool, c: Calibration, others: Readings, before: Floats) -> Left:
+def _left(name: str, which: str, c: Calibration, others: Readings, before: Floats) -> Left:
     recorded = {k: v for k in ENVIRONMENT if (v := getattr(others.states, k)) is not None}
     p = c.predict(others.states.q, others.states.wrench, recorded=recorded)
     errors, inside = judged(c, p, others)
@@ -160,7 +163,8 @@ def _left(name: str, scatter: bool, c: Calibration, others: Readings, before: Fl
     )
     return Left(
         split=name,
-        scatter=scatter,
+        model=which,
+        scatter=c.scatter.known,
         poses=len(errors),
         before_m=float(before.mean()),
         mean_m=float(errors.mean()),
@@ -198,35 +202,36 @@ def judged(c: Calibration, p: ToolPoses, others: Readings) -> tuple[Floats, Bool
 
 def _figures(series: str, found: list[Left]) -> Iterator[Figure]:
     """Yield mean and worst over the random halves, and the first half by itself."""
-    for scatter in (False, True):
-        with_scatter = "the arm's scatter estimated" if scatter else "without the arm's scatter"
-        mine = [x for x in found if x.scatter == scatter]
-        for kind in ("random half", "first half"):
-            parts = [x for x in mine if x.split.startswith(kind)]
+    low, high = WANTED_BAND
+    for kind in ("random half", "first half"):
+        for which in (FINAL, PLAIN):
+            parts = [x for x in found if x.model == which and x.split.startswith(kind)]
             if not parts:
                 continue
-            what = f"{series}, {kind} fitted ({len(parts)} splits), {with_scatter}"
-            errors = [x.mean_m for x in parts]
-            shares = [x.inside for x in parts]
+            final = which == FINAL
+            what = f"{series}, {kind} fitted, {which}"
+            if final:
+                what += f" (scatter estimated in {sum(x.scatter for x in parts)} of {len(parts)})"
+            errors, shares = [x.mean_m for x in parts], [x.inside for x in parts]
             before = float(np.mean([x.before_m for x in parts]))
             yield Figure(
                 f"{what}: mean error before → left, worst split",
                 f"{length(before)} → {length(float(np.mean(errors)))}, {length(max(errors))}; "
                 f"largest of a pose {length(max(x.worst_m for x in parts))}",
-                f"≤ {length(WANTED_M)}",
-                max(errors) <= WANTED_M,
+                f"≤ {length(WANTED_M)}" if final else "",
+                max(errors) <= WANTED_M if final else None,
             )
-            low, high = WANTED_BAND
             yield Figure(
                 f"{what}: poses within their {100 * BAND:.0f} % band, mean (least to most)",
                 f"{100 * np.mean(shares):.1f} % ({100 * min(shares):.1f} to "
                 f"{100 * max(shares):.1f} %)",
-                f"{100 * low:.0f} to {100 * high:.0f} %",
-                all(low <= s <= high for s in shares),
+                f"{100 * low:.0f} to {100 * high:.0f} %" if final else "",
+                all(low <= s <= high for s in shares) if final else None,
             )
-            share = np.mean([x.beyond for x in parts])
-            if share > 0:
+            if final and any(x.beyond for x in parts):
                 yield Figure(f"{what}: refused as outside of what was measured", _beyond(parts))
+            if final:
+                yield Figure(f"{what}: verdicts", ", ".join(x.verdict for x in parts))
 
 
 def _beyond(parts: list[Left]) -> str:

@@ -5,8 +5,9 @@ The true position of the tool differs from the prediction by
     Σ = κ J C Jᵀ + s² 1 + J_q Σ_q J_qᵀ
 
 C the covariance of the parameters, what a family does at places that nobody measured included (see
-`identify.predictive`); κ ≥ 1 what poses left out were farther off than by C; s² the misfit of the
-fit, where χ² is larger than chance allows; Σ_q the arm's scatter from one arrival to the next.
+`identify.predictive`); κ ≥ 1 what poses left out were farther off than by C; s² what the
+positions' residuals have beyond the noise, where χ² is larger than chance allows; Σ_q the arm's
+scatter from one arrival to the next.
 
 Of a fit to deflections only what the load does is known: errors are then counted from the unloaded
 arm.
@@ -163,7 +164,8 @@ class Calibration:
         values, vectors = np.linalg.eigh(p.covariance)
         noise = np.trace(found.whitening.covariance[:, :3, :3], axis1=1, axis2=2)
         misfits = float(chi2.sf(found.chi2, found.dof)) < MISFIT_ALARM
-        noisy = max(p.noise, 1.0)
+        square = float(np.mean(np.sum(found.raw[:, :3] ** 2, axis=1)))
+        beyond = square * found.whitening.rank / found.dof - float(noise.mean())
         kappa = parameter_factor(p, left_out)
         # A deflection is the difference of two readings.
         readings = 2 if found.mode == "deflection" else 1
@@ -173,7 +175,7 @@ class Calibration:
             theta=found.theta,
             mode=found.mode,
             root=vectors * np.sqrt(kappa * np.maximum(values, 0.0)),
-            misfit=(noisy - 1.0) * misfits * float(noise.mean()) / 3 / readings,
+            misfit=max(beyond, 0.0) * misfits / 3 / readings,
             scatter=scatter_of(found.readings, model.cell),
             measured=Measured.of(used.states, p, noise),
             loads={load.name: load.wrench(model.cell.gravity) for load in loads},

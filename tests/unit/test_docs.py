@@ -109,6 +109,27 @@ def test_the_guide_to_compensation_runs_as_it_stands(
     assert "e-0" in capsys.readouterr().out
 
 
+def test_the_guide_to_handing_over_runs_as_it_stands(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    guide = ROOT / "docs" / "how-to" / "hand-over.md"
+    cell = configs_dir() / "cells" / "demo_ur10e.toml"
+    config = load_config(cell)
+    monkeypatch.chdir(tmp_path)
+    with CampaignFile.create("run.hilcal", config.to_json(), str(cell.parent), "test") as file:
+        file.append_readings(rehearse(config, "nothing", 3, 20).readings)
+    given = ("--effects", "joint_compliance,encoder_offset")
+    ok(capsys, "identify", "run.hilcal", "--readings", "absolute", *given)
+    for line in "".join(blocks(guide, "sh")).splitlines():
+        ok(capsys, *line.split()[1:])
+    with hc.Campaign.open("run.hilcal") as a, hc.Campaign.open("again.hilcal") as b:
+        assert a.file.data_hash() == b.file.data_hash()
+    (code,) = blocks(guide)
+    exec(code, {})
+    assert "encoder_offset.j2" in capsys.readouterr().out
+    assert "tracker_in_base_mm_rad" in Path("frames.json").read_text()
+
+
 def test_the_guide_to_imports_is_what_the_commands_do(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
