@@ -213,6 +213,7 @@ def plan(
     criterion: str | None = None,
     given: Fit | None = None,
     seed: int = 0,
+    prior: Posterior | CarriedPrior | None = None,
 ) -> CheckedPlan:
     """Choose poses, loads and their order by optimal design, with a certificate.
 
@@ -226,13 +227,18 @@ def plan(
         criterion: "D", "A", "E", "K", "I" or "separate"; that of `[planning]` where None.
         given: a fit of what has been measured already.
         seed: of the random candidates.
+        prior: what another campaign taught of this arm; the model is planned for with what it
+            knows. Not beside `given`, which has its own.
 
     Raises:
         InputError: numbers or names that cannot be, or a cell without configuration.
         CannotAnswerError: the cell leaves too few poses, or the readings are too few.
     """
     config, rng = cell.configured(), np.random.default_rng(seed)
-    planned = make(cell, config, Request(poses, criterion=criterion), rng, given)
+    if given is not None and prior is not None:
+        raise InputError("a plan after a fit has the prior of that fit; leave out one of both")
+    request = Request(poses, criterion=criterion)
+    planned = make(cell, config, request, rng, given, prior=_carried(prior, None))
     file = replace(planned.ordered.plan, about=about(planned))
     return checked(cell, config, file, summarise(planned, config, rng, compare=False))
 

@@ -13,6 +13,7 @@ from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import check_record, fit_of
 from hilcal.cli.plan_output import POSES, Csv, Output, Poses, Quick, Seed, generator, write
+from hilcal.cli.prior import Drift, Prior, PriorOf, PriorOptions
 from hilcal.cli.terminal import Json, Record, Revision, Terminal, terminal
 from hilcal.config import CellConfig, load_config
 from hilcal.data.plan import Plan, load_plan
@@ -51,6 +52,9 @@ def plan(
         typer.Option("--after", metavar="RUN.hilcal", help="Plan on from what it knows already."),
     ] = None,
     revision: Revision = None,
+    prior: Prior = None,
+    prior_of: PriorOf = "arm",
+    drift: Drift = None,
     seed: Seed = 0,
     unloaded_first: Annotated[
         bool,
@@ -70,13 +74,16 @@ def plan(
     check_record(record)
     if revision is not None and after is None:
         raise InputError("--revision is one of a campaign; give the campaign with --after")
+    if prior is not None and after is not None:
+        raise InputError("--after has the prior of its revision; leave out --prior")
+    carried = PriorOptions(prior, prior_of, drift).load(catalogue)
     config, numbers = read_cell(cell)
     unloaded: Literal["around", "first"] = "first" if unloaded_first else "around"
     wanted = Request(poses, readings, _criterion(criterion), unloaded=unloaded)
     with working(t.progress) as say:
         known = None if after is None else _known(t, after, revision, catalogue, say)
         rng = generator(seed)
-        chosen = make(numbers, config, wanted, rng, known, say, catalogue)
+        chosen = make(numbers, config, wanted, rng, known, say, catalogue, carried)
         plan_ = replace(chosen.ordered.plan, about=about(chosen))
         summary = summarise(chosen, config, rng, say, compare=not quick)
         say("checking every motion in a dry run")

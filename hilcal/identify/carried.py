@@ -188,6 +188,21 @@ def check_prior(prior: CarriedPrior, arm: Arm, readings: Readings) -> None:
         InputError: of an arm with other joints or other links, or learnt from readings that are to
             be fitted.
     """
+    check_arm(prior, arm)
+    both = int(among(readings, prior.posterior.prints).sum())
+    if both:
+        raise InputError(
+            f"{_called(prior.posterior)} was learnt from {both} of the {len(readings)} readings "
+            "that are to be fitted; they would count twice; valid: a prior of other readings"
+        )
+
+
+def check_arm(prior: CarriedPrior, arm: Arm) -> None:
+    """Refuse a prior of another arm.
+
+    Raises:
+        InputError: of an arm with other joints or other links.
+    """
     p = prior.posterior
     of = _called(p)
     if p.links.shape != arm.links.shape:
@@ -199,12 +214,6 @@ def check_prior(prior: CarriedPrior, arm: Arm, readings: Readings) -> None:
         raise InputError(
             f"{of} is of the arm {p.arm}, whose nominal links are others than those of {arm.name}; "
             "valid: a campaign of the same arm, described alike"
-        )
-    both = int(among(readings, p.prints).sum())
-    if both:
-        raise InputError(
-            f"{of} was learnt from {both} of the {len(readings)} readings that are to be fitted; "
-            "they would count twice; valid: a prior of other readings"
         )
 
 

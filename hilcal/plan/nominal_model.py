@@ -12,6 +12,9 @@ from hilcal.effects.options import Options
 from hilcal.effects.protocol import Effect
 from hilcal.effects.written import read_effects_text
 from hilcal.errors import InputError
+from hilcal.identify.carried import CarriedPrior, check_arm
+from hilcal.identify.coordinates import coordinates_of
+from hilcal.identify.drift import least
 from hilcal.identify.fit import Fit
 from hilcal.identify.priors import prior_of
 from hilcal.model import Model
@@ -42,6 +45,8 @@ class NominalModel:
         m: elements of a reading: 3 or 6.
         fit: of what has been measured already; None at first.
         notes: what was assumed, one line each.
+        carried: (L, L) information of a prior that is carried over from another campaign, 1/SI²;
+            None without one. Those parameters have no other prior.
     """
 
     model: Model
@@ -52,6 +57,7 @@ class NominalModel:
     m: int
     fit: Fit | None
     notes: tuple[str, ...]
+    carried: Floats | None = None
 
     @property
     def elements(self) -> int:
@@ -65,7 +71,11 @@ class NominalModel:
 
 
 def nominal_model(
-    cell: Cell, config: CellConfig, m: int = 3, catalogue: Catalogue | None = None
+    cell: Cell,
+    config: CellConfig,
+    m: int = 3,
+    catalogue: Catalogue | None = None,
+    prior: CarriedPrior | None = None,
 ) -> NominalModel:
     """Return the model of `[planning]` with ordinary parameters.
 
@@ -77,9 +87,12 @@ def nominal_model(
         config: its configuration.
         m: 3 for positions, 6 for poses.
         catalogue: the effects that a model can have; the installed ones unless given.
+        prior: what another campaign taught. Its effects are in the model, too, but for families
+            that share a prior, which a plan is not made for unless they are named, and those that
+            need what a plan does not fix.
 
     Raises:
-        InputError: an unknown effect (lists the valid ones).
+        InputError: an unknown effect (lists the valid ones), or a prior of another arm.
     """
     known = catalogue or installed()
     place, given = nominal_tracker_place(cell, config)
@@ -92,19 +105,54 @@ def nominal_model(
     registered, station = _registered(cell, config, place)
     frames = known.unknown_frames(cell)
     wanted = {name: dict[str, object]() for name in frames} | planned_effects(config, known)
-    prior = FRAME_PRIOR if config.planning.readings == "deflection" else {}
+    learnt = {} if prior is None else _learnt(prior, registered, known, m)
+    wanted = {name: options or learnt.get(name, {}) for name, options in wanted.items()}
+    wanted |= {name: o for name, o in learnt.items() if name not in wanted}
+    framed = FRAME_PRIOR if config.planning.readings == "deflection" else {}
     effects = tuple(
-        build(known, name, registered, m, {**(prior if name in frames else {}), **options})
+        build(known, name, registered, m, {**(framed if name in frames else {}), **options})
         for name, options in wanted.items()
     )
-    model = Model(registered, effects, known)
+    model = Model(registered, effects, known, prior=prior)
     parts = [(e.role == "baseline") * np.array([p.scale for p in e.parameters]) for e in effects]
     notes += random_columns(effects)
     theta = np.concatenate(parts)
     prior_std = _prior_std(model)
-    return NominalModel(
-        model, theta, np.arange(model.size), prior_std, station, m, None, tuple(notes)
-    )
+    if prior is not None:
+        s = prior.posterior.source
+        called = f"{s.campaign}: " if s.campaign else ""
+        notes.append(f"planned with what is known already ({called}{s.n_readings} readings)")
+    live = np.arange(model.size)
+    carried = carried_information(model, live)
+    return NominalModel(model, theta, live, prior_std, station, m, None, tuple(notes), carried)
+
+
+def _learnt(
+    prior: CarriedPrior, cell: Cell, catalogue: Catalogue, m: int
+) -> dict[str, dict[str, object]]:
+    """Return the effects of a prior that a plan takes in, with their options."""
+    check_arm(prior, cell.arm)
+    plain = nominal_states(np.zeros((1, 1)), np.zeros((1, 6)))
+    found = {}
+    for e in prior.posterior.effects:
+        if catalogue[e.name].computable(plain):
+            options = dict(e.options)
+            if build(catalogue, e.name, cell, m, options).groups() is None:
+                found[e.name] = options
+    return found
+
+
+def carried_information(model: Model, live: Ints) -> Floats | None:
+    """Return the information (L, L) of a model's carried prior on its live parameters, 1/SI²."""
+    if model.prior is None:
+        return None
+    if model.prior.drift is None:
+        model = replace(model, prior=model.prior.with_drift(least(model.prior)))
+    of = coordinates_of(model)
+    known = of.inverse[of.std == 1.0]
+    whole = np.zeros((model.size, model.size))
+    whole[np.ix_(of.index, of.index)] = known.T @ known
+    return whole[np.ix_(live, live)]
 
 
 def after(fit: Fit, config: CellConfig) -> NominalModel:
@@ -124,14 +172,17 @@ def after(fit: Fit, config: CellConfig) -> NominalModel:
     _, station = _registered(cell, config, nominal_tracker_place(cell, config)[0])
     # The fit weighs its priors against the noise factor β.
     std = np.where(np.isinf(prior), np.inf, prior / np.sqrt(fit.solution.beta))
+    std[fit.solution.space.index] = np.inf
     names = " + ".join(fit.model.names)
     count = len(fit.readings) - int(fit.outlier.sum())
     notes = (
         f"planned on from {count} readings, fitted with {names}",
         *random_columns(fit.model.effects),
     )
-    live = np.flatnonzero(prior > 0)
-    return NominalModel(fit.model, fit.theta, live, std, station, fit.readings.m, fit, notes)
+    live = np.flatnonzero(fit.solution.estimated)
+    carried = carried_information(fit.model, live)
+    m = fit.readings.m
+    return NominalModel(fit.model, fit.theta, live, std, station, m, fit, notes, carried)
 
 
 def build(

@@ -11,6 +11,7 @@ from hilcal.config import CellConfig
 from hilcal.data.plan import UNLOADED
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import CannotAnswerError, InputError
+from hilcal.identify.carried import CarriedPrior
 from hilcal.identify.fit import Fit
 from hilcal.identify.registration import MIN_POSES
 from hilcal.plan.choice import (
@@ -119,6 +120,7 @@ def make(
     known: Fit | None = None,
     say: Say = lambda words: None,
     catalogue: Catalogue | None = None,
+    prior: CarriedPrior | None = None,
 ) -> Planned:
     """Return the plan.
 
@@ -131,6 +133,7 @@ def make(
         say: progress callback.
         catalogue: the effects that a model can have; the installed ones unless given, or those
             of `known`.
+        prior: what another campaign taught, where nothing has been measured yet.
 
     Raises:
         InputError: numbers or names that cannot be.
@@ -144,7 +147,10 @@ def make(
     home, poses = _reference(space, drawn, rng)
     drawn = replace(drawn, q=drawn.q[poses], allowed=drawn.allowed[poses])
     say("computing the information of each pose")
-    model = nominal_model(cell, config, 3, catalogue) if known is None else after(known, config)
+    if known is None:
+        model = nominal_model(cell, config, 3, catalogue, prior)
+    else:
+        model = after(known, config)
     of, undetermined = without_undetermined(problem(model, config, drawn.q, drawn.allowed))
     work = prediction_poses(of.nominal, config, drawn.q, space.clear)
     budget = _budget(request, of)

@@ -13,6 +13,8 @@ from hilcal.types import Floats
 def information_of(nominal: NominalModel, more: tuple[Effect, ...], scale: Floats) -> Floats:
     """Return AᵀA (P, P) of the readings that the assumed model was fitted to; zero without any.
 
+    With the information of a prior that is carried over from another campaign.
+
     A is the Jacobian at the fit, whitened by the readings' own covariances: what the fit's normal
     equations hold, without its priors.
 
@@ -22,9 +24,12 @@ def information_of(nominal: NominalModel, more: tuple[Effect, ...], scale: Float
             which lack a column, have no information.
         scale: (P,) what one unit of each parameter is, SI.
     """
-    fit = nominal.fit
+    fit, count = nominal.fit, len(nominal.live)
+    known = np.zeros((len(scale), len(scale)))
+    if nominal.carried is not None:
+        known[:count, :count] = nominal.carried * (scale[:count, None] * scale[:count])
     if fit is None:
-        return np.zeros((len(scale), len(scale)))
+        return known
     ordinary = [scales_of(fit.model)[nominal.live]]
     s = fit.solution
     own = whitened_jacobian(fit.model, s.prediction, s.theta, fit.whitening, nominal.live)
@@ -34,4 +39,4 @@ def information_of(nominal: NominalModel, more: tuple[Effect, ...], scale: Float
         missing = np.zeros((len(fit.white), len(e.parameters)))
         columns.append(effect_columns(fit, e).white if computable(fit, e) else missing)
     a = np.hstack(columns) * (scale / np.concatenate(ordinary))
-    return np.asarray(a.T @ a)
+    return np.asarray(known + a.T @ a)

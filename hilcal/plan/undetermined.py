@@ -82,7 +82,12 @@ def without_undetermined(of: Problem) -> tuple[Problem, tuple[Undetermined, ...]
     if len(lost) == int(flat.sum()):
         raise CannotAnswerError("; ".join(dict.fromkeys(f.remark for f in found[:1])))
     kept = np.setdiff1d(np.arange(len(of.terms)), list(lost))
-    nominal = replace(of.nominal, live=of.nominal.live[kept[kept < size]])
+    own, carried = kept[kept < size], of.nominal.carried
+    nominal = replace(
+        of.nominal,
+        live=of.nominal.live[own],
+        carried=None if carried is None else carried[np.ix_(own, own)],
+    )
     rows = np.ascontiguousarray(of.units.rows[:, :, kept])
     reduced = replace(
         of,
