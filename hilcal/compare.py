@@ -1,6 +1,7 @@
 """Two campaigns of one arm: the error of the earlier calibration today, and what has changed."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -66,7 +67,8 @@ def compare(
     drawing = _drawn(later, chosen)
     anew = not (_same_place(run, later) if same_setup is None else same_setup)
     say("predicting what the earlier calibration leaves")
-    whole, lacked = completed(fit, EFFECTS, say)
+    # A model that a diagnosis found to lack nothing that it can name is taken as it is.
+    whole, lacked = completed(fit, () if _judged(run.in_use(revision)) else EFFECTS, say)
     at = setting(earlier_fit(whole), chosen, anew=anew, cell=later.cell)
     changes = find_changes(at, say)
     record = later.in_use()
@@ -98,6 +100,12 @@ def _differences(
         return parameter_differences(Posterior.of(fit), Posterior.of(later.restore(record)))
     except (CannotAnswerError, InputError):
         return None
+
+
+def _judged(record: RevisionRecord | None) -> bool:
+    """Whether a stored diagnosis names no effect that the model lacks."""
+    found: Mapping[str, Any] = {} if record is None else record.result_json.get("diagnose", {})
+    return bool(found.get("verdict", "missing_effect") != "missing_effect")
 
 
 def _unseen(run: Campaign, later: Campaign, fit: Fit, number: int | None) -> tuple[Readings, int]:

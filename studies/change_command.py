@@ -2,19 +2,21 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import typer
 
 from hilcal.cli.demo import CELL
-from hilcal.cli.terminal import Json, terminal
+from hilcal.cli.terminal import Json, Terminal, terminal
 from hilcal.config import load_config
 from hilcal.report import text
 from hilcal.report.numbers import length
-from hilcal.report.progress import counting
+from hilcal.report.progress import counting, working
 from hilcal.robot.catalogue import configs_dir
 from studies.change import READINGS_B, REPAIRS, Case, StudiedArm, case, studied_arm
+from studies.change_real import ZERO_RAD, RealCase, real_cases
 from studies.records import Figure, Keep, keep
 
 ARMS: tuple[tuple[str, tuple[str, ...]], ...] = (
@@ -35,11 +37,25 @@ def change(
         int, typer.Option("--readings", help="Of the later campaign.")
     ] = READINGS_B,
     first_seed: Annotated[int, typer.Option("--first-seed", help="Seeds count from here.")] = 0,
+    real: Annotated[
+        Path | None,
+        typer.Option("--real", metavar="F.csv", help="Of a real arm instead: an IPA UR10 series."),
+    ] = None,
     keep_file: Keep = None,
     as_json: Json = False,
 ) -> None:
     """Repair a joint of simulated arms, measure a few readings, and ask what has changed."""
     t = terminal(as_json)
+    if real is not None:
+        with working(t.progress) as say:
+            halves = real_cases(real, seeds, first_seed, readings, say)
+        _tell(t, real_figures(halves), [asdict(c) for c in halves])
+        keep(
+            keep_file,
+            f"What has changed on a real arm, by {readings} readings",
+            real_figures(halves),
+        )
+        return
     config = load_config(configs_dir() / "cells" / CELL)
     cases: list[Case] = []
     with counting(t.progress, "comparisons", seeds + nothing) as advance:
@@ -53,12 +69,32 @@ def change(
             cases.append(case(arm, "nothing", 0, anew, seed, other=other, count=readings))
             advance(1)
     figures = figures_of(cases)
+    _tell(t, figures, [asdict(c) for c in cases])
+    keep(keep_file, f"What has changed on an arm, by {readings} readings", figures)
+
+
+def _tell(t: Terminal, figures: Sequence[Figure], cases: list[dict[str, object]]) -> None:
     out = text.table("what", "measured", "required", left=(0, 1, 2))
     for f in figures:
         out.add_row(f.what, f.measured, f.required)
     t.show(out)
-    t.document({"cases": [asdict(c) for c in cases]})
-    keep(keep_file, f"What has changed on an arm, by {readings} readings", figures)
+    t.document({"cases": cases})
+
+
+def real_figures(cases: Sequence[RealCase]) -> list[Figure]:
+    """Return what was counted on a real arm."""
+    quiet, moved = [c for c in cases if not c.joint], [c for c in cases if c.joint]
+    silent = [not c.parts and c.explained for c in quiet]
+    named = [c.parts == (f"joint {c.joint}",) for c in moved]
+    inside = [c.z is not None and abs(c.z) < WILSON for c in moved]
+    size = f"{1e3 * ZERO_RAD:g} mrad"
+    return [
+        _rate("other poses of the same series: nothing is claimed", quiet, silent, 0.98),
+        _rate(
+            f"a joint's zero moved by {size} in them: the joint is named, alone", moved, named, 0.95
+        ),
+        _rate("… and its size is in the stated 95 %", moved, inside),
+    ]
 
 
 def _repaired(arms: Sequence[StudiedArm], k: int, first: int, count: int) -> Case:

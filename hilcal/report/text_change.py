@@ -218,10 +218,12 @@ def _left(c: Comparison) -> str:
             f"What is left after that is scatter as stated ({numbers.digits(found.scatter, 2)} "
             "times)."
         )
+    outside = any(v.variable != "leverage" for v in c.today.beyond.variables)
+    more = ", or the earlier model is wrong where it was not measured" if outside else ""
     return (
         f"What is left is {numbers.digits(found.scatter, 2)} times the stated scatter "
         f"({numbers.p_equals(found.unexplained)}): more has changed than the candidates explain, "
-        "or these readings are noisier than stated."
+        f"or these readings are noisier than stated{more}."
     )
 
 

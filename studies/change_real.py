@@ -1,0 +1,105 @@
+"""A real arm against itself: half of its poses as the earlier campaign, 15 others as the later one.
+
+Nothing has changed between them, so nothing must be claimed. Then a joint's zero is moved in the
+later readings by the fitted model, and must be found.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from hilcal.cell import Cell
+from hilcal.data.readings import Readings
+from hilcal.diagnose.change import find_changes
+from hilcal.diagnose.completed import completed
+from hilcal.identify.baseline import with_effects
+from hilcal.identify.earlier import Earlier, earlier_fit
+from hilcal.identify.fit import fit
+from hilcal.identify.remeasured import setting
+from hilcal.library import read_table
+from hilcal.robot import se3
+from hilcal.robot.catalogue import configs_dir
+
+EFFECTS = ("transmission_error", "link_geometry", "link_compliance", "joint_tilt_compliance")
+"""What a refinement of the whole series ends with (`studies real`)."""
+ZERO_RAD = 0.5e-3
+"""By how much a joint's zero is moved: half a millimetre at one metre."""
+
+
+@dataclass(frozen=True, slots=True)
+class RealCase:
+    """One comparison on real readings.
+
+    Attributes:
+        joint: whose zero was moved in them; 0 for none.
+        anew: whether the tracker's place was estimated anew.
+        parts: that the program names.
+        explained: whether what is left is scatter.
+        z: (found − true)/std of the zero, where that is what is named.
+    """
+
+    joint: int
+    anew: bool
+    parts: tuple[str, ...]
+    explained: bool
+    z: float | None
+
+
+def real_cases(
+    path: Path, count: int, seed: int, count_b: int, say: Callable[[str], None]
+) -> list[RealCase]:
+    """Compare the halves of a series so many times without a change, and as often with one.
+
+    Args:
+        path: `measurements_joint_configurations.csv` of the IPA UR10 accuracy data.
+        count: comparisons of each kind.
+        seed: of halves and draws.
+        count_b: readings of the later campaign.
+        say: takes progress.
+    """
+    cell = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
+    readings, rng = read_table(path, cell, "ipa-ur10"), np.random.default_rng(seed)
+    poses = rng.permutation(np.unique(readings.pose))
+    half = np.isin(readings.pose, poses[: len(poses) // 2])
+    say("fitting one half")
+    model = with_effects(cell, readings[half], "absolute", EFFECTS)
+    found, _ = completed(fit(model, readings[half], "absolute"), (), say)
+    say("predicting the poses left out")
+    earlier, others = earlier_fit(found), np.flatnonzero(~half)
+    out = []
+    for k in range(2 * count):
+        later = readings[np.sort(rng.choice(others, count_b, replace=False))]
+        joint = int(rng.integers(2 if k % 2 else 1, 7)) if k >= count else 0
+        out.append(_case(earlier, later, joint, bool(k % 2)))
+        say(f"comparison {k + 1} of {2 * count}")
+    return out
+
+
+def _case(earlier: Earlier, later: Readings, joint: int, anew: bool) -> RealCase:
+    if joint:
+        later = _moved(earlier, later, joint - 1)
+    found = find_changes(setting(earlier, later, anew=anew))
+    z = [
+        (c.sizes[0].value - ZERO_RAD) / c.sizes[0].std
+        for c in found.found
+        if c.candidate.name == f"encoder_offset.j{joint}"
+    ]
+    parts = tuple(dict.fromkeys(c.candidate.part for c in found.found))
+    return RealCase(joint, anew, parts, found.explained, z[0] if z else None)
+
+
+def _moved(earlier: Earlier, later: Readings, j: int) -> Readings:
+    """Return the readings as they were, had the zero of a joint moved: by the fitted model."""
+    model, theta, s = earlier.fit.model, earlier.fit.theta, later.states
+    step = ZERO_RAD * np.eye(s.q.shape[1])[j]
+    actual = None if s.q_actual is None else s.q_actual + step
+    before = model.predict(s, theta).observation
+    after = model.predict(replace(s, q=s.q + step, q_actual=actual), theta).observation
+    value = later.value.copy()
+    value[:, :3] += after.position - before.position
+    if later.m == 6:
+        turn = after.rotation @ np.swapaxes(before.rotation, 1, 2)
+        value[:, 3:] = se3.rotation_vector(turn @ se3.rotation(later.value[:, 3:]))
+    return replace(later, value=value)
