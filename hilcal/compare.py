@@ -10,6 +10,7 @@ from hilcal.config import CellConfig
 from hilcal.data.readings import Readings
 from hilcal.data.revision import RevisionRecord
 from hilcal.data.same_readings import never_fitted
+from hilcal.data.stored_priors import CARRIED
 from hilcal.diagnose.change import find_changes
 from hilcal.diagnose.change_candidates import EFFECTS
 from hilcal.diagnose.comparison import Comparison, error_today
@@ -93,7 +94,7 @@ def _differences(
     fit: Fit, later: Campaign, record: RevisionRecord, say: Callable[[str], None]
 ) -> Differences | None:
     """Compare the parameters of both fits; None where they are tied, or there is nothing to."""
-    if record.options.get("prior"):
+    if record.parameters_json.get(CARRIED):
         return None
     say("comparing the parameters of both fits")
     try:

@@ -301,13 +301,16 @@ def next_step(c: Comparison, earlier: str) -> str:
         return f"put the setup right, and compare again; the calibration of {earlier} holds."
     parts = numbers.names(list(dict.fromkeys(x.candidate.part for x in arm)))
     what = f"recalibrate {parts}" if parts else "recalibrate the arm"
-    return f"{what} from a campaign of the arm as it is now."
+    return f"{what}, with what {earlier} knows as prior; more readings make it surer."
 
 
 def next_command(c: Comparison, earlier: str, later: str) -> str | None:
     """Return the command line for the next step; None where there is none."""
+    if c.another_arm:
+        return f"hilcal refine {later}"
     arm = [x for x in c.changes.found if x.candidate.of_arm]
-    return f"hilcal refine {later}" if arm or not c.changes.explained else None
+    changed = bool(arm) or not c.changes.explained
+    return f"hilcal refine {later} --prior {earlier}" if changed else None
 
 
 def to_json(c: Comparison, earlier: str, later: str) -> dict[str, object]:

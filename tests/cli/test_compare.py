@@ -83,10 +83,10 @@ def test_a_repaired_joint_is_named_and_without_a_repair_nothing_is(
     assert d["explained"] is True
     assert d["error"]["rms_m"] > 5 * d["expected_m"]
     words = ok(capsys, "compare", site.earlier, repaired).out
-    assert "Joint 3's zero has moved by +1.2" in words
+    assert "Joint 3's zero has moved by +1." in words
     assert "as if it had been set up anew" in words
     assert "Next: recalibrate joint 3" in words
-    assert words.rstrip().endswith(f"hilcal refine {repaired}")
+    assert words.rstrip().endswith(f"hilcal refine {repaired} --prior {site.earlier}")
 
 
 def test_a_later_campaign_with_a_fit_of_its_own_is_put_beside_the_earlier_one(
