@@ -173,7 +173,7 @@ class Procedure:
         self.check_files()
         first = entry(BEGUN, {"settings": self.settings.to_json()})
         more = {COVERS: covers, ENTRY.format(1): first}
-        create_run(self.run, config, self.base_dir, plan, source=_SOURCE, more=more).close()
+        create_run(self.run, config, self.base_dir, plan, source=self._source(), more=more).close()
 
     def check_files(self) -> None:
         """Refuse files of another calibration where those of this one will be.
@@ -499,10 +499,13 @@ class Procedure:
             COVERS: o.file.about(COVERS) or INSTRUMENT,
         }
         config = CellConfig.from_json(o.file.config_json)
-        create_run(path, config, self.base_dir, plan, source=_SOURCE, more=more).close()
+        source = self._source(f"{purpose} campaign of {self.run.name}, ")
+        create_run(path, config, self.base_dir, plan, source=source, more=more).close()
 
-
-_SOURCE = "measured by hilcal calibrate"
+    def _source(self, what: str = "") -> str:
+        """Say where the readings of a file come from."""
+        how = "measured" if self.settings.hide is None else "rehearsed in a simulated cell"
+        return f"{what}{how} by hilcal calibrate"
 
 
 def continued(run: Path, cell: Cell, config: CellConfig, catalogue: Catalogue) -> Procedure:
