@@ -29,9 +29,10 @@ from hilcal.discover.law import (
     Resemblance,
     form_of,
 )
+from hilcal.discover.problem import Problem
 from hilcal.discover.refit import exact, refine
 from hilcal.discover.screen import Screen, screen
-from hilcal.discover.search import LEAST, MOST_TERMS, SAME, Problem, Selection, search
+from hilcal.discover.search import LEAST, MOST_TERMS, SAME, Selection, search
 from hilcal.discover.write_effect import source_of_form
 from hilcal.errors import HilcalError, InputError
 from hilcal.identify.fit import Fit

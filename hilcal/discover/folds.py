@@ -8,8 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hilcal.discover.problem import Problem
 from hilcal.discover.screen import Screen
-from hilcal.discover.search import SAME, Problem, Selection, search
+from hilcal.discover.search import SAME, Selection, search
 from hilcal.identify.folds import random_folds
 from hilcal.identify.linearisation import by_pose
 from hilcal.regression.paired_test import improves
@@ -28,13 +29,11 @@ class FoldSearch:
         share: of the misfit of the poses left out that its laws explain.
         sure: whether their error falls by more than it scatters from pose to pose.
         found: the laws of each fold; empty where it proposes none.
-        rows: (R,) those of each fold's poses.
     """
 
     share: float
     sure: bool
     found: tuple[Selection | None, ...]
-    rows: tuple[Bools, ...]
 
 
 def search_by_folds(screen: Screen, most: int) -> FoldSearch:
@@ -49,21 +48,19 @@ def search_by_folds(screen: Screen, most: int) -> FoldSearch:
     fold = fit.whitening.rows_of(random_folds(fit.pose, FOLDS))
     before, after = np.zeros(len(fold)), np.zeros(len(fold))
     found: list[Selection | None] = []
-    outs = []
     for f in range(int(fold.max()) + 1):
         out = fold == f
         problem = Problem(screen, ~out)
         selections = search(problem, most, beam=1)
         chosen = max(selections, key=lambda s: s.total, default=None)
         found.append(chosen)
-        outs.append(out)
         before[out] = predicted(problem, None, out)
         after[out] = before[out] if chosen is None else predicted(problem, chosen, out)
     of_pose = by_pose(fit, before), by_pose(fit, after)
     rank = fit.whitening.rank
     misfit = max(float(of_pose[0].sum()) - rank, 3.0 * np.sqrt(2.0 * rank))
     share = float(np.clip((of_pose[0].sum() - of_pose[1].sum()) / misfit, -1.0, 1.0))
-    return FoldSearch(share, improves(*of_pose), tuple(found), tuple(outs))
+    return FoldSearch(share, improves(*of_pose), tuple(found))
 
 
 def predicted(problem: Problem, selection: Selection | None, out: Bools) -> Floats:

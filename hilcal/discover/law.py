@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilcal.discover.amplitudes import Amplitude
+from hilcal.discover.problem import Term
 from hilcal.discover.screen import Screen
-from hilcal.discover.search import Term
 from hilcal.discover.sites import ORDINARY, Site
 from hilcal.effects.protocol import Situation
 from hilcal.types import Floats

@@ -46,7 +46,6 @@ class Screen:
         form: (S, R', K) T_s of these rows and readings, single precision.
         square: (S, F) xᵀ M x; zero where the model explains a column.
         across: (S, F) xᵀ M x' with the partner of each amplitude.
-        pose: (R,) pose of each row.
     """
 
     linear: Linearisation
@@ -58,7 +57,6 @@ class Screen:
     form: Floats
     square: Floats
     across: Floats
-    pose: Ints
 
     @cached_property
     def price(self) -> Floats:
@@ -79,10 +77,6 @@ class Screen:
         """(S, F) xᵀ v of all candidates, v (R,), in single precision."""
         by_reading = np.einsum("srn,r->sn", self.form, v[self.rows].astype(np.float32))
         return np.asarray(by_reading @ self.values)
-
-    def column(self, site: int, amplitude: int) -> Floats:
-        """(R,) whitened column of one candidate."""
-        return self.columns([(site, amplitude)])[:, 0]
 
     def columns(self, which: list[tuple[int, int]]) -> Floats:
         """(R, P) whitened columns of candidates (site, amplitude)."""
@@ -126,7 +120,6 @@ def screen(linear: Linearisation) -> Screen:
                 square[k, elastic == kind] = 0.0
     return Screen(
         linear, words, places, motion, rows, readings, form, square, across,
-        w.rows_of(fit.pose),
     )  # fmt: skip
 
 

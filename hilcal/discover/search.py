@@ -1,30 +1,20 @@
 """Forward selection of laws with backward pruning, the size of the search paid for.
 
-A term is a site, or a few that belong together, times one amplitude or two: a periodic function
-with free phase, all axes of a site, all joints with a coefficient each. At each step all candidates
-are screened beside the terms that are chosen; the short list is scored as families are in the
-diagnosis, together with the terms that extend it. The evidence of a term less what the search
-costs it decides; it is the logarithm of the odds of the term against none, before the data a
-candidate of a complexity being as likely as each other.
+At each step the term with the best odds beside those that are chosen is added (see `problem`), and
+terms are taken out again where the others make them needless. Of terms that odds of 20 : 1 do not
+tell apart the simplest is taken.
 """
 
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
 
+from hilcal.discover.problem import SHORT_LIST, Beside, Problem, Scored, Term
 from hilcal.discover.screen import Screen
-from hilcal.regression.evidence import FamilyScore, score_family
 from hilcal.regression.forward_selection import families_beside
-from hilcal.regression.projection import Projection, projection
-from hilcal.types import Bools, Floats
+from hilcal.types import Floats
 
-SHORT_LIST = 200
-"""Candidates that are scored in full at each step; a choice."""
-EXTENDED = 40
-"""Of these, those that are extended to other axes and joints; a choice."""
 BEAM = 3
 """First terms with which selections are begun; a choice."""
 MOST_TERMS = 3
@@ -39,247 +29,24 @@ SAME = 0.98
 """Correlation of two projected columns from which on they count as the same law."""
 
 
-@dataclass(frozen=True, slots=True)
-class Term:
-    """Columns of a law that are chosen together.
-
-    Attributes:
-        parts: (site, amplitude) of each column, by index.
-        price: what the search costs it.
-        common: whether all columns have one coefficient.
-    """
-
-    parts: tuple[tuple[int, int], ...]
-    price: float
-    common: bool = False
-
-    @property
-    def count(self) -> int:
-        """Number of coefficients."""
-        return 1 if self.common else len(self.parts)
-
-
-@dataclass(frozen=True, eq=False)
-class Scored:
-    """A term beside others.
-
-    Attributes:
-        term: the term.
-        score: its score as a family.
-    """
-
-    term: Term
-    score: FamilyScore
-
-    @property
-    def odds(self) -> float:
-        """Evidence less what the search costs."""
-        return self.score.log_evidence - self.term.price
-
-
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """Terms that were chosen, and the odds that each added."""
+    """Terms that were chosen.
+
+    Attributes:
+        terms: in the order of choosing them.
+        odds: that each added.
+        near: first terms whose odds are not much less than those of the best.
+    """
 
     terms: tuple[Term, ...]
     odds: tuple[float, ...]
     near: tuple[Scored, ...] = ()
-    p_value: float = 1.0
 
     @property
     def total(self) -> float:
         """Logarithm of the odds of the whole law against none."""
         return sum(self.odds)
-
-
-class Problem:
-    """The search on some of the rows."""
-
-    def __init__(self, screen: Screen, rows: Bools | None = None) -> None:
-        """Refit the model to the rows.
-
-        Args:
-            screen: all candidates.
-            rows: (R,) those that are used; all by default.
-        """
-        linear = screen.linear
-        self.screen = screen
-        every = np.ones(len(linear.residual), dtype=np.bool_)
-        self.rows = every if rows is None else rows
-        used = self.rows
-        if rows is None:
-            self.model: Projection = linear.projection
-            self.residual = linear.residual
-        else:
-            ridge = np.maximum(linear.projection.ridge, 1e-6)
-            self.model = projection(linear.rows[used], ridge)
-            z = linear.fit.solution.coordinates()
-            self.residual = self.model.residual(linear.fit.white[used], z)
-        self.rss = float(self.residual @ self.residual)
-        lost = (1.0 - used.mean()) * len(used)
-        self.dof = max(linear.fit.dof - lost, 1.0)
-        self.share = float(used.mean())
-        self._square = self.share * screen.square
-        self._across = self.share * screen.across
-
-    def full(self, v: Floats) -> Floats:
-        """(R,) rows that are used, zero in the others."""
-        out = np.zeros(len(self.rows))
-        out[self.rows] = v
-        return out
-
-    @cached_property
-    def slope(self) -> Floats:
-        """(S, F) xᵀ r."""
-        return self.screen.inner(self.full(self.residual))
-
-    def columns(self, term: Term) -> Floats:
-        """(R', P) whitened columns of a term in the rows that are used."""
-        x = self.screen.columns(list(term.parts))[self.rows]
-        return x.sum(axis=1, keepdims=True) if term.common else x
-
-    def beside(self, chosen: Sequence[Term]) -> "Beside":
-        """Return the candidates beside chosen terms."""
-        return Beside(self, tuple(chosen))
-
-
-class Beside:
-    """The candidates beside a model and chosen terms, whose coefficients are free."""
-
-    def __init__(self, problem: Problem, chosen: tuple[Term, ...]) -> None:
-        """Project the chosen terms out."""
-        self.problem, self.chosen = problem, chosen
-        p = problem
-        self.rss, self.dof, self.slope = p.rss, p.dof, p.slope
-        self._square, self._across = p._square, p._across
-        self.unit = np.zeros((len(p.residual), 0))
-        if not chosen:
-            return
-        x = np.hstack([p.columns(t) for t in chosen])
-        free = p.model.project_out(x)
-        gram = x.T @ free
-        values, vectors = np.linalg.eigh((gram + gram.T) / 2)
-        kept = values > 1e-9 * values[-1]
-        turn = vectors[:, kept] / np.sqrt(values[kept])
-        self.turn, self.x = turn, x
-        self.unit = free @ turn  # M X T with Tᵀ Xᵀ M X T = 1
-        along = (x @ turn).T @ p.residual
-        self.rss = max(p.rss - float(along @ along), 1e-12 * p.rss)
-        self.dof = max(p.dof - int(kept.sum()), 1.0)
-        shadows = [p.screen.inner(p.full(u)) for u in self.unit.T]
-        self.slope = p.slope - sum(float(a) * s for a, s in zip(along, shadows, strict=True))
-        self._square = p._square - sum(s**2 for s in shadows)
-        partner = p.screen.grammar.partner
-        self._across = p._across - sum(s * s[:, partner] for s in shadows)
-        self._square = np.where(self._square > 1e-3 * p._square, self._square, 0.0)
-
-    def odds(self) -> tuple[Floats, Floats]:
-        """(S, F) logarithm of the odds of each candidate, and with its partner (free phase)."""
-        price = self.problem.screen.price
-        seen = self._square > 0
-        square = np.where(seen, self._square, 1.0)
-        gain = np.where(seen, self.slope**2 / square, 0.0)
-        single = np.where(seen, _evidence(gain, 1, self.rss, self.dof) - price, -np.inf)
-        partner = self.problem.screen.grammar.partner
-        both = np.full_like(single, -np.inf)
-        has = np.flatnonzero(partner >= 0)
-        a, b, c = square[:, has], square[:, partner[has]], self._across[:, has]
-        det = a * b - c**2
-        ok = seen[:, has] & seen[:, partner[has]] & (det > 1e-3 * a * b)
-        g, h = self.slope[:, has], self.slope[:, partner[has]]
-        gain2 = (b * g**2 - 2 * c * g * h + a * h**2) / np.where(ok, det, 1.0)
-        both[:, has] = np.where(
-            ok, _evidence(gain2, 2, self.rss, self.dof) - price[has] - np.log(2.0), -np.inf
-        )
-        return single, both
-
-    def score(self, terms: Sequence[Term]) -> list[Scored]:
-        """Score terms exactly beside the chosen ones."""
-        p = self.problem
-        out = []
-        for start in range(0, len(terms), 64):
-            some = terms[start : start + 64]
-            flat = [part for t in some for part in t.parts]
-            x = p.screen.columns(flat)[p.rows]
-            ends = np.cumsum([0] + [len(t.parts) for t in some])
-            columns = [
-                x[:, a:b].sum(axis=1, keepdims=True) if t.common else x[:, a:b]
-                for t, a, b in zip(some, ends[:-1], ends[1:], strict=True)
-            ]
-            for t, own in zip(some, columns, strict=True):
-                out.append(Scored(t, self._score(own)))
-        return out
-
-    def _score(self, x: Floats) -> FamilyScore:
-        p = self.problem
-        s, g = p.model.information(x), x.T @ p.residual
-        if self.unit.shape[1]:
-            along = self.unit.T @ x
-            s = s - along.T @ along
-            g = g - along.T @ (self.unit.T @ p.residual)
-        return score_family(s, g, self.rss, self.dof)
-
-    def shortlist(self) -> list[Term]:
-        """Return the candidates with the best odds, extended to phases, axes and joints."""
-        single, both = self.odds()
-        price = self.problem.screen.price
-        out: dict[tuple[tuple[int, int], ...], Term] = {}
-        best = _largest(single, SHORT_LIST)
-        for s, f in best:
-            out[((s, f),)] = Term(((s, f),), float(price[f]))
-        partner = self.problem.screen.grammar.partner
-        pairs = _largest(both, EXTENDED)
-        for s, f in pairs:
-            parts = ((s, f), (s, int(partner[f])))
-            out[parts] = Term(parts, float(price[f]) + np.log(2.0))
-        for s, f in best[:EXTENDED]:
-            for t in self._extended(s, f):
-                out.setdefault((*t.parts, (-1, int(t.common))), t)
-        return list(out.values())
-
-    def _extended(self, s: int, f: int) -> Iterator[Term]:
-        screen = self.problem.screen
-        site, price = screen.sites[s], float(screen.price[f]) + np.log(2.0)
-        same = [
-            k for k, o in enumerate(screen.sites) if o.group == site.group and screen.square[k, f]
-        ]
-        if len(same) > 1:
-            yield Term(tuple((k, f) for k in same), price)
-        for inner in screen.grammar.inner(f):
-            # The zero of one factor is free, as that of a temperature.
-            if screen.square[s, inner]:
-                yield Term(((s, f), (s, inner)), price)
-        if site.joint < 0:
-            return
-        amplitude, place = screen.grammar.amplitudes[f], screen.grammar.place
-        parts = []
-        for k, o in enumerate(screen.sites):
-            if (o.field, o.axis) != (site.field, site.axis) or o.joint < 0:
-                continue
-            other = amplitude.of_joint(site.joint, o.joint, screen.grammar.known)
-            at = None if other is None else place(other)
-            if at is not None and screen.square[k, at] > 0:
-                parts.append((k, at))
-        if len(parts) > 1:
-            yield Term(tuple(parts), price)
-            yield Term(tuple(parts), price, common=True)
-
-
-def _evidence(gain: Floats, count: int, rss: float, dof: float) -> Floats:
-    """Log evidence of columns at the best strength, by Laplace: for the short list only."""
-    gain = np.clip(gain, 0.0, 0.999999 * rss)
-    per = np.maximum(gain * dof / rss / count, 1.0)
-    return np.asarray(-0.5 * dof * np.log1p(-gain / rss) - 0.5 * count * (np.log(per) + 1.0))
-
-
-def _largest(x: Floats, count: int) -> list[tuple[int, int]]:
-    flat = x.ravel()
-    count = min(count, int(np.count_nonzero(np.isfinite(flat))))
-    if not count:
-        return []
-    top = np.argpartition(-flat, count - 1)[:count]
-    top = top[np.argsort(-flat[top], kind="stable")]
-    return [tuple(map(int, np.unravel_index(k, x.shape))) for k in top]  # type: ignore[misc]
 
 
 def search(problem: Problem, most: int = MOST_TERMS, beam: int = BEAM) -> list[Selection]:
@@ -298,7 +65,7 @@ def search(problem: Problem, most: int = MOST_TERMS, beam: int = BEAM) -> list[S
     near = tuple(c for c in found if c.odds > found[0].odds - 2 * LEAST)
     best: dict[int, Selection] = {}
     for start in starts:
-        s = Selection((start.term,), (start.odds,), near, start.score.p_value)
+        s = Selection((start.term,), (start.odds,), near)
         _keep(best, s)
         while len(s.terms) < most:
             after = problem.beside(s.terms)

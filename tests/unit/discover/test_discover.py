@@ -1,5 +1,6 @@
 """Laws searched, and none where nothing is hidden; mechanics that the model does not know."""
 
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
@@ -16,8 +17,9 @@ from hilcal.discover import amplitudes, shapes
 from hilcal.discover.amplitudes import Amplitude, Factor
 from hilcal.discover.discovery import Discovery, discover
 from hilcal.discover.law import Form, Part
+from hilcal.discover.problem import Problem, Term
 from hilcal.discover.screen import Screen, screen
-from hilcal.discover.search import Problem, Term, search
+from hilcal.discover.search import search
 from hilcal.discover.sites import sites
 from hilcal.discover.variables import variables
 from hilcal.discover.write_effect import effect_class, source_of_form
@@ -144,6 +146,17 @@ def test_candidates_beside_a_term_are_those_of_the_model_with_it() -> None:
     assert beside._square[tuple(two)] == pytest.approx(left, rel=2e-2)
     score = beside.score([second])[0].score
     assert 0 <= score.gain <= problem.rss
+
+
+def test_a_screening_of_some_of_the_poses_finds_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys.modules[Screen.__module__], "MOST_READINGS", 27)
+    thinned = screen(linearise(campaign(LAW)))
+    assert len(thinned.readings) <= 27
+    assert not thinned.rows.all()
+    (first, *_) = search(Problem(thinned))
+    (known, *_) = search(Problem(screened()))
+    assert first.terms[0].parts == known.terms[0].parts
+    assert first.total == pytest.approx(known.total, rel=1e-6)
 
 
 def test_columns_of_the_written_effect_are_those_of_the_search() -> None:
