@@ -50,6 +50,6 @@ def test_the_worst_split_decides() -> None:
     assert [f.met for f in good] == [True, True, None]
     bad = list(_figures("B", [LEFT, replace(LEFT, mean_m=76e-6, inside=0.89)]))
     assert [f.met for f in bad] == [False, False, None]
-    assert "73 µm, 76 µm" in bad[0].measured
+    assert "73.0 µm, 76.0 µm" in bad[0].measured
     far = replace(LEFT, split="first half", beyond=0.3, beyond_mean_m=3e-4, beyond_inside=1.0)
     assert "30.0 % of poses; left there 300 µm" in list(_figures("B", [far]))[2].measured
