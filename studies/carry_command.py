@@ -91,6 +91,11 @@ def carry(
                 figures += _figures(name, n, with_it, alone)
                 t.show(f"{figures[-1].what}: {figures[-1].measured}")
     title = "A real UR10 measured again: half of Series B as prior, tracker and target set up anew"
+    if not _numbers(poses):
+        title = (
+            "A real UR10 measured again elsewhere: half of Series B as prior of Series C, "
+            "frames anew"
+        )
     keep(keep_file, title, figures)
     t.document({"figures": [{"what": f.what, "measured": f.measured} for f in figures]})
 

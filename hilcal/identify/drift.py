@@ -13,8 +13,8 @@ P = V⁻¹ − V⁻¹ F (Fᵀ V⁻¹ F)⁻ Fᵀ V⁻¹ the fixed point is
 
     v_g ← v_g [yᵀ P K_g P y / (tr P K_g + 2/(s_g² + v_g))]^½
 
-and β, at least 1, follows from P y alike. The statistic yᵀ P K_g P y at v = 0 is a sum of weighted
-χ² when nothing has moved: its tail is the p-value of group g.
+and β, at least 1, follows from P y alike. The statistic yᵀ P K_g P y at v_g = 0, the others as they
+are, is a sum of weighted χ² when group g has not moved: its tail is the p-value of the group.
 
 Sources: Patterson and Thompson, Biometrika 58 (1971) 545-554; Polson and Scott, Bayesian Analysis 7
 (2012) 887-902 (half-Cauchy priors of variances).
@@ -150,7 +150,8 @@ def chosen_drift(model: Model, solution: Solution, w: Whitening) -> Floats:
 def conflicts(model: Model, solution: Solution, w: Whitening) -> tuple[Conflict, ...]:
     """Return how far the groups of a carried prior disagree with the readings, worst first.
 
-    Groups that the readings do not see are left out.
+    Each is tested beside the drift that the others were given, since a joint that has moved makes
+    its neighbours look as if they had. Groups that the readings do not see are left out.
 
     Args:
         model: fitted; without a carried prior there are none.
@@ -161,17 +162,23 @@ def conflicts(model: Model, solution: Solution, w: Whitening) -> tuple[Conflict,
         return ()
     prior = _with_least(model)
     rows = _rows(model, prior, solution, w)
-    total = rows.known @ rows.known.T + solution.beta * np.eye(len(rows.y))
-    p = _Projector.of(rows, total)
-    squares = [float(np.sum((g.T @ p.residual) ** 2)) for g in rows.drift]
     used = least(prior) if model.prior.drift is None else model.prior.drift
+    v = used**2 - least(prior) ** 2
+    total = rows.known @ rows.known.T + solution.beta * np.eye(len(rows.y))
+    for k in np.flatnonzero(v > NEGLIGIBLE):
+        total += v[k] * rows.drift[k] @ rows.drift[k].T
+    common = _Projector.of(rows, total)
     found = []
     for k, group in enumerate(prior.groups, 1):
-        inner = rows.drift[k].T @ p.matrix @ rows.drift[k]
+        x, p = rows.drift[k], common
+        if v[k] > NEGLIGIBLE:
+            p = _Projector.of(rows, total - v[k] * x @ x.T)
+        inner = x.T @ p.matrix @ x
         if not inner.size or float(np.trace(inner)) <= NEGLIGIBLE:
             continue
         values = np.maximum(np.linalg.eigvalsh(inner), 0.0)
-        chance = ratio_tail(values[values > 0] / MANY, MANY, float(squares[k]) / MANY**2)
+        square = float(np.sum((x.T @ p.residual) ** 2))
+        chance = ratio_tail(values[values > 0] / MANY, MANY, square / MANY**2)
         found.append(Conflict(group, chance, float(used[k])))
     return tuple(sorted(found, key=lambda c: c.p_value))
 
