@@ -165,8 +165,8 @@ def conflicts(model: Model, solution: Solution, w: Whitening) -> tuple[Conflict,
     used = least(prior) if model.prior.drift is None else model.prior.drift
     v = used**2 - least(prior) ** 2
     total = rows.known @ rows.known.T + solution.beta * np.eye(len(rows.y))
-    for k in np.flatnonzero(v > NEGLIGIBLE):
-        total += v[k] * rows.drift[k] @ rows.drift[k].T
+    for given in np.flatnonzero(v > NEGLIGIBLE):
+        total += v[given] * rows.drift[given] @ rows.drift[given].T
     common = _Projector.of(rows, total)
     found = []
     for k, group in enumerate(prior.groups, 1):
