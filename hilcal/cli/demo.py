@@ -117,7 +117,7 @@ def demo(
         if truth:
             t.show(text.heading("What was found against what is true"))
             t.show([*text_demo.truth_table(truth)])
-        improved = _put_to_use(t, p, m.measure)
+        improved = _put_to_use(t, p, m.measure, without_devices)
     ok, words = _judge(r, found)
     t.show([text_refine.verdict_line(found.diagnosis), "", text.heading(words)])
     if r.world.own is not None:
@@ -212,7 +212,7 @@ def _campaign(
         t.show("These readings leave no doubt: another arm is measured.\n")
 
 
-def _put_to_use(t: Terminal, p: Procedure, measure: Measure) -> Improvement | None:
+def _put_to_use(t: Terminal, p: Procedure, measure: Measure, drawn: bool) -> Improvement | None:
     """Move the simulated arm to corrected targets, and say what its tracker measures there."""
     t.show(text.heading("Put to use"))
     try:
@@ -228,6 +228,8 @@ def _put_to_use(t: Terminal, p: Procedure, measure: Measure) -> Improvement | No
         t.show(f"{error}\n")
         return None
     t.show([*text_calibrate.improvement_report(improved, None), ""])
+    if drawn:
+        t.show("What the tracker measures was drawn in the simulated world, through no wire.\n")
     return improved
 
 
