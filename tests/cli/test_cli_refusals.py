@@ -191,7 +191,7 @@ def test_an_unexpected_error_names_itself(
     def broken(*_: object) -> None:
         raise ZeroDivisionError("by\nzero")
 
-    monkeypatch.setattr("hilcal.cli.fitting.misfit_breakdown", broken)
+    monkeypatch.setattr("hilcal.cli.comparing.misfit_breakdown", broken)
     monkeypatch.delenv("HILCAL_DEBUG", raising=False)
     line = refused_with_notice(capsys, campaign)
     assert "ZeroDivisionError: by zero" in line
@@ -215,7 +215,7 @@ def test_an_interrupt_ends_quietly(
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("hilcal.cli.fitting.misfit_breakdown", interrupted)
+    monkeypatch.setattr("hilcal.cli.comparing.misfit_breakdown", interrupted)
     result = run(capsys, "compare", campaign)
     assert result.code == 130
     assert result.err.splitlines()[-1] == "error: interrupted"
@@ -232,7 +232,7 @@ def test_numerical_warnings_do_not_reach_the_user(
         warnings.warn("divide by zero", RuntimeWarning, stacklevel=1)
         return misfit_breakdown(p)  # type: ignore[arg-type]
 
-    monkeypatch.setattr("hilcal.cli.fitting.misfit_breakdown", noisy)
+    monkeypatch.setattr("hilcal.cli.comparing.misfit_breakdown", noisy)
     assert "divide" not in ok(capsys, "compare", campaign).err
 
 
