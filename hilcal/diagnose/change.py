@@ -225,6 +225,15 @@ def _pooled(now: Remeasured) -> tuple[float, float]:
     return now.rss + stated, now.dof + stated
 
 
+def _least_noise(now: Remeasured) -> float:
+    """σ² for what is stated of a size: never less than the earlier fit states.
+
+    That statement is of all directions together; a few lucky readings make none of them surer.
+    """
+    rss, dof = _pooled(now)
+    return max(rss / dof, 1.0)
+
+
 def _score(now: Remeasured, candidate: Candidate) -> _Scored:
     x, motion = now.columns(candidate.moving)
     s = now.projection.information(x)
@@ -316,8 +325,7 @@ def _needed(now: Remeasured, steps: list[_Step], tested: int) -> tuple[Remeasure
 
 
 def _sized(after: Remeasured, steps: Sequence[_Step], earlier: Earlier) -> tuple[Change, ...]:
-    rss, dof = _pooled(after)
-    noise = rss / dof
+    noise = _least_noise(after)
     out, at = [], 0
     for candidate, p_value, evidence, same in steps:
         count = len(candidate.parameters)
@@ -358,7 +366,7 @@ def _limits(
     after: Remeasured, known: Sequence[Candidate], found: Sequence[Candidate], tested: int
 ) -> tuple[Limit, ...]:
     """Return the smallest detectable changes of what was not found, of one parameter each."""
-    rss, dof = _pooled(after)
+    noise, dof = _least_noise(after), _pooled(after)[1]
     out = []
     for candidate in known:
         if len(candidate.parameters) != 1 or any(candidate is f for f in found):
@@ -367,7 +375,7 @@ def _limits(
         size = np.inf
         if s.shown:
             wanted = noncentrality_of_power(1, dof - 1, LEVEL / max(tested, 1), POWER)
-            size = float(np.sqrt(wanted * rss / dof / s.s[0, 0]))
+            size = float(np.sqrt(wanted * noise / s.s[0, 0]))
             size = size if size <= candidate.moving.effect.most() else np.inf
         moved = float(np.sqrt(np.mean(np.sum(s.motion[:, :, 0] ** 2, axis=1))))
         out.append(
