@@ -1,7 +1,7 @@
 """A campaign: its readings with their full covariance, and the fits that were stored in it."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -34,6 +34,7 @@ from hilcal.refine import Refinement
 from hilcal.report.build_story import Chapter
 from hilcal.report.diagnosis_document import to_json
 from hilcal.revisions import (
+    STORED,
     chain,
     check_sources,
     history,
@@ -188,7 +189,8 @@ class Campaign:
         """Return the fit of a stored revision; raises as `fit` does."""
         check_sources(record, self.path, self.catalogue)
         try:
-            return restore(record, self.cell, self.readings, self.catalogue)
+            stored = self.file.data_hash()
+            return restore(record, self.cell, self.readings, self.catalogue, stored)
         except InputError as error:
             if record.number != self.file.accepted():
                 raise
@@ -317,7 +319,8 @@ class Campaign:
         if hashed != content_hash(self.readings):
             raise InputError(f"{self.path}: the fit is of other readings than this campaign's")
         document = None if diagnosis is None else to_json(diagnosis)
-        return to_record(found, document, added, hashed, removed, parent)
+        record = to_record(found, document, added, hashed, removed, parent)
+        return replace(record, options={**record.options, STORED: self.file.data_hash()})
 
     def fit_in_use(
         self, say: Say = lambda text: None, revision: int | None = None

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import tomli_w
 import typer
 
@@ -101,7 +102,7 @@ def export(
             records = opened.file.revisions()
             about = {"table": "revisions", "campaign": run.name}
             write_columns(revisions, revision_table(records, record.number), about)
-            t.show(f"{revisions}: {len(records)} revisions; {record.number} is in use")
+            t.show(f"{revisions}: revisions 1 to {len(records)}; {record.number} is in use")
         if record is not None and any(of_model):
             with working(t.progress) as say:
                 _write_model(t, say, opened, revision, residuals, parameters, calibration, geometry)
@@ -269,10 +270,11 @@ def _write_geometry(found: Calibration, wanted: Geometry) -> Iterator[str]:
         words = _ur_note(note, arm, wanted.ur_hash)
         text, beyond = handover.ur_kinematics(nominal, arm.arm, words, wanted.ur_hash)
         later(wanted.ur_kinematics, text)
-        tilt = length(float(abs(beyond[:3, 3]).max()))
+        shift, tilt = np.linalg.norm(beyond[:3, 3]), np.linalg.norm(beyond[:3, :3] - np.eye(3))
         said.append(
-            f"{wanted.ur_kinematics}: kinematics_params_file of UR's ROS driver with {holds}; the "
-            f"flange's own shift ({tilt}) and tilt are in tcp_for_ur_kinematics of --frames"
+            f"{wanted.ur_kinematics}: kinematics_params_file of UR's ROS driver with {holds}; it "
+            f"has no place for the flange's own shift ({length(float(shift))}) and tilt "
+            f"({1e3 * float(tilt) / np.sqrt(2):.2g} mrad): tcp_for_ur_kinematics of --frames does"
         )
     if wanted.urdf is not None:
         later(wanted.urdf, handover.urdf(arm.arm, note))
@@ -294,7 +296,7 @@ def _write_geometry(found: Calibration, wanted: Geometry) -> Iterator[str]:
         each()
     yield from said
     if arm.beyond:
-        yield f"Not in it, since not constant: {', '.join(arm.beyond)}; hilcal compensate have it"
+        yield f"Not in it, since not constant: {', '.join(arm.beyond)}; hilcal compensate has it"
 
 
 def _ur_note(note: str, arm: Corrected, digest: str | None) -> str:
@@ -324,7 +326,8 @@ def _dh_words(path: Path, rows: dh_table.DhRows, holds: str, alone: bool) -> Ite
     far = abs(rows.d).max()
     if far > MANY:
         yield (
-            f"Nearly parallel axes have distant common normals: d up to {far:.0f} m, which cancel."
+            f"Nearly parallel axes have distant common normals: d up to {far:.0f} m, which cancel; "
+            "compute in double precision."
         )
 
 

@@ -6,15 +6,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import hilcal as hc
 from hilcal.campaign import Campaign
 from hilcal.config import load_config
 from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.covariance import COVERS, WHOLE
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import fit
 from hilcal.refine import refine
 from hilcal.robot.catalogue import configs_dir
 from studies.random_campaigns import rehearse
+from tests.support.cli_cases import rehearsal
 
 CELL = configs_dir() / "cells" / "demo_ur10e.toml"
 
@@ -84,3 +87,20 @@ def test_a_file_that_cannot_be_used_is_closed_again(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no readings"):
         Campaign.open(path)
     path.unlink()
+
+
+def test_a_revision_is_found_again_on_a_machine_that_rounds_otherwise(tmp_path: Path) -> None:
+    """The arm's scatter in the covariances is computed, and its last bits differ."""
+    path = tmp_path / "run.hilcal"
+    readings = rehearsal("nothing").readings
+    config = load_config(CELL).to_json()
+    with CampaignFile.create(path, config, str(CELL.parent), "made", more={COVERS: WHOLE}) as file:
+        file.append_readings(readings)
+    with hc.Campaign.open(path) as run:
+        run.append(hc.fit(hc.baseline(run.cell, run.readings), run.readings))
+        other = replace(run.readings, covariance=run.readings.covariance * (1 + 1e-15))
+        elsewhere = replace(run, readings=other)
+        np.testing.assert_allclose(elsewhere.fit().theta, run.fit().theta, rtol=1e-6, atol=1e-12)
+        run.file.append_readings(readings[:1])
+        with pytest.raises(hc.InputError, match="before readings were appended"):
+            replace(run, readings=run.file.readings()).fit()
