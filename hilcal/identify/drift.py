@@ -198,7 +198,8 @@ def _moments(forms: list[Floats], p: _Projector) -> tuple[Floats, Floats]:
     """YᵀP K_g P y and tr P K_g of each K_g (1 + G,)."""
     squares = [float(p.residual @ k @ p.residual) for k in forms]
     traces = [float(np.vdot(p.matrix, k)) for k in forms]
-    return np.array(squares), np.array(traces)
+    # At least zero but for rounding, as where an effect is not in the model.
+    return np.maximum(squares, 0.0), np.maximum(traces, 0.0)
 
 
 def _noise(rows: _Rows, p: _Projector, beta: float) -> float:

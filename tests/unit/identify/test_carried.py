@@ -9,6 +9,7 @@ import pytest
 from hilcal.calibration.calibration import Calibration
 from hilcal.data.records import content_hash
 from hilcal.data.revision import from_text, to_text
+from hilcal.diagnose.stepwise import add, remove
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline, with_effects
 from hilcal.identify.carried import CarriedPrior, carried_prior
@@ -96,6 +97,18 @@ def test_the_joint_that_moved_is_found_and_let_go() -> None:
     document = to_json(found)["prior"]
     assert document["source"]["n_readings"] == len(first.readings)  # type: ignore[index]
     assert document["effects"][0]["joint"] == 3  # type: ignore[index]
+
+
+@pytest.mark.filterwarnings("error")
+def test_an_effect_may_be_taken_out_or_added() -> None:
+    _, found = repaired()
+    without = remove(found, "joint_compliance")
+    assert without.model.names == NAMES[1:]
+    assert np.isfinite(without.theta).all()
+    assert without.chi2 > found.chi2
+    more = add(found, "base_compliance")
+    assert more.model.prior is not None
+    assert more.chi2 <= found.chi2 * (1 + 1e-3)
 
 
 def test_without_a_change_nothing_has_moved() -> None:
