@@ -107,8 +107,9 @@ def test_an_effect_may_be_taken_out_or_added() -> None:
     assert np.isfinite(without.theta).all()
     assert without.chi2 > found.chi2
     more = add(found, "base_compliance")
-    assert more.model.prior is not None
-    assert more.chi2 <= found.chi2 * (1 + 1e-3)
+    assert more.model.names == (*found.model.names, "base_compliance")
+    # The drift is chosen anew, so that the sum of squares may grow a little.
+    assert more.holdout.rms_sigma < 1.05 * found.holdout.rms_sigma
 
 
 def test_without_a_change_nothing_has_moved() -> None:
