@@ -3,6 +3,8 @@
 from hilcal.identify.carried import Group
 from hilcal.identify.drift import Conflict
 from hilcal.identify.fit import Fit
+from hilcal.identify.learnt import of_arm
+from hilcal.report.numbers import names
 
 TELL_P = 1e-3
 """p-value, times the number of groups that are looked at, below which a disagreement is told."""
@@ -29,7 +31,14 @@ def prior_lines(found: Fit) -> list[str]:
         )
     if len(told) > MOST:
         lines.append(f"  … and {len(told) - MOST} more (--json lists them)")
-    if not told:
+    known = {e.name for e in prior.posterior.effects}
+    new = [e.name for e in found.model.effects if of_arm(e) and e.name not in known]
+    ask = "hilcal compare EARLIER LATER says what has changed"
+    if new:
+        lines.append(f"  Its model did not have {names(new)}; {ask}.")
+    elif found.variance_factor_interval[0] > 1:
+        lines.append(f"  With it the model leaves more than the noise; {ask}.")
+    elif not told:
         lines.append("  The readings agree with it.")
     return lines
 

@@ -45,6 +45,21 @@ def test_the_next_campaign_starts_from_what_the_last_one_taught(
     assert json.loads(out)["variance_factor"] == pytest.approx(found["variance_factor"], rel=1e-6)
 
 
+def test_a_misfit_that_the_prior_does_not_know_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    old, new = tmp_path / "old.hilcal", tmp_path / "new.hilcal"
+    hidden = table(tmp_path / "b.csv", "joint_tilt_compliance", 1, 8)
+    run(capsys, "import", table(tmp_path / "a.csv", "nothing", 2, 8), "--config", CELL, "-o", old)
+    run(capsys, "import", hidden, "--config", CELL, "-o", new)
+    run(capsys, "identify", old)
+    _, out, _ = run(capsys, "identify", new, "--prior", old)
+    assert "leaves more than the noise; hilcal compare EARLIER LATER" in " ".join(out.split())
+    more = "base_frame,joint_compliance,joint_tilt_compliance"
+    _, out, _ = run(capsys, "identify", new, "--prior", old, "--effects", more)
+    assert "did not have joint_tilt_compliance; hilcal compare" in " ".join(out.split())
+
+
 def test_refusals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     old = tmp_path / "old.hilcal"
     run(capsys, "import", table(tmp_path / "a.csv", "nothing", 1, 8), "--config", CELL, "-o", old)
