@@ -12,7 +12,7 @@ from hilcal.data.revision import RevisionRecord
 from hilcal.data.same_readings import never_fitted
 from hilcal.data.stored_priors import CARRIED
 from hilcal.diagnose.change import find_changes
-from hilcal.diagnose.change_candidates import EFFECTS
+from hilcal.diagnose.change_candidates import changing
 from hilcal.diagnose.comparison import Comparison, error_today
 from hilcal.diagnose.completed import completed
 from hilcal.errors import CannotAnswerError, InputError
@@ -69,7 +69,9 @@ def compare(
     anew = not (_same_place(run, later) if same_setup is None else same_setup)
     say("predicting what the earlier calibration leaves")
     # A model that a diagnosis found to lack nothing that it can name is taken as it is.
-    whole, lacked = completed(fit, () if _judged(run.in_use(revision)) else EFFECTS, say)
+    whole, lacked = completed(
+        fit, () if _judged(run.in_use(revision)) else changing(run.catalogue), say
+    )
     at = setting(earlier_fit(whole), chosen, anew=anew, cell=later.cell)
     changes = find_changes(at, say)
     record = later.in_use()

@@ -21,7 +21,7 @@ from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
 from hilcal.data.readings import Readings
 from hilcal.diagnose.change import LEVEL, POWER, STATED_DOF, Changes, find_changes
-from hilcal.diagnose.change_candidates import EFFECTS
+from hilcal.diagnose.change_candidates import changing
 from hilcal.diagnose.completed import completed
 from hilcal.errors import HilcalError
 from hilcal.identify.baseline import with_effects
@@ -146,7 +146,7 @@ def studied_arm(
     world = replace(world, physics=physics)
     readings = measured(world, chosen, poses, rng)
     model = with_effects(cell, readings, "absolute", GEOMETRY)
-    found, _ = completed(fit(model, readings, "absolute"), EFFECTS)
+    found, _ = completed(fit(model, readings, "absolute"), changing(model.catalogue))
     return StudiedArm(robot, cell, world, chosen, loads[2:4], earlier_fit(found))
 
 

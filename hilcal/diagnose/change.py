@@ -23,6 +23,7 @@ from scipy.stats import f as f_distribution
 
 from hilcal.diagnose.change_candidates import Candidate, candidates
 from hilcal.diagnose.effect_ranking import SAME_EVIDENCE
+from hilcal.effects.changed import Changeable
 from hilcal.errors import CannotAnswerError
 from hilcal.identify.earlier import Earlier
 from hilcal.identify.remeasured import Remeasured, Setting, remeasure
@@ -41,7 +42,6 @@ TRIED = 5
 """Candidates with most evidence in the linearisation that are fitted exactly; a choice."""
 TAKEN_APART = 2
 """Joints for which zero and compliance are tried together: those of the first candidates."""
-REPAIRED = ("encoder_offset", "joint_compliance")
 MOST = 4
 """Most changes that are looked for; more is another arm. A choice."""
 ABSORBED = 1e-4
@@ -108,6 +108,7 @@ class Limit:
     Attributes:
         candidate: name.
         part: of the cell.
+        change: how it may change.
         unit: SI.
         size: in this unit; infinite where these readings cannot show any of a plausible size.
         moved_m: rms displacement of the target that it makes in the later readings, m.
@@ -115,6 +116,7 @@ class Limit:
 
     candidate: str
     part: str
+    change: Changeable
     unit: str
     size: float
     moved_m: float
@@ -283,9 +285,9 @@ def _trials(order: Sequence[Candidate]) -> list[tuple[Candidate, ...]]:
     """
     out: list[tuple[Candidate, ...]] = [(c,) for c in order[:TRIED]]
     for joint in list(dict.fromkeys(c.joint for c in order[:TRIED] if c.joint))[:TAKEN_APART]:
-        pair = [c for c in order if c.joint == joint and c.effect in REPAIRED]
-        if len(pair) == len(REPAIRED):
-            out.append((pair[0], pair[1]))
+        both = tuple(c for c in order if c.joint == joint and c.change.with_others)
+        if len(both) > 1:
+            out.append(both)
     return out
 
 
@@ -382,6 +384,7 @@ def _limits(
             Limit(
                 candidate.name,
                 candidate.part,
+                candidate.change,
                 candidate.units[0],
                 size * float(candidate.scale[0]),
                 size * moved if np.isfinite(size) else np.inf,

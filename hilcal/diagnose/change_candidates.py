@@ -7,23 +7,19 @@ temperature.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.data.readings import States
 from hilcal.effects.catalogue import Catalogue
+from hilcal.effects.changed import Changeable, Directions, Kind
 from hilcal.effects.protocol import Effect
 from hilcal.identify.remeasured import Moving
 from hilcal.types import Floats
 
-Kind = Literal["joint", "link", "base", "tool", "setup", "surroundings"]
-
-HARMONICS = 4
-"""Harmonics of a joint's transmission error that may have changed: two columns each. A choice: few
-readings resolve no more, and finer ones act as scatter."""
+PLACE = Changeable("setup", "tracker's place", "the place of the tracker, or of the base")
 SUFFIX = " changed"
 """Ends the name of an effect that stands for a change."""
 
@@ -36,8 +32,8 @@ class Candidate:
         name: effect and part, as "encoder_offset.j3"; "target_offset" for a whole effect.
         effect: name of the effect.
         part: what it is of: "joint 3", "link 2", "base", "tool", "target", "tracker", ...
-        kind: of part.
         joint: number of the joint, from 1; 0 for none.
+        change: how it may change.
         parameters: (k,) names of the directions.
         units: (k,) their units.
         scale: (k,) their ordinary magnitudes, SI.
@@ -47,12 +43,17 @@ class Candidate:
     name: str
     effect: str
     part: str
-    kind: Kind
     joint: int
+    change: Changeable
     parameters: tuple[str, ...]
     units: tuple[str, ...]
     scale: Floats
     moving: Moving
+
+    @property
+    def kind(self) -> Kind:
+        """Of what it is."""
+        return self.change.kind
 
     @property
     def of_arm(self) -> bool:
@@ -60,26 +61,9 @@ class Candidate:
         return self.kind in ("joint", "link", "base")
 
 
-PER_JOINT: Mapping[str, Mapping[str, object]] = {
-    "encoder_offset": {"joints": "each"},
-    "joint_compliance": {"joints": "each"},
-    "joint_tilt_compliance": {"joints": "each"},
-    "backlash": {"joints": "each"},
-    "hysteresis": {"joints": "each"},
-    "transmission_error": {"joints": "each", "harmonics": HARMONICS},
-}
-WHOLE: Mapping[str, tuple[Kind, str]] = {
-    "base_compliance": ("base", "base"),
-    "tool_compliance": ("tool", "tool"),
-    "load_point": ("tool", "load point"),
-    "target_offset": ("setup", "target"),
-    "wrench_bias": ("setup", "force sensor"),
-    "wrench_gain": ("setup", "force sensor"),
-    "tracker_scale": ("setup", "tracker's scale"),
-    "thermal_growth": ("surroundings", "temperature"),
-}
-EFFECTS = (*PER_JOINT, "link_geometry", "link_mass", *WHOLE)
-"""Names of the effects that a change may be of."""
+def changing(catalogue: Catalogue) -> tuple[str, ...]:
+    """Return the names of the effects that a change may be of."""
+    return tuple(e.name for e in catalogue.effects if e.change is not None)
 
 
 def candidates(
@@ -103,77 +87,61 @@ def candidates(
         effect.name = name + SUFFIX
         return effect
 
-    for name, options in PER_JOINT.items():
-        if (effect := made(name, options)) is not None:
-            out += _by_part(name, effect, "joint")
-    if (effect := made("link_geometry")) is not None:
-        out += _by_part("link_geometry", effect, "link")
-    if (effect := made("link_mass")) is not None:
-        out.append(_tool_weight(effect, cell))
-    for name, (kind, part) in WHOLE.items():
-        if (effect := made(name)) is not None:
-            out.append(_all_of(name, effect, kind, part))
+    for name in changing(catalogue):
+        change = catalogue[name].change
+        if change is None or (effect := made(name, change.options)) is None:
+            continue
+        if change.directions is not None:
+            out.append(_together(name, effect, change, change.directions(effect)))
+        elif change.part:
+            out.append(_all_of(name, effect, change))
+        else:
+            out += _by_part(name, effect, change)
     if not anew:
         for registration in catalogue.with_role("registration"):
             if (effect := made(registration.name)) is not None:
-                out.append(_all_of(registration.name, effect, "setup", "tracker's place"))
+                out.append(_all_of(registration.name, effect, PLACE))
     return tuple(out)
 
 
-def _by_part(name: str, effect: Effect, kind: Kind) -> Iterator[Candidate]:
+def _by_part(name: str, effect: Effect, change: Changeable) -> Iterator[Candidate]:
     """Yield a candidate for each joint or link: its parameters begin with "j3" or "link2"."""
     labels = [p.name.split(".")[0] for p in effect.parameters]
     for label in dict.fromkeys(labels):
         number = int(label.lstrip("jlink"))
         mine = [i for i, other in enumerate(labels) if other == label]
-        joint = number if kind == "joint" else 0
-        yield _candidate(f"{name}.{label}", name, effect, mine, kind, f"{kind} {number}", joint)
+        named = replace(change, part=f"{change.kind} {number}")
+        joint = number if change.kind == "joint" else 0
+        directions = _each(f"{name}.{label}", effect, mine)
+        yield _together(name, effect, named, directions, joint)
 
 
-def _all_of(name: str, effect: Effect, kind: Kind, part: str) -> Candidate:
-    return _candidate(name, name, effect, list(range(len(effect.parameters))), kind, part, 0)
+def _all_of(name: str, effect: Effect, change: Changeable) -> Candidate:
+    return _together(name, effect, change, _each(name, effect, list(range(len(effect.parameters)))))
 
 
-def _candidate(
-    name: str, of: str, effect: Effect, mine: list[int], kind: Kind, part: str, joint: int
-) -> Candidate:
-    parameters = effect.parameters
-    scale = np.array([parameters[i].scale for i in mine])
-    directions = np.zeros((len(parameters), len(mine)))
-    directions[mine, np.arange(len(mine))] = scale
-    return Candidate(
-        name=name,
-        effect=of,
-        part=part,
-        kind=kind,
-        joint=joint,
-        parameters=tuple(parameters[i].name for i in mine),
-        units=tuple(parameters[i].unit for i in mine),
-        scale=scale,
-        moving=Moving(effect, directions),
+def _each(name: str, effect: Effect, mine: list[int]) -> Directions:
+    """Some of the parameters, each by itself."""
+    every = effect.parameters
+    scale = np.array([every[i].scale for i in mine])
+    matrix = np.zeros((len(every), len(mine)))
+    matrix[mine, np.arange(len(mine))] = scale
+    return Directions(
+        name, tuple(every[i].name for i in mine), tuple(every[i].unit for i in mine), scale, matrix
     )
 
 
-def _tool_weight(effect: Effect, cell: Cell) -> Candidate:
-    """Mass at the flange, and first moment of the last link: a tool that is heavier, or elsewhere.
-
-    A mass δm at the origin of slot n is carried by every link before: its first moments there are
-    δm p_k, p_k (3,) the place of slot k in the axes of link k, k = 1..n.
-    """
-    n = cell.arm.n
-    mass = cell.arm.links[1:, :3, 3].reshape(-1)
-    scale = np.array([0.1, 5e-3, 5e-3, 5e-3])
-    directions = np.zeros((3 * n, 4))
-    directions[:, 0] = scale[0] * mass
-    directions[-3:, 1:] = scale[1:] * np.eye(3)
+def _together(
+    name: str, effect: Effect, change: Changeable, d: Directions, joint: int = 0
+) -> Candidate:
     return Candidate(
-        name="tool_weight",
-        effect="link_mass",
-        part="tool",
-        kind="tool",
-        joint=0,
-        parameters=("mass", "x", "y", "z"),
-        units=("kg", "kg·m", "kg·m", "kg·m"),
-        scale=scale,
-        moving=Moving(effect, directions),
+        name=d.name,
+        effect=name,
+        part=change.part,
+        joint=joint,
+        change=change,
+        parameters=d.parameters,
+        units=d.units,
+        scale=d.scale,
+        moving=Moving(effect, d.matrix),
     )

@@ -5,6 +5,7 @@ from typing import ClassVar
 import numpy as np
 
 from hilcal.data.readings import States
+from hilcal.effects.changed import Changeable
 from hilcal.effects.options import positive, rated_torques
 from hilcal.effects.per_joint import PerJoint
 from hilcal.effects.protocol import Columns, Parameter, Response, Situation
@@ -16,6 +17,9 @@ class Backlash(PerJoint):
 
     name = "backlash"
     summary = "dq_j = b_j sign(τ_j): the joint's play is taken up to the side of the torque"
+    change = Changeable(
+        "joint", words="play", cause="wear or repair?", listed=True, options={"joints": "each"}
+    )
     plausible = 20.0
     """1 mrad; makers of gears state 0.3 mrad at most. A choice."""
     elastic = True

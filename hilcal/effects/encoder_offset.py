@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from hilcal.effects.changed import Changeable
 from hilcal.effects.per_joint import PerJoint
 from hilcal.effects.protocol import Columns, Parameter, Situation
 
@@ -11,6 +12,15 @@ class EncoderOffset(PerJoint):
 
     name = "encoder_offset"
     summary = "dq_j = o_j: the zero of each joint is off"
+    change = Changeable(
+        "joint",
+        words="zero",
+        cause="repair, crash or a slipped joint?",
+        listed=True,
+        by_frame=True,
+        options={"joints": "each"},
+        with_others=True,
+    )
     plausible = 5.0
     """5 mrad: mastering to a mark, without a gauge, leaves 0.1° to 0.5°. A choice."""
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from hilcal.effects.changed import Changeable
 from hilcal.effects.per_joint import PerJoint
 from hilcal.effects.protocol import Columns, Parameter, Situation
 
@@ -11,6 +12,13 @@ class Hysteresis(PerJoint):
 
     name = "hysteresis"
     summary = "dq_j = h_j s_j: the joint stops short on the side from which it arrived"
+    change = Changeable(
+        "joint",
+        words="lost motion",
+        cause="wear or repair?",
+        listed=True,
+        options={"joints": "each"},
+    )
     plausible = 50.0
     """1 mrad; lost motion that makers of gears state is 0.3 mrad at most. A choice."""
     needs = ("approach",)

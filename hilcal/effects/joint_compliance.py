@@ -1,5 +1,6 @@
 """`joint_compliance`: the drive train twists under torque."""
 
+from hilcal.effects.changed import Changeable
 from hilcal.effects.options import rated_torques
 from hilcal.effects.per_joint import PerJoint
 from hilcal.effects.protocol import Columns, Parameter, Response, Situation
@@ -11,6 +12,14 @@ class JointCompliance(PerJoint):
 
     name = "joint_compliance"
     summary = "dq_j = c_j τ_j: each joint gives way in proportion to its torque"
+    change = Changeable(
+        "joint",
+        words="compliance",
+        cause="wear, crash or repair?",
+        listed=True,
+        options={"joints": "each"},
+        with_others=True,
+    )
     plausible = 10.0
     """30 mrad at the rated torque; gears state 1 to 5. A choice."""
     spread = 0.5

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from hilcal.effects.changed import Changeable
 from hilcal.effects.options import rated_torques
 from hilcal.effects.per_joint import PerJoint
 from hilcal.effects.protocol import Columns, Parameter, Response, Situation
@@ -15,6 +16,9 @@ class JointTiltCompliance(PerJoint):
 
     name = "joint_tilt_compliance"
     summary = "rotation k_j t_j⊥ at joint j: its bearing tilts under the moment across its axis"
+    change = Changeable(
+        "joint", words="tilt compliance", cause="wear or crash?", options={"joints": "each"}
+    )
     plausible = 10.0
     """10 mrad at the rated torque; cross-roller bearings state under 1. A choice."""
     elastic = True

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from hilcal.effects.changed import Changeable
 from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
@@ -16,6 +17,7 @@ class LinkGeometry(Effect):
 
     name = "link_geometry"
     summary = "constant displacement and rotation of each link's end (over-complete)"
+    change = Changeable("link", words="geometry", cause="crash?")
     plausible = 3.0
     """3 mm, 3 mrad; links differ from their drawings by 0.1 to 2 mm and mrad. A choice."""
 

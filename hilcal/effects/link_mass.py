@@ -2,9 +2,25 @@
 
 import numpy as np
 
+from hilcal.effects.changed import Changeable, Directions
 from hilcal.effects.protocol import Columns, Effect, LoadChange, Parameter, Situation
 from hilcal.robot.statics import first_moment_change
 from hilcal.types import Floats
+
+
+def tool_weight(effect: Effect) -> Directions:
+    """Mass at the flange, and first moment of the last link: a tool that is heavier, or elsewhere.
+
+    A mass δm at the origin of slot n is carried by every link before: its first moments there are
+    δm p_k, p_k (3,) the place of slot k in the axes of link k, k = 1..n.
+    """
+    arm = effect.cell.arm
+    scale = np.array([0.1, 5e-3, 5e-3, 5e-3])
+    matrix = np.zeros((3 * arm.n, 4))
+    matrix[:, 0] = scale[0] * arm.links[1:, :3, 3].reshape(-1)
+    matrix[-3:, 1:] = scale[1:] * np.eye(3)
+    units = ("kg", "kg·m", "kg·m", "kg·m")
+    return Directions("tool_weight", ("mass", "x", "y", "z"), units, scale, matrix)
 
 
 class LinkMass(Effect):
@@ -16,6 +32,7 @@ class LinkMass(Effect):
 
     name = "link_mass"
     summary = "moment (R_k δ_k) × g at joint k: links are heavier or balanced otherwise"
+    change = Changeable("tool", "tool", "the tool's weight", directions=tool_weight)
     for_missing_weight = True
     plausible = 20.0
     """1 kg·m: a fifth of the first moment of an upper arm of 20 kg. A choice."""

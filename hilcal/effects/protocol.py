@@ -16,6 +16,7 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.data.readings import States
+from hilcal.effects.changed import Changeable
 from hilcal.effects.options import Options
 from hilcal.errors import InputError
 from hilcal.robot.batch import zeros
@@ -121,7 +122,7 @@ class Columns:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Response:
-    """Change of an elastic deviation by P changes of the slot wrenches.
+    """Changeable of an elastic deviation by P changes of the slot wrenches.
 
     Attributes:
         dq: (N, P, n) or None.
@@ -134,7 +135,7 @@ class Response:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadChange:
-    """Change of the load on the arm, in axes that move with it.
+    """Changeable of the load on the arm, in axes that move with it.
 
     Attributes:
         point: (3,) shift of the load point, flange axes, m; None for none.
@@ -179,6 +180,7 @@ class Effect(ABC):
         drift: standard deviation by which the parameters of one arm may well have changed from one
             campaign to the next, in ordinary magnitudes, in a shrunk family in its strengths.
         spread: standard deviation between arms of one type, likewise.
+        change: what of it may have changed between two campaigns of an arm; None: nothing.
 
     Attributes:
         coarse: of an effect from `refined`, the name of the one that it is finer than; else empty.
@@ -201,6 +203,7 @@ class Effect(ABC):
     or hit, the readings ask for more."""
     spread: ClassVar[float] = 1.0
     """Other arms of the type have parameters of the ordinary magnitude; a choice."""
+    change: ClassVar[Changeable | None] = None
 
     def __init__(self, cell: Cell, states: States, options: Options | None = None) -> None:
         """Build the effect for a cell and the states at hand.
@@ -254,7 +257,7 @@ class Effect(ABC):
         return found
 
     def response(self, theta: Floats, s: Situation, change: Floats) -> Response:
-        """Change of the deviation by changes (N, P, n + 1, 6) of the slot wrenches.
+        """Changeable of the deviation by changes (N, P, n + 1, 6) of the slot wrenches.
 
         For `dq`, element (j, 5) is the torque of drive j + 1 (see `Situation.torque`).
         """
@@ -265,7 +268,7 @@ class Effect(ABC):
         return None
 
     def wrench_change(self, theta: Floats, s: Situation) -> Floats | None:
-        """Change (N, 6) of the load's wrench at the load point, base axes, or None.
+        """Changeable (N, 6) of the load's wrench at the load point, base axes, or None.
 
         For effects by which the recorded wrench `s.states.wrench` is not what acts; at the
         orientation of `s.chain`. The changes of several effects add.

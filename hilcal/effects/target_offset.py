@@ -6,6 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from hilcal.data.readings import States
+from hilcal.effects.changed import Changeable
 from hilcal.effects.options import PRIOR_HELP, Options, prior_of_lengths_and_turns
 from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
 from hilcal.errors import InputError
@@ -21,6 +22,7 @@ class TargetOffset(Effect):
 
     name = "target_offset"
     summary = "the tracked target sits elsewhere on the flange than configured"
+    change = Changeable("setup", "target", "the target's place on the tool")
     plausible = 10.0
     """10 mm, 10 mrad: a target that was mounted anew. A choice."""
     of_setup = True

@@ -5,6 +5,7 @@ from typing import ClassVar
 import numpy as np
 
 from hilcal.data.readings import States
+from hilcal.effects.changed import Changeable
 from hilcal.effects.options import choice, number
 from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
 from hilcal.errors import InputError
@@ -26,6 +27,9 @@ class ThermalGrowth(Effect):
 
     name = "thermal_growth"
     summary = "every link grows by α ΔT of its length, ΔT from 20 °C"
+    change = Changeable(
+        "surroundings", "temperature", "the length of the links with the temperature"
+    )
     plausible = 5.0
     """60e-6 per kelvin: polymers; aluminium has 23e-6. A choice."""
     needs = ("air_temperature or joint_temperature",)

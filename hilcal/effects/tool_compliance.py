@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from hilcal.effects.changed import Changeable
 from hilcal.effects.options import rated_torques
 from hilcal.effects.protocol import Columns, Effect, Parameter, Response, Situation
 from hilcal.types import Floats
@@ -20,6 +21,7 @@ class ToolCompliance(Effect):
 
     name = "tool_compliance"
     summary = "rotation a t_z + c t_⊥ at the flange: tool or force sensor tilts under the moment"
+    change = Changeable("tool", "tool", "the stiffness of what is bolted to the flange")
     plausible = 30.0
     """30 mrad at the rated torque of the last joint: a long, slender tool. A choice."""
     of_setup = True

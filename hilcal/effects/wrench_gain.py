@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from hilcal.effects.changed import Changeable
 from hilcal.effects.force_sensor import ForceSensorEffect
 from hilcal.effects.protocol import Parameter
 from hilcal.errors import CannotAnswerError
@@ -17,6 +18,7 @@ class WrenchGain(ForceSensorEffect):
 
     name = "wrench_gain"
     summary = "wrench read = (1 + g) true per axis: the force sensor has a gain error"
+    change = Changeable("setup", "force sensor", "the gain of the force sensor")
     plausible = 50.0
     """50 %: a wrong calibration matrix, a channel that hardly reads. A choice."""
     of_setup = True

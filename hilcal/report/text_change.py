@@ -11,38 +11,6 @@ from hilcal.diagnose.comparison import Comparison
 from hilcal.identify.parameter_differences import Differences
 from hilcal.report import numbers, text
 
-JOINT_WORDS = {
-    "encoder_offset": "zero",
-    "joint_compliance": "compliance",
-    "joint_tilt_compliance": "tilt compliance",
-    "backlash": "play",
-    "hysteresis": "lost motion",
-    "transmission_error": "transmission error",
-}
-WORDS = {
-    "link_mass": "the tool's weight",
-    "base_compliance": "the ground under the base",
-    "tool_compliance": "the stiffness of what is bolted to the flange",
-    "load_point": "where the load acts on the tool",
-    "target_offset": "the target's place on the tool",
-    "wrench_bias": "the zero of the force sensor",
-    "wrench_gain": "the gain of the force sensor",
-    "tracker_scale": "the tracker's scale",
-    "thermal_growth": "the length of the links with the temperature",
-    "base_frame": "the place of the tracker, or of the base",
-}
-CAUSE = {
-    "encoder_offset": "repair, crash or a slipped joint?",
-    "joint_compliance": "wear, crash or repair?",
-    "joint_tilt_compliance": "wear or crash?",
-    "backlash": "wear or repair?",
-    "hysteresis": "wear or repair?",
-    "transmission_error": "another gear or encoder?",
-    "link_geometry": "crash?",
-    "base_compliance": "loose bolts?",
-}
-SEEN = ("encoder_offset", "joint_compliance", "hysteresis", "backlash")
-"""Changes of joints whose least visible size is listed."""
 MOST_PARAMETERS = 6
 """Parameters of a change that are listed."""
 MOST_ROWS = 12
@@ -54,10 +22,10 @@ CLEAR = 2.0
 def words_of(c: Candidate) -> str:
     """Return what may have changed, in words."""
     if c.joint:
-        return f"joint {c.joint}'s {JOINT_WORDS.get(c.effect, c.effect)}"
+        return f"joint {c.joint}'s {c.change.words or c.effect}"
     if c.kind == "link":
-        return f"the geometry of {c.part}"
-    return WORDS.get(c.effect, c.effect)
+        return f"the {c.change.words or c.effect} of {c.part}"
+    return c.change.words or c.effect
 
 
 def comparison_report(c: Comparison, earlier: str, later: str) -> Iterator[RenderableType]:
@@ -171,7 +139,7 @@ def sentence(change: Change) -> str:
     c, s = change.candidate, change.sizes[0]
     what = words_of(c)
     head = what[:1].upper() + what[1:]
-    why = CAUSE.get(c.effect, "")
+    why = c.change.cause
     if len(change.sizes) > 1:
         return (
             f"{head} has changed: it moves the target by {numbers.length(change.moved_m)} rms "
@@ -180,7 +148,7 @@ def sentence(change: Change) -> str:
     unit, factor = numbers.unit_for(s.unit, [s.value])
     value, std = numbers.with_std(factor * s.value, factor * s.std)
     share = ""
-    if c.effect == "joint_compliance" and s.before is not None and s.before[0] > 0:
+    if c.moving.effect.elastic and s.before is not None and s.before[0] > 0:
         share = f", to {numbers.digits((s.before[0] + s.value) / s.before[0], 2)} times what it was"
     signed = value if value.startswith("-") else f"+{value}"
     words = f"{head} has moved by {signed} ± {std} {unit}{share} ({abs(s.z):.0f} σ)"
@@ -231,19 +199,18 @@ def _limits(c: Comparison) -> Iterator[RenderableType]:
     found = c.changes
     by_joint: dict[str, dict[str, Limit]] = {}
     for limit in found.limits:
-        effect = limit.candidate.split(".")[0]
-        if effect in SEEN:
-            by_joint.setdefault(limit.part, {})[effect] = limit
-    shown = [e for e in SEEN if any(e in of for of in by_joint.values())]
-    out = text.table("would have been seen", *(JOINT_WORDS[e] for e in shown))
+        if limit.change.listed:
+            by_joint.setdefault(limit.part, {})[limit.change.words] = limit
+    shown = list(dict.fromkeys(words for of in by_joint.values() for words in of))
+    out = text.table("would have been seen", *shown)
     for part, of in by_joint.items():
-        out.add_row(part, *(_least(of.get(e)) for e in shown))
+        out.add_row(part, *(_least(of.get(words)) for words in shown))
     yield out
     yield (
         f"The smallest change that these readings would have shown in {POWER * 10:.0f} cases of "
         f"10; where nothing has changed, a change is claimed once in {1 / LEVEL:.0f}."
     )
-    zeros = [p for p, of in by_joint.items() if _least(of.get("encoder_offset")) == "-"]
+    zeros = [x.part for x in found.limits if x.change.by_frame and _least(x) == "-"]
     if c.mode == "deflection":
         yield "Deflections do not show zeros and geometry: these cancel in them."
     elif zeros:
