@@ -125,7 +125,9 @@ def claims(outcomes: Sequence[Outcome]) -> Iterator[Figure]:
     )
     for words, mine in silent:
         least = 1.0 if "misjudged" in words else 0.99
-        yield _figure(words, [not o.formula for o in outcomes if mine(o)], least)
+        held = [not o.formula for o in outcomes if mine(o)]
+        if held:
+            yield _figure(words, held, least)
 
 
 def _bare(o: Outcome) -> bool:
