@@ -37,4 +37,4 @@ def test_claims_count_what_they_say() -> None:
     assert found["variables right"].met is True
     assert found["no law where nothing is hidden"].met is True
     assert found["no law where the noise is misjudged by two"].met is False
-    assert found["no law where an effect of the catalogue is hidden"].met is None
+    assert "no law where an effect of the catalogue is hidden" not in found  # none was
