@@ -64,7 +64,7 @@ def keep(path: Path | None, title: str, figures: Sequence[Figure]) -> None:
     """
     if path is None:
         return
-    words = [Path(w).name if Path(w).is_file() else w for w in sys.argv[1:]]
+    words = [Path(w).name if Path(w).exists() else w for w in sys.argv[1:]]
     words = [word for word in words if word not in ("--keep", path.name, str(path))]
     command = f"python -m studies {shlex.join(words)}"
     date = datetime.now(UTC).date().isoformat()
