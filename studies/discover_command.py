@@ -140,5 +140,5 @@ def _halved(o: Outcome) -> bool:
 
 def _figure(what: str, held: Sequence[bool], least: float) -> Figure:
     share = sum(held) / max(len(held), 1)
-    measured = f"{100 * share:.0f} % ({sum(held)} of {len(held)})"
+    measured = f"{100 * share:.3g} % ({sum(held)} of {len(held)})"
     return Figure(what, measured, f"{100 * least:g} %", share >= least if held else None)
