@@ -8,26 +8,20 @@ import typer
 from hilcal.campaign import Campaign
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import check_record, effect_names, fit_of
-from hilcal.cli.plan_output import POSES, Csv, Output, Quick, Seed, generator, write
+from hilcal.cli.plan_output import Csv, Output, Quick, Seed, generator, write
 from hilcal.cli.planning import read_cell
 from hilcal.cli.terminal import Json, Record, Revision, Run, Terminal, terminal
-from hilcal.data.plan import REFERENCE, read_plan
-from hilcal.data.run_log import PLAN
-from hilcal.diagnose.diagnosis import Diagnosis
-from hilcal.diagnose.doubt import MOST, in_doubt
-from hilcal.diagnose.effect_ranking import Suspect
+from hilcal.diagnose.doubt import MOST
 from hilcal.diagnose.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue
-from hilcal.errors import CannotAnswerError, InputError
-from hilcal.plan.checked_plan import checked
+from hilcal.errors import InputError
 from hilcal.plan.next import Next
-from hilcal.plan.summary import summarise
-from hilcal.procedure.separate import Doubt, plan_of, separating, without
+from hilcal.procedure.next_plan import doubt_to_settle, next_plan
+from hilcal.procedure.separate import Doubt, without
 from hilcal.report import numbers as words_of
 from hilcal.report.progress import Say, working
 from hilcal.report.text_next import next_report, poses_report
 from hilcal.report.text_plan import plan_report
-from hilcal.types import Floats
 
 
 def next_(
@@ -64,13 +58,11 @@ def next_(
     if poses is not None and poses < 1:
         raise InputError(f"--poses {poses}; valid: a whole number from 1")
     with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
-        config, numbers = (o.config, o.cell) if cell is None else read_cell(cell)
+        given = None if cell is None else read_cell(cell)
         doubt = _without_suspects(t, o, revision, _named(suspects, catalogue), say)
-        effects, place = doubt.suspects, reference_of(o)
-        found = separating(numbers, config, doubt, poses, rng, say, place, POSES)
-        summary = summarise(found.planned, config, rng, say, compare=not quick and not doubt.alone)
-        say("checking every motion in a dry run")
-        made = checked(numbers, config, plan_of(found, effects), summary)
+        n = next_plan(o, doubt, poses, rng, say, cell=given, quick=quick)
+        config, numbers = (o.config, o.cell) if given is None else given
+    found, made, effects = n.found, n.made, doubt.suspects
     write(t, numbers, config, made, output, csv, record, found.powers)
     t.show(f"In doubt: {words_of.names(effects, 'or')}.\n")
     report = next_report if doubt.alone is None else poses_report
@@ -114,68 +106,10 @@ def _without_suspects(
             f"revision {number} has scaling {newest.scaling}; next needs gc: run hilcal identify "
             "again"
         )
-    suspects, alone = named, None
-    if suspects is None:
-        say("diagnosing" if number is None else f"diagnosing revision {number}")
-        d = diagnose(newest, o.history(number), say)
-        suspects = in_doubt(d)
-        if not suspects:
-            raise CannotAnswerError(_settled(o, d))
-        finer = [s for s in d.suspects if s.coarse and s.effect in suspects]
-        if finer:
-            raise CannotAnswerError(f"not two effects, but one in doubt: {differ(o, finer[0])}")
-        a = d.pose_alone
-        alone = a if a is not None and a.chance is not None and newest.mode == "absolute" else None
-    return Doubt(without(newest, suspects, say), suspects, alone)
-
-
-def _settled(o: Campaign, d: Diagnosis) -> str:
-    """Say that no suspects are to be separated, and what else to do."""
-    head = "no suspects to separate:"
-    if d.verdict == "adequate":
-        return (
-            f"{head} the model is adequate; to sharpen it, plan on with: hilcal plan CELL.toml "
-            f"--after {o.path}, or separate named effects with --suspects A,B"
-        )
-    if d.verdict == "noise_misjudged":
-        return (
-            f"{head} the noise is misjudged, see hilcal diagnose {o.path}; repeat some readings, "
-            "or state the covariance anew"
-        )
-    if d.verdict == "missing_effect":
-        lead = d.suspects[0]
-        if lead.coarse:
-            return f"{head} {differ(o, lead)}"
-        return (
-            f"{head} {lead.effect} alone is missing; add it with: hilcal add {o.path} {lead.effect}"
-        )
-    why = "no effect of the catalogue explains the misfit"
-    if d.reason == "insufficient_catalogue":
-        why = (
-            f"all effects of the catalogue together do not explain the misfit, and "
-            f"{d.suspects[0].effect} may only resemble the missing effect"
-        )
-    return (
-        f"{head} {why}; see hilcal diagnose {o.path}, or give an effect of your own by "
-        "--effects-from"
-    )
-
-
-def differ(o: Campaign, s: Suspect) -> str:
-    """Say how to let joints differ, where the readings ask for it."""
-    return (
-        f"the model has one {s.coarse} for several joints; let them differ, and diagnose again: "
-        f'hilcal add {o.path} "{s.effect}"'
-    )
-
-
-def reference_of(o: Campaign) -> Floats | None:
-    """Return the joints (n,) of the campaign's reference pose; None where it has none."""
-    text = o.file.about(PLAN)
-    if text is None:
-        return None
-    plan = read_plan(text, f"{o.path}, its plan")
-    return plan.joints(REFERENCE) if REFERENCE in plan.pose_names else None
+    if named is not None:
+        return Doubt(without(newest, named, say), named, None)
+    say("diagnosing" if number is None else f"diagnosing revision {number}")
+    return doubt_to_settle(o, diagnose(newest, o.history(number), say), say)
 
 
 def _named(text: str | None, catalogue: Catalogue) -> tuple[str, ...] | None:

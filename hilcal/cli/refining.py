@@ -5,15 +5,15 @@ import shutil
 import signal
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from hilcal.campaign import Campaign
+from hilcal.changes import add_effect, remove_effect
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.ending import told_to_end
 from hilcal.cli.files import (
@@ -31,8 +31,6 @@ from hilcal.cli.prior import Drift, Prior, PriorOf, PriorOptions
 from hilcal.cli.terminal import Json, Record, Revision, Run, terminal
 from hilcal.data.purpose import refuse_fitting
 from hilcal.data.revision import change
-from hilcal.diagnose.diagnosis import History
-from hilcal.diagnose.effect_ranking import addition
 from hilcal.diagnose.verdict import NOTHING
 from hilcal.diagnose.verdict import diagnose as judge
 from hilcal.effects.catalogue import Catalogue
@@ -45,10 +43,7 @@ from hilcal.identify.fit_document import prior_to_json
 from hilcal.identify.frames_document import fit_to_json
 from hilcal.identify.other_arm import other_arm_of
 from hilcal.identify.weight import weight_note
-from hilcal.refine import add as add_effect
-from hilcal.refine import predicts_better
 from hilcal.refine import refine as refine_model
-from hilcal.refine import remove as remove_effect
 from hilcal.report import numbers, text, text_refine
 from hilcal.report.build_story import Chapter, build_story
 from hilcal.report.diagnosis_document import suspect_json, to_json
@@ -114,8 +109,7 @@ def add(
     if len(wanted) != 1:
         raise InputError(f"EFFECT {effect!r} has {len(wanted)} effects; valid: one")
     ((name, options),) = wanted.items()
-    make = partial(add_effect, options=options)
-    _change(run, revision, name, record, as_json, catalogue, make, options)
+    _change(run, revision, name, record, as_json, catalogue, options)
 
 
 def remove(
@@ -129,7 +123,7 @@ def remove(
     """Take an effect out of the model: error before and after."""
     catalogue = catalogue_with(effects_from)
     catalogue[effect]  # an unknown name is refused
-    _change(run, revision, effect, record, as_json, catalogue, remove_effect)
+    _change(run, revision, effect, record, as_json, catalogue)
 
 
 def _change(
@@ -139,74 +133,47 @@ def _change(
     record: Path | None,
     as_json: bool,
     catalogue: Catalogue,
-    make: Callable[[Fit, str], Fit],
     options: Options | None = None,
 ) -> None:
     """Make a revision with one effect more, which has `options`, or one less."""
     t, adds = terminal(as_json), options is not None
-    named = write_effect(effect, options or {})
     check_record(record)
     with Campaign.open(run, catalogue) as o:
         check_options(o, {effect: options or {}} if adds else {})
         with working(t.progress) as say:
-            before_number, before = stored_fit(t, o, say, revision)
-            say(f"{'adding' if adds else 'removing'} {named}")
-            after = make(before, effect)
-            say("diagnosing")
-            finer = effect in before.model.names
-            added, removed = (named if finer else effect, None) if adds else (None, effect)
-            before_it = o.history(before_number)
-            how = History(
-                added=tuple(n for n in after.model.names if n in (added, *before_it.added)),
-                removed=(*before_it.removed, *([] if removed is None else [removed])),
-            )
-            d = judge(after, how, say)
-            finish(before, say)
-            finish(after, say)
-            number = o.store(after, d, added, removed, before_number)
-            expected = addition(before, after) if adds and before.scaling == "gc" else None
-        stored = o.file.revision(before_number)
+            number, before = stored_fit(t, o, say, revision)
+            if options is None:
+                c = remove_effect(o, number, before, effect, say)
+            else:
+                c = add_effect(o, number, before, effect, options, say)
+        stored, d = o.file.revision(number), c.diagnosis
         verdict = str(stored.result_json.get("diagnose", {}).get("verdict", ""))
         rows: list[Row] = [
-            Row(before_number, before, verdict, stored.added, stored.removed),
-            Row(number, after, d.verdict, added, removed),
+            Row(number, before, verdict, stored.added, stored.removed),
+            Row(c.number, c.fit, d.verdict, c.added, c.removed),
         ]
         t.show([text_refine.revisions_table([r.shown for r in rows]), text_refine.key()])
-        t.show(_fell(before, after, named) if adds else _rose(before, after, effect))
-        t.show([] if expected is None else text_refine.addition_lines(expected))
+        named = write_effect(effect, options or {})
+        t.show(
+            text_refine.fell(before, c.fit, named)
+            if adds
+            else text_refine.rose(before, c.fit, effect)
+        )
+        t.show([] if c.expected is None else text_refine.addition_lines(c.expected))
         t.show(["", text_refine.verdict_line(d)])
         if record is not None:
             with working(t.progress) as say:
-                chapters = o.chapters(say, number)
+                chapters = o.chapters(say, c.number)
             record_story(t, chapters, record)
     t.document(
         {
             "revisions": revisions_json(rows),
             "verdict": d.verdict,
             "message": message(d),
-            **({} if expected is None else {"addition": suspect_json(expected)}),
+            **({} if c.expected is None else {"addition": suspect_json(c.expected)}),
             "diagnosis": to_json(d),
         }
     )
-
-
-def _fell(before: Fit, after: Fit, effect: str) -> str:
-    a, b = before.holdout, after.holdout
-    change = f"from {numbers.length(a.rms_m)} to {numbers.length(b.rms_m)}"
-    if b.rms_sigma < a.rms_sigma:
-        return f"With {effect} the error on poses left out falls {change}."
-    return (
-        f"With {effect} the error on poses left out does not fall ({change}): these readings do "
-        "not show this effect. The revisions before it are still there."
-    )
-
-
-def _rose(before: Fit, after: Fit, effect: str) -> str:
-    a, b = before.holdout, after.holdout
-    change = f"from {numbers.length(a.rms_m)} to {numbers.length(b.rms_m)}"
-    if predicts_better(after, before):
-        return f"Without {effect} the error on poses left out rises {change}: it belongs there."
-    return f"Without {effect} the error on poses left out goes {change}: it is not needed."
 
 
 def refine(

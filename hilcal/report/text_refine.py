@@ -7,6 +7,7 @@ from rich.text import Text
 
 from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.diagnose.effect_ranking import FALSE_ALARM, LEAST_SHARE, Suspect
+from hilcal.diagnose.stepwise import predicts_better
 from hilcal.identify.fit import Fit
 from hilcal.identify.full_prediction import full_prediction
 from hilcal.report import numbers, text
@@ -152,3 +153,27 @@ def key() -> Text:
         "the noise.\n",
         style="dim",
     )
+
+
+def fell(before: Fit, after: Fit, effect: str) -> str:
+    """Say what adding an effect did to the error on poses left out."""
+    a, b = before.holdout, after.holdout
+    if b.rms_sigma < a.rms_sigma:
+        return f"With {effect} the error on poses left out falls {_from_to(before, after)}."
+    return (
+        f"With {effect} the error on poses left out does not fall ({_from_to(before, after)}): "
+        "these readings do not show this effect. The revisions before it are still there."
+    )
+
+
+def rose(before: Fit, after: Fit, effect: str) -> str:
+    """Say what taking an effect out did to the error on poses left out."""
+    change = _from_to(before, after)
+    if predicts_better(after, before):
+        return f"Without {effect} the error on poses left out rises {change}: it belongs there."
+    return f"Without {effect} the error on poses left out goes {change}: it is not needed."
+
+
+def _from_to(before: Fit, after: Fit) -> str:
+    a, b = before.holdout, after.holdout
+    return f"from {numbers.length(a.rms_m)} to {numbers.length(b.rms_m)}"

@@ -1,0 +1,127 @@
+"""The plan of the next measurements, made from what a diagnosis leaves open; why there is none."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilcal.campaign import Campaign
+from hilcal.cell import Cell
+from hilcal.config import CellConfig
+from hilcal.diagnose.diagnosis import Diagnosis
+from hilcal.diagnose.doubt import in_doubt
+from hilcal.diagnose.effect_ranking import Suspect
+from hilcal.errors import CannotAnswerError
+from hilcal.plan.checked_plan import CheckedPlan, checked
+from hilcal.plan.next import Next
+from hilcal.plan.summary import summarise
+from hilcal.procedure.separate import Doubt, Say, plan_of, separating, without
+from hilcal.procedure.shared import reference_in
+
+POSES = 20
+"""Poses where the doubt does not say how many it needs; a choice."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NextPlan:
+    """The next measurements.
+
+    Attributes:
+        doubt: what they separate.
+        found: how well, pair by pair.
+        made: the plan, which may be run.
+    """
+
+    doubt: Doubt
+    found: Next
+    made: CheckedPlan
+
+
+def next_plan(
+    o: Campaign,
+    doubt: Doubt,
+    poses: int | None,
+    rng: np.random.Generator,
+    say: Say,
+    *,
+    cell: tuple[CellConfig, Cell] | None = None,
+    quick: bool = False,
+) -> NextPlan:
+    """Plan the measurements that settle a doubt, and check every motion in a dry run.
+
+    Args:
+        o: the campaign.
+        doubt: what is to be separated.
+        poses: as many readings as so many poses take; what the doubt needs where None.
+        rng: generator.
+        say: takes progress, one line each.
+        cell: configuration and cell, where they are not the campaign's any more.
+        quick: without comparing criteria and numbers of poses.
+
+    Raises:
+        InputError: suspects that cannot be, or a plan that may not be run.
+        CannotAnswerError: no measurement separates any two of them, or no plan can be made.
+    """
+    config, numbers = (o.config, o.cell) if cell is None else cell
+    found = separating(numbers, config, doubt, poses, rng, say, reference_in(o.file), POSES)
+    compare = not quick and not doubt.alone
+    summary = summarise(found.planned, config, rng, say, compare=compare)
+    say("checking every motion in a dry run")
+    made = checked(numbers, config, plan_of(found, doubt.suspects), summary)
+    return NextPlan(doubt, found, made)
+
+
+def doubt_to_settle(o: Campaign, d: Diagnosis, say: Say) -> Doubt:
+    """Return what a diagnosis leaves open, and a fit whose model does not hold the suspects.
+
+    Raises:
+        CannotAnswerError: nothing is in doubt; says what else to do.
+    """
+    suspects = in_doubt(d)
+    if not suspects:
+        raise CannotAnswerError(_settled(o, d))
+    finer = [s for s in d.suspects if s.coarse and s.effect in suspects]
+    if finer:
+        raise CannotAnswerError(f"not two effects, but one in doubt: {_differ(o, finer[0])}")
+    a = d.pose_alone
+    alone = a if a is not None and a.chance is not None and d.fit.mode == "absolute" else None
+    return Doubt(without(d.fit, suspects, say), suspects, alone)
+
+
+def _settled(o: Campaign, d: Diagnosis) -> str:
+    """Say that no suspects are to be separated, and what else to do."""
+    head = "no suspects to separate:"
+    if d.verdict == "adequate":
+        return (
+            f"{head} the model is adequate; to sharpen it, plan on with: hilcal plan CELL.toml "
+            f"--after {o.path}, or separate named effects with --suspects A,B"
+        )
+    if d.verdict == "noise_misjudged":
+        return (
+            f"{head} the noise is misjudged, see hilcal diagnose {o.path}; repeat some readings, "
+            "or state the covariance anew"
+        )
+    if d.verdict == "missing_effect":
+        lead = d.suspects[0]
+        if lead.coarse:
+            return f"{head} {_differ(o, lead)}"
+        return (
+            f"{head} {lead.effect} alone is missing; add it with: hilcal add {o.path} {lead.effect}"
+        )
+    why = "no effect of the catalogue explains the misfit"
+    if d.reason == "insufficient_catalogue":
+        why = (
+            f"all effects of the catalogue together do not explain the misfit, and "
+            f"{d.suspects[0].effect} may only resemble the missing effect"
+        )
+    return (
+        f"{head} {why}; see hilcal diagnose {o.path}, or give an effect of your own by "
+        "--effects-from"
+    )
+
+
+def _differ(o: Campaign, s: Suspect) -> str:
+    """Say how to let joints differ, where the readings ask for it."""
+    return (
+        f"the model has one {s.coarse} for several joints; let them differ, and diagnose again: "
+        f'hilcal add {o.path} "{s.effect}"'
+    )
