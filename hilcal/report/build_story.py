@@ -108,6 +108,7 @@ def build_story(chapters: Sequence[Chapter]) -> Story:
         target=None if readings.states.target is None else readings.target[rows],
         target_names=readings.target_names,
         pose_names=tuple(readings.pose_names[k] for k in readings.pose[rows]),
+        time_s=None if readings.states.time is None else readings.states.time[rows],
     )
 
 

@@ -181,6 +181,7 @@ class Story:
         target: (N,) number of the target that was read, into `target_names`; None for one.
         target_names: names of several targets.
         pose_names: (N,) name of each reading's pose; empty where its number is its name.
+        time_s: (N,) time of each reading, s; None where the readings do not state it.
     """
 
     arm: Arm
@@ -196,6 +197,7 @@ class Story:
     target: Ints | None = None
     target_names: tuple[str, ...] = ()
     pose_names: tuple[str, ...] = ()
+    time_s: Floats | None = None
 
     def pose_name(self, i: int) -> str:
         """Return the name of reading i's pose, as everywhere else."""

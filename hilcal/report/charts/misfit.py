@@ -1,0 +1,76 @@
+"""What the misfit follows: shares by recorded variable, and the curve of each that carries it."""
+
+from collections.abc import Sequence
+
+import plotly.graph_objects as go
+
+from hilcal.diagnose.diagnosis import Diagnosis
+from hilcal.report.charts import style
+from hilcal.report.charts.readings_drawn import escaped
+from hilcal.report.story import StoryCurve
+
+MOST = 12
+
+
+def misfit_shares(d: Diagnosis) -> go.Figure:
+    """Draw the share of the misfit that follows each recorded variable, the largest on top."""
+    rows = [v for v in d.misfit_breakdown if v.share > 0][:MOST]
+    if not rows:
+        return style.empty("The misfit follows no recorded variable.")
+    shares = [100 * v.share for v in rows]
+    names = [v.variable for v in rows]
+    return bars(
+        names,
+        shares,
+        [
+            f"{n}: {s:.0f} %, p = {v.p_value:.1g}"
+            for n, s, v in zip(names, shares, rows, strict=True)
+        ],
+        f"The misfit follows {rows[0].variable} most: {shares[0]:.0f} % of it.",
+        "share of the misfit on poses left out [%]",
+    )
+
+
+def misfit_curve(c: StoryCurve) -> go.Figure:
+    """Draw how the error depends on a variable, with standard uncertainties."""
+    trace = go.Scatter(
+        x=[escaped(n) for n in c.names] if c.names else c.x,
+        y=c.y,
+        error_y={"type": "data", "array": c.error, "color": style.GREY},
+        mode="markers" if c.names else "lines+markers",
+        marker={"color": style.MEASURED, "size": 8},
+        line={"color": style.MEASURED},
+        hovertemplate="%{x}: %{y:.3g} ± %{error_y.array:.2g}<extra></extra>",
+        showlegend=False,
+    )
+    says = (
+        f"{c.y_label} over {c.variable}, from {c.y.min():.3g} to {c.y.max():.3g}; "
+        f"{100 * c.share:.0f} % of the misfit on poses left out follows it."
+    )
+    return style.figure(says, x=c.x_label, y=c.y_label, traces=[trace], height=300)
+
+
+def bars(
+    names: Sequence[str],
+    values: Sequence[float],
+    hover: Sequence[str],
+    says: str,
+    x: str,
+    colors: Sequence[str] | str = style.MEASURED,
+) -> go.Figure:
+    """Draw horizontal bars, the first on top."""
+    trace = go.Bar(
+        x=list(values),
+        y=[escaped(n) for n in names],
+        orientation="h",
+        marker={"color": colors},
+        text=[f"{v:.3g}" for v in values],
+        textposition="auto",
+        hovertext=[escaped(h) for h in hover],
+        hoverinfo="text",
+        showlegend=False,
+    )
+    height = 90 + 28 * len(names)
+    out = style.figure(says, x=x, traces=[trace], height=height)
+    out.update_yaxes(autorange="reversed")
+    return out

@@ -1,0 +1,120 @@
+"""What all charts share: colours, templates for a light and a dark page, the sentence of a chart.
+
+The colours are those of the viewer (Okabe and Ito's, which colour-blind people tell apart), darker
+or lighter where that is needed for a contrast of 3 : 1 on both papers (WCAG 2.2, 1.4.11). No chart
+tells anything by colour alone.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import plotly.graph_objects as go
+from scipy import stats
+
+from hilcal.types import Floats, Ints
+
+MEASURED = "#3a96d0"
+NOISE = "#009e73"
+HOLDOUT = "#cc79a7"
+GREY = "#888b94"
+AMBER = "#c07f00"
+RED = "#e0325c"
+LIGHT, DARK = "#ffffff", "#15171c"
+"""The papers that charts are drawn on."""
+LEVELS = (GREY, AMBER, RED)
+LEVEL_NAMES = ("inside the noise", "doubtful", "outside the noise")
+SYMBOLS = ("circle", "diamond", "x")
+"""Marks of the levels, so that they are told apart without colours."""
+LIMITS = (0.99, 0.9999)
+"""Quantiles of χ²(3) from which a reading is doubtful, and outside: as in the viewer."""
+CONFIG: dict[str, object] = {"displayModeBar": False, "responsive": True, "scrollZoom": False}
+"""Options for plotly.js: no toolbar, and the wheel scrolls the page."""
+_INK = {False: ("#24272e", "#d9dbe0"), True: ("#e4e5e9", "#3b3f48")}
+
+
+def template(dark: bool) -> go.layout.Template:
+    """Return the look of charts on a light or dark page: transparent paper, quiet grid."""
+    ink, grid = _INK[dark]
+    axis = {
+        "gridcolor": grid,
+        "linecolor": grid,
+        "zerolinecolor": grid,
+        "automargin": True,
+        "title": {"standoff": 8},
+        "ticks": "",
+    }
+    in_space = {"gridcolor": grid, "zerolinecolor": grid, "showbackground": False, "color": ink}
+    layout = go.Layout(
+        font={"color": ink, "family": "system-ui, sans-serif", "size": 13},
+        paper_bgcolor="rgba(0,0,0,0)",
+        plot_bgcolor="rgba(0,0,0,0)",
+        xaxis=axis,
+        yaxis=axis,
+        scene={"xaxis": in_space, "yaxis": in_space, "zaxis": in_space},
+        hoverlabel={"align": "left", "bgcolor": DARK if dark else LIGHT, "font": {"color": ink}},
+        legend={"orientation": "h", "y": 1.02, "yanchor": "bottom", "x": 0, "font": {"size": 12}},
+        hovermode="closest",
+        margin={"l": 10, "r": 10, "t": 30, "b": 10},
+    )
+    return go.layout.Template(layout=layout)
+
+
+def figure(
+    says: str,
+    x: str = "",
+    y: str = "",
+    height: int = 360,
+    traces: Sequence[object] = (),
+    **layout: object,
+) -> go.Figure:
+    """Return a figure in the light scheme.
+
+    Args:
+        says: the sentence that the chart shows.
+        x: title of the horizontal axis, with its unit.
+        y: title of the vertical axis, with its unit.
+        height: CSS pixels; the width is that of the page.
+        traces: what is drawn.
+        layout: more of plotly's layout.
+    """
+    out = go.Figure(data=list(traces))
+    out.update_layout(template=template(False), height=height, meta={"says": says})
+    out.update_layout(xaxis={"title": {"text": x}}, yaxis={"title": {"text": y}})
+    out.update_layout(**layout)
+    return out
+
+
+def says(chart: go.Figure) -> str:
+    """Return the sentence that a chart shows."""
+    meta: Mapping[str, str] = chart.layout.meta or {}
+    return meta.get("says", "")
+
+
+def in_scheme(chart: go.Figure, dark: bool) -> go.Figure:
+    """Return a copy of a chart for a light or dark page."""
+    out = go.Figure(chart)
+    out.update_layout(template=template(dark))
+    return out
+
+
+def empty(words: str) -> go.Figure:
+    """Return a chart of nothing that says why."""
+    note = {"text": words, "showarrow": False, "xref": "paper", "yref": "paper", "x": 0.5, "y": 0.5}
+    hidden = {"visible": False}
+    return figure(words, height=160, annotations=[note], xaxis=hidden, yaxis=hidden)
+
+
+def levels(norm2: Floats) -> Ints:
+    """Level (N,) of squared Mahalanobis distances, 3 dof: 0 noise, 1 doubtful, 2 outside."""
+    return np.digitize(norm2, stats.chi2.ppf(LIMITS, 3)).astype(np.int64)
+
+
+def sigma_limits() -> tuple[float, float]:
+    """Mahalanobis distances from which a reading is doubtful, and outside."""
+    low, high = np.sqrt(stats.chi2.ppf(LIMITS, 3))
+    return float(low), float(high)
+
+
+def drawn(values: Floats) -> Floats:
+    """Return numbers as they are drawn: single precision makes pages half as large."""
+    return np.asarray(values, dtype=np.float32)
