@@ -12,6 +12,7 @@ from hilcal.diagnose.promise import LEAST_KEPT, kept_by_refit
 from hilcal.diagnose.stepwise import Refits, add, exchange, predicts_better, remove
 from hilcal.diagnose.stepwise_alternatives import Alternative
 from hilcal.diagnose.verdict import NOTHING, judge
+from hilcal.discover.proposal import LawSearch
 from hilcal.identify.arm_scatter import with_arm_scatter, with_prior_scatter
 from hilcal.identify.fit import Fit, fit
 from hilcal.model import Model
@@ -67,6 +68,11 @@ class Refinement:
         return self.diagnosis.verdict
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """Effects of any of its models, each once."""
+        return tuple(dict.fromkeys(n for s in self.steps for n in s.fit.model.names))
+
+    @property
     def rejected(self) -> tuple[str, ...]:
         """Effects whose addition was tried and did not lower the error on poses left out."""
         return self.diagnosis.history.rejected
@@ -78,6 +84,7 @@ def refine(
     mode: Mode,
     say: Say = lambda text: None,
     history: History = NOTHING,
+    laws: LawSearch | None = None,
 ) -> Refinement:
     """Fit, diagnose, add the first suspect, and repeat.
 
@@ -97,10 +104,13 @@ def refine(
         mode: "deflection" or "absolute".
         say: takes progress, one line each.
         history: how the starting model was reached, where it was not given.
+        laws: searches a law wherever the verdict is `unknown_effect`, before effects that only
+            resemble what is missing are added, and where the misfit is taken for the arm's scatter;
+            the law is then added and judged like any effect.
     """
     say(f"fitting {' + '.join(model.names) or 'the bare arm'}")
     readings = with_prior_scatter(model, readings)
-    path = Path(fit(model, readings, mode), say, history)
+    path = Path(fit(model, readings, mode), say, history, laws)
     changed = True
     while changed:
         path.extend()
@@ -111,16 +121,24 @@ def refine(
 class Path:
     """The revisions so far, and what was tried."""
 
-    def __init__(self, first: Fit, say: Say = lambda text: None, before: History = NOTHING) -> None:
+    def __init__(
+        self,
+        first: Fit,
+        say: Say = lambda text: None,
+        before: History = NOTHING,
+        laws: LawSearch | None = None,
+    ) -> None:
         """Begin with a fit, the effects of which stay.
 
         Args:
             first: the fit.
             say: takes progress, one line each.
             before: how its model was reached.
+            laws: searches laws.
         """
         self.steps: list[Step] = []
         self._given, self._before, self._say = first.model.names, before, say
+        self._laws = laws
         self._rejected, self._removed = [*before.rejected], [*before.removed]
         self._refits = Refits()
         taken = first.readings.arm_scatter is not None
@@ -148,8 +166,26 @@ class Path:
 
     def extend(self) -> None:
         """Add suspects while any lowers the error on poses left out."""
-        while self._room and self._add_one():
+        while self._room and (self._add_law() or self._add_one()):
             pass
+
+    def _add_law(self) -> bool:
+        """Add a law where no effect of the catalogue explains the misfit; whether one was added.
+
+        It is looked for as well where the misfit is about to be taken for the arm's scatter, which
+        is what nothing else explains.
+        """
+        last = self.steps[-1]
+        d = last.diagnosis
+        unexplained = d.verdict == "unknown_effect" or d.reason == "arm_scatter"
+        if self._laws is None or not unexplained or last.fit.readings.arm_scatter is not None:
+            return False
+        proposed = self._laws.propose(last.fit, self._say)
+        if proposed is None or not predicts_better(last.fit, proposed[0]):
+            return False
+        self._say(f"added {proposed[1]}; diagnosing")
+        self.append(*proposed)
+        return True
 
     def _add_one(self) -> bool:
         """Try the suspects, best first; returns whether one was added.

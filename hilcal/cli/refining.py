@@ -33,6 +33,7 @@ from hilcal.data.purpose import refuse_fitting
 from hilcal.data.revision import change
 from hilcal.diagnose.verdict import NOTHING
 from hilcal.diagnose.verdict import diagnose as judge
+from hilcal.discover.proposal import LawSearch
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.options import Options
 from hilcal.effects.written import read_effects_text, write_effect
@@ -48,6 +49,7 @@ from hilcal.report import numbers, text, text_refine
 from hilcal.report.build_story import Chapter, build_story
 from hilcal.report.diagnosis_document import suspect_json, to_json
 from hilcal.report.progress import working
+from hilcal.report.text_discover import laws_json, refined_laws
 from hilcal.report.text_prior import prior_lines
 from hilcal.report.text_registration import fitted_lines, other_arm_line
 from hilcal.report.text_unknown import curves
@@ -192,6 +194,14 @@ def refine(
     prior: Prior = None,
     prior_of: PriorOf = "arm",
     drift: Drift = None,
+    discover: Annotated[
+        bool,
+        typer.Option(
+            "--discover",
+            help="Where no effect explains the misfit, search a law and add it; its effect is "
+            "written beside the campaign: found.py.",
+        ),
+    ] = False,
     record: Record = None,
     effects_from: EffectsFrom = None,
     as_json: Json = False,
@@ -205,6 +215,7 @@ def refine(
     if start and (given or (from_latest and revision)):
         raise InputError(f"{start} keeps effects and readings; leave out the other options")
     known = PriorOptions(prior, prior_of, drift).load(catalogue)
+    laws = LawSearch(run.absolute().parent) if discover else None
     with Campaign.open(run, catalogue) as o:
         refuse_fitting(o.file)
         latest = o.latest() if from_latest else None if not start else o.in_use(revision)
@@ -225,7 +236,9 @@ def refine(
                 say("registering")
                 model = with_effects(o.cell, o.readings, mode, named, named, catalogue, known)
             how = NOTHING if latest is None else o.history(latest.number)
-            found = refine_model(model, fitted, mode, say, how)
+            found = refine_model(model, fitted, mode, say, how, laws)
+            if laws is not None:
+                laws.write(found.names)
             rows: list[Row] = []
             for k, step in enumerate(found.steps):
                 finish(step.fit, say)
@@ -252,6 +265,8 @@ def refine(
                 f"Tried and left out, since the error on poses left out did not fall: "
                 f"{', '.join(found.rejected)}."
             )
+        if laws is not None:
+            t.show(refined_laws(laws))
         last = found.diagnosis
         if last.verdict != "adequate" and not last.dependences:
             t.show(text.follows(last.misfit_breakdown))
@@ -265,6 +280,7 @@ def refine(
             "verdict": last.verdict,
             "message": message(last),
             "rejected": list(found.rejected),
+            **({} if laws is None else laws_json(laws)),
             "frames": fit_to_json(found.fit),
             **prior_to_json(found.fit),
             "other_arm": None if other is None else other.to_json(),

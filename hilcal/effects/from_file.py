@@ -35,7 +35,12 @@ def read_effects(path: Path) -> EffectFile:
     Raises:
         InputError: it cannot be read or run, or has no effect.
     """
-    where, content = str(path), _content(path)
+    return effects_of(_content(path), path)
+
+
+def effects_of(content: bytes, path: Path) -> EffectFile:
+    """Do as `read_effects` for what a file holds, or is going to hold."""
+    where = str(path)
     hashed = hashlib.sha256(content).hexdigest()
     module = ModuleType(f"effects_from_{hashed[:16]}")
     module.__file__ = str(path.absolute())

@@ -7,6 +7,7 @@ from rich.text import Text
 
 from hilcal.discover.discovery import Discovery
 from hilcal.discover.law import Coefficient, Law
+from hilcal.discover.proposal import LawSearch
 from hilcal.report import numbers, text
 
 FEW = 3
@@ -80,6 +81,39 @@ def coefficient(c: Coefficient) -> str:
     unit, factor = numbers.unit_for(c.unit, [c.value])
     value, std = numbers.with_std(factor * c.value, factor * c.std)
     return f"{value} ± {std} {'' if unit == '1' else unit}".rstrip()
+
+
+def refined_laws(s: LawSearch) -> Iterator[RenderableType]:
+    """Yield what the searches of a refinement came to: laws that stayed, or why there is none."""
+    for d in s.found:
+        if not d.laws:
+            yield numbers.sentence(silence(d))
+            continue
+        law = d.laws[0]
+        if law.name not in s.files:
+            yield f"{law.formula} was tried, and did not lower the error on poses left out."
+            continue
+        yield text.heading(f"{law.name}: a law that the catalogue does not have")
+        yield from _law(law, d, first=True)
+        yield (
+            f"It is the effect {law.name} in {s.files[law.name]}, to be edited; commands that read "
+            f"these revisions take it by --effects-from."
+        )
+
+
+def laws_json(s: LawSearch) -> dict[str, object]:
+    """Return the searches of a refinement as JSON."""
+    return {
+        "discover": [
+            {
+                **to_json(d),
+                "written": str(s.files[d.laws[0].name])
+                if d.laws and d.laws[0].name in s.files
+                else None,
+            }
+            for d in s.found
+        ]
+    }
 
 
 def to_json(d: Discovery) -> dict[str, object]:

@@ -4,6 +4,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,17 +19,26 @@ from hilcal.discover.amplitudes import Amplitude, Factor
 from hilcal.discover.discovery import Discovery, discover
 from hilcal.discover.law import Form, Part
 from hilcal.discover.problem import Problem, Term
+from hilcal.discover.proposal import LawSearch
 from hilcal.discover.screen import Screen, screen
 from hilcal.discover.search import search
 from hilcal.discover.sites import sites
 from hilcal.discover.variables import variables
 from hilcal.discover.write_effect import effect_class, source_of_form
+from hilcal.effects.catalogue import installed
 from hilcal.effects.check import check_effect
 from hilcal.effects.example import example_cell, example_situation, example_states
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.linearisation import effect_columns, linearise
-from hilcal.report.text_discover import discovery_report, silence, to_json
+from hilcal.refine import refine
+from hilcal.report.text_discover import (
+    discovery_report,
+    laws_json,
+    refined_laws,
+    silence,
+    to_json,
+)
 from hilcal.robot.catalogue import configs_dir
 from studies.random_campaigns import dead_weights, rehearsal_states
 from studies.unmodelled_laws import law_named, shift
@@ -93,6 +103,58 @@ def test_what_is_written_is_an_effect_that_lowers_the_error() -> None:
     assert after.parameters["bent.a"].value == pytest.approx(
         d.laws[0].parameters[0].value, rel=1e-4
     )
+
+
+def test_a_refinement_adds_the_law_and_its_file_gives_it_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, laws = campaign(LAW), LawSearch(tmp_path, "bent")
+    monkeypatch.setattr(
+        sys.modules[LawSearch.__module__], "discover", lambda fit, say, name: found()
+    )
+    r = refine(before.model, before.readings, before.mode, laws=laws)
+    assert r.steps[0].diagnosis.verdict == "unknown_effect"
+    assert [s.added for s in r.steps] == [None, "bent"]
+    assert r.verdict == "adequate"
+    laws.write(r.names)
+    again = installed().with_file(tmp_path / "bent.py")
+    stored = r.fit.model.catalogue.file_of("bent")
+    assert stored is not None
+    assert again.files[0].sha256 == stored.sha256
+    states = before.readings.states
+    model = before.model + again.make("bent", before.model.cell, states)
+    seen, same = (m.predict(states, r.fit.theta).observation for m in (r.fit.model, model))
+    assert same.position == pytest.approx(seen.position, abs=1e-12)
+    told = "\n".join(str(part) for part in refined_laws(laws))
+    assert "dq_3 = a·cos(q_4)·τ_3" in told
+    assert str(tmp_path / "bent.py") in told
+    (document,) = laws_json(laws)["discover"]  # type: ignore[misc]
+    assert document["written"] == str(tmp_path / "bent.py")
+
+
+def test_nothing_is_searched_where_the_model_is_adequate(tmp_path: Path) -> None:
+    before, laws = campaign(), LawSearch(tmp_path)
+    assert refine(before.model, before.readings, before.mode, laws=laws).verdict == "adequate"
+    assert laws.found == []
+
+
+def test_a_law_takes_a_name_and_a_file_that_are_free(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "found.py").write_text("mine", encoding="utf-8")
+    asked: list[str] = []
+
+    def silent(fit: Fit, say: object, name: str) -> Discovery:
+        asked.append(name)
+        return Discovery(fit, "no_law")
+
+    monkeypatch.setattr(sys.modules[LawSearch.__module__], "discover", silent)
+    laws = LawSearch(tmp_path)
+    assert laws.propose(campaign(LAW), lambda text: None) is None
+    laws.write(("found", "found_2"))
+    assert asked == ["found_2"]
+    assert [p.name for p in tmp_path.iterdir()] == ["found.py"]
+    assert "no law of this size" in "".join(map(str, refined_laws(laws)))
 
 
 def test_the_same_readings_give_the_same_answer() -> None:

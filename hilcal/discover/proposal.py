@@ -1,0 +1,89 @@
+"""Laws that a refinement may add where no effect explains the rest, each an effect file of its own.
+
+A proposed law is an effect like one that a user wrote: it is in the catalogue of the models that
+come after it, by a file that later commands are given again (`--effects-from`). The files are
+written at the end, those of laws that stayed; a file that exists is never replaced.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from hilcal.discover.discovery import Discovery, discover
+from hilcal.effects.from_file import effects_of
+from hilcal.errors import InputError
+from hilcal.identify.fit import Fit, fit
+
+MOST_SEARCHES = 3
+"""Searches of one refinement at most; a choice, by time."""
+NAME = "found"
+
+
+class LawSearch:
+    """Searches laws for one refinement, and keeps what it found.
+
+    Attributes:
+        found: the searches, in order.
+        files: of laws that stayed, by name; see `write`.
+    """
+
+    def __init__(self, folder: Path, name: str = NAME) -> None:
+        """Laws are named after the files that they will be: found.py, found_2.py, ….
+
+        Args:
+            folder: of the files.
+            name: of the first law.
+        """
+        self.found: list[Discovery] = []
+        self.files: dict[str, Path] = {}
+        self._folder, self._name = folder, name
+        self._sources: dict[str, str] = {}
+
+    def propose(self, of: Fit, say: Callable[[str], None]) -> tuple[Fit, str] | None:
+        """Return the fit with a law, and the law's name; None where no law is proposed."""
+        if len(self.found) == MOST_SEARCHES or of.scaling != "gc":
+            return None
+        name = self._free(of)
+        d = discover(of, say, name)
+        self.found.append(d)
+        if d.after is None:
+            return None
+        model, after = of.model, d.after
+        where = self.path(name)
+        file = effects_of(d.source.encode(), where)
+        catalogue = model.catalogue.with_effects(*file.effects)
+        catalogue = replace(catalogue, files=(*catalogue.files, file))
+        made = catalogue.make(name, model.cell, of.readings.states, m=of.readings.m)
+        grown = replace(model, effects=(*model.effects, made), catalogue=catalogue)
+        self._sources[name] = d.source
+        return fit(grown, of.readings, of.mode, of.scaling, after.theta), name
+
+    def path(self, name: str) -> Path:
+        """Return the file of a law."""
+        return self._folder.absolute() / f"{name}.py"
+
+    def write(self, names: tuple[str, ...]) -> None:
+        """Write the files of those effects that are proposed laws.
+
+        Raises:
+            InputError: a file cannot be written, or is there by now.
+        """
+        for name in names:
+            if name not in self._sources:
+                continue
+            where = self.path(name)
+            try:
+                with where.open("x", encoding="utf-8") as stream:
+                    stream.write(self._sources[name])
+            except OSError as error:
+                raise InputError(f"{where}: cannot be written ({error.strerror})") from None
+            self.files[name] = where
+
+    def _free(self, of: Fit) -> str:
+        taken = {*of.model.catalogue.names, *of.model.names, *self._sources}
+        names = (self._name if k == 1 else f"{self._name}_{k}" for k in range(1, 10_000))
+        free = (n for n in names if n not in taken and not self.path(n).exists())
+        try:
+            return next(free)
+        except StopIteration:
+            raise InputError(f"{self._folder}: no free name for a law's file") from None
