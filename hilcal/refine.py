@@ -166,7 +166,8 @@ class Path:
 
     def extend(self) -> None:
         """Add suspects while any lowers the error on poses left out."""
-        while self._room and (self._add_law() or self._add_one()):
+        # Where suspects are rejected, the step is judged anew: a law may be looked for after all.
+        while self._room and (self._add_law() or self._add_one() or self._add_law()):
             pass
 
     def _add_law(self) -> bool:

@@ -13,12 +13,12 @@ from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
 from hilcal.data.readings import Readings, States
 from hilcal.data.whitening import Mode, whitening
+from hilcal.discover.agreement import agreement
 from hilcal.discover.discovery import discover
 from hilcal.discover.law import Law
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
-from hilcal.identify.linearisation import linearise
 from hilcal.identify.residual import residual
 from hilcal.types import Floats, Ints
 from studies.foreign_laws import KINDS, Foreign, scene
@@ -128,7 +128,7 @@ def run_case(config: CellConfig, asked: Asked) -> Outcome:
         formula=d.laws[0].formula,
         site=_right_site(law, d.laws[0]),
         variables=frozenset(d.laws[0].variables) == law.variables,
-        correlation=_correlation(before, d.after, first.moved),
+        correlation=agreement(before, d.after, first.moved),
         before=_error(before, fresh),
         after=_error(d.after, fresh),
         p_value=d.laws[0].p_value,
@@ -159,17 +159,6 @@ def _scaled(c: _Campaign, size: float) -> _Campaign:
 def _right_site(law: Foreign, found: Law) -> bool:
     """Whether all that a law moves is what was hidden, or the same by geometry."""
     return all(any(words.startswith(site) for site in law.sites) for words in found.acts_on)
-
-
-def _correlation(before: Fit, after: Fit, moved: Floats) -> float:
-    """Correlation of what was hidden with what the law adds, the model projected out."""
-    linear, w = linearise(before), before.whitening
-    truth = linear.project_out(w.whiten(w.raw(moved[~before.outlier])).reshape(-1))
-    effect, theta = after.model.effects[-1], after.theta[after.model.slices()[-1]]
-    jacobian = before.model.jacobian_of((effect,), before.solution.prediction, before.theta, w.m)
-    told = linear.project_out(w.whiten(w.raw(jacobian @ theta)).reshape(-1))
-    size = float(np.linalg.norm(truth) * np.linalg.norm(told))
-    return float(truth @ told) / max(size, 1e-300)
 
 
 def _error(of: Fit, fresh: _Campaign) -> float:

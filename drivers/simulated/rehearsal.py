@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -20,6 +21,8 @@ from hilcal.types import Ints
 
 NOTHING = "nothing"
 RANDOM = "random"
+INVENTED = "invented"
+"""A law that the catalogue lacks; see `invented_law`."""
 REGISTRATION_XYZ = (2.4, -1.6, -0.5)
 REGISTRATION_ROTVEC = (0.0, 0.0, 2.1)
 _SOFTER = 1.5  # a gear that stiffens starts softer than its mean
@@ -33,6 +36,11 @@ def choices() -> tuple[str, ...]:
 def own_choices(catalogue: Catalogue | None) -> tuple[str, ...]:
     """Effects of a user's own that can be hidden, too; see `own_law`."""
     return () if catalogue is None else own_names(catalogue, EFFECTS)
+
+
+def invented_law(catalogue: Catalogue) -> Catalogue:
+    """Return a catalogue with the invented law, for the world that hides it."""
+    return catalogue.with_file(Path(__file__).with_name("invented.py"))
 
 
 def check_choice(choice: str, catalogue: Catalogue | None = None) -> None:

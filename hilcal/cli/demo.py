@@ -3,13 +3,21 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import typer
 
-from drivers.simulated.rehearsal import NOTHING, RANDOM, Rehearsal, check_choice
+from drivers.simulated.rehearsal import (
+    INVENTED,
+    NOTHING,
+    RANDOM,
+    Rehearsal,
+    check_choice,
+    invented_law,
+)
 from hilcal.calibration.improvement import Improvement
 from hilcal.campaign import Campaign
 from hilcal.cli.doubting import CAMPAIGNS, Doubted, doubted, doubtful_case
@@ -26,6 +34,9 @@ from hilcal.cli.rehearsing import (
 from hilcal.cli.terminal import Json, Record, Terminal, terminal
 from hilcal.config import load_config
 from hilcal.data.campaign_file import may_write
+from hilcal.discover.agreement import agreement
+from hilcal.discover.proposal import LawSearch
+from hilcal.discover.search import SAME
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.baseline import baseline
 from hilcal.procedure.procedure import Measure, Procedure
@@ -36,6 +47,7 @@ from hilcal.report import numbers, text, text_calibrate, text_demo, text_refine
 from hilcal.report.build_story import Chapter
 from hilcal.report.diagnosis_document import to_json
 from hilcal.report.progress import working
+from hilcal.report.text_discover import laws_json, refined_laws
 from hilcal.report.verdict_words import message
 from hilcal.revisions import to_record
 from hilcal.robot.catalogue import configs_dir
@@ -49,7 +61,12 @@ VALIDATION = 10
 
 def demo(
     hide: Annotated[
-        str | None, typer.Option("--hide", metavar="EFFECT", help="An effect, random or nothing.")
+        str | None,
+        typer.Option(
+            "--hide",
+            metavar="EFFECT",
+            help="An effect, random, nothing, or invented: a law that the catalogue lacks.",
+        ),
     ] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Of everything random.")] = None,
     output: Annotated[
@@ -83,18 +100,23 @@ def demo(
     if number < 0:
         raise InputError(f"--seed {number}; valid: a whole number, 0 or more")
     wanted = hide or config.simulation.hide
-    check_choice(wanted or RANDOM, catalogue)
+    world = invented_law(catalogue) if wanted == INVENTED else catalogue
+    check_choice(wanted or RANDOM, world)
     files = Files(output)
     for path in (output, files.validation, files.corrected):
         may_write(path, True)  # before the planning, which takes a while
     told = RehearsalSettings(
-        config, wanted or RANDOM, number, output, configs_dir() / "cells", catalogue
+        config, wanted or RANDOM, number, output, configs_dir() / "cells", catalogue, world
     )
+    laws = LawSearch(output.absolute().parent) if wanted == INVENTED else None
     asked = _Asked(wanted or RANDOM, poses, without_devices, ambiguous)
     with _campaign(t, told, asked) as (m, r, doubt):
         with working(t.progress) as say:
             model = baseline(r.cell, r.readings, r.mode, catalogue)
-            found = refine_model(model, r.readings, r.mode, say)
+            found = refine_model(model, r.readings, r.mode, say, laws=laws)
+            if laws is not None:
+                laws.write(found.names)
+                catalogue = found.fit.model.catalogue
             for step in found.steps:
                 finish(step.fit, say)
         settings = Settings(poses, validation, seed=number, readings=r.mode, hide=told.choice)
@@ -111,6 +133,8 @@ def demo(
         ]
         for row, s in zip(rows, found.steps, strict=True):
             t.show(text_demo.step_report(row.number, row.shown[1], s.diagnosis))
+        if laws is not None:
+            t.show(refined_laws(laws))
         t.show(text.heading("The error, revision by revision"))
         t.show([text_refine.revisions_table([r.shown for r in rows]), text_refine.key()])
         truth = text_demo.compared(found.steps[-1].fit, r.world.truth)
@@ -118,9 +142,14 @@ def demo(
             t.show(text.heading("What was found against what is true"))
             t.show([*text_demo.truth_table(truth)])
         improved = _put_to_use(t, p, m.measure, without_devices)
-    ok, words = _judge(r, found)
+    ok, words = _judge(r, found) if laws is None else _judge_law(r, found, laws)
     t.show([text_refine.verdict_line(found.diagnosis), "", text.heading(words)])
-    if r.world.own is not None:
+    if r.world.own is not None and laws is not None:
+        t.show(
+            f"The simulated arm moved by {r.world.own.effect.summary} with the model's own "
+            "mechanics, like a law of a user's own: this shows whether such a campaign reveals it."
+        )
+    elif r.world.own is not None:
         t.show(
             f"The simulated arm moved by the law of {r.hidden} itself: this shows whether such a "
             "campaign reveals it, not whether the law is right."
@@ -130,7 +159,8 @@ def demo(
         for k, s in zip(numbered, found.steps, strict=True)
     ]
     record_story(t, chapters, record)
-    more = "".join(f" --effects-from {path}" for path in effects_from or ())
+    files_given = [*(effects_from or ()), *(() if laws is None else laws.files.values())]
+    more = "".join(f" --effects-from {path}" for path in files_given)
     t.show(f"\nThe campaign is in {output}. Go on with: hilcal view {output}{more}")
     t.document(
         {
@@ -140,6 +170,7 @@ def demo(
             "seed": number,
             "readings": r.mode,
             "found": ok,
+            **({} if laws is None else laws_json(laws)),
             **({} if doubt is None else {"doubt": doubt.document}),
             "verdict": found.verdict,
             "message": message(found.diagnosis),
@@ -253,6 +284,8 @@ def _introduce(t: Terminal, r: Rehearsal, choice: str, seed: int) -> None:
     what = {
         NOTHING: "Nothing is hidden in it; the program does not know that.",
         RANDOM: "An effect, drawn at random, is hidden in it.",
+        INVENTED: "A law is hidden in it that no effect of the catalogue describes; the program "
+        "does not know that.",
     }.get(choice, f"The effect {r.hidden} is hidden in it; the program does not know which.")
     t.show(text.heading(f"A simulated {r.cell.arm.name} and a laser tracker, seed {seed}"))
     t.show(
@@ -261,6 +294,25 @@ def _introduce(t: Terminal, r: Rehearsal, choice: str, seed: int) -> None:
     )
     kind = "deflections: loaded minus unloaded" if r.mode == "deflection" else "absolute positions"
     t.show(f"The model is fitted to {kind}.\n")
+
+
+def _judge_law(r: Rehearsal, found: Refinement, laws: LawSearch) -> tuple[bool, str]:
+    """Whether the invented law was found, and that in words."""
+    own = r.world.own
+    if own is None:
+        return False, "Nothing was hidden."
+    ((_, true),) = own.truth.items()
+    unit, factor = numbers.unit_for(own.effect.parameters[0].unit, [true])
+    hidden = f"Hidden was a law: {own.effect.summary}, a = {factor * true:.3g} {unit}"
+    soft = r.world.physics.joint_compliance
+    moved, _ = own.moved(r.cell, r.world.registration, soft, r.readings.states)
+    for before, after in pairwise(found.steps):
+        d = next((d for d in laws.found if d.laws and d.laws[0].name == after.added), None)
+        if d is not None:
+            law, same = d.laws[0], agreement(before.fit, after.fit, moved)
+            told = f"Found was {law.formula}, which agrees with it over these readings by a"
+            return same >= SAME, f"{hidden}. {told} correlation of {same:.3f}."
+    return False, f"{hidden}. It was not found."
 
 
 def _judge(r: Rehearsal, found: Refinement) -> tuple[bool, str]:

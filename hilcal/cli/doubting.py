@@ -110,7 +110,7 @@ def doubtful_case(
         case = replace(told, config=strong, choice=choice, seed=int(rng.integers(2**31)))
         if k % ARMS == 0:
             plan = first_plan(case, few, FIRST, lambda words: None)
-        secret = case_of_plan(strong, plan, choice, case.seed, case.catalogue)
+        secret = case_of_plan(strong, plan, choice, case.seed, case.world)
         drawn = [read_plan(secret, plan, [case.seed, 1 + j]) for j in range(DRAWS)]
         if choice == NOTHING or (
             all(_resembled(r, case) for r in drawn) and _left_open(drawn[0], case)

@@ -46,6 +46,7 @@ class RehearsalSettings:
         output: the campaign file to make.
         base_dir: directory that paths in the configuration are relative to.
         catalogue: the effects that a model can have.
+        lacking: the same with what is hidden, where the models cannot have that.
     """
 
     config: CellConfig
@@ -54,6 +55,12 @@ class RehearsalSettings:
     output: Path
     base_dir: Path
     catalogue: Catalogue
+    lacking: Catalogue | None = None
+
+    @property
+    def world(self) -> Catalogue:
+        """The effects that can be hidden."""
+        return self.catalogue if self.lacking is None else self.lacking
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,7 +87,7 @@ def first_plan(told: RehearsalSettings, config: CellConfig, poses: int, say: Say
         poses: number of poses.
         say: told what is being done.
     """
-    config = as_told(config, told.choice, told.catalogue)
+    config = as_told(config, told.choice, told.world)
     cell = cell_from_config(config, told.base_dir)
     plan = make_plan(cell, config, poses, told.seed, told.catalogue, say)
     refuse(dry_run(cell, config, plan), "the plan")
@@ -100,7 +107,7 @@ def on_devices(t: Terminal, told: RehearsalSettings, plan: Plan) -> Iterator[Mea
     """
     with ExitStack() as stack:
         with working(t.progress) as say:
-            secret = case_of_plan(told.config, plan, told.choice, told.seed, told.catalogue)
+            secret = case_of_plan(told.config, plan, told.choice, told.seed, told.world)
             say("starting the simulated devices")
             there = stack.enter_context(simulated_cell(secret, told.seed, told.base_dir))
         t.notice(NEWCOMER)
@@ -134,7 +141,7 @@ def in_process(t: Terminal, told: RehearsalSettings, plan: Plan) -> Iterator[Mea
     They are written bit by bit, as a real campaign grows.
     """
     with working(t.progress):
-        secret = case_of_plan(told.config, plan, told.choice, told.seed, told.catalogue)
+        secret = case_of_plan(told.config, plan, told.choice, told.seed, told.world)
     source = "rehearsal in a simulated cell, without devices"
     made = secret.config.to_json()
     with CampaignFile.create(

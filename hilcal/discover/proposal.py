@@ -40,8 +40,11 @@ class LawSearch:
         self._sources: dict[str, str] = {}
 
     def propose(self, of: Fit, say: Callable[[str], None]) -> tuple[Fit, str] | None:
-        """Return the fit with a law, and the law's name; None where no law is proposed."""
-        if len(self.found) == MOST_SEARCHES or of.scaling != "gc":
+        """Return the fit with a law, and the law's name; None where no law is proposed.
+
+        A fit is searched once, and so many of a refinement at most.
+        """
+        if any(d.fit is of for d in self.found) or len(self.found) == MOST_SEARCHES:
             return None
         name = self._free(of)
         d = discover(of, say, name)

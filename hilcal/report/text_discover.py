@@ -97,7 +97,7 @@ def refined_laws(s: LawSearch) -> Iterator[RenderableType]:
         yield from _law(law, d, first=True)
         yield (
             f"It is the effect {law.name} in {s.files[law.name]}, to be edited; commands that read "
-            f"these revisions take it by --effects-from."
+            f"these revisions take it by --effects-from.\n"
         )
 
 

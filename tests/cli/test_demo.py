@@ -5,12 +5,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.simulated.rehearsal import choices
+from drivers.simulated.rehearsal import (
+    INVENTED,
+    check_choice,
+    choices,
+    invented_law,
+    own_choices,
+)
 from hilcal.cli.rehearsing import RehearsalSettings, first_plan
 from hilcal.config import CellConfig, load_config
 from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.plan import Plan
 from hilcal.data.purpose import purpose_of
+from hilcal.effects.catalogue import installed
 from hilcal.errors import InputError
 from hilcal.report.progress import Say
 from studies.random_campaigns import rehearse
@@ -116,6 +123,29 @@ def test_an_effect_of_ones_own_is_hidden_and_found(tmp_path: Path, capsys: Capsy
     words = " ".join(result.err.split())
     assert "moved by the law of mine itself" in words
     assert f"hilcal view {path} --effects-from {file}" in words
+
+
+@pytest.mark.slow
+def test_an_invented_law_is_discovered(tmp_path: Path, capsys: Capsys) -> None:
+    path = tmp_path / "demo.hilcal"
+    result = ok(capsys, "demo", FAST, "--hide", "invented", "-o", path, "--json")
+    d, words = result.document, " ".join(result.err.split())
+    assert (d["hidden"], d["found"], d["verdict"]) == ("invented", True, "adequate")
+    assert [r["added"] for r in d["revisions"]] == [None, "found"]
+    (search,) = d["discover"]
+    assert search["laws"][0]["formula"] == "dq_3 = a·cos(q_5)·τ_3"
+    assert search["written"] == str(tmp_path / "found.py")
+    assert "no effect of the catalogue describes" in words
+    assert f"hilcal view {path} --effects-from {tmp_path / 'found.py'}" in words
+    stored = ok(capsys, "diagnose", path, "--effects-from", tmp_path / "found.py", "--json")
+    assert stored.document["verdict"] == "adequate"
+
+
+def test_the_invented_law_is_an_effect_that_the_catalogue_lacks() -> None:
+    world = invented_law(installed())
+    assert INVENTED not in installed().names
+    assert INVENTED in own_choices(world)
+    check_choice(INVENTED, world)
 
 
 def test_what_cannot_be_hidden(tmp_path: Path, capsys: Capsys) -> None:

@@ -1,0 +1,42 @@
+"""`invented`: a law that the catalogue lacks, for `hilcal demo --hide invented`.
+
+It is hidden as an effect of a user's own is (`own_law`); the program under rehearsal is not given
+this file.
+"""
+
+import numpy as np
+
+from hilcal.effects.protocol import Columns, Effect, Parameter, Response, Situation
+from hilcal.types import Floats
+
+JOINT, BY = 2, 4
+"""Index of the joint that gives way, and of the one by whose angle it does."""
+
+
+class Invented(Effect):
+    """dq_3 = a cos(q_5) τ_3: joint 3 gives way to its torque τ_3 by the angle q_5 of the wrist.
+
+    As where a bundle of hoses along the forearm stiffens it, or not, with the turn of the wrist.
+    """
+
+    name = "invented"
+    summary = "dq_3 = a·cos(q_5)·τ_3"
+    elastic = True
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The coefficient."""
+        return (Parameter("a", "rad/(N·m)", 1e-6, "joint 3"),)
+
+    def columns(self, s: Situation) -> tuple[Columns, ...]:
+        """Derivative of the joint's displacement by the coefficient."""
+        values = np.cos(s.angle[:, BY]) * s.torque[:, JOINT]
+        return (Columns("dq", np.array([0]), np.array([JOINT]), values[:, None]),)
+
+    def response(self, theta: Floats, s: Situation, change: Floats) -> Response:
+        """Change of the displacement by changes (N, P, n + 1, 6) of the wrenches."""
+        slots = change.shape[2]
+        dq = np.zeros((len(s.angle), change.shape[1], slots - 1))
+        by = theta[0] * np.cos(s.angle[:, BY])
+        dq[:, :, JOINT] = by[:, None] * change[:, :, JOINT, 5]
+        return Response(dq=dq, twist=np.zeros((len(s.angle), change.shape[1], slots, 6)))
