@@ -9,7 +9,7 @@ from hilcal.campaign import Campaign
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import called, record_of, titles
 from hilcal.cli.terminal import Json, Revision, Run, terminal
-from hilcal.data.lengths import parse_length
+from hilcal.data.quantities import parse_length
 from hilcal.errors import CannotAnswerError, HilcalError, LimitError
 from hilcal.report import text, text_validate
 from hilcal.report.progress import working

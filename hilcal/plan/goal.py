@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilcal.acquire.progress import GoalStatus
-from hilcal.data.lengths import LENGTHS
+from hilcal.data.quantities import LENGTHS
 from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit

@@ -43,7 +43,7 @@ def test_nothing_moves_where_nobody_can_be_asked(cell: Path, capsys: Capsys) -> 
     [
         ("--goal", "0.1", "has no unit"),
         ("--limit", "much", "is not understood"),
-        ("--max-time", "2 days", 'valid: a number over 0 in s, min, h, e.g. "90 min"'),
+        ("--max-time", "2 days", 'valid: a duration over 0 in s, min, h, e.g. "90 min"'),
         ("--poses", "0", "valid: a whole number from 1"),
         ("--validation", "0", "valid: a whole number from 1"),
     ],
