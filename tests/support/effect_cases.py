@@ -93,15 +93,14 @@ def random_theta(effects, rng, elastic=1.0):
     )
 
 
-def numeric_jacobian(model, states, theta, scale, m, live=None):
-    """Central differences of the readings by parameters; rotations as small rotations."""
-    live = range(len(theta)) if live is None else live
+def numeric_slopes(model, states, theta, directions, m):
+    """Central differences of the readings along each row of directions, (N, m, K)."""
     base = model.predict(states, theta).observation.rotation
-    out = np.empty((len(states), m, len(live)))
-    for column, p in enumerate(live):
+    out = np.empty((len(states), m, len(directions)))
+    for column, direction in enumerate(directions):
 
-        def moved(h, p=p):
-            o = model.predict(states, theta + h * scale[p] * np.eye(len(theta))[p]).observation
+        def moved(h, direction=direction):
+            o = model.predict(states, theta + h * direction).observation
             turn = o.rotation @ np.swapaxes(base, 1, 2)
             skew = 0.5 * (turn - np.swapaxes(turn, 1, 2))
             w = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=1)
@@ -109,6 +108,11 @@ def numeric_jacobian(model, states, theta, scale, m, live=None):
 
         out[:, :, column] = (moved(1.0) - moved(-1.0)) / 2
     return out
+
+
+def numeric_jacobian(model, states, theta, scale, m):
+    """Central differences of the readings by parameters; rotations as small rotations."""
+    return numeric_slopes(model, states, theta, np.diag(scale), m)
 
 
 SOFT = 2e-5
