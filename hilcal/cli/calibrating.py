@@ -25,8 +25,8 @@ from hilcal.cli.running import measure
 from hilcal.cli.terminal import Json, Terminal, terminal
 from hilcal.config import CellConfig
 from hilcal.data.campaign_file import CampaignFile, may_write
-from hilcal.data.quantities import parse_duration, parse_length
 from hilcal.data.procedure_log import ProcedureLog
+from hilcal.data.quantities import parse_duration, parse_length
 from hilcal.data.run_log import RunLog
 from hilcal.data.whitening import Mode
 from hilcal.effects.catalogue import Catalogue

@@ -37,7 +37,7 @@ SECTIONS = {
         *("identify", "compare", "diagnose", "add", "remove", "refine", "discover", "next"),
     ),
     "Use the result": ("validate", "compensate", "accept", "view", "export"),
-    "Look up": ("effects", "study"),
+    "Look up": ("effects", "study", "doctor"),
 }
 """The commands in the order of the work, as `hilcal --help` lists them."""
 
@@ -115,6 +115,10 @@ COMMANDS = {
         "effects:effects",
         "List the effects that a model can have; `new` begins one of your own.",
         (("new", "effects:new"),),
+    ),
+    "doctor": Command(
+        "doctoring:doctor",
+        "Look at packages, ports, permissions, network, clock and disk of this computer.",
     ),
     "study": Command(
         "", "Studies of the program's own mathematics.", (("scaling", "study_scaling:scaling"),)

@@ -1,0 +1,151 @@
+"""Clock, disk, memory and load of this computer."""
+
+import ctypes
+import os
+import shutil
+import sqlite3
+import statistics
+import struct
+import tempfile
+import time
+from collections.abc import Callable
+from datetime import datetime
+from pathlib import Path
+
+from hilcal.doctor.finding import Finding
+
+COMPUTER = "computer"
+LEAST_FREE = 1e9
+"""Free space below which a campaign may fill the disk, bytes: its recordings take up to 0.1 GB."""
+SLOW_WRITE = 0.1
+"""Durable write that makes a campaign slow, s: a reading takes about a second."""
+LEAST_MEMORY = 2e9
+"""Memory below which large campaigns do not fit, bytes (12,000 readings took 1.84 GB)."""
+FIRST_DAY = datetime(2026, 1, 1).astimezone()
+"""A clock before this day has never been set."""
+ON_NETWORK = ("nfs", "nfs4", "cifs", "smb3", "9p", "fuse.sshfs")
+"""File systems on which SQLite's locks are not to be relied on (SQLite FAQ, question 5)."""
+_TIME_ERROR = 5
+_WRITES = 9
+
+
+def computer(folder: Path) -> tuple[Finding, ...]:
+    """Return the findings on this computer.
+
+    Args:
+        folder: where campaigns are stored.
+    """
+    return (clock(), *disk(folder), memory(), load())
+
+
+def clock(
+    now: Callable[[], datetime] = lambda: datetime.now().astimezone(),
+    state: Callable[[], int | None] = lambda: _kernel_clock(),
+) -> Finding:
+    """Return whether the clock is set and kept right: readings and revisions bear its time."""
+    is_now = now()
+    said = is_now.strftime("%Y-%m-%d %H:%M:%S %Z")
+    mend = "switch time synchronisation on: timedatectl set-ntp true"
+    if is_now < FIRST_DAY:
+        return Finding(COMPUTER, "clock", "problem", f"{said}: it was never set", mend)
+    status = state()
+    if status is None:
+        return Finding(COMPUTER, "clock", "ok", f"{said}; whether it is synchronised is not known")
+    if status == _TIME_ERROR:
+        return Finding(COMPUTER, "clock", "warning", f"{said}, not synchronised", mend)
+    return Finding(COMPUTER, "clock", "ok", f"{said}, synchronised")
+
+
+def _kernel_clock() -> int | None:
+    """Return the kernel's clock state by adjtimex(2); None where it has none."""
+    try:
+        ask = ctypes.CDLL(None).adjtimex
+    except (OSError, AttributeError):
+        return None
+    buffer = ctypes.create_string_buffer(struct.calcsize("64q"))  # all zero: it only asks
+    status = int(ask(buffer))
+    return None if status < 0 else status
+
+
+def disk(folder: Path) -> tuple[Finding, ...]:
+    """Return whether campaigns can be stored in a folder, durably and fast."""
+    name = f"disk of {folder}"
+    if not folder.is_dir():
+        mend = "make it, or name another with --folder"
+        return (Finding(COMPUTER, name, "problem", "there is no such folder", mend),)
+    out = []
+    free = shutil.disk_usage(folder).free
+    said = f"{free / 1e9:.1f} GB free"
+    if free < LEAST_FREE:
+        out.append(Finding(COMPUTER, name, "warning", said, "free some space before a campaign"))
+    else:
+        out.append(Finding(COMPUTER, name, "ok", said))
+    kind = _file_system(folder)
+    if kind in ON_NETWORK:
+        said = f"a file system on the network ({kind}): its locks are not to be relied on"
+        mend = "measure into a folder of a local disk, and copy the file afterwards"
+        out.append(Finding(COMPUTER, "file system", "warning", said, mend))
+    try:
+        seconds = _durable_write(folder)
+    except (OSError, sqlite3.Error) as error:
+        mend = f"make {folder} writable, or name another with --folder"
+        out.append(Finding(COMPUTER, "writing", "problem", f"fails: {error}", mend))
+    else:
+        said = f"a reading is stored durably in {1e3 * seconds:.1f} ms"
+        slow = seconds > SLOW_WRITE
+        mend = "measure into a folder of a local disk" if slow else ""
+        out.append(Finding(COMPUTER, "writing", "warning" if slow else "ok", said, mend))
+    return tuple(out)
+
+
+def _file_system(folder: Path, mounts: Path = Path("/proc/mounts")) -> str:
+    """Return the kind of file system of a folder; empty where it is not known."""
+    try:
+        lines = [line.split() for line in mounts.read_text(encoding="utf-8").splitlines()]
+    except OSError:
+        return ""
+    at = folder.resolve()
+    parents = {str(at), *map(str, at.parents)}
+    found = [fields for fields in lines if len(fields) > 2 and fields[1] in parents]
+    return max(found, key=lambda fields: len(fields[1]))[2] if found else ""
+
+
+def _durable_write(folder: Path) -> float:
+    """Return the median time of a small transaction as a campaign file makes it, s."""
+    times = []
+    with tempfile.TemporaryDirectory(prefix=".hilcal-doctor-", dir=folder) as inside:
+        connection = sqlite3.connect(Path(inside) / "try.sqlite", isolation_level=None)
+        try:
+            connection.execute("PRAGMA synchronous = EXTRA")
+            connection.execute("CREATE TABLE reading (bytes BLOB)")
+            for _ in range(_WRITES):
+                begun = time.perf_counter()
+                connection.execute("INSERT INTO reading VALUES (zeroblob(1000))")
+                times.append(time.perf_counter() - begun)
+        finally:
+            connection.close()
+    return statistics.median(times)
+
+
+def memory() -> Finding:
+    """Return whether there is memory for large campaigns."""
+    try:
+        free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        whole = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (ValueError, OSError):
+        return Finding(COMPUTER, "memory", "ok", "not known")
+    said = f"{whole / 1e9:.1f} GB, of which {free / 1e9:.1f} GB unused"
+    if whole < LEAST_MEMORY:
+        mend = "campaigns of thousands of readings need another computer"
+        return Finding(COMPUTER, "memory", "warning", said, mend)
+    return Finding(COMPUTER, "memory", "ok", said)
+
+
+def load(measured: Callable[[], tuple[float, float, float]] = os.getloadavg) -> Finding:
+    """Return whether other programs keep the processors busy: an arm must hear from us in time."""
+    cores, busy = os.cpu_count() or 1, measured()[0]
+    said = f"{cores}; in the last minute {busy:.1f} programs wanted one at a time"
+    if busy > cores:
+        mend = "end other programs: the arm stops by itself where this program is 0.1 s late"
+        return Finding(COMPUTER, "processors", "warning", said, mend)
+    return Finding(COMPUTER, "processors", "ok", said)

@@ -1,0 +1,215 @@
+"""What `doctor` finds on computers that are as they should be, and on others."""
+
+import os
+import pty
+import socket
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from hilcal.doctor import computer as machine
+from hilcal.doctor.computer import clock, disk, load
+from hilcal.doctor.finding import Finding
+from hilcal.doctor.network import reachable
+from hilcal.doctor.ports import System, serial_ports
+from hilcal.doctor.program import packages
+
+
+def states(findings: tuple[Finding, ...] | list[Finding]) -> list[str]:
+    return [f.state for f in findings]
+
+
+# --- packages ---------------------------------------------------------------------------------
+
+
+def test_packages_are_told_with_their_versions_and_those_that_lack() -> None:
+    found = packages(
+        [
+            "numpy>=2.0",
+            "no-such-package>=3,<4",
+            'no-such-tables>=1; extra == "tables"',
+            'no-such-linter; extra == "dev"',
+        ]
+    )
+    there, lacking, optional = found
+    assert there.said.startswith("numpy 2.")
+    assert (lacking.name, lacking.state) == ("no-such-package", "problem")
+    assert "pip install 'no-such-package>=3,<4'" in lacking.mend
+    assert (optional.name, optional.state) == ("optional: tables", "ok")
+    assert "hilcal[tables]" in optional.mend
+
+
+def test_a_package_that_does_not_load_is_a_problem(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "rtde_control.py").write_text("raise OSError('wrong processor')")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(__import__("sys").modules, "rtde_control", raising=False)
+    _, broken = packages(["ur-rtde>=1.6"])
+    assert broken.state == "problem"
+    assert "does not load: OSError: wrong processor" in broken.said
+
+
+# --- computer ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("now", "status", "state", "said"),
+    [
+        (datetime(2031, 5, 1, tzinfo=UTC), 0, "ok", "synchronised"),
+        (datetime(2031, 5, 1, tzinfo=UTC), 5, "warning", "not synchronised"),
+        (datetime(2031, 5, 1, tzinfo=UTC), None, "ok", "is not known"),
+        (datetime(1970, 1, 2, tzinfo=UTC), 0, "problem", "never set"),
+    ],
+)
+def test_the_clock(now: datetime, status: int | None, state: str, said: str) -> None:
+    found = clock(lambda: now, lambda: status)
+    assert found.state == state
+    assert said in found.said
+
+
+def test_a_folder_that_can_be_measured_into(tmp_path: Path) -> None:
+    space, writing = disk(tmp_path)[0], disk(tmp_path)[-1]
+    assert "GB free" in space.said
+    assert writing.state in ("ok", "warning")
+    assert list(tmp_path.iterdir()) == []  # nothing is left behind
+
+
+def test_a_folder_that_cannot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (lacking,) = disk(tmp_path / "no")
+    assert lacking.state == "problem"
+
+    def fails(folder: Path) -> float:
+        raise PermissionError("Read-only file system")
+
+    monkeypatch.setattr(machine, "_durable_write", fails)
+    writing = disk(tmp_path)[-1]
+    assert writing.state == "problem"
+    assert "Read-only file system" in writing.said
+
+
+def test_the_file_system_is_that_of_the_nearest_mount(tmp_path: Path) -> None:
+    mounts = tmp_path / "mounts"
+    mounts.write_text(
+        f"/dev/sda1 / ext4 rw 0 0\nserver:/x {tmp_path} nfs4 rw 0 0\nother /else cifs rw 0 0\n"
+    )
+    assert machine._file_system(tmp_path, mounts) == "nfs4"
+    assert machine._file_system(Path("/"), mounts) == "ext4"
+    assert machine._file_system(tmp_path, tmp_path / "none") == ""
+
+
+def test_a_busy_computer_is_a_warning() -> None:
+    assert load(lambda: (0.0, 0.0, 0.0)).state == "ok"
+    busy = load(lambda: (99.0, 0.0, 0.0))
+    assert busy.state == "warning"
+    assert "the arm stops by itself" in busy.mend
+
+
+# --- serial ports -----------------------------------------------------------------------------
+
+
+@pytest.fixture
+def port() -> Iterator[str]:
+    """A real character device that nobody else has open."""
+    here, there = pty.openpty()
+    yield os.ttyname(there)
+    os.close(here)
+    os.close(there)
+
+
+def a_system(root: Path, port: str, latency: int | None = None) -> System:
+    """A kernel that shows one adapter."""
+    by_id = root / "dev" / "serial" / "by-id"
+    by_id.mkdir(parents=True)
+    (by_id / "usb-FTDI_tracker").symlink_to(port)
+    (root / "proc").mkdir()
+    if latency is not None:
+        timer = root / "sys" / "bus" / "usb-serial" / "devices" / Path(port).name
+        timer.mkdir(parents=True)
+        (timer / "latency_timer").write_text(f"{latency}\n")
+    return System(root / "dev", root / "sys", root / "proc")
+
+
+def test_a_port_is_told_by_its_lasting_name(port: str, tmp_path: Path) -> None:
+    at = a_system(tmp_path, port, latency=1)
+    (found,) = serial_ports({"tracker": port}, {port: "USB Serial"}, at)
+    assert found.state == "ok"
+    assert found.name.endswith("by-id/usb-FTDI_tracker")
+    assert found.name.startswith("tracker: ")
+    assert "USB Serial" in found.said
+
+
+def test_a_slow_adapter_is_told_with_the_line_that_mends_it(port: str, tmp_path: Path) -> None:
+    at = a_system(tmp_path, port, latency=16)
+    (found,) = serial_ports({}, {port: "USB Serial"}, at)
+    assert found.state == "warning"
+    assert "up to 16 ms" in found.said
+    assert found.mend.startswith("echo 1 | sudo tee ")
+    assert found.mend.endswith("/latency_timer")
+
+
+def test_a_port_of_the_cell_that_is_not_there(port: str, tmp_path: Path) -> None:
+    at = a_system(tmp_path, port)
+    found = serial_ports({"tracker": str(tmp_path / "ttyUSB7")}, {port: "USB Serial"}, at)
+    assert found[0].state == "problem"
+    assert "usb-FTDI_tracker" in found[0].mend  # which there is instead
+    (none,) = serial_ports({}, {}, at)
+    assert (none.state, none.said) == ("ok", "none is plugged in")
+
+
+def test_a_port_without_the_right_to_use_it(
+    port: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    at = a_system(tmp_path, port)
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    (wanted,) = serial_ports({"tracker": port}, {}, at)
+    assert wanted.state == "problem"
+    assert "usermod -aG" in wanted.mend
+    (other,) = serial_ports({}, {port: ""}, at)
+    assert other.state == "warning"  # no device of the cell
+
+
+def test_a_file_that_is_no_port(tmp_path: Path) -> None:
+    path = tmp_path / "notes.txt"
+    path.write_text("")
+    (found,) = serial_ports({"tracker": str(path)}, {}, System(tmp_path, tmp_path, tmp_path))
+    assert found.state == "problem"
+    assert "no serial port" in found.said
+
+
+def test_who_has_a_port_open_and_who_meddles(port: str, tmp_path: Path) -> None:
+    at = a_system(tmp_path, port)
+    for number, name in ((4242, "minicom"), (4243, "ModemManager")):
+        folder = at.proc / str(number) / "fd"
+        folder.mkdir(parents=True)
+        (folder.parent / "comm").write_text(f"{name}\n")
+    (at.proc / "4242" / "fd" / "3").symlink_to(port)
+    held, meddler = serial_ports({}, {port: "USB Serial"}, at)
+    assert held.state == meddler.state == "warning"
+    assert "minicom (process 4242) has it open" in held.said
+    assert meddler.name == "ModemManager"
+
+
+# --- network ----------------------------------------------------------------------------------
+
+
+def test_services_that_answer_and_that_do_not() -> None:
+    with (
+        socket.create_server(("127.0.0.1", 0)) as server,
+        socket.create_server(("127.0.0.1", 0)) as closed,
+    ):
+        open_port, closed_port = server.getsockname()[1], closed.getsockname()[1]
+        closed.close()
+        answers, refuses = reachable("127.0.0.1", {open_port: "one", closed_port: "two"})
+    assert answers.state in ("ok", "warning")  # a busy machine may be slow
+    assert "answers in" in answers.said
+    assert refuses.state == "problem"
+    assert "refused" in refuses.said
+
+
+def test_a_host_that_nobody_knows() -> None:
+    (found,) = reachable("no-such-arm.invalid", {30004: "RTDE"})
+    assert found.state == "problem"
+    assert "is not known" in found.said
