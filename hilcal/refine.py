@@ -14,6 +14,7 @@ from hilcal.diagnose.stepwise_alternatives import Alternative
 from hilcal.diagnose.verdict import NOTHING, judge
 from hilcal.discover.proposal import LawSearch
 from hilcal.identify.arm_scatter import with_arm_scatter, with_prior_scatter
+from hilcal.identify.carried_evidence import carried_effects
 from hilcal.identify.fit import Fit, fit
 from hilcal.model import Model
 
@@ -98,8 +99,9 @@ def refine(
     it, too.
 
     Args:
-        model: the starting model; its effects are never taken out. The prior that it carries, with
-            the arm's scatter where that was estimated, is in every fit.
+        model: the starting model. Its effects are not taken out, but for those of a carried prior
+            that the readings speak against (`identify.carried_evidence`). The prior, with the arm's
+            scatter where that was estimated, is in every fit.
         readings: all readings.
         mode: "deflection" or "absolute".
         say: takes progress, one line each.
@@ -218,7 +220,8 @@ class Path:
     def reconsider(self) -> bool:
         """Judge every addition anew; returns whether one was removed or exchanged."""
         last = self.steps[-1]
-        names = [n for n in last.fit.model.names if n not in self._given]
+        added = [n for n in last.fit.model.names if n not in self._given]
+        names = [*added, *carried_effects(last.fit.model)]
         if not names or not self._room:
             return False
         self._say(f"reconsidering {', '.join(names)}")
@@ -229,6 +232,8 @@ class Path:
                 if not predicts_better(without, last.fit):
                     self._change(without, None, name)
                     return True
+            if name not in added:
+                continue
             if self._better(last, others[name]) and self._exchange(last, others[name]):
                 return True
         return False

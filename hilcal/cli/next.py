@@ -10,11 +10,13 @@ from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import check_record, effect_names, fit_of
 from hilcal.cli.plan_output import Csv, Output, Quick, Seed, generator, write
 from hilcal.cli.planning import read_cell
+from hilcal.cli.prior import Drift, Prior, PriorOf, PriorOptions, fitted_with
 from hilcal.cli.terminal import Json, Record, Revision, Run, Terminal, terminal
 from hilcal.diagnose.doubt import MOST
 from hilcal.diagnose.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError
+from hilcal.identify.carried import CarriedPrior
 from hilcal.plan.next import Next
 from hilcal.procedure.next_plan import doubt_to_settle, next_plan
 from hilcal.procedure.separate import Doubt, without
@@ -47,6 +49,9 @@ def next_(
     quick: Quick = False,
     csv: Csv = None,
     revision: Revision = None,
+    prior: Prior = None,
+    prior_of: PriorOf = "arm",
+    drift: Drift = None,
     record: Record = None,
     effects_from: EffectsFrom = None,
     as_json: Json = False,
@@ -54,12 +59,13 @@ def next_(
     """Plan the measurements that separate the leading suspects; exit 4 where none are in doubt."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     check_record(record)
+    carried = PriorOptions(prior, prior_of, drift).load(catalogue)
     rng = generator(seed)
     if poses is not None and poses < 1:
         raise InputError(f"--poses {poses}; valid: a whole number from 1")
     with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
         given = None if cell is None else read_cell(cell)
-        doubt = _without_suspects(t, o, revision, _named(suspects, catalogue), say)
+        doubt = _without_suspects(t, o, revision, _named(suspects, catalogue), say, carried)
         n = next_plan(o, doubt, poses, rng, say, cell=given, quick=quick)
         config, numbers = (o.config, o.cell) if given is None else given
     found, made, effects = n.found, n.made, doubt.suspects
@@ -92,12 +98,17 @@ def separates(found: Next) -> dict[str, object]:
 
 
 def _without_suspects(
-    t: Terminal, o: Campaign, revision: int | None, named: tuple[str, ...] | None, say: Say
+    t: Terminal,
+    o: Campaign,
+    revision: int | None,
+    named: tuple[str, ...] | None,
+    say: Say,
+    prior: CarriedPrior | None,
 ) -> Doubt:
     """Return the effects to separate, and a fit whose model does not hold them.
 
     Raises:
-        InputError: the revision is not in scaling gc.
+        InputError: the revision is not in scaling gc; a prior that is not one of these readings.
         CannotAnswerError: nothing is in doubt; says what else to do.
     """
     number, newest = fit_of(t, o, say, revision)
@@ -106,6 +117,9 @@ def _without_suspects(
             f"revision {number} has scaling {newest.scaling}; next needs gc: run hilcal identify "
             "again"
         )
+    if prior is not None:
+        say("fitting with the prior")
+        newest = fitted_with(prior, o, newest)
     if named is not None:
         return Doubt(without(newest, named, say), named, None)
     say("diagnosing" if number is None else f"diagnosing revision {number}")

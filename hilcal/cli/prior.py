@@ -6,9 +6,14 @@ from typing import Annotated
 
 import typer
 
+from hilcal.campaign import Campaign
+from hilcal.cli.files import chosen
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError
+from hilcal.identify.arm_scatter import with_prior_scatter
+from hilcal.identify.baseline import with_effects
 from hilcal.identify.carried import CarriedPrior, carried_prior
+from hilcal.identify.fit import Fit, fit
 from hilcal.library import load_posterior
 
 Prior = Annotated[
@@ -61,6 +66,22 @@ class PriorOptions:
             return carried_prior(posterior, self.relation, _drifts(self.drift), catalogue)
         except InputError as error:
             raise InputError(f"--prior {self.path}: {error}") from None
+
+
+def fitted_with(prior: CarriedPrior, o: Campaign, found: Fit) -> Fit:
+    """Return a fit of the same effects and those of a prior, with it; nothing is stored.
+
+    Raises:
+        InputError: a fit that has a prior already, or a prior that is not one of these readings.
+    """
+    if found.model.prior is not None:
+        known = found.model.prior.posterior.source.campaign or "a posterior"
+        raise InputError(f"the revision has a prior already, {known}; leave out --prior")
+    learnt = [e.name for e in prior.posterior.effects]
+    more = [n for n in learnt if o.catalogue[n].computable(o.readings.states)]
+    names = dict.fromkeys((*found.model.names, *more))
+    model = with_effects(o.cell, o.readings, found.mode, names, chosen(found), o.catalogue, prior)
+    return fit(model, with_prior_scatter(model, found.readings), found.mode)
 
 
 def _drifts(text: str | None) -> dict[str, float]:

@@ -7,6 +7,8 @@ redundant where its F-test is not significant.
 
 from dataclasses import dataclass
 
+from hilcal.diagnose.effect_ranking import SAME_EVIDENCE
+from hilcal.identify.carried_evidence import carried_effects, evidence_of_carried
 from hilcal.identify.fit import Fit
 from hilcal.identify.linearisation import eliminate_effect, model_columns
 from hilcal.regression.evidence import FamilyScore
@@ -31,7 +33,7 @@ class Redundant:
 def backward_elimination(fit: Fit) -> tuple[Redundant, ...]:
     """Return the redundant effects of a fit, the least significant first.
 
-    Effects with a carried prior are not judged: other readings than these speak for them.
+    Those with a carried prior are judged by `spoken_against`: other readings speak for them.
     """
     carried = fit.solution.space.carried(fit.model.size)
     judged = [
@@ -48,3 +50,16 @@ def backward_elimination(fit: Fit) -> tuple[Redundant, ...]:
         if result.p_value > CHANCE:
             found.append(Redundant(name, result))
     return tuple(sorted(found, key=lambda n: -n.score.p_value))
+
+
+def spoken_against(fit: Fit) -> tuple[str, ...]:
+    """Return effects of a carried prior that the new readings speak against, the most so first.
+
+    As after a repair: at odds of 20 : 1 they are likelier without the effect than with what the
+    earlier readings said of it.
+    """
+    names = carried_effects(fit.model) if fit.scaling == "gc" else ()
+    if not names:
+        return ()
+    of = evidence_of_carried(fit.model, fit.solution, fit.whitening, names)
+    return tuple(n for n in sorted(of, key=lambda n: of[n]) if of[n] < -SAME_EVIDENCE)

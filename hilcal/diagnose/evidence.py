@@ -7,7 +7,7 @@ from scipy.stats import chi2
 
 from hilcal.data.arm_scatter import ArmScatter
 from hilcal.diagnose.arm_repeatability import instrument_instead
-from hilcal.diagnose.backward_elimination import backward_elimination
+from hilcal.diagnose.backward_elimination import backward_elimination, spoken_against
 from hilcal.diagnose.catalogue_sufficiency import Insufficiency, insufficiency
 from hilcal.diagnose.effect_ranking import (
     FALSE_ALARM,
@@ -126,7 +126,8 @@ class Evidence:
     @cached_property
     def redundant(self) -> tuple[str, ...]:
         """Effects of the model without which the readings are explained as well."""
-        return tuple(n.effect for n in backward_elimination(self.fit))
+        needless = tuple(n.effect for n in backward_elimination(self.fit))
+        return (*spoken_against(self.fit), *needless)
 
     @cached_property
     def insufficiency(self) -> Insufficiency | None:

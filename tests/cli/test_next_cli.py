@@ -20,7 +20,7 @@ from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import fit
 from hilcal.robot.catalogue import configs_dir
 from tests.support.campaigns import configuration
-from tests.support.cli_cases import CELL, ok, refused
+from tests.support.cli_cases import CELL, ok, refused, table
 from tests.support.next_cases import SMALL, doubtful
 from tests.unit.plan.test_many_poses import fine_error
 
@@ -74,6 +74,34 @@ def test_next_in_json_and_in_words(ambiguous: Path, tmp_path: Path, capsys: Caps
     ):
         assert part in " ".join(words.split())
     assert max(map(len, words.splitlines())) <= 100
+
+
+@pytest.mark.slow
+def test_a_prior_makes_the_powers_of_now_larger_and_is_not_stored(
+    ambiguous: Path, tmp_path: Path, capsys: Capsys
+) -> None:
+    old, plan = tmp_path / "old.hilcal", tmp_path / "next.json"
+    ok(capsys, "import", table(tmp_path / "a.csv", "nothing", 3, 12), "--config", CELL, "-o", old)
+    ok(capsys, "identify", old)
+    ok(capsys, "identify", ambiguous)
+    words = ("--suspects", f"{BASE},{TILT}", "--quick", "--poses", "4", "--json")
+    alone, known = (
+        ok(capsys, "next", ambiguous, "-o", plan, *words, *more).document["separates_now"]
+        for more in ((), ("--prior", old))
+    )
+    assert all(b[:2] == a[:2] and b[2] > a[2] for a, b in zip(alone, known, strict=True))
+    assert ok(capsys, "info", ambiguous, "--json").document["revisions"][-1]["revision"] == 1
+
+
+def test_a_revision_with_a_prior_takes_no_other(
+    ambiguous: Path, tmp_path: Path, capsys: Capsys
+) -> None:
+    old = tmp_path / "old.hilcal"
+    ok(capsys, "import", table(tmp_path / "a.csv", "nothing", 3, 8), "--config", CELL, "-o", old)
+    ok(capsys, "identify", old)
+    ok(capsys, "identify", ambiguous, "--prior", old)
+    said = refused(capsys, 2, "next", ambiguous, "-o", tmp_path / "p.json", "--prior", old)
+    assert "has a prior already, old.hilcal" in said
 
 
 def test_an_effect_that_was_added_in_doubt_is_in_doubt_still(
