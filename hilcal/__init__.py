@@ -50,6 +50,7 @@ _PLACES = {
     "preview_table": "hilcal.identify.table_preview",
     "read_table": "hilcal.library",
     "refine": "hilcal.library",
+    "report": "hilcal.reporting",
     "validate": "hilcal.validate",
     "view": "hilcal.library",
 }
@@ -78,6 +79,7 @@ if TYPE_CHECKING:
     from hilcal.model import Model
     from hilcal.procedure.procedure import Procedure
     from hilcal.refine import Refinement
+    from hilcal.reporting import report
     from hilcal.validate import validate
 
 
@@ -96,11 +98,11 @@ def __dir__() -> list[str]:
 
 
 class _Library(ModuleType):
-    """A module where `diagnose`, `discover`, `plan`, `refine` are functions, not the subpackages.
+    """A module where `diagnose`, `discover`, `plan`, `refine`, `report` are functions.
 
-    Importing a submodule sets it as an attribute of its parent; here names of the library keep
-    their meaning. Modules are imported by `from hilcal.plan import planner`; `import
-    hilcal.plan.planner as planner` would look the attribute up, and find the function.
+    They are subpackages as well. Importing one sets it as an attribute of its parent; here names of
+    the library keep their meaning. Modules are imported by `from hilcal.plan import planner`;
+    `import hilcal.plan.planner as planner` would look the attribute up, and find the function.
     """
 
     def __setattr__(self, name: str, value: object) -> None:

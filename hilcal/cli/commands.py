@@ -36,7 +36,7 @@ SECTIONS = {
     "Fit, and find what is missing": (
         *("identify", "compare", "diagnose", "add", "remove", "refine", "discover", "next"),
     ),
-    "Use the result": ("validate", "compensate", "accept", "view", "export"),
+    "Use the result": ("validate", "compensate", "accept", "report", "view", "export"),
     "Look up": ("effects", "study", "doctor"),
 }
 """The commands in the order of the work, as `hilcal --help` lists them."""
@@ -106,6 +106,10 @@ COMMANDS = {
     "accept": Command(
         "campaigns:accept",
         "Choose the revision that every command uses from now on, whatever is added later.",
+    ),
+    "report": Command(
+        "reporting:report",
+        "Write the whole story as one HTML page, a certificate first; it prints to PDF.",
     ),
     "view": Command("refining:view", "Tell the story of the revisions in rerun."),
     "export": Command(

@@ -67,6 +67,7 @@ def test_the_examples_of_a_docstring_run(name: str, site: SimpleNamespace) -> No
     known = {"hc": hc, "np": np, "CELL": site.cell, "TABLE": site.table, "RUN": site.run}
     known["LATER"] = site.later
     known["PORT"] = port
+    known["REPORT"] = site.folder / "report.html"
     finder = doctest.DocTestFinder(recurse=True)
     tests = [t for t in finder.find(thing, name, module=False, globs=known) if t.examples]
     if name in WITHOUT_EXAMPLE:
@@ -89,11 +90,13 @@ def test_the_lazy_names_are_those_that_type_checkers_see() -> None:
     assert seen == hc._PLACES
 
 
-@pytest.mark.parametrize("first", ["import hilcal.plan.planner, hilcal.diagnose.verdict", "pass"])
+@pytest.mark.parametrize(
+    "first", ["import hilcal.plan.planner, hilcal.diagnose.verdict, hilcal.report.text", "pass"]
+)
 def test_functions_are_not_hidden_by_the_packages_of_their_names(first: str) -> None:
     code = (
         f"{first}\nimport hilcal as hc\nfrom hilcal.plan import tour\n"
-        "assert all(map(callable, (hc.plan, hc.diagnose, hc.refine))), hc.plan\n"
+        "assert all(map(callable, (hc.plan, hc.diagnose, hc.refine, hc.report))), hc.plan\n"
         "assert tour.__name__ == 'hilcal.plan.tour'"
     )
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)

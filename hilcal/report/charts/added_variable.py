@@ -20,7 +20,7 @@ def added_variable(r: Regressor, effect: str) -> go.Figure:
     ends = np.array([r.x.min(), r.x.max()])
     slope = float(r.x @ r.y / max(float(r.x @ r.x), 1e-300))
     traces = [
-        go.Scattergl(
+        go.Scatter(
             x=style.drawn(r.x[at]),
             y=style.drawn(r.y[at]),
             mode="markers",

@@ -46,7 +46,7 @@ def error_per_revision(story: Story) -> go.Figure:
                 connector={"line": {"color": style.GREY, "width": 1}},
                 totals={"marker": {"color": color}},
                 decreasing={"marker": {"color": color}},
-                increasing={"marker": {"color": style.RED}},
+                increasing={"marker": {"color": color}},
                 offsetgroup=key,
             )
         )
@@ -57,17 +57,11 @@ def error_per_revision(story: Story) -> go.Figure:
         traces=traces,
         waterfallgroupgap=0.15,
     )
-    out.add_hline(floor, line={"color": style.NOISE, "dash": "dash", "width": 2})
-    out.add_annotation(
-        x=1,
-        xref="paper",
-        xanchor="right",
-        y=floor,
-        yanchor="bottom",
-        showarrow=False,
-        font={"color": style.NOISE},
-        text=f"noise alone: {floor:.3g} µm",
-    )
+    line = {"color": style.NOISE, "dash": "dash", "width": 2}
+    out.add_hline(floor, line=line)
+    # for the legend alone: a shape has no entry there
+    named = {"name": f"noise alone, {floor:.3g} µm", "mode": "lines", "line": line}
+    out.add_trace(go.Scatter(x=[names[0]], y=[None], hoverinfo="skip", **named))
     out.update_yaxes(rangemode="tozero")
     return out
 

@@ -19,6 +19,6 @@ def laws(d: Discovery) -> go.Figure:
         f"{100 * d.attainable:.0f} % that anything recorded predicts."
     )
     out = bars([law.formula for law in d.laws], shares, hover, says,
-               "explained on poses left out [% of the misfit]")  # fmt: skip
+               "explained on poses left out [%]")  # fmt: skip
     out.add_vline(100 * d.attainable, line={"color": style.NOISE, "dash": "dash"})
     return out

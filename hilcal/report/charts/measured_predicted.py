@@ -34,7 +34,7 @@ def measured_predicted(story: Story, revision: StoryRevision) -> go.Figure:
     at = d.index
     for k, axis in enumerate(AXES):
         traces.append(
-            go.Scattergl(
+            go.Scatter(
                 x=style.drawn(x[at, k]),
                 y=style.drawn(y[at, k]),
                 mode="markers",

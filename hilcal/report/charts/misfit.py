@@ -5,6 +5,8 @@ from collections.abc import Sequence
 import plotly.graph_objects as go
 
 from hilcal.diagnose.diagnosis import Diagnosis
+from hilcal.diagnose.effect_ranking import LEAST_SHARE
+from hilcal.report import numbers, text
 from hilcal.report.charts import style
 from hilcal.report.charts.readings_drawn import escaped
 from hilcal.report.story import StoryCurve
@@ -14,21 +16,18 @@ MOST = 12
 
 def misfit_shares(d: Diagnosis) -> go.Figure:
     """Draw the share of the misfit that follows each recorded variable, the largest on top."""
-    rows = [v for v in d.misfit_breakdown if v.share > 0][:MOST]
+    rows = [v for v in d.misfit_breakdown if v.share >= LEAST_SHARE][:MOST]
     if not rows:
         return style.empty("The misfit follows no recorded variable.")
     shares = [100 * v.share for v in rows]
     names = [v.variable for v in rows]
-    return bars(
-        names,
-        shares,
-        [
-            f"{n}: {s:.0f} %, p = {v.p_value:.1g}"
-            for n, s, v in zip(names, shares, rows, strict=True)
-        ],
-        f"The misfit follows {rows[0].variable} most: {shares[0]:.0f} % of it.",
-        "share of the misfit on poses left out [%]",
-    )
+    hover = [
+        f"{n}: {s:.0f} %, {numbers.p_equals(v.p_value)}"
+        for n, s, v in zip(names, shares, rows, strict=True)
+    ]
+    colors = [style.MEASURED if v.p_value < text.CERTAIN else style.GREY for v in rows]
+    says = f"{text.follows(d.misfit_breakdown)} Grey bars are within chance."
+    return bars(names, shares, hover, says, "share of the misfit [%]", colors)
 
 
 def misfit_curve(c: StoryCurve) -> go.Figure:
@@ -64,7 +63,7 @@ def bars(
         y=[escaped(n) for n in names],
         orientation="h",
         marker={"color": colors},
-        text=[f"{v:.3g}" for v in values],
+        text=[f"{v:.0f}" if abs(v) >= 10 else f"{v:.2g}" for v in values],
         textposition="auto",
         hovertext=[escaped(h) for h in hover],
         hoverinfo="text",

@@ -7,9 +7,9 @@ from scipy.stats import norm
 from hilcal.identify.fit import Fit
 from hilcal.report.charts import style
 
-RANGE = 5.0
-"""Range of the histogram, σ; what lies beyond is counted in its last bins."""
-WIDTH = 0.25
+RANGE, MOST = 5.0, 50.0
+"""Least and largest range of the histogram, σ; what lies beyond is counted in its last bins."""
+BINS = 40
 
 
 def noise_check(fit: Fit) -> go.Figure:
@@ -19,23 +19,24 @@ def noise_check(fit: Fit) -> go.Figure:
     and noise are right; the density is that of this standard deviation.
     """
     white = fit.white[np.isfinite(fit.white)]
-    edges = np.arange(-RANGE, RANGE + WIDTH / 2, WIDTH)
-    counts, _ = np.histogram(np.clip(white, -RANGE + 1e-9, RANGE - 1e-9), edges)
+    reach = float(np.clip(np.ceil(np.quantile(np.abs(white), 0.995)), RANGE, MOST))
+    edges, width = np.linspace(-reach, reach, BINS + 1, retstep=True)
+    counts, _ = np.histogram(np.clip(white, -reach + 1e-9, reach - 1e-9), edges)
     centres = 0.5 * (edges[1:] + edges[:-1])
     expected = np.sqrt(min(fit.dof / max(len(white), 1), 1.0))
-    fine = np.linspace(-RANGE, RANGE, 201)
+    fine = np.linspace(-reach, reach, 401)
     traces = [
         go.Bar(
             x=centres,
             y=counts,
-            width=0.9 * WIDTH,
+            width=0.9 * width,
             name="measured",
             marker={"color": style.MEASURED},
             hovertemplate="%{x:.2f} σ: %{y} elements<extra></extra>",
         ),
         go.Scatter(
             x=fine,
-            y=len(white) * WIDTH * norm.pdf(fine, scale=max(expected, 1e-9)),
+            y=len(white) * width * norm.pdf(fine, scale=max(expected, 1e-9)),
             mode="lines",
             name="the stated noise",
             line={"color": style.NOISE, "width": 2},

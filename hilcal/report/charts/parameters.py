@@ -46,8 +46,8 @@ def parameters(revision: StoryRevision) -> go.Figure:
     )
     out = style.figure(
         says,
-        x="value over its standard uncertainty (asinh scale)" if np.abs(t).max() > 50 else
-        "value over its standard uncertainty",
+        x="value / standard uncertainty (asinh)" if np.abs(t).max() > 50 else
+        "value / standard uncertainty",
         traces=[trace],
         height=110 + 22 * len(order),
     )  # fmt: skip
@@ -146,4 +146,4 @@ def identifiability(fit: Fit) -> go.Figure:
     says = "The readings determine all parameters."
     if missing:
         says = f"The readings do not determine all parameters of {numbers.names(missing)}."
-    return bars(names, shares, hover, says, "parameters determined by the readings [%]")
+    return bars(names, shares, hover, says, "determined [%]")

@@ -11,7 +11,7 @@ from hilcal.report.charts import style
 from hilcal.report.story import Story, StoryRevision
 from hilcal.types import Bools, Floats, Ints
 
-MOST = 2000
+MOST = 1500
 """Readings that a chart draws; a choice by the size of the page, 8 MB."""
 
 

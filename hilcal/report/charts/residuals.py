@@ -93,7 +93,7 @@ def _over(revision: StoryRevision, x: Floats, name: str, unit: str) -> str:
 
 def _chart(d: Drawn, x: Floats, title: str, words: str) -> go.Figure:
     traces = [
-        go.Scattergl(
+        go.Scatter(
             x=style.drawn(x[mine]),
             y=style.drawn(d.sigma[mine]),
             mode="markers",

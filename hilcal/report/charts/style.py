@@ -25,6 +25,8 @@ LEVELS = (GREY, AMBER, RED)
 LEVEL_NAMES = ("inside the noise", "doubtful", "outside the noise")
 SYMBOLS = ("circle", "diamond", "x")
 """Marks of the levels, so that they are told apart without colours."""
+SYMBOLS_3D = ("circle", "diamond", "square")
+"""The same in space, where a cross needs a font that not every computer has."""
 LIMITS = (0.99, 0.9999)
 """Quantiles of χ²(3) from which a reading is doubtful, and outside: as in the viewer."""
 CONFIG: dict[str, object] = {"displayModeBar": False, "responsive": True, "scrollZoom": False}

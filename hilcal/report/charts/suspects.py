@@ -3,6 +3,7 @@
 import plotly.graph_objects as go
 
 from hilcal.diagnose.diagnosis import Diagnosis
+from hilcal.diagnose.effect_ranking import SAME_EVIDENCE
 from hilcal.report import numbers
 from hilcal.report.charts import style
 from hilcal.report.charts.misfit import bars
@@ -31,7 +32,7 @@ def suspects(d: Diagnosis) -> go.Figure:
             f"{100 * max(d.lead.holdout_share, 0.0):.0f} % on poses left out; ✓ marks those that "
             "pass all tests."
         )
-    return bars(names, shares, hover, says, "explained on poses left out [% of the misfit]", colors)
+    return bars(names, shares, hover, says, "explained on poses left out [%]", colors)
 
 
 def evidence(d: Diagnosis) -> go.Figure:
@@ -46,5 +47,7 @@ def evidence(d: Diagnosis) -> go.Figure:
         f"Evidence is strongest for {rows[0].effect}: the readings are e^{values[0]:.0f} times as "
         "likely with it as without."
     )
+    if values[0] < SAME_EVIDENCE:
+        says = f"No effect has evidence of more than e^{SAME_EVIDENCE:.0f} to 1."
     colors = [style.MEASURED if s.passes else style.GREY for s in rows]
     return bars([s.effect for s in rows], values, hover, says, "log evidence", colors)

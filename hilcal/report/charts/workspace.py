@@ -8,7 +8,7 @@ from hilcal.report.charts import style
 from hilcal.report.charts.readings_drawn import drawn
 from hilcal.report.story import Story, StoryRevision
 
-LONGEST = 0.12
+LONGEST = 0.25
 """Length of the largest residual as drawn, m; a choice."""
 MOST_ARROWS = 300
 _NICE = (1.0, 2.0, 5.0)
@@ -40,7 +40,7 @@ def workspace(story: Story, revision: StoryRevision) -> go.Figure:
                 **dict(zip("xyz", style.drawn(at[mine]).T.copy(), strict=True)),
                 mode="markers",
                 name=style.LEVEL_NAMES[k],
-                marker={"color": style.LEVELS[k], "size": 4, "symbol": style.SYMBOLS[k]},
+                marker={"color": style.LEVELS[k], "size": 3, "symbol": style.SYMBOLS_3D[k]},
                 text=d.named(mine),
                 hovertemplate="%{text}<extra></extra>",
             )
@@ -52,7 +52,10 @@ def workspace(story: Story, revision: StoryRevision) -> go.Figure:
         f"{numbers.length(float(d.size_m.max(initial=0.0)))}.{d.note}"
     )
     axes = {f"{a}axis": {"title": {"text": f"base {a} [m]"}} for a in "xyz"}
-    return style.figure(says, traces=traces, height=480, scene={**axes, "aspectmode": "data"})
+    camera = {"eye": {"x": 1.3, "y": 1.3, "z": 0.8}, "center": {"x": 0, "y": 0, "z": -0.15}}
+    scene = {**axes, "aspectmode": "data", "camera": camera}
+    legend = {"itemsizing": "constant"}
+    return style.figure(says, traces=traces, height=480, scene=scene, legend=legend)
 
 
 def magnification(largest_m: float) -> float:

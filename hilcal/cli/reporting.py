@@ -1,0 +1,88 @@
+"""`report`: the story of a campaign, or the comparison of two, as one HTML page."""
+
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hilcal.campaign import Campaign
+from hilcal.cli.effects_from import EffectsFrom, catalogue_with
+from hilcal.cli.terminal import Json, Revision, Run, terminal
+from hilcal.data.lengths import parse_length
+from hilcal.report.progress import working
+
+
+def report(
+    run: Run,
+    later: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[LATER.hilcal]", help="A later campaign of the same arm: compare the two."
+        ),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="F.html", help="The page; RUN.html unless given."),
+    ] = None,
+    limit: Annotated[
+        str | None,
+        typer.Option(
+            "--limit",
+            metavar="LENGTH",
+            help='The largest 3-D position error allowed, e.g. "0.1 mm": the page says passed '
+            "or failed.",
+        ),
+    ] = None,
+    validation: Annotated[
+        Path | None,
+        typer.Option(
+            "--validation",
+            metavar="OTHER.hilcal",
+            help="A campaign that was never fitted: how well is it predicted?",
+        ),
+    ] = None,
+    operator: Annotated[
+        str, typer.Option("--operator", metavar="NAME", help="Who answers for the measurement.")
+    ] = "",
+    revision: Revision = None,
+    effects_from: EffectsFrom = None,
+    as_json: Json = False,
+) -> None:
+    """Write the whole story as one HTML page, a certificate first; it prints to PDF."""
+    from hilcal.reporting import write_report
+
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
+    limit_m = None if limit is None else parse_length(limit, "--limit")
+    output = run.with_suffix(".html") if output is None else output
+    with ExitStack() as stack, working(t.progress) as say:
+
+        def opened(path: Path | None) -> Campaign | None:
+            if path is None:
+                return None
+            return stack.enter_context(Campaign.open(path, catalogue, read_only=True))
+
+        first = stack.enter_context(Campaign.open(run, catalogue, read_only=True))
+        done = write_report(
+            first,
+            output,
+            later=opened(later),
+            validation=opened(validation),
+            limit_m=limit_m,
+            operator=operator,
+            revision=revision,
+            say=say,
+        )
+    t.show(f"{done.headline}.")
+    if done.limit:
+        t.show(done.limit)
+    t.show(f"Report: {output} ({output.stat().st_size / 1e6:.1f} MB); print it for a PDF.")
+    t.document(
+        {
+            "report": str(output),
+            "bytes": output.stat().st_size,
+            "headline": done.headline,
+            "passed": done.passed,
+            "verdict": done.verdict,
+        }
+    )

@@ -1,0 +1,86 @@
+"""What a report is made of: values of the library, none of them computed by the report itself."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from hilcal.data.overview import Overview
+from hilcal.data.plan import Plan
+from hilcal.data.whitening import Scaling
+from hilcal.diagnose.diagnosis import Diagnosis
+from hilcal.identify.acceptance import Acceptance, Judged
+from hilcal.identify.extrapolation import Extrapolation
+from hilcal.identify.fit import Fit
+from hilcal.identify.full_covariance import CovarianceParts
+from hilcal.identify.validation import Validation
+from hilcal.report.build_story import Chapter
+from hilcal.report.story import Story
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tested:
+    """A model against readings of another campaign.
+
+    Attributes:
+        name: of the campaign's file.
+        sha256: of that file.
+        judged: which readings.
+        prediction: of them.
+        beyond: what the fit states of them.
+        shares: errors by load and pose, and the limit.
+    """
+
+    name: str
+    sha256: str
+    judged: Judged
+    prediction: Validation
+    beyond: Extrapolation
+    shares: Acceptance
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Material:
+    """Everything that a report says.
+
+    Attributes:
+        name: of the campaign's file.
+        sha256: of that file.
+        made: when the report was made, ISO 8601, UTC.
+        version: of the program.
+        overview: what the campaign holds.
+        covariance: what the covariances consist of.
+        chapters: the revisions, oldest first; the last is what the report is about.
+        stored: whether they are in the file; else the baseline was fitted for the report alone.
+        story: of the same revisions.
+        scalings: the last model fitted with each scaling.
+        plan: what was planned; None where nothing was.
+        tested: on readings that were never fitted; None without a validation campaign.
+        limit_m: the largest 3-D position error that is allowed, m; None without a limit.
+        operator: who answers for the measurement; empty where nobody is named.
+        commands: that lead to the same result.
+    """
+
+    name: str
+    sha256: str
+    made: str
+    version: str
+    overview: Overview
+    covariance: CovarianceParts
+    chapters: tuple[Chapter, ...]
+    stored: bool
+    story: Story
+    scalings: Mapping[Scaling, Fit]
+    plan: Plan | None
+    tested: Tested | None
+    limit_m: float | None
+    operator: str
+    commands: tuple[str, ...]
+
+    @property
+    def fit(self) -> Fit:
+        """The fit that the report is about."""
+        return self.chapters[-1].fit
+
+    @property
+    def diagnosis(self) -> Diagnosis | None:
+        """Its diagnosis; None where it is not scaled by gc."""
+        return self.chapters[-1].diagnosis

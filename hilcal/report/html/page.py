@@ -1,0 +1,72 @@
+"""The page: template, style, script and plotly.js in one file that loads nothing else."""
+
+import json
+from functools import cache
+from pathlib import Path
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+from plotly.offline import get_plotlyjs
+
+from hilcal.report.charts import style
+from hilcal.report.html.certificate import First, certificate, first_screen
+from hilcal.report.html.material import Material
+from hilcal.report.html.parts import Section, in_script
+from hilcal.report.html.sections import sections
+
+HERE = Path(__file__).parent
+
+
+def page(m: Material) -> str:
+    """Return the report of one campaign as HTML."""
+    about = f"{m.overview.config.robot.model}, {m.name}, {m.made[:10]}"
+    return render("Calibration report", about, first_screen(m), (certificate(m), *sections(m)))
+
+
+def render(title: str, about: str, first: First, parts: tuple[Section, ...]) -> str:
+    """Return a page.
+
+    Args:
+        title: of the page.
+        about: what it is of, one line.
+        first: what the first screen says.
+        parts: the sections below it.
+    """
+    looks = {
+        name: json.loads(json.dumps(style.template(dark).to_plotly_json(), default=_plain))
+        for name, dark in (("light", False), ("dark", True))
+    }
+    return (
+        _environment()
+        .get_template("page.html")
+        .render(
+            title=title,
+            about=about,
+            first=first,
+            sections=parts,
+            looks=Markup(in_script(json.dumps(looks))),  # noqa: S704  (escaped by in_script)
+            config=Markup(in_script(json.dumps(style.CONFIG))),  # noqa: S704
+            plotly=Markup(get_plotlyjs()),  # noqa: S704  (the library's own text)
+            css=Markup((HERE / "style.css").read_text(encoding="utf-8")),  # noqa: S704
+            script=Markup((HERE / "script.js").read_text(encoding="utf-8")),  # noqa: S704
+        )
+    )
+
+
+def _plain(value: object) -> object:
+    to_json = getattr(value, "to_plotly_json", None)
+    if to_json is None:
+        raise TypeError(f"{type(value)} is no JSON")
+    return to_json()
+
+
+@cache
+def _environment() -> Environment:
+    """Every text is escaped; what is markup is named in `render`."""
+    return Environment(
+        loader=FileSystemLoader(HERE),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )

@@ -1,0 +1,121 @@
+"""What a page consists of: sections of words, tables, lists and charts; no markup in any of it."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+import plotly.graph_objects as go
+from rich.console import RenderableType
+from rich.table import Table as RichTable
+from rich.text import Text
+
+from hilcal.report.charts import style
+
+
+@dataclass(frozen=True, slots=True)
+class Words:
+    """A paragraph; `kind` is "text", "note" (small), "heading", "strong" or "code"."""
+
+    text: str
+    kind: str = "text"
+
+
+@dataclass(frozen=True, slots=True)
+class Items:
+    """A list."""
+
+    rows: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """A table; the first cell of each row is its header.
+
+    Attributes:
+        caption: what it shows.
+        heads: of the columns.
+        rows: cells as text.
+    """
+
+    caption: str
+    heads: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Chart:
+    """A chart with the sentence that it shows.
+
+    Attributes:
+        title: short.
+        json: the figure without its template, as plotly.js takes it, safe inside of a script.
+        says: its text alternative.
+        height: CSS pixels.
+        wide: whether it takes the whole width of the page.
+    """
+
+    title: str
+    json: str
+    says: str
+    height: int
+    wide: bool
+
+
+Part = Words | Items | Table | Chart
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """A section; `details` is what is folded away on screen (a printed page shows it)."""
+
+    id: str
+    title: str
+    parts: tuple[Part, ...]
+    details: tuple[Part, ...] = field(default=())
+
+
+def chart(title: str, figure: go.Figure, *, wide: bool = False) -> Chart:
+    """Return a figure as part of a page."""
+    bare = go.Figure(figure)
+    bare.layout.template = None
+    return Chart(
+        title,
+        in_script(bare.to_json()),
+        style.says(figure),
+        int(figure.layout.height or 360),
+        wide,
+    )
+
+
+def in_script(json: str) -> str:
+    """Return JSON that nothing in it can end the script that holds it."""
+    return json.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
+
+
+def from_terminal(parts: Iterable[RenderableType], caption: str = "") -> tuple[Part, ...]:
+    """Return what a command says at the terminal as parts: the words exist once."""
+    out: list[Part] = []
+    for part in parts:
+        if isinstance(part, RichTable):
+            out.append(_table(part, caption))
+            continue
+        words = part.plain if isinstance(part, Text) else str(part)
+        styled = str(part.style) if isinstance(part, Text) else ""
+        kind = {"bold": "heading", "dim": "note"}.get(styled, "text")
+        if words.strip():
+            out.append(Words(words.strip(), kind))
+    return tuple(out)
+
+
+def _table(of: RichTable, caption: str) -> Table:
+    heads = tuple(" ".join(_plain(c.header).split()) for c in of.columns)
+    columns = [[" ".join(_plain(cell).split()) for cell in c.cells] for c in of.columns]
+    return Table(caption or heads[0], heads, tuple(zip(*columns, strict=True)))
+
+
+def _plain(cell: RenderableType) -> str:
+    return cell.plain if isinstance(cell, Text) else str(cell)
+
+
+def table(caption: str, heads: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
+    """Return a table."""
+    return Table(caption, tuple(heads), tuple(tuple(r) for r in rows))

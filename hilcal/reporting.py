@@ -1,0 +1,208 @@
+"""`report`: collects what a campaign says, and writes it as one HTML page."""
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import hilcal
+from hilcal.campaign import Campaign
+from hilcal.data.overview import overview
+from hilcal.data.plan import Plan
+from hilcal.data.revision import utc_now
+from hilcal.data.run_log import PLAN, RunLog
+from hilcal.data.whitening import SCALINGS, Scaling
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.identify.fit import Fit, fit
+from hilcal.report.build_story import Chapter, build_story
+from hilcal.report.html.material import Material, Tested
+from hilcal.validate import validate
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Written:
+    """What a page says first.
+
+    Attributes:
+        headline: the verdict in a few words.
+        limit: whether the limit is kept, in words; empty without one.
+        passed: the same; None without a limit.
+        verdict: of the diagnosis; None where nothing was diagnosed.
+    """
+
+    headline: str
+    limit: str
+    passed: bool | None
+    verdict: str | None
+
+
+def report(
+    run: Campaign,
+    path: str | Path,
+    *,
+    later: Campaign | None = None,
+    validation: Campaign | None = None,
+    limit_m: float | None = None,
+    operator: str = "",
+    revision: int | None = None,
+    say: Say = lambda text: None,
+) -> Path:
+    """Write the story of a campaign as one HTML page, which needs neither hilcal nor a network.
+
+    >>> with hc.Campaign.open(RUN) as run:
+    ...     page = hc.report(run, REPORT, operator="A. Miller", limit_m=0.5e-3)
+    >>> page.suffix
+    '.html'
+
+    Args:
+        run: the campaign; without a revision the baseline is fitted, and not kept.
+        path: of the page; a file that is there is replaced.
+        later: a later campaign of the same arm: the page compares the two.
+        validation: a campaign that was never fitted: the page says how well it is predicted.
+        limit_m: the largest 3-D position error that is allowed, m.
+        operator: who answers for the measurement.
+        revision: what the page is about; the one in use where None.
+        say: takes progress, one line each.
+
+    Raises:
+        InputError: no such revision, the page cannot be written, or see `validate` and `compare`.
+        CannotAnswerError: the readings do not determine the baseline, or see `validate`.
+    """
+    write_report(
+        run,
+        Path(path),
+        later=later,
+        validation=validation,
+        limit_m=limit_m,
+        operator=operator,
+        revision=revision,
+        say=say,
+    )
+    return Path(path)
+
+
+def write_report(
+    run: Campaign,
+    path: Path,
+    *,
+    later: Campaign | None = None,
+    validation: Campaign | None = None,
+    limit_m: float | None = None,
+    operator: str = "",
+    revision: int | None = None,
+    say: Say = lambda text: None,
+) -> Written:
+    """Write a page as `report` does, and return what it says first."""
+    if path.resolve() in {c.path.resolve() for c in (run, later, validation) if c is not None}:
+        raise InputError(f"{path}: this is the campaign itself; name another file for the page")
+    if later is not None:
+        if validation is not None or limit_m is not None:
+            raise InputError("a comparison of two campaigns takes neither --validation nor --limit")
+        from hilcal.compare import compare
+        from hilcal.report.html import change
+
+        found = compare(run, later, revision, say=say)
+        names = ((run.path.name, _sha256(run.path)), (later.path.name, _sha256(later.path)))
+        html = change.page(found, names, operator, utc_now(), hilcal.__version__)
+        first, verdict = change.first_screen(found, run.path.name), None
+    else:
+        from hilcal.report.html.certificate import first_screen
+        from hilcal.report.html.page import page
+
+        m = material(run, validation, limit_m, operator, revision, say)
+        say("writing the page")
+        html, first = page(m), first_screen(m)
+        verdict = None if m.diagnosis is None else m.diagnosis.verdict
+    _write(path, html)
+    return Written(first.headline, first.limit, first.passed, verdict)
+
+
+def material(
+    run: Campaign,
+    validation: Campaign | None = None,
+    limit_m: float | None = None,
+    operator: str = "",
+    revision: int | None = None,
+    say: Say = lambda text: None,
+) -> Material:
+    """Collect what a report says; arguments and errors as of `report`."""
+    record = run.in_use(revision)
+    chapters = run.chapters(say, revision)
+    last = chapters[-1].fit
+    say("preparing the story")
+    commands = [f"hilcal info {run.path.name}"]
+    number = "" if record is None else f" --revision {record.number}"
+    commands += [f"hilcal {c} {run.path.name}{number}" for c in ("compare", "diagnose")]
+    tested = None
+    if validation is not None:
+        found = validate(run, validation, record, limit_m, say=say)
+        tested = Tested(
+            validation.path.name,
+            _sha256(validation.path),
+            found.judged,
+            found.prediction,
+            found.beyond,
+            found.shares,
+        )
+        commands.append(f"hilcal validate {run.path.name} {validation.path.name}{number}")
+    return Material(
+        name=run.path.name,
+        sha256=_sha256(run.path),
+        made=utc_now(),
+        version=hilcal.__version__,
+        overview=overview(run.file),
+        covariance=run.covariance_parts,
+        chapters=tuple(chapters),
+        stored=record is not None,
+        story=build_story(chapters),
+        scalings=_scalings(last, chapters, say),
+        plan=_plan(run),
+        tested=tested,
+        limit_m=limit_m,
+        operator=operator,
+        commands=tuple(commands),
+    )
+
+
+def _scalings(last: Fit, chapters: list[Chapter], say: Say) -> dict[Scaling, Fit]:
+    """Fit the last model with each scaling, where its own is gc."""
+    if last.scaling != "gc":
+        return {}
+    out: dict[Scaling, Fit] = {}
+    for s in SCALINGS:
+        say(f"fitting with scaling {s}")
+        try:
+            out[s] = last if s == "gc" else fit(last.model, last.readings, last.mode, s)
+        except CannotAnswerError:
+            continue
+    return out
+
+
+def _plan(run: Campaign) -> Plan | None:
+    return None if run.file.about(PLAN) is None else RunLog(run.file).plan
+
+
+def _sha256(path: Path) -> str:
+    """Hash of a campaign file as it is on the disk."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _write(path: Path, html: str) -> None:
+    """Replace a file whole, or leave it as it is."""
+    try:
+        handle, part = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        try:
+            with os.fdopen(handle, "w", encoding="utf-8") as stream:
+                stream.write(html)
+            Path(part).chmod(0o644)
+            Path(part).replace(path)
+        except BaseException:
+            Path(part).unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
