@@ -9,7 +9,7 @@ import typer
 from hilcal.campaign import Campaign
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.terminal import Json, Revision, Run, terminal
-from hilcal.data.lengths import parse_length
+from hilcal.data.quantities import parse_length
 from hilcal.report.progress import working
 
 
