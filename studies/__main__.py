@@ -13,6 +13,7 @@ from studies.corrected import corrected
 from studies.descriptions_command import descriptions
 from studies.diagnosis_command import diagnosis
 from studies.discover_command import discover
+from studies.discover_real_command import discover_real
 from studies.plans_command import plans
 from studies.real_command import real
 from studies.records import results
@@ -28,6 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     app: typer.Typer = application("Evaluate the program itself on simulated campaigns.")
     app.command("diagnosis")(diagnosis)
     app.command("discover")(discover)
+    app.command("discover-real")(discover_real)
     app.command("plans")(plans)
     app.command("descriptions")(descriptions)
     app.command("scaling")(scaling)

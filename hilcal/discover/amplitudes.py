@@ -26,6 +26,9 @@ MOST_FACTORS = 2
 """Factors of a product; a choice, likewise."""
 HARMONICS = 4
 """Multiples of an angle; as in the diagnosis."""
+FINEST = 512
+"""Highest multiple of a joint's angle, as of encoders and gears; a choice. Not more than there are
+poses: each order costs the search, and few poses do not tell hundreds of them apart."""
 FLAT = 1e-3
 """Amplitudes whose spread is a smaller share of their size are a constant; a choice."""
 
@@ -162,9 +165,16 @@ def _key(a: Amplitude) -> frozenset[tuple[str, str, Numbers]]:
     return frozenset((f.variable.symbol, f.shape.name, f.numbers) for f in a.factors)
 
 
-def grammar(known: list[Variable], s: Situation) -> Grammar:
-    """Return all products of the functions of the quantities."""
+def grammar(known: list[Variable], s: Situation, poses: int = 0) -> Grammar:
+    """Return all products of the functions of the quantities.
+
+    Args:
+        known: the quantities.
+        s: the situation of the readings.
+        poses: number of poses, which limits the multiples of an angle; see `FINEST`.
+    """
     singles = [f for v in known for f in _factors(v, v.read(s))]
+    singles += [f for v in known if v.kind == "angle" for f in _fine(v, min(poses, FINEST))]
     value = np.array([f.values(s) for f in singles]).reshape(len(singles), -1)
     cost = np.array([f.cost for f in singles])
     pairs: list[tuple[int, int]] = [(-1, -1)] + [
@@ -222,6 +232,15 @@ def _partner(
             low, high = sorted(other, key=lambda i: (i < 0, i))
             return place.get((low, high), -1)
     return -1
+
+
+def _fine(v: Variable, finest: int) -> list[Factor]:
+    """Return waves of an angle beyond `HARMONICS`; as complex as a product, so in none."""
+    return [
+        Factor(v, f, (float(k),))
+        for k in range(HARMONICS + 1, finest + 1)
+        for f in (shapes.FINE_COS, shapes.FINE_SIN)
+    ]
 
 
 def _factors(v: Variable, x: Floats) -> list[Factor]:

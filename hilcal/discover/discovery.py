@@ -21,6 +21,7 @@ from scipy.stats import chi2
 from hilcal.diagnose.effect_ranking import FALSE_ALARM, catalogue_columns
 from hilcal.diagnose.noise_verdict import MISFIT_ALARM, PREDICTABLE
 from hilcal.diagnose.residual_regression import residual_regression
+from hilcal.discover.curve import Curve, curves
 from hilcal.discover.folds import FoldSearch, search_by_folds, stability
 from hilcal.discover.law import (
     Coefficient,
@@ -72,7 +73,8 @@ class Discovery:
         catalogue: effects of the catalogue that explain the misfit, where they do.
         candidates: number of candidates that were tried.
         after: the fit with the first law.
-        source: of the effects in `laws`, as a Python file.
+        source: of the first law's effect, as a Python file.
+        curves: the first law over what it depends on, with the readings.
     """
 
     fit: Fit
@@ -84,6 +86,7 @@ class Discovery:
     candidates: int = 0
     after: Fit | None = None
     source: str = ""
+    curves: tuple[Curve, ...] = ()
 
 
 def discover(
@@ -237,6 +240,7 @@ def _laws(
         found.candidates,
         made[kept[0]][1],
         made[kept[0]][3],
+        curves(made[kept[0]][1], laws[0].form),
     )
 
 

@@ -92,7 +92,8 @@ def screen(linear: Linearisation) -> Screen:
     """Prepare the search beside a fit."""
     fit = linear.fit
     situation = fit.solution.prediction.situation
-    words = grammar(variables(situation), situation)
+    poses = len(np.unique(fit.pose))
+    words = grammar(variables(situation), situation, poses)
     places, motion = site_motions(fit)
     w = fit.whitening
     rows, readings = _thinned(fit)

@@ -11,7 +11,7 @@ step        tanh((x − x0)/w)
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -90,6 +90,8 @@ SIN = Shape(
     lambda x, p: f"sin({_times(p[0], x)})",
     lambda x, p: rf"\sin({_latex_times(p[0], x)})",
 )  # fmt: skip
+FINE_COS, FINE_SIN = replace(COS, cost=3), replace(SIN, cost=3)
+"""Of high orders, which are many to choose from."""
 
 
 def _root(x: Floats, p: Numbers) -> Floats:

@@ -1,16 +1,21 @@
 """Laws that the readings speak for, in words, for people and as JSON."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
+import numpy as np
 from rich.console import RenderableType
 from rich.text import Text
 
+from hilcal.discover.curve import Curve
 from hilcal.discover.discovery import Discovery
 from hilcal.discover.law import Coefficient, Law
 from hilcal.discover.proposal import LawSearch
 from hilcal.report import numbers, text
+from hilcal.report.text_unknown import sparkline
 
 FEW = 3
+LEAST_BINS = 3
+"""Bins that make a curve; a choice."""
 
 
 def discovery_report(d: Discovery) -> Iterator[RenderableType]:
@@ -26,6 +31,8 @@ def discovery_report(d: Discovery) -> Iterator[RenderableType]:
     for k, law in enumerate(d.laws):
         yield ""
         yield from _law(law, d, first=k == 0)
+        if k == 0:
+            yield from curve_tables(d.curves)
 
 
 def silence(d: Discovery) -> str:
@@ -74,6 +81,41 @@ def _law(law: Law, d: Discovery, first: bool) -> Iterator[RenderableType]:
     ]
     if seen:
         yield f"  seen for     {', '.join(seen)}; nothing is known outside"
+
+
+def curve_tables(curves: Sequence[Curve]) -> Iterator[RenderableType]:
+    """Yield the law over each quantity beside the mean of the readings there."""
+    for c in curves:
+        x, y, std, _ = c.binned
+        if len(x) < LEAST_BINS:
+            continue
+        unit, factor = numbers.unit_for(c.unit, list(y))
+        head = c.quantity if c.quantity_unit == "1" else f"{c.quantity} [{c.quantity_unit}]"
+        law = np.interp(x, *c.line)
+        out = text.table(head, f"{c.of} [{unit}] {sparkline(list(y))}", "±", "law")
+        for at, seen, error, told in zip(x, y, std, law, strict=True):
+            value, spread = numbers.with_std(factor * float(seen), factor * float(error))
+            places = len(value.partition(".")[2])
+            out.add_row(numbers.digits(float(at)), value, spread, f"{factor * told:.{places}f}")
+        yield ""
+        yield out
+
+
+def curve_json(c: Curve) -> dict[str, object]:
+    """Return a curve as JSON: what is drawn, the binned readings, and the law; SI."""
+    x, y, std, count = c.binned
+    return {
+        "site": c.site,
+        "of": c.of,
+        "unit": c.unit,
+        "quantity": c.quantity,
+        "quantity_unit": c.quantity_unit,
+        "binned": [
+            {"x": float(a), "y": float(b), "std": float(e), "readings": int(n)}
+            for a, b, e, n in zip(x, y, std, count, strict=True)
+        ],
+        "law": [[float(a), float(b)] for a, b in c.line.T],
+    }
 
 
 def coefficient(c: Coefficient) -> str:
@@ -126,6 +168,7 @@ def to_json(d: Discovery) -> dict[str, object]:
         "candidates": d.candidates,
         "catalogue": list(d.catalogue),
         "laws": [law_json(law) for law in d.laws],
+        "curves": [curve_json(c) for c in d.curves],
     }
 
 

@@ -15,11 +15,13 @@ from hilcal.cell import cell_from_config
 from hilcal.config import load_config
 from hilcal.data.readings import Readings
 from hilcal.discover import amplitudes, shapes
-from hilcal.discover.amplitudes import Amplitude, Factor
+from hilcal.discover.amplitudes import Amplitude, Factor, grammar
+from hilcal.discover.curve import curves
 from hilcal.discover.discovery import Discovery, discover
 from hilcal.discover.law import Form, Part
 from hilcal.discover.problem import Problem, Term
 from hilcal.discover.proposal import LawSearch
+from hilcal.discover.refit import exact
 from hilcal.discover.screen import Screen, screen
 from hilcal.discover.search import search
 from hilcal.discover.sites import sites
@@ -250,6 +252,36 @@ def test_what_is_told_of_a_law_names_all_that_speaks_for_it() -> None:
     assert law["latex"] == r"\delta q_3 = a\,\cos(q_4)\,\tau_3"
 
 
+def test_the_curve_of_a_law_lies_where_the_readings_are() -> None:
+    by_angle, by_torque = found().curves
+    assert (by_angle.site, by_angle.quantity, by_angle.of) == ("joint 3", "q_4", "dq_3/(τ_3)")
+    assert (by_torque.quantity, by_torque.unit) == ("τ_3", "rad")
+    (a,) = found().laws[0].parameters
+    x, law = by_angle.line
+    assert law == pytest.approx(a.value * np.cos(x), rel=1e-9)
+    for c in (by_angle, by_torque):
+        x, y, std, count = c.binned
+        off = (c.y - np.interp(c.x, *c.line)) / c.std
+        assert np.sqrt(np.mean(off**2)) == pytest.approx(1.0, abs=0.5)
+        assert count.sum() == len(c.x)
+        assert np.all(np.abs(y - np.interp(x, *c.line)) < 5 * std)
+    told = "".join(str(part) for part in discovery_report(found()))
+    assert "seen for" in told
+    drawn = to_json(found())["curves"][0]  # type: ignore[index]
+    assert drawn["binned"][0]["readings"] == by_angle.binned[3][0]
+
+
+def test_a_wave_of_high_order_is_drawn_over_one_period() -> None:
+    f = campaign(LAW)
+    v = next(v for v in variables(f.solution.prediction.situation) if v.symbol == "q_2")
+    wave = Amplitude((Factor(v, shapes.FINE_COS, (40.0,)),))
+    form = Form((Part(screened().sites[1], wave, 0),))
+    after, _, _ = exact(screened(), form, "waves")
+    (c,) = curves(after, form)
+    assert np.abs(c.x).max() <= np.pi / 40
+    assert c.quantity == "q_2 within a period of 2π/40"
+
+
 def test_every_function_is_an_effect_with_its_derivative() -> None:
     cell = example_cell()
     s = example_situation(cell, example_states(cell))
@@ -279,6 +311,22 @@ def test_every_function_is_an_effect_with_its_derivative() -> None:
             (Part(site, Amplitude((factor, other)), 0), Part(places[1], Amplitude((factor,)), 1))
         )
         check_effect(effect_class(source_of_form(form, "tried"), "tried"))
+
+
+def test_fine_waves_are_tried_up_to_the_number_of_poses_and_in_no_product(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(amplitudes, "MOST", 3)
+    cell = example_cell()
+    s = example_situation(cell, example_states(cell))
+    words = grammar([v for v in variables(s) if v.kind == "angle"][:2], s, 14)
+    fine = [a for a in words.amplitudes if any(f.shape.cost == 3 for f in a.factors)]
+    assert {a.factors[0].numbers[0] for a in fine} == set(range(5, 15))
+    assert all(len(a.factors) == 1 for a in fine)
+    place = words.place(fine[0])
+    assert place is not None
+    partner = words.amplitudes[words.partner[place]].factors[0]
+    assert (partner.shape.name, partner.numbers) == ("sin", fine[0].factors[0].numbers)
 
 
 def test_every_quantity_reads_the_same_in_the_written_effect() -> None:

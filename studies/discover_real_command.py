@@ -1,0 +1,126 @@
+"""`python -m studies discover-real`: laws of two series of a real UR10, each tried on the other."""
+
+from dataclasses import dataclass
+from itertools import permutations
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from hilcal.cell import Cell
+from hilcal.cli.terminal import Json, terminal
+from hilcal.diagnose.residual_regression import residual_regression
+from hilcal.discover.discovery import Discovery, discover
+from hilcal.discover.write_effect import effect_class
+from hilcal.identify.baseline import baseline
+from hilcal.identify.fit import Fit, fit
+from hilcal.identify.linearisation import linearise
+from hilcal.library import read_table
+from hilcal.refine import refine
+from hilcal.report.numbers import length, percent
+from hilcal.report.progress import Say, working
+from hilcal.report.text_discover import coefficient
+from hilcal.robot.catalogue import configs_dir
+from studies.records import Figure, Keep, keep
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Series:
+    """What a series came to.
+
+    Attributes:
+        name: of its folder.
+        left: the fit after refinement, its noise as stated: without an estimated scatter.
+        regression: share of the misfit that a regression of everything recorded predicts.
+        found: the search for a law.
+    """
+
+    name: str
+    left: Fit
+    regression: float
+    found: Discovery
+
+
+def discover_real(
+    series: Annotated[
+        list[Path],
+        typer.Argument(metavar="F.csv F.csv", help="measurements_joint_configurations.csv, …"),
+    ],
+    keep_file: Keep = None,
+    as_json: Json = False,
+) -> None:
+    """Search a law for what refinement leaves of the IPA UR10's series; try it on the other one."""
+    t = terminal(as_json)
+    done = []
+    for path in series:
+        with working(t.progress) as say:
+            done.append(_searched(path, say))
+    figures = [f for s in done for f in _of_series(s)]
+    figures += [_carried(a, b) for a, b in permutations(done, 2) if a.found.laws]
+    for f in figures:
+        t.show(f"{f.what}: {f.measured}")
+    keep(keep_file, "What is left of a real UR10", figures)
+    t.document({"figures": [{"what": f.what, "measured": f.measured} for f in figures]})
+
+
+def _searched(path: Path, say: Say) -> Series:
+    cell = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
+    say(f"reading {path}")
+    readings = read_table(path, cell, "ipa-ur10")
+    last = refine(baseline(cell, readings, "absolute"), readings, "absolute", say).fit
+    left = fit(last.model, last.readings.as_stated(), last.mode, start=last.theta)
+    found = discover(left, say)
+    say("asking what is predictable at all")
+    return Series(path.parent.name, left, residual_regression(linearise(left)).share, found)
+
+
+def _of_series(s: Series) -> list[Figure]:
+    before = s.left.holdout.mean_m
+    out = [
+        Figure(
+            f"{s.name}: left by {' + '.join(s.left.model.names)}",
+            f"{length(before)} mean of poses left out, variance factor "
+            f"{s.left.variance_factor:.2f} of the stated noise",
+        ),
+        Figure(
+            f"{s.name}: share of the misfit that a regression of everything recorded predicts",
+            percent(s.regression),
+        ),
+    ]
+    d = s.found
+    if not d.laws or d.after is None:
+        return [*out, Figure(f"{s.name}: law", f"none ({d.reason})")]
+    law = d.laws[0]
+    values = ", ".join(f"{c.name} = {coefficient(c)}" for c in law.parameters)
+    after = d.after.holdout.mean_m
+    share = (
+        f"{percent(law.holdout_share)} of the misfit on poses left out; without them searches find "
+        f"laws that explain {percent(d.searched_share)}"
+    )
+    return [
+        *out,
+        Figure(f"{s.name}: law", f"{law.formula}, with {values}"),
+        Figure(f"{s.name}: what it explains", f"{share}; {length(before)} → {length(after)}"),
+    ]
+
+
+def _carried(a: Series, b: Series) -> Figure:
+    """What the law of one series explains of the other, its coefficients as found."""
+    law = a.found.laws[0]
+    linear, w = linearise(b.left), b.left.whitening
+    states = b.left.solution.prediction.situation.states
+    effect = effect_class(a.found.source, law.name)(b.left.model.cell, states)
+    values = np.array([c.value for c in law.parameters])
+    prediction, theta = b.left.solution.prediction, b.left.theta
+    moved = b.left.model.jacobian_of((effect,), prediction, theta, w.m) @ values
+    told = w.whiten(w.raw(moved)).reshape(-1)
+    free = linear.project_out(told)
+    along = float(told @ linear.residual)
+    gain = 2.0 * along - float(told @ free)
+    cosine = along / max(float(np.sqrt((told @ free) * linear.rss)), 1e-300)
+    return Figure(
+        f"law of {a.name}, coefficients as found there, on {b.name}",
+        f"explains {100 * gain / (linear.rss - b.left.dof):.1f} % of the misfit; correlation with "
+        f"the residual {cosine:.2f}",
+    )
