@@ -131,9 +131,15 @@ def _curve(
         divided = type(first.amplitude)(tuple(others)).unit()
         unit = unit if divided == "1" else f"{unit}/({divided})"
     return Curve(
-        site.words, f"{site.symbol}/({inner})" if inner else site.symbol, unit, name, v.unit,
+        site.words, _over(site.symbol, inner), unit, name, v.unit,
         x, y, std, _binned(x, y, std), np.vstack([ends, law(ends)]),
     )  # fmt: skip
+
+
+def _over(symbol: str, inner: str) -> str:
+    if not inner:
+        return symbol
+    return f"{symbol}/({inner})" if "·" in inner else f"{symbol}/{inner}"
 
 
 def _said(after: Fit, motion: Floats) -> tuple[Floats, Floats]:

@@ -12,7 +12,7 @@
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -207,21 +207,20 @@ def _laws(
     misfit = max(float(before.sum()) - rank, 3.0 * np.sqrt(2.0 * rank))
     made: list[tuple[Law, Fit, Floats, str]] = []
     for s in selections:
-        own = name if not made else f"{name}_{len(made) + 1}"
         form = refine(found, form_of(found, s.terms))
         say(f"refitting with {form.text()}")
         try:
-            after, coefficients, _ = exact(found, form, own)
+            after, coefficients, _ = exact(found, form, name)
         except HilcalError:
             continue
         left = left_out_by_pose(after)
         share = float(np.clip((before.sum() - left.sum()) / misfit, -1.0, 1.0))
-        law = _law(problem, s, form, own, coefficients, share, after, folds, catalogue)
+        law = _law(problem, s, form, name, coefficients, share, after, folds, catalogue)
         evidence = (
             f"It explains {100 * share:.0f} % of the misfit on poses left out; p-value "
             f"{law.p_value:.1g}, the search\npaid for."
         )
-        source = source_of_form(form, own, coefficients, evidence, f"{name}.py")
+        source = source_of_form(form, name, coefficients, evidence, f"{name}.py")
         made.append((law, after, left, source))
     if not made:
         return _silent(fit, found, say, folds.share)
@@ -229,7 +228,10 @@ def _laws(
     kept = [k for k in range(len(made)) if _as_good(made[k][2], made[best][2])]
     say("asking what is predictable at all")
     attainable = residual_regression(found.linear).share
-    laws = tuple(made[k][0] for k in kept)
+    laws = tuple(
+        replace(made[k][0], name=name if not rank else f"{name}_{rank + 1}")
+        for rank, k in enumerate(kept)
+    )
     return Discovery(
         fit,
         "law",

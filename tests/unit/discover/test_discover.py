@@ -87,6 +87,10 @@ def test_a_law_outside_of_the_catalogue_is_found_with_its_site_and_variables() -
     law = found().laws[0]
     assert found().reason == "law"
     assert law.formula == "dq_3 = a·cos(q_4)·τ_3"
+    assert law.name == "bent"
+    after = found().after
+    assert after is not None
+    assert after.model.names[-1] == "bent"
     assert law.acts_on == ("joint 3",)
     assert set(law.variables) == {"joint 4 angle", "joint 3 torque"}
     assert law.parameters[0].unit == "rad/(N·m)"
@@ -254,7 +258,7 @@ def test_what_is_told_of_a_law_names_all_that_speaks_for_it() -> None:
 
 def test_the_curve_of_a_law_lies_where_the_readings_are() -> None:
     by_angle, by_torque = found().curves
-    assert (by_angle.site, by_angle.quantity, by_angle.of) == ("joint 3", "q_4", "dq_3/(τ_3)")
+    assert (by_angle.site, by_angle.quantity, by_angle.of) == ("joint 3", "q_4", "dq_3/τ_3")
     assert (by_torque.quantity, by_torque.unit) == ("τ_3", "rad")
     (a,) = found().laws[0].parameters
     x, law = by_angle.line
