@@ -244,7 +244,7 @@ def plan(
 
 
 @contextmanager
-def view(run: Campaign, port: int = 9876) -> Iterator[str]:
+def view(run: Campaign, port: int = 9877) -> Iterator[str]:
     """Serve the story of a campaign's revision in use to rerun viewers while the block lasts.
 
     >>> with hc.Campaign.open(RUN) as run, hc.view(run, port=PORT) as url:

@@ -86,6 +86,7 @@ def refine(
     say: Say = lambda text: None,
     history: History = NOTHING,
     laws: LawSearch | None = None,
+    seen: Callable[[Step], None] = lambda step: None,
 ) -> Refinement:
     """Fit, diagnose, add the first suspect, and repeat.
 
@@ -109,10 +110,11 @@ def refine(
         laws: searches a law wherever the verdict is `unknown_effect`, before effects that only
             resemble what is missing are added, and where the misfit is taken for the arm's scatter;
             the law is then added and judged like any effect.
+        seen: takes each step as soon as it is judged; of the last one the verdict can still change.
     """
     say(f"fitting {' + '.join(model.names) or 'the bare arm'}")
     readings = with_prior_scatter(model, readings)
-    path = Path(fit(model, readings, mode), say, history, laws)
+    path = Path(fit(model, readings, mode), say, history, laws, seen)
     changed = True
     while changed:
         path.extend()
@@ -129,6 +131,7 @@ class Path:
         say: Say = lambda text: None,
         before: History = NOTHING,
         laws: LawSearch | None = None,
+        seen: Callable[[Step], None] = lambda step: None,
     ) -> None:
         """Begin with a fit, the effects of which stay.
 
@@ -137,10 +140,11 @@ class Path:
             say: takes progress, one line each.
             before: how its model was reached.
             laws: searches laws.
+            seen: takes each step.
         """
         self.steps: list[Step] = []
         self._given, self._before, self._say = first.model.names, before, say
-        self._laws = laws
+        self._laws, self._seen = laws, seen
         self._rejected, self._removed = [*before.rejected], [*before.removed]
         self._refits = Refits()
         taken = first.readings.arm_scatter is not None
@@ -165,6 +169,7 @@ class Path:
         self._evidence = Evidence(found, self._refits.add, self._say)
         diagnosis = judge(self._evidence, self._history(found))
         self.steps.append(Step(found, diagnosis, added, removed))
+        self._seen(self.steps[-1])
 
     def extend(self) -> None:
         """Add suspects while any lowers the error on poses left out."""

@@ -1,5 +1,7 @@
 """Moving the arm from pose to pose while every limit is checked."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from hilcal.acquire.clock import Clock
@@ -35,12 +37,13 @@ class Mover:
         guard: Guard,
         config: CellConfig,
         clock: Clock,
+        passed: Callable[[Floats], None] = lambda q: None,
     ) -> None:
-        """Use an open arm."""
+        """Use an open arm; `passed` is told where it is (n,) while it moves, and must not wait."""
         self.goal: Floats | None = None
         self.side = np.zeros(guard.cell.arm.n)
         self._arm, self._meter, self._guard = arm, meter, guard
-        self._motion, self._clock = config.motion, clock
+        self._motion, self._clock, self._passed = config.motion, clock, passed
 
     def look(self) -> ArmSample:
         """Return a sample of the arm after it and the force sensor have been checked.
@@ -84,6 +87,7 @@ class Mover:
         begun, slowest = self._clock.now(), 1.0
         while self._arm.moving():
             sample = self.look()
+            self._passed(sample.q)
             slowest = min(slowest, max(sample.speed_scaling, SLOWEST))
             allowed = 3.0 * usual / slowest + GRACE_S * self._clock.scale
             if self._clock.now() - begun > allowed:
@@ -92,7 +96,9 @@ class Mover:
                     f"{usual:.0f} s are usual"
                 )
             self._clock.sleep(POLL_S * self._clock.scale)
-        off = np.abs(self.look().q - q)
+        arrived = self.look().q
+        self._passed(arrived)
+        off = np.abs(arrived - q)
         if not off.max() <= motion.arrival_rad:
             k = int(np.argmax(off))
             raise DeviceError(

@@ -22,6 +22,13 @@ class Remark:
 
 
 @dataclass(frozen=True, slots=True)
+class ArmAt:
+    """Where the arm is on its way: joint angles, rad; told many times a second."""
+
+    q: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class LiveResidual:
     """A new reading against the prediction of a model that was fitted to the readings before it.
 
@@ -33,6 +40,8 @@ class LiveResidual:
         deflection: distance of the reading from the predicted unloaded position, m; None for an
             unloaded reading, and without a model.
         deflection_std: standard deviation of that distance, m.
+        vector: the residual as a vector, measured − predicted, base axes, m.
+        covariance: of that vector where the model is right, rows one after the other, m².
     """
 
     residual: float | None = None
@@ -40,6 +49,8 @@ class LiveResidual:
     uncertain: bool = False
     deflection: float | None = None
     deflection_std: float = 0.0
+    vector: tuple[float, ...] | None = None
+    covariance: tuple[float, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,7 @@ from hilcal.acquire.guard import Guard
 from hilcal.acquire.loads import Hook, payload
 from hilcal.acquire.measure import Measured, Measurer
 from hilcal.acquire.motion import Mover
-from hilcal.acquire.progress import LiveResidual, Phase, ReadingStored, Remark, Watcher
+from hilcal.acquire.progress import ArmAt, LiveResidual, Phase, ReadingStored, Remark, Watcher
 from hilcal.acquire.reading_record import detail, reading_of, sample_json, stored_wrench
 from hilcal.acquire.rig import Rig
 from hilcal.acquire.route import Stop
@@ -64,7 +64,7 @@ class Session:
         if rig.force is not None and config.force_sensor is not None:
             self._meter = ForceMeter(rig.force, config.force_sensor, cell, window)
         self._guard = Guard(cell, config)
-        self._mover = Mover(rig.arm, self._meter, self._guard, config, clock)
+        self._mover = Mover(rig.arm, self._meter, self._guard, config, clock, self._passed)
         self._measurer = Measurer(self._mover, rig.tracker, self._meter, config, clock, watcher)
         self._hook = Hook(
             rig.arm, rig.operator, self._meter, self._mover, cell, config, clock, watcher
@@ -311,6 +311,10 @@ class Session:
             self._watcher.notify(Remark(shift.words(limit)))
 
     # people
+
+    def _passed(self, q: Floats) -> None:
+        """Tell where the arm is on its way."""
+        self._watcher.notify(ArmAt(tuple(q.tolist())))
 
     def _tell(
         self, step: Step, reading: Readings, total: int, left: float, settling: float

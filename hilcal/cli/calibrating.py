@@ -19,10 +19,11 @@ from hilcal.cli.living_cell import LivingCell
 from hilcal.cli.plan_output import POSES
 from hilcal.cli.planning import CellFile, read_cell, refuse_unready
 from hilcal.cli.prior import Prior, PriorOptions
-from hilcal.cli.refining import Row
+from hilcal.cli.refining import Row, chapter_of
 from hilcal.cli.rehearsing import to_the_end
 from hilcal.cli.running import measure
 from hilcal.cli.terminal import Json, Terminal, terminal
+from hilcal.cli.viewing import View, followed
 from hilcal.config import CellConfig
 from hilcal.data.campaign_file import CampaignFile, may_write
 from hilcal.data.procedure_log import ProcedureLog
@@ -37,6 +38,7 @@ from hilcal.procedure.procedure import Procedure, continued
 from hilcal.procedure.state import DECIDED, REFINED, VALIDATED, Settings, Step
 from hilcal.refine import Refinement
 from hilcal.report import text_calibrate, text_refine
+from hilcal.report.live_viewer import LiveViewer
 from hilcal.report.progress import working
 from hilcal.report.text_plan import plan_facts
 from hilcal.report.text_prior import prior_lines
@@ -105,6 +107,7 @@ def calibrate(
     yes: Annotated[
         bool, typer.Option("--yes", "-y", help="Do not ask before the arm moves; for scripts.")
     ] = False,
+    view: View = False,
     effects_from: EffectsFrom = None,
     as_json: Json = False,
 ) -> None:
@@ -115,7 +118,7 @@ def calibrate(
     if prior is not None:
         asked["prior"] = str(prior.absolute())
     on = ["hilcal", "calibrate", str(cell), "-o", str(output)]
-    more = ["--rehearse"] * rehearse + ["--yes"] * yes
+    more = ["--rehearse"] * rehearse + ["--yes"] * yes + ["--view"] * view
     for path in effects_from or ():
         more += ["--effects-from", str(path)]
     told = _Told(t, shlex.join([*on, "--resume", *more]), shlex.join([*on, *more]))
@@ -128,7 +131,8 @@ def calibrate(
             "nobody can be asked before the arm moves; give --yes, or run it at a terminal"
         )
     with told.how_to_go_on(p), ExitStack() as stack:
-        Operator(t, p, stack, rehearse, yes).to_the_end()
+        live = stack.enter_context(followed(t, view, output))
+        Operator(t, p, stack, rehearse, yes, live).to_the_end()
         with working(t.progress) as say:
             found = p.compare(say)
     limit_m = p.settings.limit_m
@@ -260,9 +264,16 @@ class Operator:
     """Does one step after the other, and asks before the arm moves."""
 
     def __init__(
-        self, t: Terminal, p: Procedure, stack: ExitStack, rehearse: bool, yes: bool
+        self,
+        t: Terminal,
+        p: Procedure,
+        stack: ExitStack,
+        rehearse: bool,
+        yes: bool,
+        viewer: LiveViewer | None = None,
     ) -> None:
         """Nothing is connected yet."""
+        self._viewer = viewer
         self._t, self._p, self._stack = t, p, stack
         self._rehearse, self._yes = rehearse, yes
         self._clock = p.config.simulation.clock if rehearse else 1.0
@@ -292,7 +303,7 @@ class Operator:
         config = self._config()
 
         def work(campaign: CampaignFile, epoch: float | None) -> None:
-            measure(self._t, config, self._p.cell, campaign, epoch=epoch)
+            measure(self._t, config, self._p.cell, campaign, epoch=epoch, viewer=self._viewer)
 
         def whole() -> None:
             self._p.measure(step, work)
@@ -336,8 +347,12 @@ class Operator:
             t.show(plan_facts(made.summary))
             p.begin(made.plan, p.config)
             return
+        viewer = self._viewer
         with working(t.progress) as say:
-            found = p.compute(step, say)
+            if step.kind == "refine" and viewer is not None:
+                found: object = p.refine(say, lambda n, s: viewer.revised(chapter_of(n, s)))
+            else:
+                found = p.compute(step, say)
         self._say(step.kind, found)
 
     def _say(self, kind: str, found: Any) -> None:

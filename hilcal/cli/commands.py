@@ -111,7 +111,7 @@ COMMANDS = {
         "reporting:report",
         "Write the whole story as one HTML page, a certificate first; it prints to PDF.",
     ),
-    "view": Command("refining:view", "Tell the story of the revisions in rerun."),
+    "view": Command("viewing:view", "Tell the story of the revisions in rerun."),
     "export": Command(
         "exporting:export", "Hand over: readings, parameters, calibration, URDF, DH, frames."
     ),

@@ -1,10 +1,6 @@
-"""`diagnose`, `add`, `refine` and `view`: which effect is missing, and what adding it does."""
+"""`diagnose`, `add` and `refine`: which effect is missing, and what adding it does."""
 
-import os
-import shutil
-import signal
-import sys
-import threading
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +11,6 @@ import typer
 from hilcal.campaign import Campaign
 from hilcal.changes import add_effect, remove_effect
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
-from hilcal.cli.ending import told_to_end
 from hilcal.cli.files import (
     check_options,
     check_record,
@@ -29,6 +24,7 @@ from hilcal.cli.files import (
 from hilcal.cli.fitting import Readings, options_json, options_line
 from hilcal.cli.prior import Drift, Prior, PriorOf, PriorOptions
 from hilcal.cli.terminal import Json, Record, Revision, Run, terminal
+from hilcal.cli.viewing import View, followed
 from hilcal.data.purpose import refuse_fitting
 from hilcal.data.revision import change
 from hilcal.diagnose.verdict import NOTHING
@@ -44,9 +40,10 @@ from hilcal.identify.fit_document import prior_to_json
 from hilcal.identify.frames_document import fit_to_json
 from hilcal.identify.other_arm import other_arm_of
 from hilcal.identify.weight import weight_note
+from hilcal.refine import Step as RefinementStep
 from hilcal.refine import refine as refine_model
 from hilcal.report import numbers, text, text_refine
-from hilcal.report.build_story import Chapter, build_story
+from hilcal.report.build_story import Chapter
 from hilcal.report.diagnosis_document import suspect_json, to_json
 from hilcal.report.progress import working
 from hilcal.report.text_discover import laws_json, refined_laws
@@ -54,8 +51,6 @@ from hilcal.report.text_prior import prior_lines
 from hilcal.report.text_registration import fitted_lines, other_arm_line
 from hilcal.report.text_unknown import curves
 from hilcal.report.verdict_words import message
-
-ENDING = 5.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,6 +97,7 @@ def add(
     ],
     revision: Revision = None,
     record: Record = None,
+    view: View = False,
     effects_from: EffectsFrom = None,
     as_json: Json = False,
 ) -> None:
@@ -111,7 +107,7 @@ def add(
     if len(wanted) != 1:
         raise InputError(f"EFFECT {effect!r} has {len(wanted)} effects; valid: one")
     ((name, options),) = wanted.items()
-    _change(run, revision, name, record, as_json, catalogue, options)
+    _change(run, revision, name, record, view, as_json, catalogue, options)
 
 
 def remove(
@@ -119,13 +115,14 @@ def remove(
     effect: Annotated[str, typer.Argument(metavar="EFFECT", help="One of the model.")],
     revision: Revision = None,
     record: Record = None,
+    view: View = False,
     effects_from: EffectsFrom = None,
     as_json: Json = False,
 ) -> None:
     """Take an effect out of the model: error before and after."""
     catalogue = catalogue_with(effects_from)
     catalogue[effect]  # an unknown name is refused
-    _change(run, revision, effect, record, as_json, catalogue)
+    _change(run, revision, effect, record, view, as_json, catalogue)
 
 
 def _change(
@@ -133,6 +130,7 @@ def _change(
     revision: int | None,
     effect: str,
     record: Path | None,
+    view: bool,
     as_json: bool,
     catalogue: Catalogue,
     options: Options | None = None,
@@ -140,14 +138,19 @@ def _change(
     """Make a revision with one effect more, which has `options`, or one less."""
     t, adds = terminal(as_json), options is not None
     check_record(record)
-    with Campaign.open(run, catalogue) as o:
+    with Campaign.open(run, catalogue) as o, followed(t, view, run) as live:
         check_options(o, {effect: options or {}} if adds else {})
         with working(t.progress) as say:
             number, before = stored_fit(t, o, say, revision)
+            if live is not None:
+                for chapter in o.chapters(say, number):
+                    live.revised(chapter)
             if options is None:
                 c = remove_effect(o, number, before, effect, say)
             else:
                 c = add_effect(o, number, before, effect, options, say)
+            if live is not None:
+                live.revised(Chapter(c.number, c.added, c.fit, c.diagnosis, c.removed))
         stored, d = o.file.revision(number), c.diagnosis
         verdict = str(stored.result_json.get("diagnose", {}).get("verdict", ""))
         rows: list[Row] = [
@@ -203,6 +206,7 @@ def refine(
         ),
     ] = False,
     record: Record = None,
+    view: View = False,
     effects_from: EffectsFrom = None,
     as_json: Json = False,
 ) -> None:
@@ -216,7 +220,7 @@ def refine(
         raise InputError(f"{start} keeps effects and readings; leave out the other options")
     known = PriorOptions(prior, prior_of, drift).load(catalogue)
     laws = LawSearch(run.absolute().parent) if discover else None
-    with Campaign.open(run, catalogue) as o:
+    with Campaign.open(run, catalogue) as o, followed(t, view, run) as live:
         refuse_fitting(o.file)
         latest = o.latest() if from_latest else None if not start else o.in_use(revision)
         if start and latest is None:
@@ -236,7 +240,17 @@ def refine(
                 say("registering")
                 model = with_effects(o.cell, o.readings, mode, named, named, catalogue, known)
             how = NOTHING if latest is None else o.history(latest.number)
-            found = refine_model(model, fitted, mode, say, how, laws)
+            numbers_to_be = itertools.count(len(o.file.revisions()) + 1)
+            first = latest
+
+            def seen(step: RefinementStep) -> None:
+                nonlocal first
+                number = next(numbers_to_be) if first is None else first.number
+                first = None
+                if live is not None:
+                    live.revised(chapter_of(number, step))
+
+            found = refine_model(model, fitted, mode, say, how, laws, seen)
             if laws is not None:
                 laws.write(found.names)
             rows: list[Row] = []
@@ -272,7 +286,9 @@ def refine(
             t.show(text.follows(last.misfit_breakdown))
         t.show([*curves(last.dependences)])
         steps = zip(rows, found.steps, strict=True)
-        chapters = [Chapter(r.number, r.added, r.fit, s.diagnosis, r.removed) for r, s in steps]
+        chapters = [chapter_of(r.number, s) for r, s in steps]
+        if live is not None:  # its verdict may have changed when others were tried
+            live.revised(chapters[-1])
         record_story(t, chapters, record)
     t.document(
         {
@@ -287,6 +303,11 @@ def refine(
             "diagnosis": to_json(last),
         }
     )
+
+
+def chapter_of(number: int, step: RefinementStep) -> Chapter:
+    """Return a step of a refinement as a chapter of the story."""
+    return Chapter(number, step.added, step.fit, step.diagnosis, step.removed)
 
 
 def revisions_json(rows: Sequence[Row]) -> list[dict[str, object]]:
@@ -306,52 +327,3 @@ def revisions_json(rows: Sequence[Row]) -> list[dict[str, object]]:
         }
         for r in rows
     ]
-
-
-def view(
-    run: Run,
-    revision: Revision = None,
-    record: Record = None,
-    port: Annotated[int, typer.Option("--port", help="Port to serve viewers on.")] = 9876,
-    effects_from: EffectsFrom = None,
-    as_json: Json = False,
-) -> None:
-    """Tell the story of the revisions in rerun."""
-    t, catalogue = terminal(as_json), catalogue_with(effects_from)
-    check_record(record)
-    with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
-        chapters = o.chapters(say, revision)
-    if record is not None:
-        record_story(t, chapters, record)
-        t.document({"recording": str(record), "revisions": [c.number for c in chapters]})
-        return
-    with working(t.progress) as say:
-        say("preparing the viewer")
-        from hilcal.report.viewer import serve  # loads the viewer's library, which takes a while
-
-        story = build_story(chapters)
-    # Ending the server can wait for a viewer that does not answer; the campaign is closed.
-    guard = threading.Timer(ENDING, os._exit, (0,))
-    guard.daemon = True
-    try:
-        with (
-            told_to_end(signal.SIGINT, signal.SIGTERM) as wait,
-            serve(story, port=port) as served,
-        ):
-            t.show("Open the viewer with:")
-            t.command(f"{viewer_command()} {served.url}")
-            t.document({"url": served.url, "revisions": [c.number for c in chapters]})
-            sys.stdout.flush()
-            t.notice("Serving until Ctrl-C.")
-            wait()
-            guard.start()
-    finally:
-        guard.cancel()
-
-
-def viewer_command() -> str:
-    """Return how to start the viewer that came with the program."""
-    beside = Path(sys.executable).with_name("rerun")
-    if shutil.which("rerun") is None and beside.is_file():
-        return str(beside)
-    return "rerun"

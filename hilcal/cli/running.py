@@ -33,6 +33,7 @@ from hilcal.cli.planning import (
     refuse_unready,
 )
 from hilcal.cli.terminal import Json, Terminal, terminal
+from hilcal.cli.viewing import View, followed
 from hilcal.config import CellConfig
 from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.plan import Plan, load_plan
@@ -44,6 +45,7 @@ from hilcal.plan.checked_plan import refuse
 from hilcal.plan.goal_rule import GoalRule
 from hilcal.report.goal_words import full_words, missed_words
 from hilcal.report.live_run import watching
+from hilcal.report.live_viewer import LiveViewer, Several
 from hilcal.report.progress import Say, working
 from hilcal.report.text_plan import plan_facts
 
@@ -82,6 +84,7 @@ def run(
             "--yes", "-y", help="Without --plan: do not ask whether to measure what was planned."
         ),
     ] = False,
+    view: View = False,
     effects_from: EffectsFrom = None,
     as_json: Json = False,
 ) -> None:
@@ -123,11 +126,13 @@ def run(
             campaign = stack.enter_context(create_run(output, config, base_dir, made))
         planned = len(RunLog(campaign).plan.steps) * len(numbers.all_targets)
         more = (*_given("--rehearse", rehearse), *_given("--until", until))
+        more = (*more, *_given("--view", view))
         for path in effects_from or ():
             more = (*more, "--effects-from", str(path))
         on = shlex.join(("hilcal", "run", str(cell), "-o", str(output), "--resume", *more))
+        live = stack.enter_context(followed(t, view, output))
         with _says_how_to_resume(campaign, planned, on):
-            measured = measure(t, config, numbers, campaign, goal)
+            measured = measure(t, config, numbers, campaign, goal, viewer=live)
     document: dict[str, object] = {"campaign": str(output), "readings": measured}
     document["planned"] = planned
     if goal is not None:
@@ -220,11 +225,12 @@ def measure(
     campaign: CampaignFile,
     goal: GoalRule | None = None,
     epoch: float | None = None,
+    viewer: LiveViewer | None = None,
 ) -> int:
     """Measure what is missing in a campaign; returns how many readings it then holds.
 
     With a goal it is only as much as that needs; nothing where it is met already. The campaign's
-    time counts from `epoch`, a time of day in s, where that is given.
+    time counts from `epoch`, a time of day in s, where that is given. A live viewer is told all.
 
     Raises:
         DeviceError: a device failed; the arm stands, and what was measured is stored.
@@ -245,6 +251,9 @@ def measure(
         refuse_unready(answers)
         assert rig is not None  # noqa: S101  (refuse_unready has raised otherwise)
         watcher: Watcher = stack.enter_context(watching(t.progress, len(log.plan.steps)))
+        if viewer is not None:
+            viewer.measuring(campaign.path.name, cell, log)
+            watcher = Several((watcher, viewer))
         log.event("devices", {"answers": [answer_json(answer) for answer in answers]})
         clock = Clock(config.simulation.clock)
         live = LiveModel(cell, config)

@@ -113,12 +113,21 @@ def _compared(known: _Known, last: Readings) -> LiveResidual:
     sigma = float(np.sqrt(mahalanobis2(off, last.covariance + own)[0] / last.m))
     uncertain = bool(np.trace(own[0, :3, :3]) > np.trace(last.covariance[0, :3, :3]))
     residual_m = float(np.linalg.norm(off[0, :3]))
+    axes = known.model.predict(last.states, known.theta).observation.axes[0]
+    spread = axes.T @ (last.covariance + own)[0, :3, :3] @ axes
+    found = LiveResidual(
+        residual_m,
+        sigma,
+        uncertain,
+        vector=tuple((axes.T @ off[0, :3]).tolist()),
+        covariance=tuple(spread.ravel().tolist()),
+    )
     if not loaded:
-        return LiveResidual(residual_m, sigma, uncertain)
+        return found
     rest = replace(last, states=replace(last.states, wrench=np.zeros_like(last.states.wrench)))
     deflection_std = float(np.sqrt(known.rms**2 + np.trace(_spread(known, rest)[0, :3, :3])))
     deflection = float(np.linalg.norm(_residual(known, rest)[0, :3]))
-    return LiveResidual(residual_m, sigma, uncertain, deflection, deflection_std)
+    return replace(found, deflection=deflection, deflection_std=deflection_std)
 
 
 def _residual(known: _Known, last: Readings) -> Floats:

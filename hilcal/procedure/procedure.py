@@ -9,6 +9,7 @@ by one. So the next step follows from the files (`state.next_step`), whatever ha
 before, and nothing is measured twice.
 """
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -44,6 +45,7 @@ from hilcal.procedure.state import (
 )
 from hilcal.procedure.validation_steps import ValidationSteps
 from hilcal.refine import Refinement, refine
+from hilcal.refine import Step as RefinementStep
 
 Say = Callable[[str], None]
 Measure = Callable[[CampaignFile, float | None], None]
@@ -177,8 +179,16 @@ class Procedure(ValidationSteps):
 
     # fitting
 
-    def refine(self, say: Say = lambda words: None) -> Refinement:
+    def refine(
+        self,
+        say: Say = lambda words: None,
+        seen: Callable[[int, RefinementStep], None] = lambda number, step: None,
+    ) -> Refinement:
         """Fit, diagnose, and change the model until it is adequate; all revisions are stored.
+
+        Args:
+            say: takes progress.
+            seen: takes each step as soon as it is judged, with the number of its revision.
 
         Raises:
             CannotAnswerError: the readings do not determine the baseline.
@@ -187,7 +197,10 @@ class Procedure(ValidationSteps):
             mode = self._mode(o.readings)
             say("registering")
             model = baseline(o.cell, o.readings, mode, o.catalogue, self.known)
-            found = refine(model, o.readings, mode, say)
+            numbers = itertools.count(len(o.file.revisions()) + 1)
+            found = refine(
+                model, o.readings, mode, say, seen=lambda step: seen(next(numbers), step)
+            )
             say("computing standard uncertainties")
             self.keep(o, found)
         return found

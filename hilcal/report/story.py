@@ -182,6 +182,7 @@ class Story:
         target_names: names of several targets.
         pose_names: (N,) name of each reading's pose; empty where its number is its name.
         time_s: (N,) time of each reading, s; None where the readings do not state it.
+        growing: whether further revisions may follow.
     """
 
     arm: Arm
@@ -198,6 +199,7 @@ class Story:
     target_names: tuple[str, ...] = ()
     pose_names: tuple[str, ...] = ()
     time_s: Floats | None = None
+    growing: bool = False
 
     def pose_name(self, i: int) -> str:
         """Return the name of reading i's pose, as everywhere else."""

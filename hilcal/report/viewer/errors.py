@@ -63,8 +63,11 @@ def decades(low: float, high: float) -> Floats:
     return found if len(found) >= 2 else ticks(low, high, most=3)
 
 
-def error_picture(rec: rr.RecordingStream, d: Digest) -> None:
-    """Log, for all times, the errors of all revisions: marks only, nothing is between them."""
+def error_picture(rec: rr.RecordingStream, d: Digest, static: bool = True) -> None:
+    """Log, for all times, the errors of all revisions: marks only, nothing is between them.
+
+    Without `static` for the recording's current time.
+    """
     frame = axis(d)
     low = frame.y[0]
     for k, (name, _, color) in enumerate(SERIES):
@@ -74,7 +77,7 @@ def error_picture(rec: rr.RecordingStream, d: Digest) -> None:
         rec.log(
             f"{ORIGIN}/{name}",
             rr.Points2D(at, colors=[color], radii=rr.Radius.ui_points(4.0), draw_order=50.0),
-            static=True,
+            static=static,
         )
     floor = np.maximum(height(np.full(2, 1e6 * d.story.noise_floor_m)), low)
     rec.log(
@@ -84,13 +87,13 @@ def error_picture(rec: rr.RecordingStream, d: Digest) -> None:
             colors=[style.NOISE],
             radii=rr.Radius.ui_points(1.2),
         ),
-        static=True,
+        static=static,
     )
     levels = decades(10.0 ** frame.y[0], 10.0 ** frame.y[1])
-    rec.log(f"{ORIGIN}/axes", frame.lines(np.zeros(0), np.log10(levels)), static=True)
+    rec.log(f"{ORIGIN}/axes", frame.lines(np.zeros(0), np.log10(levels)), static=static)
     up = frame.place(np.zeros(len(levels)), np.log10(levels))[:, 1]
     places = [(-9.0, float(y) + RAISED) for y in up]
-    write(rec, f"{ORIGIN}/ticks", places, [f"{v:.6g}" for v in levels], static=True)
+    write(rec, f"{ORIGIN}/ticks", places, [f"{v:.6g}" for v in levels], static=static)
 
 
 def error_now(rec: rr.RecordingStream, d: Digest, r: StoryRevision) -> None:

@@ -1,5 +1,7 @@
 """The blueprint: which view stands where, and what its title says."""
 
+from typing import Literal
+
 import numpy as np
 import rerun.blueprint as rrb
 
@@ -10,15 +12,17 @@ from hilcal.report.viewer.scene import center, seen
 FOLLOWS = "Residual against suspect"
 LIMITS = "Could have been seen"
 ERRORS = "Error of each revision [µm, logarithmic]; framed: this one"
-_EYE = np.array([1.05, -1.35, 0.55])
+EYE = np.array([1.05, -1.35, 0.55])
 # Views that draw with light colours stay dark in the light theme too.
-_DARK = rrb.Background(color=(22, 24, 29), kind=rrb.BackgroundKind.SolidColor)
+BACKGROUND = rrb.Background(color=(22, 24, 29), kind=rrb.BackgroundKind.SolidColor)
+
+GRID = rrb.LineGrid3D(visible=True, spacing=0.25, stroke_width=0.7, color=(120, 124, 132, 70))
 
 
 def blueprint(d: Digest) -> rrb.Blueprint:
     """Left: 3-D over the error of each revision. Right: the verdict over residual and details.
 
-    It opens at the first revision and stands there.
+    It opens at the first revision and stands there; that of a growing story goes along with it.
     """
     left = rrb.Vertical(
         rrb.Tabs(_residuals(d), _deflections(d)),
@@ -48,9 +52,10 @@ def blueprint(d: Digest) -> rrb.Blueprint:
         ),
         row_shares=[5, 4],
     )
+    play: Literal["following", "paused"] = "following" if d.story.growing else "paused"
     return rrb.Blueprint(
         rrb.Horizontal(left, right, column_shares=[3, 2]),
-        rrb.TimePanel(timeline="revision", state="collapsed", fps=1.0, play_state="paused"),
+        rrb.TimePanel(timeline="revision", state="collapsed", fps=1.0, play_state=play),
         rrb.SelectionPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),
         auto_views=False,
@@ -82,15 +87,13 @@ def _view3d(d: Digest, name: str, hidden: str) -> rrb.Spatial3DView:
     middle, size = center(d)
     return rrb.Spatial3DView(
         origin="world",
-        contents=["+ $origin/**", f"- $origin/{hidden}/**"],
+        contents=["+ $origin/**", f"- $origin/{hidden}/**", "- $origin/live/**"],
         name=name,
-        background=_DARK,
-        line_grid=rrb.LineGrid3D(
-            visible=True, spacing=0.25, stroke_width=0.7, color=(120, 124, 132, 70)
-        ),
+        background=BACKGROUND,
+        line_grid=GRID,
         eye_controls=rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital,
-            position=eye.near(middle, _EYE * size, seen(d)),
+            position=eye.near(middle, EYE * size, seen(d)),
             look_target=middle,
             eye_up=(0.0, 0.0, 1.0),
         ),
@@ -112,6 +115,6 @@ def _flat(
     return rrb.Spatial2DView(
         origin=origin,
         name=name,
-        background=_DARK,
+        background=BACKGROUND,
         visual_bounds=rrb.VisualBounds2D(x_range=(-x, w + x), y_range=y),
     )

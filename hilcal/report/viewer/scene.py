@@ -30,7 +30,7 @@ def static_scene(rec: rr.RecordingStream, d: Digest) -> None:
 def revision_scene(rec: rr.RecordingStream, d: Digest, r: StoryRevision) -> None:
     """Log one revision at the recording's current time: arrows, balls, the arm at its worst."""
     story, worst = d.story, d.worst(r)
-    _arm(rec, d, int(d.row[worst]))
+    stand(rec, d.bodies[int(d.row[worst])])
     shown = d.shown(r)
     colors = style.LEVEL_COLORS[style.levels(r.whitened_norm2[shown])]
     rec.log(
@@ -160,14 +160,14 @@ def center(d: Digest) -> tuple[Floats, float]:
     return (lo + hi) / 2, max(float(np.linalg.norm(hi - lo)) / 2, 0.3 * d.story.arm.reach)
 
 
-def _arm(rec: rr.RecordingStream, d: Digest, pose: int) -> None:
-    quaternion = quaternions_of(d.bodies[pose, :, :3, :3])
-    for i in range(1, d.bodies.shape[1]):
+def stand(rec: rr.RecordingStream, bodies: Floats) -> None:
+    """Log where the arm's bodies (n + 2, 4, 4) are at the recording's current time."""
+    quaternion = quaternions_of(bodies[:, :3, :3])
+    for i in range(1, len(bodies)):
         rec.log(
             f"world/arm/body{i}",
             rr.Transform3D(
-                translation=d.bodies[pose, i, :3, 3],
-                quaternion=rr.Quaternion(xyzw=quaternion[i]),
+                translation=bodies[i, :3, 3], quaternion=rr.Quaternion(xyzw=quaternion[i])
             ),
         )
 

@@ -17,6 +17,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from hilcal.errors import HilcalError, InputError
+from hilcal.report.live_viewer import PORT
 from hilcal.report.story import Story, StoryRevision, check
 from hilcal.report.viewer import charts, errors, layout, scene, style, words
 from hilcal.report.viewer.digest import Digest, Limits, digest
@@ -51,7 +52,7 @@ def record(story: Story, *sinks: Sink, limits: Limits | None = None) -> rr.Recor
     """
     d, rec = _open(story, limits)
     rec.set_sinks(*sinks, default_blueprint=layout.blueprint(d))
-    _tell(rec, d)
+    tell(rec, d)
     return rec
 
 
@@ -65,12 +66,12 @@ def save(story: Story, path: Path, limits: Limits | None = None) -> None:
     path = Path(path)
     require_folder(path)
     d, rec = _open(story, limits)
-    write(rec, layout.blueprint(d), lambda: _tell(rec, d), path)
+    write(rec, layout.blueprint(d), lambda: tell(rec, d), path)
 
 
 @contextlib.contextmanager
 def serve(
-    story: Story, ip: str = "127.0.0.1", port: int = 9876, limits: Limits | None = None
+    story: Story, ip: str = "127.0.0.1", port: int = PORT, limits: Limits | None = None
 ) -> Iterator[Served]:
     """Serve a story to viewers until the block ends; viewers may join late and rejoin.
 
@@ -82,9 +83,7 @@ def serve(
     """
     disable_analytics()
     try:
-        with socket.socket() as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind((ip, port))  # the server itself would only log that the port is taken
+        bind(ip, port)
     except (OSError, OverflowError) as error:
         raise InputError(
             f"viewer server {ip}:{port}: {error}; choose a free port of this machine"
@@ -97,6 +96,27 @@ def serve(
         yield Served(f"rerun+http://{ip}:{port}/proxy")
     finally:
         rec.disconnect()
+
+
+def bind(ip: str, port: int) -> None:
+    """Bind a port and let it go; the server itself would only log that it is taken.
+
+    Raises:
+        OSError: it is taken, or not allowed.
+        OverflowError: no port has this number.
+    """
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        probe.bind((ip, port))
+
+
+def free(ip: str, port: int) -> bool:
+    """Return whether a port can be bound."""
+    try:
+        bind(ip, port)
+    except (OSError, OverflowError):
+        return False
+    return True
 
 
 def recording_id(story: Story) -> str:
@@ -205,22 +225,28 @@ def _open(story: Story, limits: Limits | None) -> tuple[Digest, rr.RecordingStre
     return digest(story, limits or Limits()), opened(recording_id(story))
 
 
-def _tell(rec: rr.RecordingStream, d: Digest) -> None:
+def tell(rec: rr.RecordingStream, d: Digest) -> None:
     """Log the whole story, flushed after each revision."""
     rec.send_recording_name(f"hilcal: {style.safe(d.story.arm.name)}, {len(d.story)} readings")
-    scene.static_scene(rec, d)
+    begin(rec, d)
     errors.error_picture(rec, d)
-    rec.log("words/guide", _markdown(words.GUIDE), static=True)
     for r in d.story.revisions:
         rec.set_time("revision", sequence=r.revision)
-        _revision(rec, d, r)
+        tell_revision(rec, d, r)
         flush(rec)
     rec.reset_time()
     _poses(rec, d)
     flush(rec)
 
 
-def _revision(rec: rr.RecordingStream, d: Digest, r: StoryRevision) -> None:
+def begin(rec: rr.RecordingStream, d: Digest) -> None:
+    """Log what is the same in every revision."""
+    scene.static_scene(rec, d)
+    rec.log("words/guide", _markdown(words.GUIDE), static=True)
+
+
+def tell_revision(rec: rr.RecordingStream, d: Digest, r: StoryRevision) -> None:
+    """Log one revision at the recording's current time."""
     scene.revision_scene(rec, d, r)
     charts.revision_charts(rec, d, r)
     rec.log("words/verdict", _markdown(words.verdict(d, r)))
@@ -235,7 +261,7 @@ def _poses(rec: rr.RecordingStream, d: Digest) -> None:
     """Tell the last revision on the timeline `pose`, and move the arm along it."""
     last = d.story.revisions[-1]
     rec.set_time("pose", sequence=int(d.poses[0]))
-    _revision(rec, d, last)
+    tell_revision(rec, d, last)
     rec.reset_time()
     scene.pose_scene(rec, d)
     time = [rr.TimeColumn("pose", sequence=d.poses)]

@@ -36,6 +36,8 @@ def verdict(d: Digest, r: StoryRevision) -> str:
 
 def place(d: Digest, r: StoryRevision) -> str:
     """Return where in the story a revision stands, e.g. "Revision 2 of 2, the last"."""
+    if d.story.growing:
+        return f"Revision {r.revision}"
     told = [o.revision for o in d.story.revisions]
     k, count = told.index(r.revision) + 1, len(told)
     if told == list(range(1, count + 1)):

@@ -35,7 +35,7 @@ def test_a_viewer_that_joins_late_gets_the_whole_story(told, tmp_path, monkeypat
     with serve(told, port=free_port) as served:
         assert served.url == f"rerun+http://127.0.0.1:{free_port}/proxy"
         client = subprocess.Popen(
-            [executable(), "--save", str(late), served.url],
+            [executable(), "--port", "auto", "--save", str(late), served.url],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )

@@ -1,0 +1,118 @@
+"""Follows a command while it works: serves viewers that come and go, and records."""
+
+import contextlib
+import pickle
+import threading
+import uuid
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import BinaryIO, Protocol
+
+import rerun as rr
+
+from hilcal.acquire.progress import ArmAt
+from hilcal.errors import HilcalError, InputError
+from hilcal.report.viewer.live_scene import LiveScene
+from hilcal.report.viewer.stream import APPLICATION, Sink, disable_analytics, free
+
+PORTS = 20
+"""Ports that are tried, from the wanted one; a choice."""
+MEMORY = "256MiB"
+"""What the server keeps for viewers that come late at most; a choice, some 10,000 readings."""
+_FLUSH_S = 5.0
+_END_S = 8.0
+
+
+class Reply(Protocol):
+    """Tells the command something: `url`, or a `problem` in one line."""
+
+    def __call__(self, **told: object) -> None:
+        """Tell it."""
+        ...
+
+
+def follow(messages: BinaryIO, reply: Reply, record: Path, port: int) -> None:
+    """Show what messages tell, until they end.
+
+    Args:
+        messages: pickled pairs of a time of day, s, and what happened; see `LiveScene`.
+        reply: told `url` when viewers can be served (None: they cannot), and problems.
+        record: the recording; a file that is there is replaced.
+        port: the first to be tried, on the loopback interface only.
+    """
+    identifier = str(uuid.uuid4())
+    file = _Outlet(
+        identifier, reply, f"recording {record}", lambda: rr.FileSink(str(record)), to_open=True
+    )
+    outlets = [file]
+    with contextlib.suppress(OSError):
+        disable_analytics()
+    found = next((p for p in range(port, port + PORTS) if free("127.0.0.1", p)), None)
+    if found is None:
+        reply(problem=f"no free port from {port} to {port + PORTS - 1}: no live viewer is served")
+        reply(url=None)
+    else:
+        sink = rr.GrpcServerSink(bind_ip="127.0.0.1", port=found, server_memory_limit=MEMORY)
+        name = f"live viewer at port {found}"
+        outlets.append(_Outlet(identifier, reply, name, lambda: sink, to_open=False))
+        reply(url=f"rerun+http://127.0.0.1:{found}/proxy")
+    with contextlib.suppress(EOFError, pickle.UnpicklingError):
+        while True:
+            wall, what = pickle.load(messages)  # noqa: S301 - of the command that started us
+            for outlet in outlets:
+                whole = not isinstance(what, ArmAt)  # places of the arm go on in batches
+                outlet.tell(partial(LiveScene.tell, wall=wall, what=what), whole)
+    guard = threading.Thread(target=_end, args=(outlets,), daemon=True)
+    guard.start()
+    guard.join(_END_S)
+
+
+def _end(outlets: list["_Outlet"]) -> None:
+    for outlet in outlets:
+        outlet.end()
+
+
+class _Outlet:
+    """One place where the pictures go; what fails here is told once, and the others go on."""
+
+    def __init__(
+        self, identifier: str, reply: Reply, name: str, sink: Callable[[], Sink], to_open: bool
+    ) -> None:
+        """Open it; `to_open`: it is a file that is read later."""
+        self._reply, self._name, self._to_open = reply, name, to_open
+        self._scene: LiveScene | None = None
+        self._rec = rr.RecordingStream(APPLICATION, recording_id=identifier, send_properties=False)
+        self._rec.set_log_time_enabled(False)
+        self._rec.set_log_tick_enabled(False)
+        try:
+            self._rec.set_sinks(sink())
+            self._scene = LiveScene(self._rec, batches=to_open)
+        except (OSError, RuntimeError, ValueError) as error:
+            self._fail(error)
+
+    def tell(self, told: Callable[[LiveScene], None], flush: bool = True) -> None:
+        """Draw something, and hand it on: now, or with what comes next."""
+        if self._scene is None:
+            return
+        try:
+            told(self._scene)
+        except (InputError, ValueError, IndexError, KeyError) as error:
+            self._reply(problem=f"{self._name}: not drawn: {error}")
+        if not flush:
+            return
+        try:
+            self._rec.flush(timeout_sec=_FLUSH_S)
+        except (OSError, RuntimeError, ValueError, HilcalError) as error:
+            if "timeout" in str(error).lower() or "timed out" in str(error).lower():
+                return  # slow; what does not fit in is dropped by the command
+            self._fail(error)
+
+    def end(self) -> None:
+        """End it, whole."""
+        self.tell(lambda scene: scene.end(self._to_open))
+        self._rec.disconnect()
+
+    def _fail(self, error: Exception) -> None:
+        self._scene = None
+        self._reply(problem=f"{self._name}: cannot be written ({error}); everything else goes on")

@@ -1,0 +1,139 @@
+"""What is known of a campaign while it is measured: places of its readings, and a tally."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy import stats
+
+from hilcal.acquire.progress import LiveResidual, ReadingStored
+from hilcal.data.plan import UNLOADED, Step
+from hilcal.report.live_messages import Measuring
+from hilcal.report.viewer import style
+from hilcal.robot.body import body_poses
+from hilcal.types import Floats
+
+SIGMA_LENGTH = 0.02
+"""One σ of a residual is drawn this long, m; a choice."""
+ARROW_CAP = 0.4
+"""Longest arrow, m; a choice."""
+BALL = SIGMA_LENGTH * style.BALL_SIGMAS
+"""Radius of the ball that holds 99 % of the readings where the model is right, m."""
+LIMIT = style.BALL_SIGMAS / 3**0.5
+"""The same in the σ of a reading."""
+ALARM = 0.001
+"""Chance that noise alone leaves as many readings outside their balls as is called wrong."""
+WORST = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """A reading against the model.
+
+    Attributes:
+        step: its step.
+        length: of the residual r, m.
+        norm2: rᵀ V⁻¹ r, V the covariance of reading and prediction; 3 degrees of freedom.
+    """
+
+    step: Step
+    length: float
+    norm2: float
+
+    @property
+    def sigma(self) -> float:
+        """sqrt(rᵀ V⁻¹ r / 3), as the terminal has it: 1 where the model is right."""
+        return float(np.sqrt(self.norm2 / 3))
+
+    @property
+    def level(self) -> int:
+        """0 inside the noise, 1 beyond 99 %, 2 beyond 99.99 %."""
+        return int(style.levels(np.array([self.norm2]))[0])
+
+
+@dataclass(slots=True, eq=False)
+class LiveDigest:
+    """A campaign that is being measured.
+
+    Attributes:
+        told: what is measured.
+        bodies: (P, n + 2, 4, 4) poses of the arm's bodies at each pose of the plan.
+        anchor: (P, 3) nominal position of the first target at each pose, base axes, m.
+        done: readings that are stored.
+        left: real seconds that the rest takes.
+        phase: what is being done.
+        last: the last reading.
+        judged: how many readings were compared with a model.
+        outside: of these how many are outside their ball, by load; and all of them.
+        worst: those that are farthest from the model.
+        remarks: that people should look at, newest last.
+    """
+
+    told: Measuring
+    bodies: Floats
+    anchor: Floats
+    done: int = 0
+    left: float = 0.0
+    phase: str = ""
+    last: ReadingStored | None = None
+    judged: int = 0
+    outside: int = 0
+    loads: dict[str, list[int]] = field(default_factory=dict)
+    worst: list[Judged] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, told: Measuring) -> "LiveDigest":
+        """Return that of a campaign that begins, or goes on."""
+        bodies = body_poses(told.arm, told.plan.q)
+        anchor = bodies[:, -1, :3, 3] + bodies[:, -1, :3, :3] @ told.targets[0]
+        done = len({step for _, step in told.earlier})
+        return cls(told, bodies, anchor, done)
+
+    @property
+    def total(self) -> int:
+        """Readings that are planned."""
+        return len(self.told.plan.steps)
+
+    def place(self, step: Step) -> Floats:
+        """(3,) where the nominal arm holds the target, m."""
+        return np.asarray(self.anchor[self.told.plan.pose_names.index(step.pose)])
+
+    def add(self, event: ReadingStored) -> Judged | None:
+        """Take note of a reading; returns it judged, None where there is no model yet."""
+        self.last, self.done, self.left = event, event.done, event.left_real
+        found = judged(event.step, event.live)
+        if found is None:
+            return None
+        self.judged += 1
+        of_load = self.loads.setdefault(event.step.load, [0, 0])
+        of_load[0] += 1
+        if found.level > 0:
+            self.outside += 1
+            of_load[1] += 1
+        self.worst = sorted([*self.worst, found], key=lambda j: -j.norm2)[:WORST]
+        return found
+
+    @property
+    def wrong(self) -> bool:
+        """Whether more readings are outside than noise leaves there, see `ALARM`."""
+        chance = stats.binom.sf(self.outside - 1, self.judged, 1.0 - style.INSIDE_P)
+        return self.outside > 0 and bool(chance < ALARM)
+
+    @property
+    def loaded(self) -> bool:
+        """Whether any load is planned."""
+        return any(step.load != UNLOADED for step in self.told.plan.steps)
+
+
+def judged(step: Step, live: LiveResidual) -> Judged | None:
+    """Return a reading as `Judged`; None where it was not compared."""
+    if live.vector is None or live.covariance is None:
+        return None
+    r, v = np.array(live.vector), np.array(live.covariance).reshape(3, 3)
+    return Judged(step, float(np.linalg.norm(r)), float(r @ np.linalg.solve(v, r)))
+
+
+def arrow(live: LiveResidual, found: Judged) -> Floats:
+    """(3,) a residual as drawn: its direction, and as long as sqrt(rᵀ V⁻¹ r) says, m."""
+    length = min(SIGMA_LENGTH * float(np.sqrt(found.norm2)), ARROW_CAP)
+    return np.asarray(length / (found.length or 1.0) * np.array(live.vector))
