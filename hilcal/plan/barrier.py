@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.linalg as sl
@@ -14,10 +15,11 @@ from hilcal.types import Floats
 _STEPS = 80
 _BACK = 0.995  # share of the way to the boundary
 _CENTRAL = 1.0  # square of Newton's decrement at which μ may fall
+_KEPT = 20_000_000  # elements of products that are kept, 160 MB
 _CLAMP = 1e4  # how far a dual may be from μ / w
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Program:
     """Maximise φ(M0 + Σ w_k A_kᵀA_k) over w with Σ w_k c_k ≤ B, 0 ≤ w_k ≤ most.
 
@@ -39,8 +41,28 @@ class Program:
 
     def information(self, weight: Floats) -> Floats:
         """Return (P, P) M."""
-        root = (self.rows * np.sqrt(weight)[:, None, None]).reshape(-1, self.rows.shape[2])
-        return np.asarray(self.prior + root.T @ root)
+        return np.asarray(self.prior + self.change(weight))
+
+    def change(self, weight: Floats) -> Floats:
+        """Return (P, P) Σ w_k A_kᵀA_k; weights of either sign."""
+        flat = self.rows.reshape(-1, self.rows.shape[2])
+        if self._grams is None:
+            return np.asarray((flat * np.repeat(weight, self.rows.shape[1])[:, None]).T @ flat)
+        out = np.zeros((flat.shape[1], flat.shape[1]))
+        up, across = np.triu_indices(len(out))
+        out[up, across] = out[across, up] = weight @ self._grams
+        return out
+
+    @cached_property
+    def _grams(self) -> Floats | None:
+        """(n, P (P + 1) / 2) upper triangles of A_kᵀA_k; None where they are too large to keep."""
+        up, across = np.triu_indices(self.rows.shape[2])
+        if len(self.rows) * len(up) > _KEPT:
+            return None
+        out = np.empty((len(self.rows), len(up)))
+        for k, a in enumerate(self.rows):
+            out[k] = (a.T @ a)[up, across]
+        return out
 
     def bound(self, smooth: Smooth) -> float:
         """Return the bound of φ over these units."""
@@ -177,7 +199,8 @@ def solve(program: Program, start: Floats, tolerance: float, order: float = 1.0)
         if capped:
             length = min(length, _BACK * _room(top, -move))
         push = float(lean @ move)
-        length = _search(program, surrogate, smooth, w, move, length, mu, push)
+        moved = program.change(move)
+        length = _search(program, surrogate, smooth, (w, m), (move, moved), length, mu, push)
         if length == 0.0 and (program.criterion.kinked or mu <= tolerance / (10 * n)):
             break
         z = _dual(z, mu / w - z - z / w * move)
@@ -234,14 +257,18 @@ def _search(
     program: Program,
     surrogate: Callable[[Floats], Smooth | None],
     here: Smooth,
-    w: Floats,
-    move: Floats,
+    at: tuple[Floats, Floats],
+    step: tuple[Floats, Floats],
     length: float,
     mu: float,
     slope: float,
 ) -> float:
-    """Return the length of the step: halved until the barrier problem improves; 0 if never."""
+    """Return the length of the step: halved until the barrier problem improves; 0 if never.
+
+    The information is linear in the weights: `at` and `step` are weights and information.
+    """
     capped = np.isfinite(program.most)
+    (w, m), (move, moved) = at, step
 
     def barrier(x: Floats) -> float:
         out = float(np.log(x).sum())
@@ -251,7 +278,7 @@ def _search(
     noise = 1e-13 * (1.0 + abs(here.value))
     for _ in range(30):
         x = w + length * move
-        there = surrogate(program.information(x))
+        there = surrogate(m + length * moved)
         if there is not None:
             gain = there.value - here.value + mu * (barrier(x) - start)
             if gain >= 1e-4 * length * slope - noise:

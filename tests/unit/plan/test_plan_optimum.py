@@ -240,7 +240,7 @@ def test_peer_problem_against_another_algorithm() -> None:
     rng = np.random.default_rng(6)
     units = CandidateSet(rng.normal(size=(300, 3, 24)) * np.exp(rng.normal(size=24)), np.ones(300))
     found = relax(units, D(), 1.0)
-    reference = np.exp(multiplicative(units, 2000) / 24)
+    reference = np.exp(multiplicative(units, 400) / 24)
     assert found.value >= reference * (1 - 1e-6)
     assert found.bound >= reference
     assert found.gap <= 1e-6

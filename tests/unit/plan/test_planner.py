@@ -81,7 +81,7 @@ def test_more_readings_promise_more() -> None:
 
 @pytest.mark.parametrize("criterion", CRITERIA)
 def test_every_criterion_gives_a_certified_plan(criterion: str) -> None:
-    config = small(against=("joint_tilt_compliance", "load_point"))
+    config = small(candidates=30, against=("joint_tilt_compliance", "load_point"))
     made = planned(config, 6, criterion=criterion)
     assert made.criterion == criterion
     assert 0.5 < made.design.efficiency <= 1.0
