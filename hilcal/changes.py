@@ -42,17 +42,25 @@ class Changed:
 
 
 def add_effect(
-    o: Campaign, number: int, before: Fit, effect: str, options: Options, say: Say
+    o: Campaign,
+    number: int | None,
+    before: Fit,
+    effect: str,
+    options: Options,
+    say: Say,
+    judged: Diagnosis | None = None,
 ) -> Changed:
     """Add an effect to a revision's model, and store the fit as a revision that comes from it.
 
     Args:
         o: the campaign.
-        number: of the revision.
+        number: of the revision; None where there is none yet: `before` then becomes one, too, when
+            the effect could be added.
         before: its fit.
         effect: name in the catalogue.
         options: of the effect.
         say: takes progress, one line each.
+        judged: the diagnosis of `before`, which is kept with it.
 
     Raises:
         InputError: an effect that the model has already, or that these readings do not allow.
@@ -62,23 +70,31 @@ def add_effect(
     say(f"adding {named}")
     after = add(before, effect, options=options)
     added = named if effect in before.model.names else effect
-    return _stored(o, number, before, after, added, None, say)
+    return _stored(o, number, before, after, added, None, say, judged)
 
 
-def remove_effect(o: Campaign, number: int, before: Fit, effect: str, say: Say) -> Changed:
+def remove_effect(
+    o: Campaign,
+    number: int | None,
+    before: Fit,
+    effect: str,
+    say: Say,
+    judged: Diagnosis | None = None,
+) -> Changed:
     """Take an effect out of a revision's model; else as `add_effect`."""
     say(f"removing {effect}")
-    return _stored(o, number, before, remove(before, effect), None, effect, say)
+    return _stored(o, number, before, remove(before, effect), None, effect, say, judged)
 
 
 def _stored(
     o: Campaign,
-    number: int,
+    number: int | None,
     before: Fit,
     after: Fit,
     added: str | None,
     removed: str | None,
     say: Say,
+    judged: Diagnosis | None,
 ) -> Changed:
     say("diagnosing")
     known = o.history(number)
@@ -92,6 +108,8 @@ def _stored(
         _ = found.holdout
         say("computing standard uncertainties")
         _ = found.uncertainty
+    if number is None:
+        number = o.store(before, judged)
     made = o.store(after, d, added, removed, number)
     promised = added is not None and before.scaling == "gc"
     expected = addition(before, after) if promised else None

@@ -35,6 +35,7 @@ SECTIONS = {
     "Measure": ("run", "import", "info"),
     "Fit, and find what is missing": (
         *("identify", "compare", "diagnose", "add", "remove", "refine", "discover", "next"),
+        "workbench",
     ),
     "Use the result": ("validate", "compensate", "accept", "report", "view", "export"),
     "Look up": ("effects", "study", "doctor"),
@@ -112,6 +113,10 @@ COMMANDS = {
         "Write the whole story as one HTML page, a certificate first; it prints to PDF.",
     ),
     "view": Command("viewing:view", "Tell the story of the revisions in rerun."),
+    "workbench": Command(
+        "working:workbench",
+        "Compare, add, remove, measure next on one page, which only this machine can open.",
+    ),
     "export": Command(
         "exporting:export", "Hand over: readings, parameters, calibration, URDF, DH, frames."
     ),

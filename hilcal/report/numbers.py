@@ -28,6 +28,11 @@ def unit_for(unit: str, values: Sequence[float]) -> tuple[str, float]:
     return unit, 1.0
 
 
+def angle_or(unit: str) -> tuple[str, float]:
+    """Unit for people, and its factor, of a recorded variable: angles in degrees, others in SI."""
+    return ("°", 180.0 / math.pi) if unit == "rad" else (unit, 1.0)
+
+
 def sizes(of: Iterable[tuple[str, float]]) -> str:
     """Write (unit, value) pairs, SI, in units for people."""
     parts = []

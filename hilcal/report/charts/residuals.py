@@ -19,7 +19,7 @@ def residual_by_pose(story: Story, revision: StoryRevision) -> go.Figure:
     """Draw the residual of each reading in σ over its pose, poses in the order of their numbers."""
     d = drawn(story, revision)
     _, first, of = np.unique(story.pose, return_index=True, return_inverse=True)
-    out = _chart(d, of.reshape(-1)[d.index].astype(float), "pose", _by(story, revision, "pose"))
+    out = chart(d, of.reshape(-1)[d.index].astype(float), "pose", _by(story, revision, "pose"))
     names = [escaped(story.pose_name(int(i))) for i in first]
     step = -(-len(names) // MOST_POSES)
     out.update_xaxes(tickvals=list(range(0, len(names), step)), ticktext=names[::step])
@@ -33,7 +33,7 @@ def residual_by_load(story: Story, revision: StoryRevision) -> go.Figure:
     of = np.array([loads.index(name) for name in story.load_names], dtype=float)
     # beside each other within a load, so that points do not hide each other
     beside = np.random.default_rng(0).uniform(-0.3, 0.3, len(of))
-    out = _chart(d, (of + beside)[d.index], "load", _by(story, revision, "load"))
+    out = chart(d, (of + beside)[d.index], "load", _by(story, revision, "load"))
     names = ["unloaded" if name == UNLOADED else escaped(name) for name in loads]
     out.update_xaxes(tickvals=list(range(len(names))), ticktext=names)
     return out
@@ -44,7 +44,7 @@ def residual_by_joint(story: Story, revision: StoryRevision, joint: int) -> go.F
     d = drawn(story, revision)
     name = f"joint {joint + 1} angle"
     angle = np.degrees(story.q[:, joint])
-    return _chart(d, angle[d.index], f"{name} [°]", _over(revision, angle, name, "°"))
+    return chart(d, angle[d.index], f"{name} [°]", over(revision, angle, name, "°"))
 
 
 def residual_by_time(story: Story, revision: StoryRevision) -> go.Figure:
@@ -52,11 +52,11 @@ def residual_by_time(story: Story, revision: StoryRevision) -> go.Figure:
     d = drawn(story, revision)
     if story.time_s is None:
         rows = np.arange(len(story), dtype=float)
-        says = _over(revision, rows, "row order", "")
-        return _chart(d, rows[d.index], "row, in the order of the file", says)
+        says = over(revision, rows, "row order", "")
+        return chart(d, rows[d.index], "row, in the order of the file", says)
     minutes = (story.time_s - story.time_s.min()) / 60
-    says = _over(revision, minutes, "time", "min")
-    return _chart(d, minutes[d.index], "time since the first reading [min]", says)
+    says = over(revision, minutes, "time", "min")
+    return chart(d, minutes[d.index], "time since the first reading [min]", says)
 
 
 def worst_of(names: Sequence[str], sigma: Floats) -> list[tuple[str, float, int]]:
@@ -80,7 +80,8 @@ def _by(story: Story, revision: StoryRevision, what: str) -> str:
     return f"Worst is {name} with {rms:.2g} times the noise rms; best, {rest[-1][1]:.2g} times."
 
 
-def _over(revision: StoryRevision, x: Floats, name: str, unit: str) -> str:
+def over(revision: StoryRevision, x: Floats, name: str, unit: str) -> str:
+    """Say how the residual differs between small and large values (N,) of a variable."""
     sigma = np.sqrt(revision.whitened_norm2 / 3)
     middle = np.median(x)
     low, high = x <= middle, x > middle
@@ -91,7 +92,8 @@ def _over(revision: StoryRevision, x: Floats, name: str, unit: str) -> str:
     return f"Residual over {name}: {a:.2g} times the noise rms up to {at}, {b:.2g} times beyond."
 
 
-def _chart(d: Drawn, x: Floats, title: str, words: str) -> go.Figure:
+def chart(d: Drawn, x: Floats, title: str, words: str) -> go.Figure:
+    """Draw residuals over x (K,); each point carries the number of its reading."""
     traces = [
         go.Scatter(
             x=style.drawn(x[mine]),
@@ -100,6 +102,7 @@ def _chart(d: Drawn, x: Floats, title: str, words: str) -> go.Figure:
             name=style.LEVEL_NAMES[k],
             marker={"color": style.LEVELS[k], "symbol": style.SYMBOLS[k], "size": 6},
             text=d.named(mine),
+            customdata=d.index[mine],
             hovertemplate="%{text}<extra></extra>",
         )
         for k, mine in d.by_level()

@@ -1,0 +1,85 @@
+"""The small parts that the page is made of: the strip of the status, titles, buttons, charts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import plotly.graph_objects as go
+from nicegui import ui
+from nicegui.events import GenericEventArguments
+
+from hilcal.report import numbers
+from hilcal.report.charts import style
+from hilcal.workbench.work import Work
+
+if TYPE_CHECKING:
+    from hilcal.workbench.page import View
+
+
+class Status:
+    """The strip that says what is being done, what failed, and whether the file was changed."""
+
+    def __init__(self, view: View) -> None:
+        """Make it, empty."""
+        with ui.column().classes("strip").style("gap: 0"):
+            with ui.row().classes("bench items-center no-wrap").style("gap: 12px") as self.busy:
+                ui.spinner(size="1.3em")
+                self.doing = ui.label().classes("soft").props("aria-live=polite")
+            with ui.row().classes("bench items-center").style("gap: 12px") as self.failed:
+                self.why = ui.label().classes("bad").props("role=alert")
+                self.refit = button(
+                    view, "Fit anew to all readings", view.fit_anew, "outline dense"
+                )
+            with ui.row().classes("bench items-center").style("gap: 12px") as self.stale:
+                ui.label("Another command has changed the file.").classes("bad")
+                button(view, "Read it again", view.again, "outline dense")
+        for row in (self.busy, self.failed, self.stale):
+            row.set_visibility(False)
+
+    def show(self, work: Work) -> None:
+        """Show how the work stands."""
+        line, failure = work.line, work.failure
+        self.busy.set_visibility(bool(line))
+        self.doing.set_text(f"{line} …")
+        self.failed.set_visibility(bool(failure) and not line)
+        self.why.set_text(numbers.sentence(failure) if failure else "")
+        self.refit.set_visibility("readings were appended" in failure)
+
+
+def number(what: str, value: str) -> None:
+    """Draw a number with what it is."""
+    ui.html(f"<b>{plain(value)}</b><span>{plain(what)}</span>", sanitize=False).classes("number")
+
+
+def title(words: str) -> None:
+    """Draw the title of a part."""
+    ui.html(f"<h2>{plain(words)}</h2>", sanitize=False)
+
+
+def button(view: View, words: str, act: Callable[[], object], props: str) -> ui.button:
+    """Draw a button that cannot be pressed while something is being done."""
+    color = None if "outline" in props or "flat" in props else "primary"
+    made = ui.button(words, on_click=act, color=color).props(f"no-caps {props}")
+    return made.bind_enabled_from(view.work, "what", backward=lambda what: what is None)
+
+
+def chart(view: View, figure: go.Figure) -> ui.plotly:
+    """Draw a chart in the page's scheme, with its sentence for those who do not see it."""
+    dressed = style.in_scheme(figure, view.tab.dark).to_plotly_json()
+    shown = ui.plotly({**dressed, "config": style.CONFIG}).classes("chart")
+    shown.props["role"], shown.props["aria-label"] = "img", style.says(figure)
+    return shown
+
+
+def point(e: GenericEventArguments) -> dict[str, Any]:
+    """Return the point of a chart that was clicked, as plotly.js describes it."""
+    points = e.args.get("points") or [{}]
+    return dict(points[0])
+
+
+def plain(words: str) -> str:
+    """Return words without a meaning in HTML."""
+    return (
+        words.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;").replace("'", "&#39;")
+    )

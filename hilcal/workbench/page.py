@@ -1,0 +1,288 @@
+"""The page: what happens when something is clicked, and when it is drawn anew."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from fastapi import FastAPI, Request
+from fastapi.responses import PlainTextResponse, Response
+from nicegui import app as bench
+from nicegui import ui
+
+from hilcal.workbench import parts
+from hilcal.workbench.desk import Desk
+from hilcal.workbench.elements import Status
+from hilcal.workbench.session import Say, Session
+from hilcal.workbench.viewer import WebViewer
+from hilcal.workbench.work import Work
+
+TICK = 0.2
+"""How often a tab looks whether something has changed, s."""
+LOOK = 2.0
+"""How often it looks at the file, s."""
+CSS = Path(__file__).with_name("page.css")
+DARK = "matchMedia('(prefers-color-scheme: dark)').matches"
+
+
+@dataclass
+class Tab:
+    """What one tab looks at; nothing of it is stored.
+
+    Attributes:
+        desk: the desk that the rest belongs to.
+        suspect: the missing effect whose evidence is shown.
+        variable: the variable over which residuals are drawn; None for the pose.
+        picked: measurements of the story that were clicked; None before.
+        told: what they are, in words.
+        dark: whether the browser asks for a dark page.
+        viewer: address of the 3-D view; empty before it was opened.
+    """
+
+    desk: Desk | None = None
+    suspect: str | None = None
+    variable: str | None = None
+    picked: list[int] | None = None
+    told: str = ""
+    dark: bool = False
+    viewer: str = ""
+
+
+@dataclass
+class Bench:
+    """What all tabs share."""
+
+    session: Session
+    work: Work = field(default_factory=Work)
+    viewer: WebViewer = field(default_factory=WebViewer)
+    drawing: tuple[Desk, str] | None = None
+
+
+def install(app: FastAPI, session: Session) -> None:
+    """Add the page, and the files of the 3-D viewer, to an application; begin to read."""
+    shared = Bench(session)
+
+    @app.get("/viewer/{name:path}")
+    def viewer(name: str) -> Response:
+        found = shared.viewer.file(name)
+        if found is None:
+            return PlainTextResponse("nothing here\n", status_code=404)
+        content, kind = found
+        return Response(content, media_type=kind, headers={"rerun-final-length": str(len(content))})
+
+    @ui.page("/")
+    async def page(request: Request) -> None:
+        view = View(shared, str(request.base_url))
+        view.build()
+        await ui.context.client.connected()
+        view.begin(dark=bool(await ui.run_javascript(DARK, timeout=5.0)))
+
+    bench.on_startup(lambda: shared.work.start(f"Reading {session.path.name}", read(session)))
+
+
+def read(session: Session, revision: int | None = None) -> Callable[[Say], None]:
+    """Return what reads the file and shows a revision."""
+
+    def do(say: Say) -> None:
+        session.load(say, revision)
+
+    return do
+
+
+class View:
+    """One tab of the page."""
+
+    def __init__(self, shared: Bench, address: str) -> None:
+        """Begin with what is there.
+
+        Args:
+            shared: what all tabs share.
+            address: of this server, as the browser calls it.
+        """
+        self.shared, self.address, self.tab = shared, address, Tab()
+        self.readings: ui.column | None = None
+        self.evidence: ui.column | None = None
+        self.planned: ui.column | None = None
+        self.adder: ui.button | None = None
+        self._drawn = (-1, "", False)
+        self._ready = False
+        self._planned: object = None
+
+    @property
+    def session(self) -> Session:
+        """The session."""
+        return self.shared.session
+
+    @property
+    def work(self) -> Work:
+        """The work."""
+        return self.shared.work
+
+    def build(self) -> None:
+        """Make the parts that stay, and look for changes from time to time."""
+        ui.colors(primary="#1f6f9f", positive="#00785a", negative="#c0274b", warning="#8a5a00")
+        ui.add_css(CSS)
+        self.status = Status(self)
+        self.body = ui.column().classes("bench")
+        self.below = ui.column().classes("bench")
+        ui.timer(TICK, self.tick)
+        ui.timer(LOOK, self.look)
+
+    def begin(self, *, dark: bool) -> None:
+        """Draw, now that it is known whether the browser asks for a dark page."""
+        self.tab.dark, self._ready = dark, True
+        self.draw()
+
+    def tick(self) -> None:
+        """Show what is being done, and draw anew what has changed."""
+        self.status.show(self.work)
+        if not self._ready:
+            return
+        state = (self.session.count, self.work.failure, self.work.what is not None)
+        if state != self._drawn:
+            redraw = state[0] != self._drawn[0] or self.session.desk is None
+            self._drawn = state
+            if redraw:
+                self.draw()
+        if self.session.planned is not self._planned:
+            self.draw_plan()
+        if self.shared.drawing is not None and self.tab.viewer != self.shared.drawing[1]:
+            desk, self.tab.viewer = self.shared.drawing
+            if desk is self.tab.desk:
+                self.draw_below()
+
+    def look(self) -> None:
+        """Say when another command has changed the file."""
+        self.status.stale.set_visibility(self.work.what is None and self.session.stale)
+
+    def draw(self) -> None:
+        """Draw everything for what the session shows now."""
+        self._drawn = (self.session.count, self.work.failure, self.work.what is not None)
+        desk = self.session.desk
+        if desk is not self.tab.desk:
+            named = desk.diagnosis.significant if desk else ()
+            self.tab = Tab(desk, named[0] if named else None, dark=self.tab.dark)
+        self.body.clear()
+        with self.body:
+            if desk is None:
+                parts.waiting(self)
+            else:
+                parts.desk(self, desk)
+        self.draw_below()
+
+    def draw_below(self) -> None:
+        """Draw the 3-D view alone."""
+        self.below.clear()
+        with self.below:
+            if self.tab.desk is not None:
+                parts.viewer(self)
+
+    # what can be clicked
+
+    def do(self, what: str, act: Callable[[Desk, Say], object]) -> None:
+        """Begin something at the desk of this tab; only one thing is done at a time."""
+        desk = self.tab.desk
+        if desk is not None and not self.work.start(what, lambda say: act(desk, say)):
+            ui.notify("Something else is being done; nothing was begun.")
+
+    def add(self) -> None:
+        """Add the chosen effect."""
+        effect = self.tab.suspect or ""
+        self.do(f"Adding {effect}", lambda desk, say: self.session.add(desk, effect, say))
+
+    def remove(self, effect: str) -> None:
+        """Take an effect out."""
+        self.do(f"Removing {effect}", lambda desk, say: self.session.remove(desk, effect, say))
+
+    def go_back(self, number: int) -> None:
+        """Show a revision and let every command use it."""
+        self.do(
+            f"Going to revision {number}",
+            lambda desk, say: self.session.go_back(desk, number, say),
+        )
+
+    def show(self, number: int) -> None:
+        """Show a revision; nothing is written."""
+        self.do(f"Reading revision {number}", lambda desk, say: self.session.load(say, number))
+
+    def again(self) -> None:
+        """Read the file again."""
+        self.work.start(f"Reading {self.session.path.name}", read(self.session))
+
+    def fit_anew(self) -> None:
+        """Fit the model of the revision in use to all readings."""
+        desk = self.session.desk
+        self.work.start("Fitting anew", lambda say: self.session.fit_anew(desk, say))
+
+    def plan(self, poses: float | None, file: str) -> None:
+        """Plan the next measurements."""
+        output = self.session.path.parent / Path(file).name
+        count = None if poses is None else int(poses)
+        self.do(
+            "Planning the next measurements",
+            lambda desk, say: self.session.plan(desk, count, output, say),
+        )
+
+    def open_viewer(self) -> None:
+        """Prepare the 3-D view."""
+
+        def act(desk: Desk, say: Say) -> None:
+            name = self.shared.viewer.prepare(desk.story, self.session.count, say)
+            at = f"{self.address}viewer/"
+            self.shared.drawing = desk, f"{at}?persist=0&hide_welcome_screen&url={at}{name}"
+
+        self.do("Opening the 3-D view", act)
+
+    def choose(self, effect: str) -> None:
+        """Show the evidence of a suspect."""
+        if effect != self.tab.suspect:
+            self.tab.suspect = effect
+            if self.adder is not None:
+                self.adder.set_text(f"Add {effect}")
+                self.adder.set_visibility(True)
+            self.draw_evidence()
+
+    def pick_variable(self, name: str) -> None:
+        """Show the residuals over a variable, and its readings that are furthest off."""
+        self.tab.variable = name
+        worst = parts.furthest(self.tab.desk) if self.tab.desk else []
+        self.pick(worst, "The readings that are furthest off")
+
+    def pick(self, measurements: list[int], told: str) -> None:
+        """Show some readings, and what distinguishes them."""
+        self.tab.picked, self.tab.told = measurements, told
+        self.draw_readings()
+
+    def pick_pose(self, measurement: int) -> None:
+        """Show the readings of the pose of one."""
+        desk = self.tab.desk
+        if desk is not None and 0 <= measurement < len(desk.story):
+            mine = np.flatnonzero(desk.story.pose == desk.story.pose[measurement])
+            self.pick(mine.tolist(), f"The readings of pose {desk.story.pose_name(measurement)}")
+
+    def draw_readings(self) -> None:
+        """Draw the readings that were picked."""
+        if self.readings is None:
+            return
+        self.readings.clear()
+        with self.readings:
+            if self.tab.desk is not None:
+                parts.readings(self, self.tab.desk)
+
+    def draw_plan(self) -> None:
+        """Draw the next measurements, where they are planned."""
+        self._planned = self.session.planned
+        if self.planned is None:
+            return
+        self.planned.clear()
+        with self.planned:
+            parts.planned(self.session)
+
+    def draw_evidence(self) -> None:
+        """Draw the evidence of the chosen suspect."""
+        if self.evidence is None:
+            return
+        self.evidence.clear()
+        with self.evidence:
+            if self.tab.desk is not None:
+                parts.evidence(self, self.tab.desk)

@@ -1,0 +1,143 @@
+"""The workbench's server: NiceGUI on the loopback address, behind the guard."""
+
+import contextlib
+import os
+import secrets
+import signal
+import socket
+import tempfile
+import threading
+import webbrowser
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import FrameType
+
+from hilcal.errors import InputError
+from hilcal.workbench.session import Session
+
+HOST = "127.0.0.1"
+PORT = 8787
+"""The port that is tried where none is asked for; a choice."""
+GRACE = 2
+"""How long an open page may delay the end, s."""
+
+
+def require_nicegui() -> None:
+    """Refuse to begin where the user-interface library is not installed.
+
+    Raises:
+        InputError: says how to install it.
+    """
+    try:
+        import nicegui  # noqa: F401
+    except ImportError:
+        raise InputError(
+            "the workbench needs NiceGUI, which is not installed: pip install 'hilcal[workbench]'"
+        ) from None
+
+
+def listening(port: int | None) -> socket.socket:
+    """Return a socket that listens on the loopback address.
+
+    Args:
+        port: its port; where None, the usual one or, where that is taken, any.
+
+    Raises:
+        InputError: the port cannot be had.
+    """
+    wanted = (PORT, 0) if port is None else (port,)
+    for one in wanted:
+        made = socket.socket()
+        made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            made.bind((HOST, one))
+        except (OSError, OverflowError) as error:
+            made.close()
+            why = str(error)
+            continue
+        made.listen(128)
+        return made
+    raise InputError(f"--port {port}: {why}; choose a free port of this machine")
+
+
+def quiet_environment() -> None:
+    """Let NiceGUI neither read nor write storage of its own, nor speak to another machine."""
+    folder = Path(tempfile.gettempdir()) / f"hilcal-no-storage-{secrets.token_hex(8)}"
+    os.environ["NICEGUI_STORAGE_PATH"] = str(folder)
+    for name in ("NICEGUI_REDIS_URL", "NICEGUI_HOST", "NICEGUI_PORT", "NICEGUI_PROTOCOL"):
+        os.environ.pop(name, None)
+
+
+def serve(
+    session: Session, port: int | None, told: Callable[[str], None], *, browser: bool
+) -> None:
+    """Serve the workbench of a campaign until Ctrl-C.
+
+    Args:
+        session: of the campaign.
+        port: on this machine; a free one where None.
+        told: is called with the address once it is served.
+        browser: open the address in the default browser.
+
+    Raises:
+        InputError: NiceGUI is not installed, or the port cannot be had.
+    """
+    require_nicegui()
+    quiet_environment()
+    import logging
+
+    import uvicorn
+    from fastapi import FastAPI
+    from nicegui import core, ui
+
+    from hilcal.workbench.guard import TOKEN, Guard
+    from hilcal.workbench.page import install
+
+    # What a click fails by is told on the page; the library's own remarks are for its developers.
+    logging.getLogger("nicegui").setLevel(logging.CRITICAL)
+    with listening(port) as sock:
+        number, token = int(sock.getsockname()[1]), secrets.token_urlsafe(32)
+        app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
+        install(app, session)
+        ui.run_with(
+            app,
+            title=f"{session.path.name} – hilcal workbench",
+            dark=None,
+            tailwind=False,
+            show_welcome_message=False,
+            reconnect_timeout=10.0,
+        )
+        guard = Guard(app, number, token)
+        core.sio.eio.cors_allowed_origins = list(guard.origins)
+        url = f"http://{HOST}:{number}/?{TOKEN}={token}"
+
+        class Server(uvicorn.Server):
+            @contextlib.contextmanager
+            def capture_signals(self) -> Iterator[None]:
+                def end(number: int, frame: FrameType | None) -> None:
+                    self.should_exit = True
+
+                kinds = (signal.SIGINT, signal.SIGTERM)
+                before = [signal.signal(kind, end) for kind in kinds]
+                try:
+                    yield
+                finally:
+                    for kind, handler in zip(kinds, before, strict=True):
+                        signal.signal(kind, handler)
+
+            async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+                await super().startup(sockets)
+                told(url)
+                if browser:
+                    threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
+
+        config = uvicorn.Config(
+            guard,
+            log_level="critical",
+            access_log=False,
+            server_header=False,
+            proxy_headers=False,
+            timeout_graceful_shutdown=GRACE,
+            lifespan="on",
+        )
+        Server(config).run(sockets=[sock])

@@ -1,0 +1,305 @@
+"""The state of a workbench, and what can be done at it; every number is one of the library.
+
+One session serves all tabs. Its methods take seconds and are run one at a time (`work`). Each
+change names the desk that it was asked for at: where the session has gone on since, by another tab
+or a second click, it is refused and nothing is appended.
+"""
+
+import shlex
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from hilcal.campaign import Campaign
+from hilcal.changes import Changed, add_effect, remove_effect
+from hilcal.data.purpose import refuse_fitting
+from hilcal.data.revision import RevisionRecord
+from hilcal.diagnose.diagnosis import Diagnosis
+from hilcal.diagnose.distinguish import Difference, Recorded, distinguish, recorded_values
+from hilcal.diagnose.verdict import diagnose
+from hilcal.effects.catalogue import Catalogue
+from hilcal.effects.written import read_effects_text
+from hilcal.errors import InputError
+from hilcal.identify.baseline import with_effects
+from hilcal.identify.fit import fit
+from hilcal.identify.full_prediction import full_prediction
+from hilcal.procedure.next_plan import NextPlan, doubt_to_settle, next_plan
+from hilcal.report.build_story import Chapter, build_story, regressor
+from hilcal.report.story import Regressor
+from hilcal.revisions import chain, mode_of
+from hilcal.types import Ints
+from hilcal.workbench.desk import Desk, Stamp, require_judged, row_of
+
+Say = Callable[[str], None]
+
+
+def silent(words: str) -> None:
+    """Say nothing."""
+
+
+class Session:
+    """A campaign file at the workbench.
+
+    Attributes:
+        path: the file.
+        desk: what is shown; None before `load`.
+        changed: what the last change did; None before any, and after another revision was chosen.
+        planned: the next measurements and their file, of the shown desk.
+        count: grows whenever another desk is shown.
+    """
+
+    def __init__(self, path: str | Path, catalogue: Catalogue | None = None) -> None:
+        """Take a file; nothing is read yet."""
+        self.path, self._catalogue = Path(path), catalogue
+        self.desk: Desk | None = None
+        self.changed: Changed | None = None
+        self.planned: tuple[NextPlan, Path] | None = None
+        self.count = 0
+        self._known: dict[int, Chapter] = {}
+        self._hash = ""
+
+    def load(self, say: Say = silent, revision: int | None = None) -> Desk:
+        """Read the file, judge a revision and those that it was made from, and show it.
+
+        Nothing is written to the file, nor beside it.
+
+        Args:
+            say: takes progress, one line each.
+            revision: its number; the one in use where None.
+
+        Raises:
+            InputError: no sound campaign, no such revision, or one that cannot be restored.
+            CannotAnswerError: the readings do not determine the baseline.
+        """
+        stamp = self._stamp()
+        with self._open(read_only=True) as o:
+            self._forget_others(o)
+            chapters = self._chapters(o, revision, say)
+            desk = self._desk(o, None if o.in_use(revision) is None else chapters[-1].number,
+                              chapters, stamp)  # fmt: skip
+        return self._show(desk)
+
+    def add(self, desk: Desk, effect: str, say: Say = silent) -> Desk:
+        """Add an effect, written as for `hilcal add`, to the shown model; see `changes`.
+
+        Raises:
+            InputError: not one effect, one that cannot be added, or a desk that is gone.
+            CannotAnswerError: the readings do not determine it.
+        """
+        with self._writing(desk) as o:
+            wanted = read_effects_text(effect, "effect", o.catalogue)
+            if len(wanted) != 1:
+                raise InputError(f"effect {effect!r} has {len(wanted)} effects; valid: one")
+            ((name, options),) = wanted.items()
+            o.catalogue.make(name, o.cell, o.readings.states, options).prior_std()
+            of = desk.number, desk.fit
+            return self._changed(o, add_effect(o, *of, name, options, say, desk.diagnosis))
+
+    def remove(self, desk: Desk, effect: str, say: Say = silent) -> Desk:
+        """Take an effect out of the shown model; raises as `add`."""
+        with self._writing(desk) as o:
+            of = desk.number, desk.fit
+            return self._changed(o, remove_effect(o, *of, effect, say, desk.diagnosis))
+
+    def accept(self, desk: Desk, number: int | None) -> Desk:
+        """Let every command use a revision from now on; None: the latest one.
+
+        Raises:
+            InputError: no such revision, or a desk that is gone.
+        """
+        with self._writing(desk) as o:
+            o.accept(number)
+            return self._show(replace(desk, accepted=number, stamp=self._stamp()), self.changed)
+
+    def go_back(self, desk: Desk, number: int, say: Say = silent) -> Desk:
+        """Show a revision, and let every command use it; nothing is taken away.
+
+        Raises:
+            InputError: no such revision, one that cannot be restored, or a desk that is gone.
+        """
+        with self._writing(desk) as o:
+            chapters = self._chapters(o, number, say)
+            o.accept(None if number == len(o.file.revisions()) else number)
+            found = self._desk(o, number, chapters, self._stamp())
+        return self._show(found)
+
+    def fit_anew(self, desk: Desk | None, say: Say = silent) -> Desk:
+        """Fit the model of the revision in use to all readings, those appended later included.
+
+        Raises:
+            InputError: no revision, or a desk that is gone.
+            CannotAnswerError: the readings do not determine it.
+        """
+        with self._writing(desk) as o:
+            record = o.in_use()
+            if record is None:
+                raise InputError(f"{o.path}: no revision yet")
+            options, mode = record.options["effects"], mode_of(record)
+            say(f"fitting {' + '.join(record.effects)} to all {len(o.readings)} readings")
+            names = record.effects
+            model = with_effects(o.cell, o.readings, mode, names, options, o.catalogue)
+            found = diagnose(fit(model, o.readings, mode), say=say)
+            number = self._store(o, found)
+            if o.file.accepted() is not None:
+                o.accept(None)  # it cannot be used any more
+            desk = self._desk(o, number, (self._known[number],), self._stamp())
+        return self._show(desk)
+
+    def plan(self, desk: Desk, poses: int | None, output: Path, say: Say = silent) -> NextPlan:
+        """Plan the measurements that settle what the shown diagnosis leaves open, and save them.
+
+        Args:
+            desk: what is shown.
+            poses: as many readings as so many poses take; what the doubt needs where None.
+            output: the plan's file; it must not exist.
+            say: takes progress, one line each.
+
+        Raises:
+            InputError: a file that cannot be written, or a plan that may not be run.
+            CannotAnswerError: nothing is in doubt, or no measurement would settle it.
+        """
+        if output.exists():
+            raise InputError(f"{output}: the file exists; choose another name")
+        self._require(desk)
+        with self._open(read_only=True) as o:
+            doubt = doubt_to_settle(o, desk.diagnosis, say)
+            rng = np.random.default_rng(0)
+            found = next_plan(o, doubt, poses, rng, say, quick=True)
+        found.made.save(output)
+        self.planned = found, output
+        return found
+
+    def run_line(self) -> str:
+        """Return the command that measures the plan into the same campaign."""
+        if self.planned is None:
+            return ""
+        plan, run = (shlex.quote(str(p)) for p in (self.planned[1], self.path))
+        return f"hilcal run CELL.toml -o {run} --append --plan {plan}"
+
+    @property
+    def stale(self) -> bool:
+        """Whether another command has changed the file since it was read."""
+        try:
+            return self.desk is not None and self._stamp() != self.desk.stamp
+        except InputError:
+            return True
+
+    def evidence(self, desk: Desk, effect: str) -> Regressor | None:
+        """Return residual and regressor of a suspect, for its added-variable plot."""
+        found = next((s for s in desk.diagnosis.suspects if s.effect == effect), None)
+        return None if found is None else regressor(desk.fit, found)
+
+    def recorded(self, desk: Desk) -> dict[str, Recorded]:
+        """Return what was recorded of each measurement of the story (D,), by name."""
+        rows = full_prediction(desk.fit).whitening.reading
+        found = recorded_values(desk.fit)
+        return {v.name: replace(v, values=v.values[rows]) for v in found}
+
+    def differences(self, desk: Desk, measurements: Ints) -> tuple[Difference, ...]:
+        """Return what sets some measurements of the story apart, the clearest first."""
+        picked = np.zeros(len(desk.fit.readings), dtype=bool)
+        picked[full_prediction(desk.fit).whitening.reading[measurements]] = True
+        return distinguish(desk.fit, picked)
+
+    def _open(self, *, read_only: bool) -> Campaign:
+        return Campaign.open(self.path, self._catalogue, read_only=read_only)
+
+    def _writing(self, desk: Desk | None) -> Campaign:
+        """Open the file for a change that was asked for at a desk.
+
+        Raises:
+            InputError: the session, or the file, has gone on since.
+        """
+        self._require(desk)
+        o = self._open(read_only=False)
+        try:
+            refuse_fitting(o.file)
+            self._forget_others(o)
+        except BaseException:
+            o.close()
+            raise
+        return o
+
+    def _require(self, desk: Desk | None) -> None:
+        if desk is not self.desk:
+            raise InputError("the workbench has gone on since that click; nothing was changed")
+        if self.stale:
+            raise InputError(
+                f"{self.path.name} was changed by another command; read it again first"
+            )
+
+    def _chapters(self, o: Campaign, revision: int | None, say: Say) -> tuple[Chapter, ...]:
+        record = o.in_use(revision)
+        if record is None:
+            refuse_fitting(o.file)
+            if 0 not in self._known:
+                _, found = o.fit_in_use(say)
+                say("diagnosing the baseline")
+                self._known[0] = Chapter(1, None, found, diagnose(found, say=say))
+            return (self._known[0],)
+        out = [self._chapter(o, r, say) for r in chain(o.file.revisions(), record.number)]
+        require_judged(o, out[-1])
+        return tuple(out)
+
+    def _chapter(self, o: Campaign, record: RevisionRecord, say: Say) -> Chapter:
+        number = record.number
+        if number not in self._known:
+            say(f"restoring revision {number}")
+            found, judged = o.restore(record), None
+            if found.scaling == "gc":
+                say(f"diagnosing revision {number}")
+                judged = diagnose(found, o.history(number), say)
+            self._known[number] = Chapter(number, record.added, found, judged, record.removed)
+        return self._known[number]
+
+    def _forget_others(self, o: Campaign) -> None:
+        """Forget what was fitted to other readings than the file has now."""
+        stored = o.file.data_hash()
+        if stored != self._hash:
+            self._known, self._hash = {}, stored
+
+    def _store(self, o: Campaign, found: Diagnosis) -> int:
+        number = o.append(found)
+        self._known[number] = Chapter(number, None, found.fit, found)
+        return number
+
+    def _changed(self, o: Campaign, c: Changed) -> Desk:
+        if c.before_number not in self._known:  # the baseline, kept now
+            self._known[c.before_number] = self._known[0]
+        self._known[c.number] = Chapter(c.number, c.added, c.fit, c.diagnosis, c.removed)
+        chapters = self._chapters(o, c.number, silent)
+        return self._show(self._desk(o, c.number, chapters, self._stamp()), c)
+
+    def _desk(
+        self, o: Campaign, number: int | None, chapters: tuple[Chapter, ...], stamp: Stamp
+    ) -> Desk:
+        return Desk(
+            name=self.path.name,
+            arm=o.cell.arm.name,
+            n_readings=len(o.readings),
+            rows=tuple(row_of(r) for r in o.file.revisions()),
+            accepted=o.file.accepted(),
+            number=number,
+            chapters=chapters,
+            story=build_story(chapters),
+            stamp=stamp,
+        )
+
+    def _show(self, desk: Desk, changed: Changed | None = None) -> Desk:
+        self.desk, self.changed, self.planned = desk, changed, None
+        self.count += 1
+        return desk
+
+    def _stamp(self) -> Stamp:
+        """Return what tells whether the file was changed.
+
+        Raises:
+            InputError: it is not there.
+        """
+        try:
+            found = self.path.stat()
+        except OSError as error:
+            raise InputError(f"{self.path}: cannot be read ({error.strerror})") from None
+        return found.st_size, found.st_mtime_ns, found.st_ino

@@ -1,0 +1,123 @@
+"""The rerun web viewer as a part of the page, served behind the same guard as the rest.
+
+rerun serves its web viewer on every interface of the machine, and its page asks other hosts for
+fonts. So a short-lived process of it is asked for the viewer's files once; they and the recording
+are then served by the workbench, on the loopback address and to the operator's browser alone.
+"""
+
+import re
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from http.client import HTTPConnection, HTTPException
+from pathlib import Path
+
+from hilcal.errors import HilcalError
+from hilcal.report.story import Story
+
+FILES = {
+    "index.html": "text/html; charset=utf-8",
+    "re_viewer.js": "text/javascript",
+    "re_viewer_bg.wasm": "application/wasm",
+}
+RECORDING = "application/octet-stream"
+_PATIENCE = 30.0
+_ELSEWHERE = re.compile(r"<link\b[^>]*>", re.DOTALL)
+_HEAD = "<head>"
+# rerun asks for newer versions and sends usage statistics: both get an empty answer, and what is
+# of this server is asked for with the operator's cookie. (The policy of the page forbids the rest.)
+_HERE = (
+    "<script>const asked = fetch; window.fetch = (to, how) => "
+    "new URL(to.url || to, location).origin === location.origin "
+    '? asked(to, {...how, credentials: "same-origin"}) '
+    ": Promise.resolve(new Response(null, {status: 204}));</script>"
+)
+_SERVE = (
+    "import sys, rerun; rerun.serve_web_viewer(web_port=int(sys.argv[1]), open_browser=False); "
+    "sys.stdin.read()"
+)
+
+Say = Callable[[str], None]
+
+
+class WebViewer:
+    """The viewer's files and the recordings that it shows, in memory."""
+
+    def __init__(self) -> None:
+        """Begin with nothing."""
+        self._files: dict[str, bytes] = {}
+        self._recording: tuple[str, bytes] = ("", b"")
+
+    def prepare(self, story: Story, count: int, say: Say) -> str:
+        """Record a story, and return the path at which the viewer shows it.
+
+        Args:
+            story: it.
+            count: makes its name differ from those before.
+            say: takes progress.
+
+        Raises:
+            HilcalError: the viewer cannot be had, or the story not be recorded.
+        """
+        from hilcal.report.viewer import save  # loads the viewer's library, which takes a while
+
+        say("recording")
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "story.rrd"
+            save(story, path)
+            recorded = path.read_bytes()
+        if not self._files:
+            say("preparing the viewer")
+            self._files = _fetched()
+        self._recording = (f"story-{count}.rrd", recorded)
+        return self._recording[0]
+
+    def file(self, name: str) -> tuple[bytes, str] | None:
+        """Return content and kind of a file; None where there is none of this name."""
+        name = name or "index.html"
+        if name == self._recording[0]:
+            return self._recording[1], RECORDING
+        return (self._files[name], FILES[name]) if name in self._files else None
+
+
+def _fetched() -> dict[str, bytes]:
+    """Return the files of the web viewer that came with rerun-sdk."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = int(probe.getsockname()[1])
+    process = subprocess.Popen(  # noqa: S603 (our own arguments)
+        [sys.executable, "-c", _SERVE, str(port)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        found = {name: _get(port, name, process) for name in FILES}
+    finally:
+        process.kill()
+        process.wait()
+    page = _ELSEWHERE.sub("", found["index.html"].decode("utf-8"))
+    page = page.replace(_HEAD, _HEAD + _HERE, 1)
+    return {**found, "index.html": page.encode("utf-8")}
+
+
+def _get(port: int, name: str, process: "subprocess.Popen[bytes]") -> bytes:
+    end = time.monotonic() + _PATIENCE
+    while True:
+        line = HTTPConnection("127.0.0.1", port, timeout=_PATIENCE)
+        try:
+            line.request("GET", f"/{name}")
+            answer = line.getresponse()
+            content = answer.read()
+            if answer.status == 200 and content:
+                return content
+            raise HilcalError(f"the 3-D viewer has no {name}: rerun-sdk is built without it")
+        except (OSError, HTTPException) as error:
+            if process.poll() is not None or time.monotonic() > end:
+                raise HilcalError(f"the 3-D viewer does not start: {error}") from None
+            time.sleep(0.1)
+        finally:
+            line.close()

@@ -1,0 +1,307 @@
+"""`hilcal workbench` as a process: who may talk to it, what the operator clicks, how it looks."""
+
+import json
+import re
+import signal
+import socket
+import subprocess
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from email.message import Message
+from http.client import HTTPConnection
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, Page, expect
+
+from hilcal.campaign import Campaign
+from tests.support.bench_cases import BASE, TILT, stored
+from tests.support.browser import DESKTOP, PHONE, needs_chromium, open_browser
+from tests.support.cli_cases import refused, start
+
+WAIT = 120_000
+"""Nothing here takes longer, ms; far above what it takes."""
+SOCKET = "/_nicegui_ws/socket.io/?EIO=4&transport=websocket"
+
+
+@dataclass(frozen=True)
+class Answer:
+    status: int
+    headers: Message
+    text: str
+
+
+@dataclass(frozen=True)
+class Served:
+    run: Path
+    url: str
+    process: "subprocess.Popen[str]"
+
+    @property
+    def port(self) -> int:
+        return int(re.findall(r":(\d+)/", self.url)[0])
+
+    @property
+    def token(self) -> str:
+        return self.url.partition("token=")[2]
+
+    def ask(self, path: str = "/", method: str = "GET", **heads: str) -> Answer:
+        """Ask as a program does; underscores in names of headers are dashes."""
+        given = {k.replace("_", "-"): v for k, v in heads.items()}
+        with closing(HTTPConnection("127.0.0.1", self.port, timeout=30)) as line:
+            line.request(method, path, headers=given)
+            found = line.getresponse()
+            return Answer(found.status, found.headers, found.read().decode("utf-8", "replace"))
+
+    @property
+    def cookie(self) -> str:
+        """What the address with the token gives to a browser."""
+        answer = self.ask(f"/?token={self.token}")
+        assert answer.status == 303
+        assert answer.headers["Location"] == "/"
+        return str(answer.headers["Set-Cookie"]).split(";")[0]
+
+    def handshake(self, **heads: str) -> int:
+        """Ask for a WebSocket; returns the status."""
+        given = {
+            "Host": f"127.0.0.1:{self.port}",
+            "Connection": "Upgrade",
+            "Upgrade": "websocket",
+            "Sec-WebSocket-Version": "13",
+            "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==",
+            **heads,
+        }
+        lines = [f"GET {SOCKET} HTTP/1.1", *(f"{k}: {v}" for k, v in given.items() if v), "", ""]
+        with socket.create_connection(("127.0.0.1", self.port), timeout=30) as line:
+            line.sendall("\r\n".join(lines).encode())
+            return int(line.recv(4096).split()[1])
+
+
+@contextmanager
+def workbench(folder: Path) -> Iterator[Served]:
+    run = stored(folder / "run.hilcal")
+    process = start("workbench", run, "--no-browser", "--port", "0", "--json", cwd=folder)
+    try:
+        assert process.stdout is not None
+        told = "".join(iter(process.stdout.readline, "}\n")) + "}"
+        yield Served(run, json.loads(told)["url"], process)
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    with workbench(tmp_path_factory.mktemp("bench")) as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with open_browser() as found:
+        yield found
+
+
+def test_only_the_browser_with_the_address_is_let_in(served: Served) -> None:
+    cookie, host = served.cookie, f"127.0.0.1:{served.port}"
+    here = {"Cookie": cookie}
+    page = served.ask(**here)
+    assert page.status == 200
+    assert re.findall(r"(?:src|href|url\()\W{0,2}(?:https?:)?//", page.text) == []
+    policy = str(page.headers["Content-Security-Policy"])
+    assert "default-src 'self'" in policy
+    assert "frame-ancestors 'self'" in policy
+    assert "//" not in policy.replace(f"ws://{host}", "").replace(
+        f"ws://localhost:{served.port}", ""
+    )
+    assert served.ask(Cookie=cookie, Host=f"localhost:{served.port}").status == 200
+
+    strangers: tuple[dict[str, str], ...] = (
+        {"Cookie": ""},
+        {"Cookie": cookie[:-1]},
+        {**here, "Host": "evil.example"},  # a name made to resolve to this machine
+        {**here, "Host": f"evil.example:{served.port}"},
+        {**here, "Host": f"127.0.0.1:{served.port + 1}"},
+        {**here, "Origin": "http://evil.example"},
+        {**here, "Origin": f"http://127.0.0.1:{served.port + 1}"},  # another page of this machine
+        {**here, "Origin": "null"},
+        {**here, "Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "no-cors"},
+        {**here, "Sec_Fetch_Site": "same-site", "Sec_Fetch_Mode": "cors"},
+    )
+    for heads in strangers:
+        answer = served.ask(**heads)
+        assert (answer.status, answer.headers["Set-Cookie"]) == (403, None), heads
+        assert len(answer.text.splitlines()) == 1
+    assert served.ask("/?token=wrong").status == 403
+    assert served.ask(f"/?token={served.token}", Host="evil.example").status == 403
+    given = str(served.ask(f"/?token={served.token}").headers["Set-Cookie"])
+    assert "HttpOnly" in given
+    assert "SameSite=Strict" in given
+
+
+def test_a_socket_is_opened_by_its_own_page_alone(served: Served) -> None:
+    own = {"Cookie": served.cookie, "Origin": f"http://127.0.0.1:{served.port}"}
+    assert served.handshake(**own) == 101
+    for heads in (
+        {**own, "Cookie": ""},
+        {**own, "Origin": ""},
+        {**own, "Origin": "http://evil.example"},
+        {**own, "Origin": f"http://127.0.0.1:{served.port + 1}"},
+        {**own, "Host": f"evil.example:{served.port}"},
+    ):
+        assert served.handshake(**heads) == 403, heads
+    poll = SOCKET.replace("websocket", "polling")
+    assert served.ask(poll, Cookie=served.cookie).status == 200
+    assert (
+        served.ask(poll, "POST", Cookie=served.cookie, Origin="http://evil.example").status == 403
+    )
+    assert served.ask(poll).status == 403
+
+
+def test_no_file_of_the_machine_is_served(served: Served) -> None:
+    for path in (
+        "/run.hilcal",
+        "/etc/passwd",
+        "/_nicegui/",
+        "/_nicegui/3/static/",
+        "/viewer/../../../etc/passwd",
+        "/viewer/%2e%2e/%2e%2e/etc/passwd",
+        "/viewer/run.hilcal",
+        "/docs",
+        "/openapi.json",
+    ):
+        answer = served.ask(path, Cookie=served.cookie)
+        assert answer.status == 404, path
+    with socket.socket() as other:  # bound to the loopback address alone
+        other.bind(("127.0.0.2", served.port))
+
+
+def test_what_is_wrong_is_one_line(
+    tmp_path: Path, served: Served, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    assert "no such campaign file" in refused(capsys, 2, "workbench", tmp_path / "none.hilcal")
+    taken = ("workbench", served.run, "--no-browser", "--port", str(served.port))
+    assert "choose a free port" in refused(capsys, 2, *taken)
+    monkeypatch.setitem(__import__("sys").modules, "nicegui", None)
+    line = refused(capsys, 2, "workbench", served.run)
+    assert line.endswith("pip install 'hilcal[workbench]'")
+
+
+def opened(browser: Browser, served: Served, told: list[str], **options: object) -> Page:
+    """Open the page, and collect what its console says."""
+    page = browser.new_context(**options).new_page()  # type: ignore[arg-type]
+    page.set_default_timeout(WAIT)
+    page.on("console", lambda m: told.append(m.text) if m.type == "error" else None)
+    page.on("pageerror", lambda e: told.append(str(e)))
+    page.on("requestfailed", lambda r: told.append(r.url))
+    page.goto(served.url)
+    page.locator("[data-part=fell] .main-svg").first.wait_for()
+    return page
+
+
+def number(page: Page, what: str) -> float:
+    """Read a number with its unit, µm."""
+    return float(page.locator(".number", has_text=what).locator("b").inner_text().split()[0])
+
+
+@needs_chromium
+def test_an_operator_sees_adds_removes_and_goes_back(browser: Browser, served: Served) -> None:
+    told: list[str] = []
+    before = served.run.read_bytes()
+    page = opened(browser, served, told, viewport=DESKTOP)
+    assert page.url == f"http://127.0.0.1:{served.port}/"  # the token is in it no more
+    expect(page.locator("[data-part=verdict]")).to_contain_text("Ambiguous")
+    at_first = number(page, "error on poses left out")
+    assert served.run.read_bytes() == before  # opening it wrote nothing
+
+    bar = page.locator("[data-part=fails] .bars .point path").nth(1).bounding_box()
+    assert bar is not None
+    x, y = bar["x"] + bar["width"] / 2, bar["y"] + bar["height"] / 2
+    page.mouse.move(x - 2, y)
+    page.mouse.move(x, y)
+    page.mouse.click(x, y)
+    page.locator("[data-part=picked] tbody tr").first.wait_for()
+    expect(page.locator("[data-part=differences]")).to_contain_text("apart")
+
+    suspects = page.locator("[data-part=missing] tbody tr")
+    suspects.filter(has_text=TILT).click()
+    page.get_by_text(f"The evidence for {TILT}").wait_for()
+    suspects.filter(has_text=BASE).click()
+    page.get_by_text(f"The evidence for {BASE}").wait_for()
+
+    other = opened(browser, served, told, viewport=DESKTOP)  # a second tab
+    page.locator("[data-part=add]").dblclick()
+    fell = page.get_by_text(f"With {BASE} the error on poses left out falls")
+    fell.wait_for()
+    after = number(page, "error on poses left out")
+    assert after < 0.8 * at_first
+    expect(page.locator("[data-revision]")).to_have_count(2)
+    other.get_by_text(f"With {BASE} the error on poses left out falls").wait_for()
+    other.close()
+
+    page.get_by_role("button", name=f"Remove {BASE}").click()
+    page.get_by_text(f"Without {BASE} the error on poses left out rises").wait_for()
+    assert number(page, "error on poses left out") == pytest.approx(at_first, rel=1e-2)
+
+    page.locator("[data-revision='2']").get_by_role("button", name="Go back to it").click()
+    page.get_by_text("Revision 2 is accepted").wait_for()
+    assert number(page, "error on poses left out") == after
+    with Campaign.open(served.run, read_only=True) as o:
+        made = [(r.added, r.removed) for r in o.file.revisions()]
+        assert made == [(None, None), (BASE, None), (None, BASE)]  # each click once, none lost
+        used = o.in_use()
+        assert used is not None
+        assert used.number == 2
+    assert told == []
+
+
+@needs_chromium
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_the_page_fits_desktop_and_phone(
+    browser: Browser, served: Served, scheme: str, tmp_path: Path
+) -> None:
+    told: list[str] = []
+    page = opened(browser, served, told, viewport=DESKTOP, color_scheme=scheme)
+    for size in (DESKTOP, PHONE):
+        page.set_viewport_size(size)  # type: ignore[arg-type]
+        page.wait_for_timeout(300)
+        page.screenshot(path=tmp_path / f"{scheme}-{size['width']}.png", full_page=True)
+        assert page.evaluate("document.documentElement.scrollWidth") <= size["width"]
+        first = page.locator("[data-part=verdict]").bounding_box()
+        assert first is not None
+        assert first["y"] + first["height"] < size["height"]  # the verdict is on the first screen
+    dark = page.evaluate("getComputedStyle(document.body).backgroundColor")
+    assert (sum(map(int, re.findall(r"\d+", dark)[:3])) < 200) == (scheme == "dark")
+    assert told == []
+
+
+@needs_chromium
+@pytest.mark.slow
+def test_the_next_measurement_is_planned_and_the_arm_is_seen(
+    browser: Browser, tmp_path: Path
+) -> None:
+    told: list[str] = []
+    with workbench(tmp_path) as served:
+        page = opened(browser, served, told, viewport=DESKTOP)
+        page.get_by_label("poses").fill("8")
+        page.get_by_role("button", name="Plan the next measurements").click()
+        expect(page.locator("[data-part=planned]")).to_contain_text("readings at", timeout=WAIT)
+        expect(page.locator(".code")).to_contain_text("--append --plan")
+        assert (tmp_path / "run-next-0.json").is_file()
+        page.get_by_role("button", name="Open the 3-D view").click()
+        frame = page.frame_locator("iframe")
+        frame.locator("canvas.visible").wait_for(state="attached")
+        page.wait_for_timeout(8000)
+        page.screenshot(path=tmp_path / "viewer.png", full_page=True)
+    assert told == []
+
+
+def test_ctrl_c_ends_it_and_leaves_nothing(tmp_path: Path) -> None:
+    with workbench(tmp_path) as served:
+        served.process.send_signal(signal.SIGINT)
+        _, err = served.process.communicate(timeout=60)
+        assert served.process.returncode == 0
+        assert "Traceback" not in err
+        assert sorted(p.name for p in tmp_path.iterdir()) == ["run.hilcal"]

@@ -1,0 +1,134 @@
+"""The workbench without a page: what is shown is the library's, and nothing is appended twice."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilcal.campaign import Campaign
+from hilcal.diagnose.verdict import diagnose
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.report.diagnosis_document import to_json
+from hilcal.workbench.session import Session
+from tests.support.bench_cases import BASE, few_effects, stored
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    return stored(tmp_path / "run.hilcal")
+
+
+def revisions(path: Path) -> list[tuple[str | None, str | None, int | None]]:
+    with Campaign.open(path, read_only=True) as o:
+        return [(r.added, r.removed, r.made_from) for r in o.file.revisions()]
+
+
+def test_an_operator_adds_removes_and_goes_back(run: Path) -> None:
+    before = run.read_bytes()
+    session = Session(run, few_effects())
+    desk = session.load()
+    assert (run.read_bytes(), list(run.parent.iterdir())) == (before, [run])  # only looked at
+    assert (desk.number, desk.rows, desk.in_use) == (None, (), None)
+    with Campaign.open(run, few_effects(), read_only=True) as o:
+        assert to_json(desk.diagnosis) == to_json(diagnose(o.fit_in_use()[1]))
+    assert desk.diagnosis.significant[0] == BASE
+    assert desk.removable == ("joint_compliance",)
+
+    r = session.evidence(desk, BASE)
+    assert r is not None
+    assert 0.5 < float(r.x @ r.y / (r.x @ r.x)) < 2.0
+    assert session.evidence(desk, "no_such_effect") is None
+
+    for effect, why in (
+        ("no_such_effect", "unknown"),
+        ("joint_compliance", "already"),
+        (f"{BASE}, joint_tilt_compliance", "has 2 effects; valid: one"),
+    ):
+        with pytest.raises(InputError, match=why):
+            session.add(desk, effect)
+    with pytest.raises(InputError, match="no revision 7"):
+        session.go_back(desk, 7)
+    assert revisions(run) == []
+
+    added = session.add(desk, BASE)
+    assert session.changed is not None
+    assert (added.number, [row.change for row in added.rows]) == (2, ["", f"+ {BASE}"])
+    assert added.fit.holdout.rms_m < 0.8 * desk.fit.holdout.rms_m
+    assert [c.number for c in added.chapters] == [1, 2]
+    assert added.rows[1].left_out_m == added.fit.holdout.rms_m
+    assert added.rows[1].verdict == added.diagnosis.verdict
+    assert added.rows[0].verdict == desk.diagnosis.verdict
+
+    with pytest.raises(InputError, match="has gone on since that click; nothing was changed"):
+        session.add(desk, BASE)  # the second of a double click
+    with pytest.raises(InputError, match="has gone on"):
+        session.plan(desk, None, run.with_name("p.json"))
+    assert len(revisions(run)) == 2
+
+    removed = session.remove(added, BASE)
+    assert removed.fit.holdout.rms_m == pytest.approx(desk.fit.holdout.rms_m, rel=1e-3)
+    back = session.go_back(removed, 2)
+    assert (back.number, back.accepted, back.in_use) == (2, 2, 2)
+    assert revisions(run) == [(None, None, None), (BASE, None, 1), (None, BASE, 2)]
+    with Campaign.open(run, read_only=True) as o:
+        kept = o.in_use()
+        assert kept is not None
+        assert kept.number == 2  # what every command takes
+    assert session.go_back(back, 3).accepted is None  # the latest: none needs to be accepted
+    first = session.load(revision=1)
+    assert first.number == 1
+
+    os.utime(run)  # another command wrote to it
+    assert session.stale
+    with pytest.raises(InputError, match=r"run\.hilcal was changed by another command"):
+        session.add(first, BASE)
+    assert session.load().number == 3
+    assert not session.stale
+    run.unlink()
+    assert session.stale
+    with pytest.raises(InputError, match="cannot be read"):
+        session.load()
+
+
+def test_readings_that_came_later_are_fitted_anew(run: Path) -> None:
+    session = Session(run, few_effects())
+    desk = session.load()
+    with Campaign.open(run, few_effects()) as o:
+        o.append(desk.fit)
+        o.file.append_readings(o.file.readings()[:6])
+    with pytest.raises(InputError, match="was fitted before readings were appended"):
+        session.load()
+    anew = Session(run, few_effects())
+    found = anew.fit_anew(None)
+    assert (found.number, found.fit.model.names) == (2, desk.fit.model.names)
+    assert len(found.fit.readings) == len(desk.fit.readings) + 6
+
+
+def test_a_plan_names_what_it_separates_or_why_there_is_none(run: Path) -> None:
+    session = Session(run, few_effects())
+    desk = session.load()
+    exists = run.with_name("there.json")
+    exists.touch()
+    with pytest.raises(InputError, match="the file exists; choose another name"):
+        session.plan(desk, None, exists)
+    kept = session.remove(desk, "joint_compliance")
+    if kept.diagnosis.verdict == "ambiguous":
+        pytest.skip("in doubt")
+    with pytest.raises(CannotAnswerError, match="no suspects to separate"):
+        session.plan(kept, None, run.with_name("plan.json"))
+
+
+def test_the_readings_that_were_picked_are_told_apart(run: Path) -> None:
+    session = Session(run, few_effects())
+    desk = session.load()
+    story = desk.story
+    pulled = np.flatnonzero(np.array(story.load_names) == "pull y")
+    told = {d.variable: d for d in session.differences(desk, pulled)}
+    mine = told["load pull y"]
+    assert (mine.picked, mine.others, mine.larger, mine.clear) == (1.0, 0.0, 1.0, True)
+    reach = session.recorded(desk)["distance from the base axis"].values
+    far = np.flatnonzero(reach > np.median(reach))
+    told = {d.variable: d for d in session.differences(desk, far)}
+    assert told["distance from the base axis"].larger == 1.0
+    assert session.differences(desk, np.arange(len(story))) == ()  # no others
