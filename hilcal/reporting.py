@@ -99,6 +99,8 @@ def write_report(
     """Write a page as `report` does, and return what it says first."""
     if path.resolve() in {c.path.resolve() for c in (run, later, validation) if c is not None}:
         raise InputError(f"{path}: this is the campaign itself; name another file for the page")
+    if not path.absolute().parent.is_dir():  # said before minutes of work
+        raise InputError(f"{path}: cannot be written, there is no folder {path.absolute().parent}")
     if later is not None:
         if validation is not None or limit_m is not None:
             raise InputError("a comparison of two campaigns takes neither --validation nor --limit")

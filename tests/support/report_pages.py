@@ -1,0 +1,63 @@
+"""What the tests of report pages share: a small campaign, its material, pages in a browser."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+from playwright.sync_api import Browser, Page, Route
+
+from hilcal.campaign import Campaign
+from hilcal.data.campaign_file import CampaignFile
+from hilcal.report.html.material import Material
+from hilcal.reporting import material
+from hilcal.robot.catalogue import configs_dir
+from tests.support.campaigns import campaign, configuration
+
+EVIL = "<script>window.harmed = 1</script>"
+ALLOWED = ("file:", "data:", "blob:")
+
+
+def write_campaign(path: Path, poses: int = 6) -> None:
+    """A campaign in which joints tilt; one pose and one load have names that look like markup."""
+    found = campaign("joint_tilt_compliance", "deflection", poses=poses, strength=8.0).readings
+    names = (f"{EVIL}1", *found.pose_names[1:])
+    loads = (*found.load_names[:-1], f'"><img src=x onerror="window.harmed = 2">{EVIL}')
+    content = configuration().to_json()
+    with CampaignFile.create(path, content, str(configs_dir() / "cells"), EVIL) as file:
+        file.append_readings(replace(found, pose_names=names, load_names=loads))
+
+
+@cache
+def small_material(folder: Path) -> Material:
+    """The material of a page on that campaign, without any revision, with a limit."""
+    path = folder / "a&<b>.hilcal"
+    write_campaign(path)
+    with Campaign.open(path) as run:
+        return material(run, limit_m=1e-3, operator=EVIL)
+
+
+@contextmanager
+def opened(browser: Browser, file: Path, **context: object) -> Iterator[tuple[Page, list[str]]]:
+    """A page whose console errors, and requests to anywhere else, are listed; none is answered."""
+    bad: list[str] = []
+
+    def answer(route: Route) -> None:
+        url = route.request.url
+        if url.startswith(ALLOWED):
+            route.continue_()
+        else:
+            bad.append(f"request to {url}")
+            route.abort()
+
+    site = browser.new_context(offline=True, **context)  # type: ignore[arg-type]
+    page = site.new_page()
+    page.route("**/*", answer)
+    page.on("console", lambda m: bad.append(m.text) if m.type == "error" else None)
+    page.on("pageerror", lambda error: bad.append(str(error)))
+    page.goto(file.as_uri())
+    try:
+        yield page, bad
+    finally:
+        site.close()

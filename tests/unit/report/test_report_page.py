@@ -1,0 +1,165 @@
+"""The report in a browser: whole on a desk and on a phone, light and dark, offline, on paper."""
+
+import itertools
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser
+
+from hilcal.calibration.budget import budget
+from hilcal.report.html.certificate import left_out_errors, limit_words, mm
+from hilcal.report.html.material import Material
+from hilcal.report.html.page import page as page_of
+from tests.support.browser import DESKTOP, PHONE, needs_chromium, open_browser
+from tests.support.report_pages import EVIL, opened, small_material
+
+DRAW_ALL = "charts.forEach(draw)"
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Material, Path]:
+    folder = tmp_path_factory.mktemp("report")
+    m = small_material(folder)
+    path = folder / "report.html"
+    path.write_text(page_of(m), encoding="utf-8")
+    return m, path
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with open_browser() as found:
+        yield found
+
+
+class Outline(HTMLParser):
+    """Headings, tables and charts of a page, and text outside of scripts."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+
+def test_the_page_is_one_file_with_its_headings_tables_and_sentences(made) -> None:
+    text = made[1].read_text(encoding="utf-8")
+    outline = Outline()
+    outline.feed(text)
+    tags = [tag for tag, _ in outline.tags]
+    assert tags.count("h1") == 1
+    levels = [int(t[1]) for t in tags if re.fullmatch(r"h[1-6]", t)]
+    assert all(b <= a + 1 for a, b in itertools.pairwise(levels)), levels
+    for name, found in outline.tags:
+        assert not (name in ("script", "img", "iframe") and "src" in found)
+        if name == "th":
+            assert found["scope"] in ("row", "col")
+        if found.get("class") == "chart":
+            assert len(str(found["aria-label"])) > 20
+            assert found["role"] == "img"
+        if name == "link":
+            assert found["href"] == "data:,"
+    assert tags.count("table") == tags.count("caption")
+    ids = [found["id"] for name, found in outline.tags if name == "section"]
+    assert ids[:3] == ["certificate", "measured", "where"]
+    assert {"evidence", "revisions", "parameters", "noise", "scalings", "plan"} < set(ids)
+    links = [found["href"] for name, found in outline.tags if name == "a"]
+    assert links == [f"#{i}" for i in ids]
+
+
+def test_names_are_text_and_nothing_else(made) -> None:
+    text = made[1].read_text(encoding="utf-8")
+    assert EVIL not in text
+    assert "<img" not in text.split("<body>")[1].split("<script>/**")[0]
+    assert "&lt;script&gt;" in text
+
+
+def test_numbers_of_the_certificate_are_those_of_the_fit(made) -> None:
+    m, path = made
+    text = path.read_text(encoding="utf-8")
+    error = left_out_errors(m.fit)
+    assert error.max() == pytest.approx(m.fit.holdout.max_m)
+    words, passed = limit_words(m)
+    assert passed == bool(error.max() <= m.limit_m)
+    assert words.startswith("PASSED" if passed else "FAILED")
+    assert mm(m.fit.holdout.rms_m) in text
+    failed, kept = limit_words(replace(m, limit_m=float(np.median(error))))
+    assert not kept
+    assert failed.startswith(f"FAILED: {(len(error) + 1) // 2} of {len(error)}")
+    b = budget(m.fit)
+    np.testing.assert_allclose(
+        b.expanded**2 / 4, b.parameters**2 + b.scatter**2 + b.misfit**2, rtol=1e-12
+    )
+    assert f"U = {mm(float(np.sqrt(np.mean(b.expanded**2))))}" in text
+
+
+@needs_chromium
+@pytest.mark.parametrize(
+    ("size", "scheme"),
+    [
+        pytest.param(DESKTOP, "light", id="desk-light"),
+        pytest.param(PHONE, "dark", id="phone-dark"),
+        pytest.param(DESKTOP, "dark", id="desk-dark", marks=pytest.mark.slow),
+        pytest.param(PHONE, "light", id="phone-light", marks=pytest.mark.slow),
+    ],
+)
+def test_it_is_whole_in_a_browser(made, browser: Browser, size, scheme: str) -> None:
+    m, path = made
+    with opened(browser, path, viewport=size, color_scheme=scheme) as (page, bad):
+        head = page.locator("h1")
+        box, answers = head.bounding_box(), page.locator(".answers").bounding_box()
+        assert box is not None
+        assert answers is not None
+        assert answers["y"] + answers["height"] < size["height"]
+        assert "joint_tilt_compliance" in head.inner_text() or m.diagnosis.lead is None
+        page.evaluate(DRAW_ALL)
+        page.wait_for_function("charts.every((c) => c._fullLayout && c.querySelector('svg'))")
+        assert page.evaluate("document.documentElement.scrollWidth") <= size["width"]
+        drawn = page.evaluate(
+            "charts.map((c) => [c.getAttribute('aria-label').split(':')[0], c._fullData.map("
+            "(t) => (t.x && !t.isempty ? Array.from(t.x).filter((v) => v !== null).length : 0))])"
+        )
+        counts = {name: sum(points) for name, points in drawn}
+        readings = len(m.story)
+        assert counts["By pose"] == counts["By load"] == counts["Over joint 3"] == readings
+        assert counts["Measured against predicted"] == 3 * readings + 2
+        marks = "c => c.getAttribute('aria-label').startsWith('By pose:')"
+        found = page.evaluate(f"charts.find({marks}).querySelectorAll('.point').length")
+        assert found == readings
+        ink = page.evaluate("charts[0]._fullLayout.font.color")
+        assert ink == {"light": "#24272e", "dark": "#e4e5e9"}[scheme]
+        assert page.evaluate("window.harmed") is None
+        assert bad == []
+
+
+@needs_chromium
+def test_it_prints_on_a4_in_light_colours_with_all_charts(made, browser: Browser) -> None:
+    _, path = made
+    with opened(browser, path, viewport=DESKTOP, color_scheme="dark") as (page, bad):
+        page.evaluate(
+            "window.addEventListener('beforeprint', () => { window.printed = charts.map("
+            "(c) => [!!c._fullLayout, c.getBoundingClientRect().width,"
+            " c._fullLayout.font.color]); })"
+        )
+        pdf = page.pdf(prefer_css_page_size=True)
+        printed = page.evaluate("window.printed")
+        assert all(drawn for drawn, _, _ in printed)
+        assert max(width for _, width, _ in printed) <= 681  # 180 mm in CSS pixels
+        assert {ink for _, _, ink in printed} == {"#24272e"}
+        assert re.search(rb"/MediaBox \[0 0 59[45][.0-9]* 84[12][.0-9]*\]", pdf)
+        assert page.evaluate("charts[0]._fullLayout.font.color") == "#e4e5e9"  # as it was
+        assert bad == []
+
+
+def test_what_is_in_scripts_is_json(made) -> None:
+    text = made[1].read_text(encoding="utf-8")
+    found = re.findall(r'<script type="application/json">(.*?)</script>', text, re.S)
+    assert len(found) > 10
+    for one in found:
+        assert "data" in json.loads(one)
