@@ -2,20 +2,28 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from hilcal.config import load_config
 from hilcal.data.campaign_file import CampaignFile
-from hilcal.discover.amplitudes import Amplitude
+from hilcal.discover import shapes
+from hilcal.discover.amplitudes import Amplitude, Factor
 from hilcal.discover.discovery import Discovery
 from hilcal.discover.law import Coefficient, Form, Law, Part
 from hilcal.discover.sites import sites
+from hilcal.discover.variables import variables
 from hilcal.discover.write_effect import source_of_form
+from hilcal.effects.example import example_cell, example_situation, example_states
 from hilcal.effects.from_file import read_effects
 from hilcal.identify.fit import Fit
 from studies.random_campaigns import rehearse
 from tests.support.cli_cases import CELL, ok, run
 
+SITUATION = example_situation(example_cell(), example_states(example_cell()))
+VARIABLES = {v.symbol: v for v in variables(SITUATION)}
+PRODUCT = (Factor(VARIABLES["q_5"], shapes.COS, (1.0,)), Factor(VARIABLES["τ_3"], shapes.LINEAR))
+COMPLIANCE = Form((Part(sites(6)[2], Amplitude(PRODUCT), 0),))
 Capsys = pytest.CaptureFixture[str]
 
 
@@ -60,6 +68,45 @@ def test_a_law_is_written_as_an_effect_and_told(
     assert found.document["laws"][0]["formula"] == "dq_2 = a"
     assert [kind.name for kind in read_effects(out).effects] == ["bent"]
     assert "--effects-from" in found.err
+
+
+def test_a_law_with_a_name_of_its_own_is_an_effect_everywhere(
+    campaign: Path, tmp_path: Path, capsys: Capsys
+) -> None:
+    """The file of a law, its name changed by hand: the catalogue, fits, plans, and use."""
+    run_file = tmp_path / "run.hilcal"
+    run_file.write_bytes(campaign.read_bytes())
+    law = source_of_form(COMPLIANCE, "found", (Coefficient("a", 1e-6, 1e-7, "rad/(N·m)"),))
+    hose = tmp_path / "hose.py"
+    named = law.replace('name = "found"', 'name = "forearm_hose"').replace("Found", "ForearmHose")
+    hose.write_text(named, encoding="utf-8")
+    own = ("--effects-from", hose)
+    listed = ok(capsys, "effects", *own, "--json").document
+    assert "forearm_hose" in str(listed)
+    model = ("--effects", "joint_compliance, forearm_hose")
+    fitted = ok(capsys, "identify", run_file, *model, *own, "--json").document
+    assert "forearm_hose" in str(fitted["model"])
+    judged = ok(capsys, "diagnose", run_file, *own, "--json").document
+    assert judged["model"][-1] == "forearm_hose"
+    assert "forearm_hose" in run(capsys, "diagnose", run_file).err  # refused by name
+    other = tmp_path / "other.hilcal"
+    config = load_config(CELL)
+    with CampaignFile.create(other, config.to_json(), str(CELL.parent), "test") as file:
+        file.append_readings(rehearse(config, "nothing", 5, 6).readings)
+    validated = ok(capsys, "validate", run_file, other, *own, "--json")
+    assert validated.document
+    calibration = tmp_path / "cal.json"
+    ok(capsys, "export", run_file, "--calibration", calibration, *own)
+    points = tmp_path / "points.csv"
+    with CampaignFile.open(run_file) as file:
+        near = np.degrees(file.readings().states.q[:1] + 0.01)
+    rows = "\n".join(",".join(f"{x:.6f}" for x in row) for row in near)
+    points.write_text(f"q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg\n{rows}\n", encoding="utf-8")
+    use = ("--load", "10kg", "--allow-outside", "--json")
+    by_run = ok(capsys, "compensate", run_file, points, *use, *own).document
+    by_file = ok(capsys, "compensate", calibration, points, *use, *own).document
+    assert by_run["points"][0]["q_rad"] == pytest.approx(by_file["points"][0]["q_rad"], abs=1e-9)
+    assert "forearm_hose" in run(capsys, "compensate", calibration, points, *use).err
 
 
 @pytest.mark.parametrize(
