@@ -265,7 +265,7 @@ def _poses(rec: rr.RecordingStream, d: Digest) -> None:
     rec.reset_time()
     scene.pose_scene(rec, d)
     time = [rr.TimeColumn("pose", sequence=d.poses)]
-    cards = [words.pose_card(d, k) for k in range(len(d.poses))]
+    cards = words.pose_cards(d)
     rec.send_columns(
         "words/verdict",
         indexes=time,

@@ -26,6 +26,7 @@ LEVEL_NAMES = ("inside", "doubtful", "outside")
 INSIDE_P = 0.99  # grey up to here: the noise ball drawn
 OUTSIDE_P = 0.9999  # red beyond: noise does this once in 10,000 readings
 _NICE = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)
+_LIMITS = stats.chi2.ppf([INSIDE_P, OUTSIDE_P], 3)
 BALL_SIGMAS = float(np.sqrt(stats.chi2.ppf(INSIDE_P, 3)))
 
 # Greek letters and these signs are in the viewer's fonts; a missing glyph ends the viewer.
@@ -53,7 +54,7 @@ def levels(norm2: Floats) -> Ints:
     Returns:
         (N,) levels; the limits are the quantiles `INSIDE_P` and `OUTSIDE_P` of chi2(3).
     """
-    return np.digitize(norm2, stats.chi2.ppf([INSIDE_P, OUTSIDE_P], 3)).astype(np.int64)
+    return np.digitize(norm2, _LIMITS).astype(np.int64)
 
 
 def nice(value: float) -> float:

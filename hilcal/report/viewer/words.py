@@ -15,6 +15,7 @@ _MARKS = {"adequate": "✓ ", "missing_effect": "✗ ", "unknown_effect": "✗ "
 _SUSPECTS = 3
 _BAR = 5
 _POSE_LOADS = 12
+_LEVEL_WORDS = ("inside the noise", "doubtful", "outside the noise")
 _CARRIERS = 4
 _RIVALS = 2
 _HIDDEN = 4
@@ -205,29 +206,33 @@ def limits(r: StoryRevision) -> str:
     return "\n".join(lines)
 
 
-def pose_card(d: Digest, k: int) -> str:
-    """Return one pose of the last revision in words: residual of each load, and joints."""
+def pose_cards(d: Digest) -> list[str]:
+    """Return each pose of the last revision in words: residual of each load, and joints."""
     r = d.story.revisions[-1]
-    rows = np.flatnonzero(d.row == k)
-    rms = float(np.sqrt((r.residual[rows] ** 2).sum(1).mean()))
-    lines = [
-        f"### Pose {escaped(d.story.pose_name(int(rows[0])))}: {micrometres(rms)} rms",
-        f"With the model of {title(r)[0].lower()}{title(r)[1:]}.",
-        "",
-        "| load | residual | in σ | |",
-        "|---|---|---|---|",
-    ]
-    words = ("inside the noise", "doubtful", "outside the noise")
-    for i in rows[:_POSE_LOADS]:
-        level = int(style.levels(r.whitened_norm2[i : i + 1])[0])
-        lines.append(
-            f"| {escaped(d.story.load_names[i])} "
-            f"| {micrometres(float(np.linalg.norm(r.residual[i])))} "
-            f"| {np.sqrt(r.whitened_norm2[i]):.1f} | {words[level]} |"
-        )
-    joints = ", ".join(f"{a:.1f}" for a in np.rad2deg(d.story.q[rows[0]]))
-    lines += ["", f"Joints {joints} deg."]
-    return "\n".join(lines)
+    told = f"With the model of {title(r)[0].lower()}{title(r)[1:]}."
+    length, sigma = np.linalg.norm(r.residual, axis=1).tolist(), np.sqrt(r.whitened_norm2).tolist()
+    level, rms = style.levels(r.whitened_norm2).tolist(), d.pose_rms(r).tolist()
+    loads = {name: escaped(name) for name in set(d.story.load_names)}
+    degrees = np.rad2deg(d.story.q[d.first]).tolist()
+    order = np.argsort(d.row, kind="stable")
+    ends = np.cumsum(np.bincount(d.row, minlength=len(d.poses)))
+    out = []
+    for k, rows in enumerate(np.split(order, ends[:-1])):
+        lines = [
+            f"### Pose {escaped(d.story.pose_name(int(rows[0])))}: {micrometres(rms[k])} rms",
+            told,
+            "",
+            "| load | residual | in σ | |",
+            "|---|---|---|---|",
+        ]
+        lines += [
+            f"| {loads[d.story.load_names[i]]} | {micrometres(length[i])} "
+            f"| {sigma[i]:.1f} | {_LEVEL_WORDS[level[i]]} |"
+            for i in rows[:_POSE_LOADS].tolist()
+        ]
+        lines += ["", f"Joints {', '.join(f'{a:.1f}' for a in degrees[k])} deg."]
+        out.append("\n".join(lines))
+    return out
 
 
 def parameters(r: StoryRevision, limit: int) -> str:
