@@ -10,6 +10,7 @@ from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import check_options, fit_of, wanted_effects
 from hilcal.cli.terminal import Json, Revision, Run, terminal
 from hilcal.discover.discovery import discover as search
+from hilcal.discover.discovery import rival_sources
 from hilcal.effects.check import NAME
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.baseline import with_effects
@@ -32,6 +33,14 @@ def discover(
             help="Beside these effects instead of those of the revision in use.",
         ),
     ] = None,
+    alternatives: Annotated[
+        bool,
+        typer.Option(
+            "--alternatives",
+            help="Also write laws that these readings do not tell from it: F_or_1.py; hilcal next "
+            "plans what separates them.",
+        ),
+    ] = False,
     revision: Revision = None,
     effects_from: EffectsFrom = None,
     as_json: Json = False,
@@ -63,13 +72,24 @@ def discover(
     t.show(discovery_report(d))
     if not d.laws:
         t.document(document, CannotAnswerError(silence(d)))
-    try:
-        output.write_text(d.source, encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{output}: cannot be written ({error.strerror})") from None
+    rivals = rival_sources(d) if alternatives else {}
+    written = {name: d.source, **rivals}
+    places = {own: output.with_name(f"{own}.py") for own in written}
+    for own, source in written.items():
+        try:
+            places[own].write_text(source, encoding="utf-8")
+        except OSError as error:
+            raise InputError(f"{places[own]}: cannot be written ({error.strerror})") from None
     t.show(
         f"\n{output} has the first law as the effect {name}. Add it, and judge the model with it:"
     )
     t.command(f"hilcal add {run} {name} --effects-from {output}")
     t.command(f"hilcal diagnose {run} --effects-from {output}")
-    t.document({**document, "written": str(output)})
+    if alternatives and not rivals:
+        t.show("No other law explains these readings as well.")
+    if rivals:
+        t.show("Plan the measurements that separate it from what explains these readings as well:")
+        files = " ".join(f"--effects-from {places[own]}" for own in written)
+        t.command(f"hilcal next {run} -o PLAN.json --suspects {','.join(written)} {files}")
+    others = [{"name": own, "written": str(places[own])} for own in rivals]
+    t.document({**document, "written": str(output), "alternatives": others})

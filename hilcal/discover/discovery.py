@@ -31,7 +31,7 @@ from hilcal.discover.law import (
     form_of,
 )
 from hilcal.discover.problem import Problem
-from hilcal.discover.refit import exact, refine
+from hilcal.discover.refit import at_linearisation, exact, refine
 from hilcal.discover.screen import Screen, screen
 from hilcal.discover.search import LEAST, MOST_TERMS, SAME, Selection, search
 from hilcal.discover.write_effect import source_of_form
@@ -58,6 +58,10 @@ LEAST_SHARE = 0.1
 """Share of the misfit on poses left out that a law must explain, searched for without them."""
 NEAR = 0.7
 """Cosine from which an effect of the catalogue is named as resembling; a choice."""
+
+
+MOST_RIVALS = 2
+"""Alternatives that can be written as effects; a choice: `next` separates few."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +136,18 @@ def discover(
     if not folds.sure or folds.share < LEAST_SHARE:
         return _silent(fit, found, say, folds.share)
     return _laws(fit, problem, selections, folds, columns, say, name)
+
+
+def rival_sources(d: Discovery) -> dict[str, str]:
+    """Return the effects of what these readings do not tell from the first law, by name."""
+    if not d.laws:
+        return {}
+    law, out = d.laws[0], {}
+    for k, (form, values) in enumerate(law.rivals, start=1):
+        own = f"{law.name}_or_{k}"
+        evidence = f"These readings do not tell it from {law.name}: {law.formula}"
+        out[own] = source_of_form(form, own, values, evidence, f"{own}.py")
+    return out
 
 
 def _silent(fit: Fit, found: Screen, say: Callable[[str], None], searched: float) -> Discovery:
@@ -275,11 +291,12 @@ def _law(
     for symbol, v in known.items():
         values = v.read(situation)
         ranges.append((symbol, float(values.min()), float(values.max()), v.unit))
-    others = []
+    others: dict[str, Form] = {}
     for c in s.near:
-        text = form_of(problem.screen, (c.term,)).text()
+        other = form_of(problem.screen, (c.term,))
         if len(s.terms) == 1 and c.odds > s.odds[0] - LEAST and c.term not in s.terms:
-            others.append(text)
+            others.setdefault(other.text(), other)
+    rivals = [(f, at_linearisation(problem.screen, f)) for f in [*others.values()][:MOST_RIVALS]]
     return Law(
         name=name,
         form=form,
@@ -289,7 +306,8 @@ def _law(
         holdout_share=share,
         left=after.variance_factor,
         stability=stability(problem.screen, folds, curve(problem, s)),
-        alternatives=tuple(dict.fromkeys(others)),
+        alternatives=tuple(others),
         resembles=near[:3],
         ranges=tuple(ranges),
+        rivals=tuple(rivals),
     )

@@ -193,6 +193,7 @@ class Law:
         alternatives: formulas that these readings do not tell from it, at odds of 20 : 1.
         resembles: effects of the catalogue that are near, the nearest first.
         ranges: least and largest of each quantity in the readings.
+        rivals: forms of `alternatives`, with coefficients by algebra.
     """
 
     name: str
@@ -206,6 +207,7 @@ class Law:
     alternatives: tuple[str, ...]
     resembles: tuple[Resemblance, ...]
     ranges: tuple[tuple[str, float, float, str], ...]
+    rivals: tuple[tuple[Form, tuple[Coefficient, ...]], ...] = ()
 
     @property
     def formula(self) -> str:

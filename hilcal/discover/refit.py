@@ -113,6 +113,15 @@ def by_algebra(screen: Screen, form: Form, s: Situation) -> Floats:
     return np.asarray(step, dtype=float)
 
 
+def at_linearisation(screen: Screen, form: Form) -> tuple[Coefficient, ...]:
+    """Return the coefficients by algebra, without their uncertainties."""
+    s = screen.linear.fit.solution.prediction.situation
+    step = by_algebra(screen, form, s) * ordinary(form)
+    return tuple(
+        Coefficient(LETTERS[k], float(v), float("nan"), form.unit(k)) for k, v in enumerate(step)
+    )
+
+
 def exact(screen: Screen, form: Form, name: str) -> tuple[Fit, tuple[Coefficient, ...], str]:
     """Refit the model with the law as an effect.
 
@@ -125,9 +134,7 @@ def exact(screen: Screen, form: Form, name: str) -> tuple[Fit, tuple[Coefficient
     before = screen.linear.fit
     s = before.solution.prediction.situation
     letters = LETTERS[: form.count]
-    step = by_algebra(screen, form, s) * ordinary(form)
-    named = tuple(Coefficient(k, float(v), 0.0, "") for k, v in zip(letters, step, strict=True))
-    source = source_of_form(form, name, named)
+    source = source_of_form(form, name, at_linearisation(screen, form))
     kind = effect_class(source, name)
     effect = kind(before.model.cell, s.states)
     model = replace(before.model, effects=(*before.model.effects, effect))

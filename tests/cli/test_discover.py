@@ -53,7 +53,18 @@ def test_a_law_is_written_as_an_effect_and_told(
 ) -> None:
     form = Form((Part(sites(6)[1], Amplitude(()), 0),))
     law = Law(
-        "bent", form, (Coefficient("a", 1e-4, 1e-6, "rad"),), 1e-9, 30.0, 0.8, 1.1, 1.0, (), (), ()
+        "bent",
+        form,
+        (Coefficient("a", 1e-4, 1e-6, "rad"),),
+        1e-9,
+        30.0,
+        0.8,
+        1.1,
+        1.0,
+        (),
+        (),
+        (),
+        ((COMPLIANCE, (Coefficient("a", 2e-6, float("nan"), "rad/(N·m)"),)),),
     )
     source = source_of_form(form, "bent", law.parameters)
 
@@ -63,7 +74,17 @@ def test_a_law_is_written_as_an_effect_and_told(
 
     monkeypatch.setattr("hilcal.cli.discovering.search", search)
     out = tmp_path / "bent.py"
-    found = ok(capsys, "discover", campaign, "-o", out, "--against", "joint_compliance", "--json")
+    asked = ("-o", out, "--against", "joint_compliance", "--json")
+    found = ok(capsys, "discover", campaign, *asked, "--alternatives")
+    other = tmp_path / "bent_or_1.py"
+    assert found.document["alternatives"] == [{"name": "bent_or_1", "written": str(other)}]
+    assert f"--suspects bent,bent_or_1 --effects-from {out} --effects-from {other}" in found.err
+    (kind,) = read_effects(other).effects
+    assert (kind.name, kind.summary) == ("bent_or_1", "dq_3 = a·cos(q_5)·τ_3")
+    other.unlink()
+    found = ok(capsys, "discover", campaign, *asked)
+    assert found.document["alternatives"] == []
+    assert not other.exists()
     assert found.document["written"] == str(out)
     assert found.document["laws"][0]["formula"] == "dq_2 = a"
     assert [kind.name for kind in read_effects(out).effects] == ["bent"]
