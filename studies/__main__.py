@@ -7,6 +7,7 @@ import typer
 
 from hilcal.cli import application, execute
 from studies.carry_command import carry
+from studies.carry_picture import carry_picture
 from studies.change_command import change
 from studies.compensation_command import compensation
 from studies.corrected import corrected
@@ -35,6 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     app.command("scaling")(scaling)
     app.command("real")(real)
     app.command("carry")(carry)
+    app.command("carry-picture")(carry_picture)
     app.command("compensation")(compensation)
     app.command("change")(change)
     app.command("corrected")(corrected)

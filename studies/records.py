@@ -3,7 +3,7 @@
 import json
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -56,8 +56,19 @@ class Record:
     figures: tuple[Figure, ...]
 
 
-def keep(path: Path | None, title: str, figures: Sequence[Figure]) -> None:
+def keep(
+    path: Path | None,
+    title: str,
+    figures: Sequence[Figure],
+    more: Mapping[str, object] | None = None,
+) -> None:
     """Write the figures of the study that runs in this process, where asked for.
+
+    Args:
+        path: of the file; None where it is not asked for.
+        title: of the study.
+        figures: what it measured.
+        more: numbers that a picture is made of; "picture" is its place from the page of results.
 
     Raises:
         InputError: the file cannot be written.
@@ -69,7 +80,8 @@ def keep(path: Path | None, title: str, figures: Sequence[Figure]) -> None:
     command = f"python -m studies {shlex.join(words)}"
     date = datetime.now(UTC).date().isoformat()
     record = Record(title, command, date, __version__, tuple(figures))
-    _write(path, json.dumps(asdict(record), indent=1, ensure_ascii=False) + "\n")
+    content = {**asdict(record), **(more or {})}
+    _write(path, json.dumps(content, indent=1, ensure_ascii=False) + "\n")
 
 
 def results(
@@ -106,6 +118,8 @@ def page(folder: Path) -> str:
         out += ["| what | measured | required | met |", "|---|---|---|---|"]
         met = {True: "yes", False: "**no**", None: ""}
         out += [f"| {f.what} | {f.measured} | {f.required} | {met[f.met]} |" for f in rows]
+        if picture := record.get("picture"):
+            out += ["", f"![{record['title']}]({picture})"]
     return "\n".join(out) + "\n"
 
 

@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
 
 from hilcal.calibration.compensation import Inverse, Pose, invert, singular
 from hilcal.calibration.compiled import Compiled, compiled
@@ -32,7 +31,6 @@ from hilcal.calibration.sensed import SensorMount
 from hilcal.calibration.tool import Tool, in_chain, one_of_each, tool_of, tool_poses
 from hilcal.data.readings import States
 from hilcal.data.whitening import Mode
-from hilcal.diagnose.noise_verdict import MISFIT_ALARM
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit
@@ -162,10 +160,7 @@ class Calibration:
         prior = found.solution.prior
         p = predictive(model, found.theta, prior, used, found.mode, left_out)
         values, vectors = np.linalg.eigh(p.covariance)
-        noise = np.trace(found.whitening.covariance[:, :3, :3], axis1=1, axis2=2)
-        misfits = float(chi2.sf(found.chi2, found.dof)) < MISFIT_ALARM
-        square = float(np.mean(np.sum(found.raw[:, :3] ** 2, axis=1)))
-        beyond = square * found.whitening.rank / found.dof - float(noise.mean())
+        noise = np.trace(p.of_noise(found.whitening)[:, :3, :3], axis1=1, axis2=2)
         kappa = parameter_factor(p, left_out)
         # A deflection is the difference of two readings.
         readings = 2 if found.mode == "deflection" else 1
@@ -175,7 +170,7 @@ class Calibration:
             theta=found.theta,
             mode=found.mode,
             root=vectors * np.sqrt(kappa * np.maximum(values, 0.0)),
-            misfit=max(beyond, 0.0) * misfits / 3 / readings,
+            misfit=p.excess.position / readings,
             scatter=scatter_of(found.readings, model.cell),
             measured=Measured.of(used.states, p, noise),
             loads={load.name: load.wrench(model.cell.gravity) for load in loads},
@@ -184,7 +179,12 @@ class Calibration:
             # With a carried prior the covariance does not follow from these readings alone.
             learnt=None
             if model.prior is not None
-            else Learnt(used, open_prior(model, found.theta, prior), p.noise, kappa),
+            else Learnt(
+                p.excess.of_readings(used, found.mode),
+                open_prior(model, found.theta, prior),
+                p.noise,
+                kappa,
+            ),
         )
 
     @classmethod

@@ -48,9 +48,10 @@ class Measured:
         Args:
             states: of the fitted readings.
             p: what the fit knows of others.
-            noise: (D,) trace of the position's noise covariance of each measurement, m².
+            noise: (D,) trace of the position's covariance of each measurement, by noise and
+                misfit, m².
         """
-        spread = p.factor * p.noise * noise * p.leverage / (1 - p.leverage)
+        spread = noise * p.leverage / (1 - p.leverage)
         return cls(ranges_of(states), float(np.sqrt(FAR * np.quantile(spread, 0.99))))
 
     def outside(self, states: States, std_m: Floats | None) -> list[Outside]:

@@ -267,14 +267,23 @@ def _best(
         return None
     most = sure[0][0]
     equal = [t for t in sure if most - t[0] < SAME_EVIDENCE]
-    # Of those that explain the readings alike, the one with fewest parameters.
-    evidence, p_value, after, best = min(equal, key=lambda t: sum(len(c.parameters) for c in t[3]))
+    # Of those that explain the readings alike, the one with fewest parameters, then the one whose
+    # size is the least beside what is plausible.
+    evidence, p_value, after, best = min(
+        equal, key=lambda t: (sum(len(c.parameters) for c in t[3]), _beside_plausible(t[2], t[3]))
+    )
     others = [t for t in tried if all(c is not b for c in t[3] for b in best)]
     rivals = [(c, t[0]) for t in others for c in t[3]]
     rivals += [(s.candidate, s.score.log_evidence) for s in order[TRIED:]]
     same = {c.name: c for c, e in rivals if most - e < SAME_EVIDENCE}
     chance = min(p_value * tested, 1.0)
     return after, [(c, chance, evidence, tuple(same.values())) for c in best]
+
+
+def _beside_plausible(after: Remeasured, mine: Sequence[Candidate]) -> float:
+    """Rms size of the last changes, in units of what is plausible of their effects."""
+    most = [c.moving.effect.most() for c in mine for _ in c.parameters]
+    return float(np.sqrt(np.mean((after.sizes[-len(most) :] / most) ** 2)))
 
 
 def _trials(order: Sequence[Candidate]) -> list[tuple[Candidate, ...]]:

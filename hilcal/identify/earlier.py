@@ -55,7 +55,7 @@ def earlier_fit(fit: Fit) -> Earlier:
     w = fit.whitening
     sigma = float(np.sqrt(np.sum(w.whiten(fit.left_out) ** 2) / w.rank))
     knows = predictive(fit.model, fit.theta, fit.solution.prior, kept, fit.mode, sigma)
-    beyond = max(knows.factor * knows.noise - 1.0, 0.0)
+    beyond = max(knows.factor * knows.scatter - 1.0, 0.0)
     shared = beyond * _shared(fit, knows, kept)
     values, vectors = np.linalg.eigh(knows.factor * knows.covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))

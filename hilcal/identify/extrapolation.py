@@ -77,7 +77,7 @@ def extrapolation(p: Predictive, fitted: Readings, found: Validation) -> Extrapo
     """
     w, other = found.whitening, found.readings
     prediction = p.model.predict(other.states, p.theta)
-    spread, noise = p.of_prediction(prediction, w), p.factor * p.noise * w.covariance
+    spread, noise = p.of_prediction(prediction, w), p.of_noise(w)
     total = spread + noise
     root = inverse_root(noise)
     leverage = np.linalg.eigvalsh(root @ spread @ np.swapaxes(root, 1, 2))[:, -1]

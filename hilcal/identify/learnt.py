@@ -8,6 +8,7 @@ from hilcal.data.ranges import ranges_of
 from hilcal.data.records import content_hash
 from hilcal.data.revision import utc_now
 from hilcal.data.same_readings import prints
+from hilcal.data.whitening import whitening
 from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.fit import Fit
@@ -69,7 +70,10 @@ def _information(fit: Fit, scale: Floats) -> tuple[Floats, Floats]:
     p = predictive(
         model, fit.theta, s.prior, fit.readings[~fit.outlier], fit.mode, fit.holdout.rms_sigma
     )
-    a = whitened_jacobian(model, s.prediction, s.theta, fit.whitening, np.arange(model.size))
+    w = fit.whitening
+    if not p.excess.none:
+        w = whitening(p.excess.of_readings(fit.readings[~fit.outlier], fit.mode), fit.mode, "gc")
+    a = whitened_jacobian(model, s.prediction, s.theta, w, np.arange(model.size))
     a *= scale
     std = family_prior(model, s.prior) / scale
     with np.errstate(divide="ignore"):

@@ -9,14 +9,15 @@ visited: there the dropped harmonics of a transmission error, too, add up to its
 - a parameter without a prior has one about zero of its ordinary magnitude, or the rms of its
   effect's parameters if more, as where poses are left out (see `holdout`);
 
-and with the whitened Jacobian A (R, P) of the fitted readings, σ² their noise factor, Λ the prior
-precision,
+and with the Jacobian A (R, P) of the fitted readings, whitened by W, σ² their noise factor, Λ the
+prior precision,
 
-    C = (AᵀA/σ² + Λ)⁻¹,    Cov(prediction) = κ (σ² V + J C Jᵀ)
+    C = (AᵀA/σ² + Λ)⁻¹,    Cov(measured − predicted) = κ (σ² W + J C Jᵀ)
 
-where κ, at least 1, makes the mean variance on a pose left out, σ² tr (1 − H)⁻¹/R, H (R, R) the
-leverage of its R rows, equal to the mean square that was found on poses left out: a misfit is no
-noise, and repeats itself in new poses.
+W is the stated covariance V, with more for positions or attitudes where their residual asks for it
+(`identify.excess`): a misfit has not the shape of an instrument's noise.
+κ, at least 1, makes the mean variance on a pose left out, in units of V, equal to the mean square
+that was found there: what repeats itself in new poses.
 """
 
 from dataclasses import dataclass
@@ -25,7 +26,8 @@ import numpy as np
 
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode, Whitening, whitening
-from hilcal.identify.coordinates import coordinates_of
+from hilcal.identify.coordinates import Coordinates, coordinates_of
+from hilcal.identify.excess import Excess, excess
 from hilcal.identify.gauss_newton import whitened_jacobian
 from hilcal.identify.holdout import ordinary
 from hilcal.identify.residual import residual
@@ -34,6 +36,8 @@ from hilcal.types import Floats, Ints
 
 ITERATIONS = 20
 """Fixed-point iterations of the noise factor; it converges within a few."""
+ROUNDS = 3
+"""Most times that the covariance of the parameters is computed anew as W changes; a choice."""
 MOST_LEVERAGE = 0.99
 """Bound on the leverage of a row, since that of a row which alone tells something is 1."""
 CHUNK = 4096
@@ -48,19 +52,23 @@ class Predictive:
         model: the model.
         theta: (P,) its parameters.
         covariance: (P, P) C.
-        noise: σ², noise factor of the fitted readings.
+        excess: what W has beyond V.
+        noise: σ², noise factor of the fitted readings in units of W.
         factor: κ.
         leverage: (D,) largest eigenvalue of a fitted measurement's leverage: variance of the
             prediction over that of the noise.
-        left_out: mean variance of the predictions of poses left out by C, in units of the noise.
+        scatter: mean variance of the fitted readings by σ² W, in units of V.
+        left_out: mean variance of the predictions of poses left out by C, in units of V.
     """
 
     model: Model
     theta: Floats
     covariance: Floats
+    excess: Excess
     noise: float
     factor: float
     leverage: Floats
+    scatter: float
     left_out: float
 
     def of_prediction(self, prediction: Prediction, w: Whitening) -> Floats:
@@ -70,8 +78,12 @@ class Predictive:
         return np.asarray(self.factor * spread)
 
     def of_reading(self, prediction: Prediction, w: Whitening) -> Floats:
-        """Return κ (σ² V + J C Jᵀ) (D, m, m), of measured minus predicted."""
-        return self.of_prediction(prediction, w) + self.factor * self.noise * w.covariance
+        """Return κ (σ² W + J C Jᵀ) (D, m, m), of measured minus predicted."""
+        return self.of_prediction(prediction, w) + self.of_noise(w)
+
+    def of_noise(self, w: Whitening) -> Floats:
+        """Return κ σ² W (D, m, m)."""
+        return self.factor * self.noise * self.excess.widened(w.covariance)
 
 
 def predictive(
@@ -88,41 +100,90 @@ def predictive(
         mode: "deflection" or "absolute".
         left_out_sigma: rms of the whitened residual on poses left out.
     """
-    w = whitening(fitted, mode, "gc")
+    stated = whitening(fitted, mode, "gc")
     prediction = model.predict(fitted.states, theta)
-    white = w.whiten(residual(fitted, prediction, w)).reshape(-1)
+    raw = residual(fitted, prediction, stated)
     of = coordinates_of(model)
     std = of.prior(open_prior(model, theta, prior))
     std[np.isinf(std)] = 1.0
-    a = of.columns(whitened_jacobian(model, prediction, theta, w, np.arange(model.size)))
-    a *= std
-    values, vectors = np.linalg.eigh(a.T @ a)
-    values = np.maximum(values, 0.0)
-    rss, noise = float(white @ white), 1.0
-    for _ in range(ITERATIONS):
-        free = max(w.rank - float(np.sum(values / (values + noise))), 1.0)
-        noise = max(1.0, rss / free)
-    root = vectors * np.sqrt(noise / (values + noise))
+    more, w = Excess(), stated
+    for _ in range(ROUNDS):
+        a = _rows(model, prediction, theta, of, std, w)
+        values, vectors, noise = _spectrum(a, raw, w)
+        root = vectors * np.sqrt(noise / (values + noise))
+        found = excess(raw, stated, w, a, root)
+        if found.near(more):
+            break
+        more, w = found, whitening(found.of_readings(fitted, mode), mode, "gc")
+    else:
+        a = _rows(model, prediction, theta, of, std, w)
+        values, vectors, noise = _spectrum(a, raw, w)
+        root = vectors * np.sqrt(noise / (values + noise))
     shares = []
     for k in range(0, len(a), CHUNK * w.m):
         part = (a[k : k + CHUNK * w.m] @ root).reshape(-1, w.m, len(root))
         shares.append(np.linalg.eigvalsh(part @ np.swapaxes(part, 1, 2)) / noise)
     leverage = np.clip(np.concatenate(shares), 0.0, MOST_LEVERAGE).max(axis=1)
-    left_out = _left_out(a, root, w.rows_of(fitted.pose[w.reading]), noise)
+    pose = w.rows_of(fitted.pose[w.reading])
+    scatter, b = noise, a
+    if not more.none:
+        wider = np.linalg.solve(stated.covariance, more.widened(stated.covariance))
+        scatter = noise * float(np.trace(wider, axis1=1, axis2=2).mean()) / w.m
+        b = _rows(model, prediction, theta, of, std, stated)
+    left_out = _left_out(a, b, root, pose, noise)
     root = of.transform(root * std[:, None])
-    factor = max(1.0, left_out_sigma**2 / (noise + left_out))
-    return Predictive(model, theta, root @ root.T, noise, factor, leverage, left_out)
+    factor = max(1.0, left_out_sigma**2 / (scatter + left_out))
+    return Predictive(model, theta, root @ root.T, more, noise, factor, leverage, scatter, left_out)
 
 
-def _left_out(a: Floats, root: Floats, pose: Ints, noise: float) -> float:
-    """Mean variance of the rows (R, P) of each pose, predicted without it, beside the noise."""
+def _rows(
+    model: Model,
+    prediction: Prediction,
+    theta: Floats,
+    of: Coordinates,
+    std: Floats,
+    w: Whitening,
+) -> Floats:
+    """Whitened derivatives (R, P) by coordinates of unit prior variance."""
+    a = of.columns(whitened_jacobian(model, prediction, theta, w, np.arange(model.size)))
+    a *= std
+    return a
+
+
+def _spectrum(a: Floats, raw: Floats, w: Whitening) -> tuple[Floats, Floats, float]:
+    """Eigenvalues and eigenvectors of AᵀA, and σ²."""
+    values, vectors = np.linalg.eigh(a.T @ a)
+    values = np.maximum(values, 0.0)
+    white = w.whiten(raw).reshape(-1)
+    rss, noise = float(white @ white), 1.0
+    for _ in range(ITERATIONS):
+        free = max(w.rank - float(np.sum(values / (values + noise))), 1.0)
+        noise = max(1.0, rss / free)
+    return values, vectors, noise
+
+
+def _left_out(a: Floats, b: Floats, root: Floats, pose: Ints, noise: float) -> float:
+    """Mean variance of the rows of each pose, predicted without it.
+
+    Args:
+        a: (R, P) rows in units of W.
+        b: (R, P) the same in units of V, in which the variance is asked for.
+        root: (P, K) root of C.
+        pose: (R,) of each row.
+        noise: σ².
+    """
     order = np.argsort(pose, kind="stable")
     total = 0.0
     for mine in np.split(order, np.flatnonzero(np.diff(pose[order])) + 1):
-        part = a[mine] @ root
-        small = part @ part.T if len(part) < len(root) else part.T @ part
-        h = np.clip(np.linalg.eigvalsh(small) / noise, 0.0, MOST_LEVERAGE)
-        total += noise * float(np.sum(h / (1 - h)))
+        x, y = a[mine] @ root, b[mine] @ root
+        # C without the pose: root (1 − XᵀX/σ²)⁻¹ rootᵀ.
+        values, vectors = np.linalg.eigh(x @ x.T if len(x) < len(root) else x.T @ x)
+        h = np.clip(values / noise, 0.0, MOST_LEVERAGE)
+        if len(x) < len(root):
+            along = y @ (x.T @ vectors)
+            total += float(np.sum(y**2) + np.sum(along**2 / (noise * (1 - h))))
+        else:
+            total += float(np.sum((y @ vectors) ** 2 / (1 - h)))
     return total / max(len(a), 1)
 
 
@@ -151,4 +212,4 @@ def parameter_factor(p: Predictive, left_out_sigma: float) -> float:
         p: what a fit knows.
         left_out_sigma: rms of the whitened residual on poses left out.
     """
-    return max(1.0, (left_out_sigma**2 - max(p.noise, 1.0)) / max(p.left_out, 1e-12))
+    return max(1.0, (left_out_sigma**2 - max(p.scatter, 1.0)) / max(p.left_out, 1e-12))
