@@ -37,6 +37,7 @@ WANTED_M = 75e-6
 WANTED_BAND = (0.90, 0.97)
 """Share of poses within their 95 % band that counts as true; the project's goal."""
 FINAL, PLAIN = "as refine ends", "before the arm's scatter was estimated"
+HALF = 0.5
 ENVIRONMENT = ("time", "load_time", "air_temperature", "joint_temperature", "approach")
 
 
@@ -79,7 +80,10 @@ class Left:
 
 def compensation(
     series: Annotated[list[Path], typer.Argument(metavar="F.csv...", help="Series of the UR10.")],
-    splits: Annotated[int, typer.Option("--splits", help="Random halves of each series.")] = 3,
+    splits: Annotated[int, typer.Option("--splits", help="Random parts of each series.")] = 3,
+    share: Annotated[
+        float, typer.Option("--share", help="Of the poses that is fitted; half: the first, too.")
+    ] = 0.5,
     folder: Annotated[
         Path | None,
         typer.Option("--calibrations", metavar="DIR", help="Keep them there; use what is there."),
@@ -87,7 +91,7 @@ def compensation(
     keep_file: Keep = None,
     as_json: Json = False,
 ) -> None:
-    """Fit one half of a real series, and correct the other half."""
+    """Fit one part of a real series, and correct the other part."""
     t = terminal(as_json)
     cell = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
     figures: list[Figure] = []
@@ -95,7 +99,7 @@ def compensation(
     for path in series:
         readings = read_table(path, cell, "ipa-ur10")
         found: list[Left] = []
-        for name, fitted in _halves(len(readings), splits):
+        for name, fitted in _parts(len(readings), splits, share):
             begun = time.monotonic()
             with working(t.progress) as say:
                 say(f"{path.parent.name}, {name}: refining {int(fitted.sum())} readings")
@@ -115,13 +119,15 @@ def compensation(
     t.document({"series": document})
 
 
-def _halves(count: int, splits: int) -> Iterator[tuple[str, Bools]]:
+def _parts(count: int, splits: int, share: float) -> Iterator[tuple[str, Bools]]:
     """Yield names and rows (N,) of what is fitted."""
+    fitted = int(share * count)
     for seed in range(1, splits + 1):
         rows = np.zeros(count, dtype=np.bool_)
-        rows[np.random.default_rng(seed).permutation(count)[: count // 2]] = True
-        yield f"random half {seed}", rows
-    yield "first half", np.arange(count) < count // 2
+        rows[np.random.default_rng(seed).permutation(count)[:fitted]] = True
+        yield f"random {'half' if share == HALF else f'{100 * share:.0f} %'} {seed}", rows
+    if share == HALF:
+        yield "first half", np.arange(count) < fitted
 
 
 def _calibrations(
@@ -203,7 +209,8 @@ def judged(c: Calibration, p: ToolPoses, others: Readings) -> tuple[Floats, Bool
 def _figures(series: str, found: list[Left]) -> Iterator[Figure]:
     """Yield mean and worst over the random halves, and the first half by itself."""
     low, high = WANTED_BAND
-    for kind in ("random half", "first half"):
+    kinds = dict.fromkeys(x.split.rstrip("0123456789 ") for x in found)
+    for kind in kinds:
         for which in (FINAL, PLAIN):
             parts = [x for x in found if x.model == which and x.split.startswith(kind)]
             if not parts:
