@@ -99,7 +99,7 @@ def error_picture(rec: rr.RecordingStream, d: Digest, static: bool = True) -> No
 def error_now(rec: rr.RecordingStream, d: Digest, r: StoryRevision) -> None:
     """Log a frame about one revision and what it changed, and its errors in words.
 
-    The words have the colours of the marks.
+    Above the words are lines in the colours of the marks.
     """
     k = [o.revision for o in d.story.revisions].index(r.revision)
     frame = axis(d)
@@ -119,8 +119,13 @@ def error_now(rec: rr.RecordingStream, d: Digest, r: StoryRevision) -> None:
     at = frame.place(np.array(shown, dtype=float), np.zeros(len(shown)))[:, 0]
     names = [f"{numbers[i]}" for i in shown[:-1]] + [f"{r.revision}: {r.change or 'first model'}"]
     foot = [(float(x), FOOT) for x in at]
-    grey = [style.GREY] * len(foot)
-    write(rec, f"{ORIGIN}/words", [*places, *foot], [*texts, *names], [*colors, *grey])
+    write(rec, f"{ORIGIN}/words", [*places, *foot], [*texts, *names])
+    reach = 0.4 * WIDTH / len(texts)
+    keys = [[(x - reach, TITLE - 5.0), (x + reach, TITLE - 5.0)] for x, _ in places]
+    rec.log(
+        f"{ORIGIN}/keys",
+        rr.LineStrips2D(keys, colors=colors, radii=rr.Radius.ui_points(2.0)),
+    )
 
 
 def _length(micrometres: float) -> str:

@@ -72,17 +72,16 @@ def write(
     path: str,
     places: list[tuple[float, float]],
     texts: list[str],
-    colors: list[style.Color] | None = None,
     static: bool = False,
 ) -> None:
-    """Log words at places of the picture, grey unless they have colours."""
+    """Log words at places of the picture."""
     rec.log(
         path,
         rr.Points2D(
             places,
             labels=[style.safe(t) for t in texts],
             radii=rr.Radius.ui_points(0.1),
-            colors=colors or [style.GREY],
+            colors=[style.LABEL],
             show_labels=True,
         ),
         static=static,

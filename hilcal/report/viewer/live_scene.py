@@ -1,6 +1,5 @@
 """Draws a command while it works: readings as they come, revisions as they are found."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +15,7 @@ from hilcal.report.viewer import (
     layout,
     live_layout,
     live_words,
+    scene,
     stream,
     style,
 )
@@ -23,8 +23,8 @@ from hilcal.report.viewer.arm_shapes import MovingArm
 from hilcal.report.viewer.digest import Digest, Limits, digest
 from hilcal.report.viewer.live_digest import BALL, LIMIT, LiveDigest, arrow
 from hilcal.robot.body import body_poses
-from hilcal.types import Floats
 
+_ABOVE = np.array([0.0, 0.0, 1.3 * BALL])
 BALLS = 60
 """Readings from which a ball is drawn only where its arrow leaves it, for legibility."""
 
@@ -151,13 +151,12 @@ class LiveScene:
     def _reading(self, d: LiveDigest, event: ReadingStored) -> None:
         """Draw a reading: its arrow in its ball, its place in time, and a label at it."""
         rec, at, found = self._rec, d.place(event.step), d.add(event)
-        label, color = f"{event.step.pose}, {event.step.load}", style.LABEL_COLORS[0]
+        words = f"{event.step.pose}, {event.step.load}"
         if found is None:
             dot = rr.Points3D([at], colors=[style.MEASURED], radii=[0.01])
             rec.log(f"{self._world}/dots", dot)
         else:
-            color = style.LABEL_COLORS[found.level]
-            label += f": {live_words.residual(found)}"
+            words += f": {live_words.residual(found)}"
             rec.log(
                 f"{self._world}/arrows",
                 rr.Arrows3D(
@@ -180,7 +179,7 @@ class LiveScene:
             name = style.LEVEL_NAMES[found.level]
             rec.log(f"{self._series}/{name}", rr.Scalars(found.sigma))
             rec.log(f"{self._series}/limit", rr.Scalars(LIMIT))
-        rec.log(f"{self._world}/last", _label(at, label, color.tolist()))
+        rec.log(f"{self._world}/last", scene.label(at + _ABOVE, words))
 
     def _words(self, d: LiveDigest) -> None:
         self._rec.log("words/measuring", _markdown(live_words.status(d)))
@@ -216,13 +215,6 @@ class LiveScene:
 
 def _titles(d: Digest) -> tuple[str, ...]:
     return layout.residual_title(d), layout.deflection_title(d), layout.bars_title(d)
-
-
-def _label(at: Floats, text: str, color: Sequence[int]) -> rr.Points3D:
-    above = at + np.array([0.0, 0.0, 1.3 * BALL])
-    return rr.Points3D(
-        [above], labels=[style.safe(text)], colors=[color], radii=[1e-4], show_labels=True
-    )
 
 
 def _markdown(text: str) -> rr.TextDocument:

@@ -72,7 +72,7 @@ def _obstacles(rec: rr.RecordingStream, things: tuple[Obstacle, ...]) -> None:
             rr.Points3D(
                 [_named_at(x) for x in things],
                 labels=[style.safe(x.name) for x in things],
-                colors=[plan_style.TEXT],
+                colors=[style.LABEL],
                 radii=[1e-4],
                 show_labels=True,
             ),
@@ -157,7 +157,7 @@ def _tracker(rec: rr.RecordingStream, place: Floats) -> None:
         rr.Points3D(
             [place + 2.2 * _HEAD * up],
             labels=["tracker"],
-            colors=[plan_style.TEXT],
+            colors=[style.LABEL],
             radii=[1e-4],
             show_labels=True,
         ),

@@ -88,7 +88,7 @@ def _label(rec: rr.RecordingStream, d: PlanDigest, time: list[rr.TimeColumn]) ->
         columns=rr.Points3D.columns(
             positions=above + np.array([0.0, 0.0, 0.25 * _LABEL_ABOVE]),
             labels=words,
-            colors=plan_style.text_colors(d.sight),
+            colors=np.tile(np.array(style.LABEL, dtype=np.uint8), (len(d), 1)),
             radii=np.full(len(d), 1e-4),
             show_labels=[True] * len(d),
         ),

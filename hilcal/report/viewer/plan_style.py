@@ -13,8 +13,6 @@ Colors = NDArray[np.uint8]
 SIGHT_COLORS = np.array([style.NOISE, style.AMBER, style.RED, style.GREY], dtype=np.uint8)
 SIGHT_WORDS = ("seen", "turned too far away", "hidden", "sight not checked")
 # Labels stand on a plate in the theme's colour: these have a contrast of about 3 on both.
-TEXT: style.Color = (128, 131, 140)
-_SIGHT_TEXT = np.array([(0, 158, 115), (190, 125, 0), (225, 60, 95), TEXT], dtype=np.uint8)
 BARE: style.Color = (225, 226, 230)
 """Of what is unloaded."""
 # After Okabe & Ito's set for colour-blind readers, without the green, amber and red of the sight.
@@ -45,8 +43,3 @@ def load_colors(names: tuple[str, ...]) -> Colors:
 def sight_colors(sight: Ints) -> Colors:
     """(S, 3) colour of the beam of each step."""
     return np.asarray(SIGHT_COLORS[sight])
-
-
-def text_colors(sight: Ints) -> Colors:
-    """(S, 3) colour of the label of each step."""
-    return np.asarray(_SIGHT_TEXT[sight])

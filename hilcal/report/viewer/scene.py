@@ -2,7 +2,6 @@
 
 import numpy as np
 import rerun as rr
-from numpy.typing import NDArray
 
 from hilcal.report.story import StoryRevision
 from hilcal.report.viewer import arm_shapes, style
@@ -53,13 +52,11 @@ def revision_scene(rec: rr.RecordingStream, d: Digest, r: StoryRevision) -> None
             fill_mode="solid",
         ),
     )
-    level = int(style.levels(r.whitened_norm2[worst : worst + 1])[0])
     rec.log(
         "world/residual/worst",
-        _label(
+        label(
             story.anchor[worst] + _LABEL_ABOVE,
             f"worst: pose {story.pose_name(worst)}, {pose_words(d, r, worst)}",
-            style.LABEL_COLORS[level],
         ),
     )
     rec.log(
@@ -119,7 +116,7 @@ def pose_scene(rec: rr.RecordingStream, d: Digest) -> None:
         columns=rr.Points3D.columns(
             positions=story.anchor[worst] + _LABEL_ABOVE,
             labels=[style.safe(f"pose {story.pose_name(i)}: {pose_words(d, r, i)}") for i in worst],
-            colors=style.LABEL_COLORS[style.levels(r.whitened_norm2[worst])],
+            colors=np.tile(np.array(style.LABEL, dtype=np.uint8), (len(worst), 1)),
             radii=np.full(len(worst), 1e-4),
             show_labels=[True] * len(worst),
         ),
@@ -197,7 +194,8 @@ def _deflections(rec: rr.RecordingStream, d: Digest, r: StoryRevision) -> None:
     )
 
 
-def _label(position: Floats, text: str, color: NDArray[np.uint8]) -> rr.Points3D:
+def label(position: Floats, text: str) -> rr.Points3D:
+    """Return words at a place, in the colour that is legible in both themes."""
     return rr.Points3D(
-        [position], labels=[style.safe(text)], colors=[color], radii=[1e-4], show_labels=True
+        [position], labels=[style.safe(text)], colors=[style.LABEL], radii=[1e-4], show_labels=True
     )

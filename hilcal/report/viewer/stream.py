@@ -51,7 +51,9 @@ def record(story: Story, *sinks: Sink, limits: Limits | None = None) -> rr.Recor
         HilcalError: a sink does not take the data (disk full, ...).
     """
     d, rec = _open(story, limits)
-    rec.set_sinks(*sinks, default_blueprint=layout.blueprint(d))
+    rec.set_sinks(*sinks)
+    # Active, too: a viewer that has shown another recording would keep the layout of that one.
+    rec.send_blueprint(layout.blueprint(d), make_active=True, make_default=True)
     tell(rec, d)
     return rec
 
@@ -168,7 +170,7 @@ def write(
         HilcalError: the file cannot be written.
     """
     memory = rec.memory_recording()
-    rec.send_blueprint(blueprint, make_active=False, make_default=True)
+    rec.send_blueprint(blueprint, make_active=True, make_default=True)
     tell()
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:

@@ -19,7 +19,9 @@ PREDICTED: Color = (240, 240, 240)
 NOISE: Color = (0, 158, 115)
 HOLDOUT: Color = (204, 121, 167)
 LEVEL_COLORS = np.array([GREY, AMBER, RED], dtype=np.uint8)
-LABEL_COLORS = np.array([(225, 226, 230), AMBER, RED], dtype=np.uint8)
+# Words in a picture stand in a box that the viewer makes: almost black in its dark theme, a middle
+# grey in its light one. Only white is legible in both, so colours are told by marks beside words.
+LABEL: Color = (255, 255, 255)
 LEADER: Color = (165, 168, 176)
 LEVEL_NAMES = ("inside", "doubtful", "outside")
 
