@@ -36,6 +36,7 @@ class Tab:
         picked: measurements of the story that were clicked; None before.
         told: what they are, in words.
         dark: whether the browser asks for a dark page.
+        looks: whether the 3-D view was asked for.
         viewer: address of the 3-D view; empty before it was opened.
     """
 
@@ -45,6 +46,7 @@ class Tab:
     picked: list[int] | None = None
     told: str = ""
     dark: bool = False
+    looks: bool = False
     viewer: str = ""
 
 
@@ -55,7 +57,7 @@ class Bench:
     session: Session
     work: Work = field(default_factory=Work)
     viewer: WebViewer = field(default_factory=WebViewer)
-    drawing: tuple[Desk, str] | None = None
+    drawing: tuple[Desk, tuple[str, ...]] | None = None
 
 
 def install(app: FastAPI, session: Session) -> None:
@@ -146,10 +148,13 @@ class View:
                 self.draw()
         if self.session.planned is not self._planned:
             self.draw_plan()
-        if self.shared.drawing is not None and self.tab.viewer != self.shared.drawing[1]:
-            desk, self.tab.viewer = self.shared.drawing
-            if desk is self.tab.desk:
-                self.draw_below()
+        drawing = self.shared.drawing
+        asked = self.tab.looks and not self.tab.viewer
+        if asked and drawing is not None and drawing[0] is self.tab.desk:
+            at = f"{self.address}viewer/"
+            files = "".join(f"&url={at}{name}" for name in drawing[1])
+            self.tab.viewer = f"{at}?persist=0&notebook=0&theme=dark{files}"
+            self.draw_below()
 
     def look(self) -> None:
         """Say when another command has changed the file."""
@@ -224,12 +229,14 @@ class View:
         )
 
     def open_viewer(self) -> None:
-        """Prepare the 3-D view."""
+        """Prepare the 3-D view, unless another tab has."""
+        self.tab.looks = True
+        if self.shared.drawing is not None and self.shared.drawing[0] is self.tab.desk:
+            return
 
         def act(desk: Desk, say: Say) -> None:
-            name = self.shared.viewer.prepare(desk.story, self.session.count, say)
-            at = f"{self.address}viewer/"
-            self.shared.drawing = desk, f"{at}?persist=0&hide_welcome_screen&url={at}{name}"
+            names = self.shared.viewer.prepare(desk.story, self.session.count, say)
+            self.shared.drawing = desk, names
 
         self.do("Opening the 3-D view", act)
 

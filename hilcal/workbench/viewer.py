@@ -49,10 +49,12 @@ class WebViewer:
     def __init__(self) -> None:
         """Begin with nothing."""
         self._files: dict[str, bytes] = {}
-        self._recording: tuple[str, bytes] = ("", b"")
+        self._recorded: dict[str, bytes] = {}
 
-    def prepare(self, story: Story, count: int, say: Say) -> str:
-        """Record a story, and return the path at which the viewer shows it.
+    def prepare(self, story: Story, count: int, say: Say) -> tuple[str, ...]:
+        """Record a story, and return the names of the files by which the viewer shows it.
+
+        The layout is a file of its own: a web viewer takes the one in a recording for a proposal.
 
         Args:
             story: it.
@@ -63,23 +65,28 @@ class WebViewer:
             HilcalError: the viewer cannot be had, or the story not be recorded.
         """
         from hilcal.report.viewer import save  # loads the viewer's library, which takes a while
+        from hilcal.report.viewer.digest import Limits, digest
+        from hilcal.report.viewer.layout import blueprint
+        from hilcal.report.viewer.stream import APPLICATION
 
         say("recording")
+        names = (f"story-{count}.rrd", f"layout-{count}.rbl")
         with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "story.rrd"
-            save(story, path)
-            recorded = path.read_bytes()
+            paths = [Path(folder) / name for name in names]
+            save(story, paths[0])
+            blueprint(digest(story, Limits())).save(APPLICATION, str(paths[1]))
+            recorded = {path.name: path.read_bytes() for path in paths}
         if not self._files:
             say("preparing the viewer")
             self._files = _fetched()
-        self._recording = (f"story-{count}.rrd", recorded)
-        return self._recording[0]
+        self._recorded = recorded
+        return names
 
     def file(self, name: str) -> tuple[bytes, str] | None:
         """Return content and kind of a file; None where there is none of this name."""
         name = name or "index.html"
-        if name == self._recording[0]:
-            return self._recording[1], RECORDING
+        if name in self._recorded:
+            return self._recorded[name], RECORDING
         return (self._files[name], FILES[name]) if name in self._files else None
 
 

@@ -285,7 +285,7 @@ def test_the_next_measurement_is_planned_and_the_arm_is_seen(
     told: list[str] = []
     with workbench(tmp_path) as served:
         page = opened(browser, served, told, viewport=DESKTOP)
-        page.get_by_label("poses").fill("8")
+        page.get_by_label("poses (as needed)").fill("8")
         page.get_by_role("button", name="Plan the next measurements").click()
         expect(page.locator("[data-part=planned]")).to_contain_text("readings at", timeout=WAIT)
         expect(page.locator(".code")).to_contain_text("--append --plan")
