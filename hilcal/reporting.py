@@ -4,18 +4,22 @@ import hashlib
 import os
 import tempfile
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import hilcal
 from hilcal.campaign import Campaign
 from hilcal.data.overview import overview
 from hilcal.data.plan import Plan
-from hilcal.data.revision import utc_now
+from hilcal.data.procedure_log import ProcedureLog
+from hilcal.data.revision import RevisionRecord, utc_now
 from hilcal.data.run_log import PLAN, RunLog
 from hilcal.data.whitening import SCALINGS, Scaling
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.fit import Fit, fit
+from hilcal.procedure.state import IMPROVED, Files
 from hilcal.report.build_story import Chapter, build_story
 from hilcal.report.html.material import Material, Tested
 from hilcal.validate import validate
@@ -62,7 +66,8 @@ def report(
         run: the campaign; without a revision the baseline is fitted, and not kept.
         path: of the page; a file that is there is replaced.
         later: a later campaign of the same arm: the page compares the two.
-        validation: a campaign that was never fitted: the page says how well it is predicted.
+        validation: a campaign that was never fitted: the page says how well it is predicted; where
+            None, the one that `calibrate` has put beside the campaign, if there is one.
         limit_m: the largest 3-D position error that is allowed, m.
         operator: who answers for the measurement.
         revision: what the page is about; the one in use where None.
@@ -115,7 +120,13 @@ def write_report(
         from hilcal.report.html.certificate import first_screen
         from hilcal.report.html.page import page
 
-        m = material(run, validation, limit_m, operator, revision, say)
+        with ExitStack() as stack:
+            beside = Files(run.path).validation
+            if validation is None and beside.is_file():
+                say(f"taking {beside.name}, which stands beside it, as validation campaign")
+                opened = Campaign.open(beside, run.catalogue, read_only=True)
+                validation = stack.enter_context(opened)
+            m = material(run, validation, limit_m, operator, revision, say)
         say("writing the page")
         html, first = page(m), first_screen(m)
         verdict = None if m.diagnosis is None else m.diagnosis.verdict
@@ -164,6 +175,7 @@ def material(
         scalings=_scalings(last, chapters, say),
         plan=_plan(run),
         tested=tested,
+        corrected=_corrected(run, record),
         limit_m=limit_m,
         operator=operator,
         commands=tuple(commands),
@@ -182,6 +194,14 @@ def _scalings(last: Fit, chapters: list[Chapter], say: Say) -> dict[Scaling, Fit
         except CannotAnswerError:
             continue
     return out
+
+
+def _corrected(run: Campaign, record: RevisionRecord | None) -> dict[str, Any] | None:
+    """Return the gain at corrected targets that was measured with this very revision."""
+    found = ProcedureLog(run.file).last(IMPROVED)
+    if found is None or record is None or found["revision"] != record.number:
+        return None
+    return found
 
 
 def _plan(run: Campaign) -> Plan | None:

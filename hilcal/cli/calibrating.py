@@ -144,6 +144,8 @@ def calibrate(
         f"{files.corrected.name}. Correct your points and programs with:"
     )
     t.command(shlex.join(["hilcal", "compensate", str(output), "POINTS"]))
+    t.show("Write it up as one HTML page, with a certificate first:")
+    t.command(shlex.join(["hilcal", "report", str(output), "--operator", "NAME"]))
     failed: HilcalError | None = None
     if limit_m is not None and found.over(limit_m):
         words = text_calibrate.failure(found, limit_m)

@@ -162,6 +162,8 @@ def demo(
     files_given = [*(effects_from or ()), *(() if laws is None else laws.files.values())]
     more = "".join(f" --effects-from {path}" for path in files_given)
     t.show(f"\nThe campaign is in {output}. Go on with: hilcal view {output}{more}")
+    t.show("As one HTML page, with a certificate first:")
+    t.command(f"hilcal report {output}{more}")
     t.document(
         {
             "campaign": str(output),

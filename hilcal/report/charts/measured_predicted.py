@@ -54,6 +54,6 @@ def measured_predicted(story: Story, revision: StoryRevision) -> go.Figure:
         f"Measured against predicted {what}: the model accounts for {share:.1f} % of what was "
         f"measured.{d.note}"
     )
-    return style.figure(
-        says, x=f"predicted {what} [µm]", y=f"measured {what} [µm]", traces=traces, height=420
-    )
+    short = what.split(" ")[0]
+    titles = {"x": f"predicted {short} [µm]", "y": f"measured {short} [µm]"}
+    return style.figure(says, **titles, traces=traces, height=420)

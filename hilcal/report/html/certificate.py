@@ -1,7 +1,8 @@
 """The first page: verdict, before and after, limit, uncertainty, what was not tested, by what."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -134,6 +135,14 @@ def _cards(m: Material, fit: Fit) -> Iterator[Card]:
         e = m.tested.prediction.error
         seen = "never fitted" if m.tested.judged.unseen else "fitted, so no test"
         yield Card("After, validation", mm(e.rms_m), f"rms; largest {mm(e.max_m)}; {seen}")
+    if m.corrected is not None:
+        e = m.corrected["error"]
+        before_m, after_m = (mm(float(e[k]["rms_m"])) for k in ("before", "after"))
+        yield Card(
+            "Measured at corrected targets",
+            after_m,
+            f"rms; {before_m} without correction; {e['count']} points",
+        )
     held = fit.holdout
     yield Card("After, poses left out", mm(held.rms_m), f"rms; largest {mm(held.max_m)}")
     yield Card("Noise alone", mm(m.story.noise_floor_m), "rms that no model can go below")
@@ -179,12 +188,26 @@ def certificate(m: Material) -> Section:
     fit = m.fit
     parts: list[Part] = [Words(text.before_and_after(fit))]
     parts += from_terminal([text.errors(fit)], "Error before and after")
+    if m.corrected is not None:
+        parts.append(_corrected(m.corrected))
     parts += [Words("Poses and loads", "heading"), *_conditions(m)]
     parts += [Words("Limit", "heading"), *_limit(m)]
     parts += [Words("Uncertainty", "heading"), *_uncertainty(fit)]
     parts += [Words("What was not tested", "heading"), Items(tuple(not_tested(m)))]
     parts += [Words("Measured with", "heading"), *_instruments(m)]
     return Section("certificate", "Certificate", tuple(parts))
+
+
+def _corrected(found: Mapping[str, Any]) -> Table:
+    """Errors where the arm was moved to corrected joint targets and measured again."""
+    rows = []
+    for part in (*found["loads"], found["error"]):
+        name = "unloaded" if part["name"] == UNLOADED else str(part["name"])
+        sizes = [part[when][k] for when in ("before", "after") for k in ("rms_m", "max_m")]
+        within = f"{part['inside']} of {part['count']}"
+        rows.append((name, str(part["count"]), *(mm(float(x)) for x in sizes), within))
+    heads = ("load", "n", "before, rms", "largest", "corrected, rms", "largest", "in 95 % band")
+    return table("Measured at uncorrected and at corrected joint targets", heads, rows)
 
 
 def _conditions(m: Material) -> Iterator[Part]:
@@ -345,7 +368,8 @@ def _instruments(m: Material) -> Iterator[Part]:
             ),
         )
     else:
-        yield Words("The file names no instrument: the readings were imported from a table.")
+        imported = ": the readings were imported from a table" if o.planned is None else ""
+        yield Words(f"The file names no instrument{imported}.")
     yield Words(f"Noise of the readings: {covariance_words(m.covariance)}.", "note")
     revision = m.chapters[-1].number
     yield table(

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from hilcal.data.overview import Overview
 from hilcal.data.plan import Plan
@@ -54,6 +55,8 @@ class Material:
         scalings: the last model fitted with each scaling.
         plan: what was planned; None where nothing was.
         tested: on readings that were never fitted; None without a validation campaign.
+        corrected: error at uncorrected and at corrected joint targets, as `calibrate` measured it
+            with this revision and the file keeps it: a document of `Improvement`; None without.
         limit_m: the largest 3-D position error that is allowed, m; None without a limit.
         operator: who answers for the measurement; empty where nobody is named.
         commands: that lead to the same result.
@@ -71,6 +74,7 @@ class Material:
     scalings: Mapping[Scaling, Fit]
     plan: Plan | None
     tested: Tested | None
+    corrected: Mapping[str, Any] | None
     limit_m: float | None
     operator: str
     commands: tuple[str, ...]
