@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from nicegui import ui
-from nicegui.events import GenericEventArguments
+from nicegui.events import GenericEventArguments, TableSelectionEventArguments
 
 from hilcal.data.plan import UNLOADED
 from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.diagnose.distinguish import Difference
 from hilcal.diagnose.effect_ranking import Suspect
 from hilcal.report import numbers, text, text_next, text_refine
-from hilcal.report.charts import error_per_revision, measured_predicted, misfit, residuals, style
+from hilcal.report.charts import error_per_revision, measured_predicted, misfit, residuals
 from hilcal.report.charts.added_variable import added_variable
 from hilcal.report.charts.residual_over import residual_over
 from hilcal.report.verdict_words import message
@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 CERTAIN = text.CERTAIN
 SUSPECTS = 6
 FURTHEST = 8
+FURTHEST_SHARE = 0.05
+"""Share of the readings that are compared with the others as those furthest off; a choice."""
 DIFFERENCES = 4
 
 
@@ -35,7 +37,11 @@ def waiting(view: View) -> None:
     """Say that nothing is there yet."""
     with ui.column().classes("part").style("margin-top: 16px"):
         ui.html(f"<h2>{plain(view.session.path.name)}</h2>", sanitize=False)
-        ui.label("The readings are fitted and judged; this takes some seconds.").classes("soft")
+        if view.work.failure:
+            ui.label("There is nothing to show: see above.").classes("soft")
+            button(view, "Read it again", view.again, "outline")
+        else:
+            ui.label("The readings are fitted and judged; this takes some seconds.").classes("soft")
 
 
 def desk(view: View, d: Desk) -> None:
@@ -102,8 +108,8 @@ def verdict(view: View, d: Desk) -> None:
             number("error on fitted poses", numbers.length(fit.error.rms_m))
             number("noise alone would leave", numbers.length(d.story.noise_floor_m))
             low, high = fit.variance_factor_interval
-            number(f"variance factor, 95 %: {low:.2g} to {high:.2g}",
-                   numbers.digits(fit.variance_factor))  # fmt: skip
+            interval = f"{numbers.digits(low, 2)} to {numbers.digits(high, 2)}"
+            number(f"variance factor, 95 %: {interval}", numbers.digits(fit.variance_factor))
         model(view, d)
 
 
@@ -173,6 +179,12 @@ def missing(view: View, d: Desk) -> None:
             view.choose(row["effect"])
 
         table.on("row-click", clicked)
+
+        def ticked(e: TableSelectionEventArguments) -> None:
+            for row in e.selection:
+                view.choose(row["effect"])
+
+        table.on_select(ticked)
         same = rows[0].same_as if rows[0].passes else ()
         if same:
             ui.label(
@@ -284,12 +296,10 @@ def difference(x: Difference) -> str:
 
 
 def furthest(d: Desk) -> list[int]:
-    """Return the readings outside the noise; where none is, those that are furthest off."""
+    """Return the readings that are furthest off, in units of the noise."""
     norm2 = d.revision.whitened_norm2
-    outside = np.flatnonzero(style.levels(norm2) == len(style.LEVELS) - 1)
-    if len(outside) == 0:
-        outside = np.argsort(-norm2, kind="stable")[:FURTHEST]
-    return [int(k) for k in outside[np.argsort(-norm2[outside], kind="stable")]]
+    count = max(FURTHEST, round(FURTHEST_SHARE * len(norm2)))
+    return [int(k) for k in np.argsort(-norm2, kind="stable")[:count]]
 
 
 def fell(view: View, d: Desk) -> None:

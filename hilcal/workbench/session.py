@@ -132,7 +132,7 @@ class Session:
             InputError: no revision, or a desk that is gone.
             CannotAnswerError: the readings do not determine it.
         """
-        with self._writing(desk) as o:
+        with self._writing(desk, changed=True) as o:
             record = o.in_use()
             if record is None:
                 raise InputError(f"{o.path}: no revision yet")
@@ -206,13 +206,17 @@ class Session:
     def _open(self, *, read_only: bool) -> Campaign:
         return Campaign.open(self.path, self._catalogue, read_only=read_only)
 
-    def _writing(self, desk: Desk | None) -> Campaign:
+    def _writing(self, desk: Desk | None, *, changed: bool = False) -> Campaign:
         """Open the file for a change that was asked for at a desk.
+
+        Args:
+            desk: it.
+            changed: whether another command may have changed the file since.
 
         Raises:
             InputError: the session, or the file, has gone on since.
         """
-        self._require(desk)
+        self._require(desk, changed=changed)
         o = self._open(read_only=False)
         try:
             refuse_fitting(o.file)
@@ -222,10 +226,10 @@ class Session:
             raise
         return o
 
-    def _require(self, desk: Desk | None) -> None:
+    def _require(self, desk: Desk | None, *, changed: bool = False) -> None:
         if desk is not self.desk:
             raise InputError("the workbench has gone on since that click; nothing was changed")
-        if self.stale:
+        if self.stale and not changed:
             raise InputError(
                 f"{self.path.name} was changed by another command; read it again first"
             )

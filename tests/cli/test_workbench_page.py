@@ -1,6 +1,7 @@
 """`hilcal workbench` as a process: who may talk to it, what the operator clicks, how it looks."""
 
 import json
+import os
 import re
 import signal
 import socket
@@ -254,6 +255,14 @@ def test_an_operator_sees_adds_removes_and_goes_back(browser: Browser, served: S
         used = o.in_use()
         assert used is not None
         assert used.number == 2
+
+    os.utime(served.run)  # as another command leaves it
+    page.get_by_text("Another command has changed the file").wait_for()
+    page.get_by_role("button", name=f"Remove {BASE}").click()
+    expect(page.get_by_role("alert")).to_contain_text("read it again first")
+    page.get_by_role("button", name="Read it again").click()
+    page.get_by_text("Another command has changed the file").wait_for(state="hidden")
+    assert number(page, "error on poses left out") == after
     assert told == []
 
 
