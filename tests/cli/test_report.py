@@ -1,9 +1,17 @@
 """`report`: the page, its JSON document, and what it refuses."""
 
+import hashlib
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from hilcal.data.campaign_file import CampaignFile
+from hilcal.robot.catalogue import configs_dir
+from studies.change import measured
+from tests.support.campaigns import campaign as simulated
+from tests.support.campaigns import cell_of, configuration
 from tests.support.cli_cases import ok, refused
 from tests.support.report_pages import write_campaign
 
@@ -34,6 +42,26 @@ def test_a_campaign_that_nothing_was_fitted_to_has_a_page_of_the_baseline(
     assert "the baseline was fitted for this report" in text
     assert "FAILED: 0 of" in text
     assert campaign.read_bytes() == before
+
+
+@pytest.mark.slow
+def test_two_campaigns_of_one_arm_have_a_page_that_says_what_has_changed(
+    campaign: Path, capsys: Capsys
+) -> None:
+    world = simulated("joint_tilt_compliance", "deflection", poses=6, strength=8.0).world
+    compliance = world.physics.joint_compliance * [1, 2, 1, 1, 1, 1]
+    worn = replace(world, physics=world.physics.with_effect("joint_compliance", compliance))
+    config, later = configuration(), campaign.with_name("later.hilcal")
+    loads = [(load.name, load.wrench(cell_of().gravity)) for load in config.loads]
+    base = str(configs_dir() / "cells")
+    with CampaignFile.create(later, config.to_json(), base, "test") as file:
+        file.append_readings(measured(worn, loads, 4, np.random.default_rng(8)))
+    page = campaign.with_name("both.html")
+    found = ok(capsys, "report", campaign, later, "-o", page, "--json").document
+    assert found["headline"] == "Something has changed: joint 2"
+    text = page.read_text(encoding="utf-8")
+    for file in (campaign, later):
+        assert hashlib.sha256(file.read_bytes()).hexdigest() in text
 
 
 @pytest.mark.parametrize(

@@ -98,7 +98,7 @@ def _evidence(m: Material) -> Section:
     parts += [chart("Suspects", suspects(d)), chart("Evidence", evidence(d))]
     parts.append(_suspects(d.suspects[:MOST_LISTED], "Suspects, best first"))
     parts += from_terminal([*doubtful(d), *redundant_line(d)])
-    tested = [s for s in d.suspects if s.score.rank > 0]
+    tested = [s for s in d.suspects if s.score.rank > 0 and s.plausible]
     strong = [s for s in tested if s.explains or s.score.p_value < text.CERTAIN]
     for s in strong[:MOST_SUSPECTS] or tested[:1]:
         found = regressor(d.fit, s)
