@@ -265,6 +265,56 @@ def _power(rng: np.random.Generator) -> Foreign:
     return Foreign(words, displaced, (f"joint {j}",), frozenset({_torque(j)}))
 
 
+def _scale_waves(rng: np.random.Generator) -> Foreign:
+    """The waves of an encoder's scale, drawn with their number per turn and phase."""
+    j, waves = int(rng.integers(1, 6)), int(rng.integers(9, 29))
+    phase = float(rng.uniform(0, 2 * np.pi))
+    return Foreign(
+        f"dq_{j} = c cos({waves} q_{j} - {phase:.1f})",
+        lambda s: s.of_joint(j, np.cos(waves * s.states.q[:, j - 1] - phase)),
+        (f"joint {j}",), frozenset({_angle(j)}),
+    )  # fmt: skip
+
+
+def _softens_warm(rng: np.random.Generator) -> Foreign:
+    """A gear whose plastic part softens with the temperature of its own joint."""
+    j = int(rng.integers(2, 5))
+
+    def displaced(s: Scene) -> Floats:
+        warm = _given(s.states.joint_temperature)[:, j - 1] - 25.0
+        return s.of_joint(j, s.torque[:, j - 1] * warm)
+
+    names = frozenset({_torque(j), f"joint {j} temperature"})
+    return Foreign(f"dq_{j} = c tau_{j} (T_{j} - 25)", displaced, (f"joint {j}",), names)
+
+
+def _settling(rng: np.random.Generator) -> Foreign:
+    """A gear that settles in the course of the campaign, fast at first."""
+    j = int(rng.integers(2, 4))
+
+    def displaced(s: Scene) -> Floats:
+        time = _given(s.states.time)
+        return s.of_joint(j, s.torque[:, j - 1] * np.sqrt(time - time.min()))
+
+    return Foreign(
+        f"dq_{j} = c tau_{j} sqrt(t)", displaced, (f"joint {j}",), frozenset({_torque(j), "time"})
+    )
+
+
+def _wrist_bundle(rng: np.random.Generator) -> Foreign:
+    """A bundle of cables that bends with the turn of two wrist joints together."""
+    j, k = (4, 5) if rng.random() < 0.5 else (5, 6)
+    phase = float(rng.uniform(0, 2 * np.pi))
+
+    def displaced(s: Scene) -> Floats:
+        turn = s.states.q[:, j - 1] + s.states.q[:, k - 1]
+        return s.of_joint(j - 1, np.exp(np.cos(turn - phase)))
+
+    names = frozenset({_angle(j), _angle(k)})
+    words = f"dq_{j - 1} = c exp(cos(q_{j} + q_{k} - {phase:.1f}))"
+    return Foreign(words, displaced, (f"joint {j - 1}",), names)
+
+
 KINDS: dict[str, tuple[str, Draw]] = {
     "one-sided compliance": (DEFLECTION, _one_sided),
     "preload": (DEFLECTION, _dead_zone),
@@ -279,5 +329,9 @@ KINDS: dict[str, tuple[str, Draw]] = {
     "soft mount": (ABSOLUTE, _mount),
     "refraction": (ABSOLUTE, _refraction),
     "fractional power": (DEFLECTION, _power),
+    "waves of a scale": (ABSOLUTE, _scale_waves),
+    "softer when warm": (DEFLECTION, _softens_warm),
+    "settling gear": (DEFLECTION, _settling),
+    "wrist bundle": (ABSOLUTE, _wrist_bundle),
 }
 """Laws by name: the readings that show them, and how one is drawn."""
