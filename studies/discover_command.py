@@ -70,7 +70,10 @@ def discover(
     figures = list(claims(outcomes))
     for f in figures:
         t.show(f"{f.what}: {f.measured}; required {f.required}")
-    keep(keep_file, "Laws discovered, and none where none is hidden", figures)
+    title = "Laws discovered, and none where none is hidden"
+    if law:
+        title = f"Laws discovered: {', '.join(law)}"
+    keep(keep_file, title, figures)
     t.document({"cases": [asdict(o) for o in outcomes], "figures": [asdict(f) for f in figures]})
 
 
