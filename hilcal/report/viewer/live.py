@@ -19,7 +19,7 @@ from hilcal.report.viewer.stream import APPLICATION, Sink, disable_analytics, fr
 PORTS = 20
 """Ports that are tried, from the wanted one; a choice."""
 MEMORY = "256MiB"
-"""What the server keeps for viewers that come late at most; a choice, some 10,000 readings."""
+"""What the server keeps for viewers that come late at most; a choice, some 5000 readings."""
 _FLUSH_S = 5.0
 _END_S = 8.0
 

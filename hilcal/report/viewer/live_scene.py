@@ -140,6 +140,8 @@ class LiveScene:
             self._log(f"{what.done}/{what.total} {what.step}{figures(what)}")
         elif isinstance(what, Phase):
             d.phase = what.text
+            if self._batches:  # a file needs no word on what is going on between two readings
+                return
         elif isinstance(what, Remark | GoalMet):
             text = what.text if isinstance(what, Remark) else met_words(what)
             d.remarks.append(text)

@@ -151,7 +151,7 @@ def _axes(
     rec: rr.RecordingStream, frame: Frame, x: Floats, names: list[str], above: str, below: str
 ) -> None:
     """Log ticks, those of x with their names, and what is seen: a title, and what the axes are."""
-    y = ticks(*frame.y, most=4)
+    y = ticks(*frame.y, most=5)
     rec.log("regressor/axes", frame.lines(x, y))
     at_x = frame.place(x, np.full(len(x), frame.y[0]))[:, 0]
     at_y = frame.place(np.full(len(y), frame.x[0]), y)[:, 1]
