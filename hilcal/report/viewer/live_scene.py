@@ -27,6 +27,8 @@ from hilcal.robot.body import body_poses
 _ABOVE = np.array([0.0, 0.0, 1.3 * BALL])
 BALLS = 60
 """Readings from which a ball is drawn only where its arrow leaves it, for legibility."""
+MANY = 300
+"""Readings from which only arrows are drawn, and only those that leave their balls; a choice."""
 
 
 class LiveScene:
@@ -159,16 +161,17 @@ class LiveScene:
             rec.log(f"{self._world}/dots", dot)
         else:
             words += f": {live_words.residual(found)}"
-            rec.log(
-                f"{self._world}/arrows",
-                rr.Arrows3D(
-                    origins=[at],
-                    vectors=[arrow(event.live, found)],
-                    colors=[style.LEVEL_COLORS[found.level]],
-                    radii=[0.0055 if found.level else 0.0035],
-                ),
-            )
-            if found.level or d.judged <= BALLS:
+            if found.level or d.judged <= MANY:
+                rec.log(
+                    f"{self._world}/arrows",
+                    rr.Arrows3D(
+                        origins=[at],
+                        vectors=[arrow(event.live, found)],
+                        colors=[style.LEVEL_COLORS[found.level]],
+                        radii=[0.0055 if found.level else 0.0035],
+                    ),
+                )
+            if d.judged <= (MANY if found.level else BALLS):
                 rec.log(
                     f"{self._world}/balls",
                     rr.Ellipsoids3D(

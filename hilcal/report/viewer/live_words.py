@@ -17,6 +17,7 @@ readings **before** it.
 the model does not know yet would leave 99 % of the readings; an arrow that leaves its ball = the
 model is wrong there. All arrows are in units of that noise. Grey: noise. Amber: beyond 99 %.
 Red: beyond 99.99 %. Blue dots were measured before there was a model, or in an earlier session.
+After 300 readings only arrows that leave their balls are drawn; below stand all.
 
 **Residual of each reading** (below): the same along the time of day, in σ as on the
 terminal (rms of the three axes): 1 is noise, the green line 99 %.

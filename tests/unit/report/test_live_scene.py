@@ -12,7 +12,7 @@ from hilcal.acquire.progress import ReadingStored, Remark
 from hilcal.report.live_messages import Revised
 from hilcal.report.viewer import live_words, style
 from hilcal.report.viewer.live_digest import BALL, LiveDigest, judged
-from hilcal.report.viewer.live_scene import LiveScene
+from hilcal.report.viewer.live_scene import MANY, LiveScene
 from tests.support.live_story import BLIND, events, measuring, plan
 from tests.support.picture import Shot, pictures, vulkan_available
 from tests.support.viewer_story import story
@@ -74,6 +74,16 @@ def test_each_reading_has_its_arrow_and_leaves_its_ball_where_the_model_is_wrong
     sigma = rows(measured, "/live/1/outside", "Scalars:scalars")
     assert len(sigma) == sum(j.level == 2 for j in found)
     assert np.ravel(sigma) == pytest.approx([j.sigma for j in found if j.level == 2])
+
+
+def test_of_many_readings_only_those_outside_are_drawn_in_space(tmp_path):
+    told = measuring(plan(200))
+    path = recorded(tmp_path / "many.rrd", events(told))
+    stored = [e for _, e in events(told) if isinstance(e, ReadingStored)][BLIND:]
+    outside = [judged(e.step, e.live).level > 0 for e in stored]
+    arrows = rows(path, "/world/live/1/arrows", "Arrows3D:vectors")
+    assert len(arrows) == MANY + sum(outside[MANY:]) < len(stored)
+    assert len(rows(path, "/live/1/limit", "Scalars:scalars")) == len(stored)
 
 
 def test_the_arm_moves_through_every_place_that_is_told(measured):

@@ -77,12 +77,13 @@ def client(url: str, path: Path) -> subprocess.Popen[bytes]:
 
 
 def readings(path: Path) -> int:
-    """Readings with an arrow that a recording has so far; it may still be growing."""
+    """Compared readings that a recording has so far; it may still be growing."""
     if not path.exists() or path.stat().st_size == 0:
         return 0
     try:
-        chunks = RrdReader(path).stream().filter(content="/world/live/1/arrows").to_chunks()
-        return sum(c.to_record_batch().num_rows for c in chunks)
+        chunks = RrdReader(path).stream().filter(content="/live/1/limit").to_chunks()
+        batches = [c.to_record_batch() for c in chunks]
+        return sum(b.num_rows for b in batches if "Scalars:scalars" in b.schema.names)
     except (ValueError, RuntimeError):  # nothing in it yet; a part of a message
         return 0
 
