@@ -139,6 +139,7 @@ def test_it_is_whole_in_a_browser(made, browser: Browser, size, scheme: str) -> 
 
 
 @needs_chromium
+@pytest.mark.slow
 def test_it_prints_on_a4_in_light_colours_with_all_charts(made, browser: Browser) -> None:
     _, path = made
     with opened(browser, path, viewport=DESKTOP, color_scheme="dark") as (page, bad):
