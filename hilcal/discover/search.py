@@ -95,12 +95,20 @@ def _ordered(beside: Beside) -> list[Scored]:
 
 
 def _simplicity(screen: Screen, t: Term) -> tuple[float, ...]:
-    """Coefficients, complexity, and rank of sites and functions, smaller is simpler."""
+    """Coefficients, complexity, rank of sites and functions, joints apart; smaller is simpler.
+
+    Of causes that the readings do not tell apart, as joints that warm alike, the one of the joint
+    itself is simpler than that of another.
+    """
     amplitudes = [screen.grammar.amplitudes[a] for _, a in t.parts]
     cost = max(a.cost for a in amplitudes)
     sites = max(screen.sites[s].rank for s, _ in t.parts)
     functions = max(sum(f.shape.rank for f in a.factors) for a in amplitudes)
-    return t.count, cost, sites, functions
+    apart = max(
+        sum(f.variable.joint not in (-1, screen.sites[s].joint) for f in amplitudes[k].factors)
+        for k, (s, _) in enumerate(t.parts)
+    )
+    return t.count, cost, sites, functions, apart
 
 
 def _keep(best: dict[int, Selection], s: Selection) -> None:

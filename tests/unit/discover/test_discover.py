@@ -23,7 +23,7 @@ from hilcal.discover.problem import Problem, Term
 from hilcal.discover.proposal import LawSearch
 from hilcal.discover.refit import exact
 from hilcal.discover.screen import Screen, screen
-from hilcal.discover.search import search
+from hilcal.discover.search import _simplicity, search
 from hilcal.discover.sites import sites
 from hilcal.discover.variables import variables
 from hilcal.discover.write_effect import effect_class, source_of_form
@@ -331,6 +331,15 @@ def test_fine_waves_are_tried_up_to_the_number_of_poses_and_in_no_product(
     assert place is not None
     partner = words.amplitudes[words.partner[place]].factors[0]
     assert (partner.shape.name, partner.numbers) == ("sin", fine[0].factors[0].numbers)
+
+
+def test_of_equals_the_cause_in_the_joint_itself_is_simpler() -> None:
+    s = screened()
+    by = {a.names: k for k, a in enumerate(s.grammar.amplitudes) if a.names and a.cost == 1}
+    own, other = (
+        _simplicity(s, Term(((2, by[name,]),), 0.0)) for name in ("joint 3 angle", "joint 4 angle")
+    )
+    assert own < other
 
 
 def test_every_quantity_reads_the_same_in_the_written_effect() -> None:
