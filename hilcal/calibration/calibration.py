@@ -61,6 +61,19 @@ class Compensation:
         """(N, n) the joint values, rad."""
         return self.inverse.q
 
+    @property
+    def given(self) -> Floats:
+        """(N, n) the joint values that were given, rad."""
+        return self._states.q
+
+    @property
+    def inside(self) -> Bools:
+        """(N,) whether the point lies within what was measured."""
+        out = np.ones(len(self.q), dtype=bool)
+        for o in self.after.outside:
+            out &= ~o.points
+        return out
+
     @cached_property
     def before(self) -> ToolPoses:
         """The tool at the joint values that were given; without uncertainties."""
@@ -88,9 +101,7 @@ class Compensation:
     def usable(self) -> Bools:
         """(N,) points that are solved, not singular, within limits and what was measured."""
         good = self.inverse.solved & ~self.singular & ~self.limits.any(axis=1)
-        for o in self.after.outside:
-            good &= ~o.points
-        return np.asarray(good)
+        return np.asarray(good & self.inside)
 
     @cached_property
     def _goal(self) -> tuple[Floats, Floats]:

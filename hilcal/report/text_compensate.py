@@ -109,7 +109,12 @@ def _parts(calibration: Calibration) -> list[str]:
 def document(
     calibration: Calibration, names: Sequence[str], c: Compensation, refused: Sequence[str]
 ) -> dict[str, object]:
-    """Return the JSON document, SI."""
+    """Return the JSON document, SI.
+
+    `expected_error_m` is the rms error to be expected at the corrected joint values: what the
+    inversion leaves, and the standard deviation of the position.
+    """
+    expected, inside = np.hypot(c.inverse.residual_m, c.after.std_m), c.inside
     return {
         "calibration": dict(calibration.source),
         "readings": calibration.mode,
@@ -123,6 +128,10 @@ def document(
         "points": [
             {
                 "name": name,
+                "q_command": c.given[k].tolist(),
+                "q_corrected": c.q[k].tolist(),
+                "expected_error_m": float(expected[k]),
+                "inside": bool(inside[k]),
                 "q_rad": c.q[k].tolist(),
                 "before_m": float(c.before.error_m[k]),
                 "before_rad": float(c.before.error_rad[k]),
