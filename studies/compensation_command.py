@@ -82,8 +82,11 @@ def compensation(
     series: Annotated[list[Path], typer.Argument(metavar="F.csv...", help="Series of the UR10.")],
     splits: Annotated[int, typer.Option("--splits", help="Random parts of each series.")] = 3,
     share: Annotated[
-        float, typer.Option("--share", help="Of the poses that is fitted; half: the first, too.")
-    ] = 0.5,
+        float,
+        typer.Option(
+            "--share", min=0.1, max=0.9, help="Of the poses that is fitted; half: the first, too."
+        ),
+    ] = HALF,
     folder: Annotated[
         Path | None,
         typer.Option("--calibrations", metavar="DIR", help="Keep them there; use what is there."),

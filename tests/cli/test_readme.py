@@ -36,7 +36,7 @@ Capsys = pytest.CaptureFixture[str]
 FEW = "candidates = 60\nagainst = []\n"
 """In [planning]: so that planning takes a second."""
 SEED = 3
-ELSEWHERE = {"simulate", "demo", "init"}
+ELSEWHERE = {"simulate", "demo", "init", "workbench"}
 """Commands of the section that other tests run."""
 
 

@@ -259,7 +259,7 @@ def test_an_operator_sees_adds_removes_and_goes_back(browser: Browser, served: S
     os.utime(served.run)  # as another command leaves it
     page.get_by_text("Another command has changed the file").wait_for()
     page.get_by_role("button", name=f"Remove {BASE}").click()
-    expect(page.get_by_role("alert")).to_contain_text("read it again first")
+    expect(page.get_by_role("alert").filter(has_text="read it again first")).to_be_visible()
     page.get_by_role("button", name="Read it again").click()
     page.get_by_text("Another command has changed the file").wait_for(state="hidden")
     assert number(page, "error on poses left out") == after
