@@ -63,7 +63,7 @@ def bars(
         y=[escaped(n) for n in names],
         orientation="h",
         marker={"color": colors},
-        text=[f"{v:.0f}" if abs(v) >= 10 else f"{v:.2g}" for v in values],
+        text=[_short(v) for v in values],
         textposition="auto",
         hovertext=[escaped(h) for h in hover],
         hoverinfo="text",
@@ -73,3 +73,10 @@ def bars(
     out = style.figure(says, x=x, traces=[trace], height=height)
     out.update_yaxes(autorange="reversed")
     return out
+
+
+def _short(value: float) -> str:
+    """A value at the end of its bar, with two digits; what rounds to nothing is 0."""
+    if abs(value) < 0.005:
+        return "0"
+    return f"{value:.0f}" if abs(value) >= 10 else f"{value:.2g}"

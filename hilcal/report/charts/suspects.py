@@ -1,5 +1,6 @@
 """Missing effects, ranked: what each would explain, and how strong the evidence is."""
 
+import numpy as np
 import plotly.graph_objects as go
 
 from hilcal.diagnose.diagnosis import Diagnosis
@@ -48,6 +49,6 @@ def evidence(d: Diagnosis) -> go.Figure:
         "likely with it as without."
     )
     if values[0] < SAME_EVIDENCE:
-        says = f"No effect has evidence of more than e^{SAME_EVIDENCE:.0f} to 1."
+        says = f"No effect has evidence of more than {np.exp(SAME_EVIDENCE):.0f} to 1."
     colors = [style.MEASURED if s.passes else style.GREY for s in rows]
     return bars([s.effect for s in rows], values, hover, says, "log evidence", colors)
