@@ -11,9 +11,9 @@ from nicegui import app as bench
 from nicegui import ui
 
 from hilcal.workbench import parts
-from hilcal.workbench.desk import Desk
 from hilcal.workbench.elements import Status
 from hilcal.workbench.session import Say, Session
+from hilcal.workbench.snapshot import Snapshot
 from hilcal.workbench.viewer import WebViewer
 from hilcal.workbench.work import Work
 
@@ -30,7 +30,7 @@ class Tab:
     """What one tab looks at; nothing of it is stored.
 
     Attributes:
-        desk: the desk that the rest belongs to.
+        snapshot: the snapshot that the rest belongs to.
         suspect: the missing effect whose evidence is shown.
         variable: the variable over which residuals are drawn; None for the pose.
         picked: measurements of the story that were clicked; None before.
@@ -40,7 +40,7 @@ class Tab:
         viewer: address of the 3-D view; empty before it was opened.
     """
 
-    desk: Desk | None = None
+    snapshot: Snapshot | None = None
     suspect: str | None = None
     variable: str | None = None
     picked: list[int] | None = None
@@ -51,18 +51,18 @@ class Tab:
 
 
 @dataclass
-class Bench:
+class Shared:
     """What all tabs share."""
 
     session: Session
     work: Work = field(default_factory=Work)
     viewer: WebViewer = field(default_factory=WebViewer)
-    drawing: tuple[Desk, tuple[str, ...]] | None = None
+    drawing: tuple[Snapshot, tuple[str, ...]] | None = None
 
 
 def install(app: FastAPI, session: Session) -> None:
     """Add the page, and the files of the 3-D viewer, to an application; begin to read."""
-    shared = Bench(session)
+    shared = Shared(session)
 
     @app.get("/viewer/{name:path}")
     def viewer(name: str) -> Response:
@@ -94,7 +94,7 @@ def read(session: Session, revision: int | None = None) -> Callable[[Say], None]
 class View:
     """One tab of the page."""
 
-    def __init__(self, shared: Bench, address: str) -> None:
+    def __init__(self, shared: Shared, address: str) -> None:
         """Begin with what is there.
 
         Args:
@@ -142,7 +142,7 @@ class View:
             return
         state = (self.session.count, self.work.failure, self.work.what is not None)
         if state != self._drawn:
-            redraw = state[0] != self._drawn[0] or self.session.desk is None
+            redraw = state[0] != self._drawn[0] or self.session.snapshot is None
             self._drawn = state
             if redraw:
                 self.draw()
@@ -150,7 +150,7 @@ class View:
             self.draw_plan()
         drawing = self.shared.drawing
         asked = self.tab.looks and not self.tab.viewer
-        if asked and drawing is not None and drawing[0] is self.tab.desk:
+        if asked and drawing is not None and drawing[0] is self.tab.snapshot:
             at = f"{self.address}viewer/"
             files = "".join(f"&url={at}{name}" for name in drawing[1])
             self.tab.viewer = f"{at}?persist=0&notebook=0&theme=dark{files}"
@@ -163,52 +163,54 @@ class View:
     def draw(self) -> None:
         """Draw everything for what the session shows now."""
         self._drawn = (self.session.count, self.work.failure, self.work.what is not None)
-        desk = self.session.desk
-        if desk is not self.tab.desk:
-            named = desk.diagnosis.significant if desk else ()
-            self.tab = Tab(desk, named[0] if named else None, dark=self.tab.dark)
+        snapshot = self.session.snapshot
+        if snapshot is not self.tab.snapshot:
+            named = snapshot.diagnosis.significant if snapshot else ()
+            self.tab = Tab(snapshot, named[0] if named else None, dark=self.tab.dark)
         self.body.clear()
         with self.body:
-            if desk is None:
+            if snapshot is None:
                 parts.waiting(self)
             else:
-                parts.desk(self, desk)
+                parts.snapshot(self, snapshot)
         self.draw_below()
 
     def draw_below(self) -> None:
         """Draw the 3-D view alone."""
         self.below.clear()
         with self.below:
-            if self.tab.desk is not None:
+            if self.tab.snapshot is not None:
                 parts.viewer(self)
 
     # what can be clicked
 
-    def do(self, what: str, act: Callable[[Desk, Say], object]) -> None:
-        """Begin something at the desk of this tab; only one thing is done at a time."""
-        desk = self.tab.desk
-        if desk is not None and not self.work.start(what, lambda say: act(desk, say)):
+    def do(self, what: str, act: Callable[[Snapshot, Say], object]) -> None:
+        """Begin something on the snapshot of this tab; only one thing is done at a time."""
+        snapshot = self.tab.snapshot
+        if snapshot is not None and not self.work.start(what, lambda say: act(snapshot, say)):
             ui.notify("Something else is being done; nothing was begun.")
 
     def add(self) -> None:
         """Add the chosen effect."""
         effect = self.tab.suspect or ""
-        self.do(f"Adding {effect}", lambda desk, say: self.session.add(desk, effect, say))
+        self.do(f"Adding {effect}", lambda snapshot, say: self.session.add(snapshot, effect, say))
 
     def remove(self, effect: str) -> None:
         """Take an effect out."""
-        self.do(f"Removing {effect}", lambda desk, say: self.session.remove(desk, effect, say))
+        self.do(
+            f"Removing {effect}", lambda snapshot, say: self.session.remove(snapshot, effect, say)
+        )
 
     def go_back(self, number: int) -> None:
         """Show a revision and let every command use it."""
         self.do(
             f"Going to revision {number}",
-            lambda desk, say: self.session.go_back(desk, number, say),
+            lambda snapshot, say: self.session.go_back(snapshot, number, say),
         )
 
     def show(self, number: int) -> None:
         """Show a revision; nothing is written."""
-        self.do(f"Reading revision {number}", lambda desk, say: self.session.load(say, number))
+        self.do(f"Reading revision {number}", lambda snapshot, say: self.session.load(say, number))
 
     def again(self) -> None:
         """Read the file again."""
@@ -216,8 +218,8 @@ class View:
 
     def fit_anew(self) -> None:
         """Fit the model of the revision in use to all readings."""
-        desk = self.session.desk
-        self.work.start("Fitting anew", lambda say: self.session.fit_anew(desk, say))
+        snapshot = self.session.snapshot
+        self.work.start("Fitting anew", lambda say: self.session.fit_anew(snapshot, say))
 
     def plan(self, poses: float | None, file: str) -> None:
         """Plan the next measurements."""
@@ -225,18 +227,18 @@ class View:
         count = None if poses is None else int(poses)
         self.do(
             "Planning the next measurements",
-            lambda desk, say: self.session.plan(desk, count, output, say),
+            lambda snapshot, say: self.session.plan(snapshot, count, output, say),
         )
 
     def open_viewer(self) -> None:
         """Prepare the 3-D view, unless another tab has."""
         self.tab.looks = True
-        if self.shared.drawing is not None and self.shared.drawing[0] is self.tab.desk:
+        if self.shared.drawing is not None and self.shared.drawing[0] is self.tab.snapshot:
             return
 
-        def act(desk: Desk, say: Say) -> None:
-            names = self.shared.viewer.prepare(desk.story, self.session.count, say)
-            self.shared.drawing = desk, names
+        def act(snapshot: Snapshot, say: Say) -> None:
+            names = self.shared.viewer.prepare(snapshot.story, self.session.count, say)
+            self.shared.drawing = snapshot, names
 
         self.do("Opening the 3-D view", act)
 
@@ -252,7 +254,7 @@ class View:
     def pick_variable(self, name: str) -> None:
         """Show the residuals over a variable, and its readings that are furthest off."""
         self.tab.variable = name
-        worst = parts.furthest(self.tab.desk) if self.tab.desk else []
+        worst = parts.furthest(self.tab.snapshot) if self.tab.snapshot else []
         self.pick(worst, "The readings that are furthest off")
 
     def pick(self, measurements: list[int], told: str) -> None:
@@ -262,10 +264,12 @@ class View:
 
     def pick_pose(self, measurement: int) -> None:
         """Show the readings of the pose of one."""
-        desk = self.tab.desk
-        if desk is not None and 0 <= measurement < len(desk.story):
-            mine = np.flatnonzero(desk.story.pose == desk.story.pose[measurement])
-            self.pick(mine.tolist(), f"The readings of pose {desk.story.pose_name(measurement)}")
+        snapshot = self.tab.snapshot
+        if snapshot is not None and 0 <= measurement < len(snapshot.story):
+            mine = np.flatnonzero(snapshot.story.pose == snapshot.story.pose[measurement])
+            self.pick(
+                mine.tolist(), f"The readings of pose {snapshot.story.pose_name(measurement)}"
+            )
 
     def draw_readings(self) -> None:
         """Draw the readings that were picked."""
@@ -273,8 +277,8 @@ class View:
             return
         self.readings.clear()
         with self.readings:
-            if self.tab.desk is not None:
-                parts.readings(self, self.tab.desk)
+            if self.tab.snapshot is not None:
+                parts.readings(self, self.tab.snapshot)
 
     def draw_plan(self) -> None:
         """Draw the next measurements, where they are planned."""
@@ -291,5 +295,5 @@ class View:
             return
         self.evidence.clear()
         with self.evidence:
-            if self.tab.desk is not None:
-                parts.evidence(self, self.tab.desk)
+            if self.tab.snapshot is not None:
+                parts.evidence(self, self.tab.snapshot)

@@ -18,9 +18,9 @@ from hilcal.report.charts import error_per_revision, measured_predicted, misfit,
 from hilcal.report.charts.added_variable import added_variable
 from hilcal.report.charts.residual_over import residual_over
 from hilcal.report.verdict_words import message
-from hilcal.workbench.desk import Desk, RevisionRow
 from hilcal.workbench.elements import button, chart, number, plain, point, title
 from hilcal.workbench.session import Session
+from hilcal.workbench.snapshot import RevisionRow, Snapshot
 
 if TYPE_CHECKING:
     from hilcal.workbench.page import View
@@ -44,7 +44,7 @@ def waiting(view: View) -> None:
             ui.label("The readings are fitted and judged; this takes some seconds.").classes("soft")
 
 
-def desk(view: View, d: Desk) -> None:
+def snapshot(view: View, d: Snapshot) -> None:
     """Draw everything."""
     head(d)
     verdict(view, d)
@@ -72,7 +72,7 @@ def desk(view: View, d: Desk) -> None:
     view.draw_plan()
 
 
-def head(d: Desk) -> None:
+def head(d: Snapshot) -> None:
     """Draw which campaign this is."""
     kind = "deflections" if d.fit.mode == "deflection" else "absolute readings"
     with ui.row().classes("items-baseline").style("gap: 4px 16px; padding-top: 16px"):
@@ -80,7 +80,7 @@ def head(d: Desk) -> None:
         ui.label(f"{d.arm} · {d.n_readings} readings, judged as {kind}").classes("soft")
 
 
-def verdict(view: View, d: Desk) -> None:
+def verdict(view: View, d: Snapshot) -> None:
     """Draw whether the model is good."""
     found, fit = d.diagnosis, d.fit
     good = found.verdict == "adequate"
@@ -113,7 +113,7 @@ def verdict(view: View, d: Desk) -> None:
         model(view, d)
 
 
-def model(view: View, d: Desk) -> None:
+def model(view: View, d: Snapshot) -> None:
     """Draw the effects of the model, each with a button that takes it out."""
     called = "Baseline, not kept yet" if d.number is None else f"Revision {d.number}"
     with ui.row().classes("items-center").style("gap: 6px 10px"):
@@ -122,7 +122,7 @@ def model(view: View, d: Desk) -> None:
             button(view, f"Remove {name}", partial(view.remove, name), "outline dense")
 
 
-def fails(view: View, d: Desk) -> None:
+def fails(view: View, d: Snapshot) -> None:
     """Draw where the model fails."""
     title("Where it fails")
     if d.diagnosis.residual_is_noise:
@@ -135,14 +135,14 @@ def fails(view: View, d: Desk) -> None:
     ui.label("Click a bar: the readings over that variable.").classes("soft")
 
 
-def _picked_bar(view: View, d: Desk, e: GenericEventArguments) -> None:
+def _picked_bar(view: View, d: Snapshot, e: GenericEventArguments) -> None:
     names = [v.variable for v in d.diagnosis.misfit_breakdown]
     told = str(point(e).get("y", ""))
     if told in names:
         view.pick_variable(told)
 
 
-def missing(view: View, d: Desk) -> None:
+def missing(view: View, d: Snapshot) -> None:
     """Draw the ranked missing effects."""
     title("What is missing")
     rows = suspects(d.diagnosis)
@@ -215,7 +215,7 @@ def suspects(d: Diagnosis) -> list[Suspect]:
     return [s for s in d.suspects if s.passes or s.score.p_value < CERTAIN][:SUSPECTS]
 
 
-def evidence(view: View, d: Desk) -> None:
+def evidence(view: View, d: Snapshot) -> None:
     """Draw the evidence of the chosen suspect."""
     effect = view.tab.suspect
     title("The evidence" if effect is None else f"The evidence for {effect}")
@@ -229,7 +229,7 @@ def evidence(view: View, d: Desk) -> None:
         chart(view, added_variable(drawn, effect)).props("data-part=evidence")
 
 
-def readings(view: View, d: Desk) -> None:
+def readings(view: View, d: Snapshot) -> None:
     """Draw the residuals over a variable, the readings that were picked and what they share."""
     variable = view.tab.variable
     found = view.session.recorded(d).get(variable or "")
@@ -259,7 +259,7 @@ def readings(view: View, d: Desk) -> None:
     picked_table(d, picked)
 
 
-def picked_table(d: Desk, picked: list[int]) -> None:
+def picked_table(d: Snapshot, picked: list[int]) -> None:
     """Draw the picked readings, the furthest off first."""
     sigma = np.sqrt(d.revision.whitened_norm2)
     size = np.linalg.norm(d.revision.residual, axis=1)
@@ -295,20 +295,20 @@ def difference(x: Difference) -> str:
     return f"{x.variable} {a} {unit}, the others {b} {unit}".replace(" ,", ",").rstrip()
 
 
-def furthest(d: Desk) -> list[int]:
+def furthest(d: Snapshot) -> list[int]:
     """Return the readings that are furthest off, in units of the noise."""
     norm2 = d.revision.whitened_norm2
     count = max(FURTHEST, round(FURTHEST_SHARE * len(norm2)))
     return [int(k) for k in np.argsort(-norm2, kind="stable")[:count]]
 
 
-def fell(view: View, d: Desk) -> None:
+def fell(view: View, d: Snapshot) -> None:
     """Draw how the error fell."""
     title("How the error fell")
     chart(view, error_per_revision.error_per_revision(d.story)).props("data-part=fell")
 
 
-def revisions(view: View, d: Desk) -> None:
+def revisions(view: View, d: Snapshot) -> None:
     """Draw all revisions, each with the way back to it."""
     title("Revisions")
     if not d.rows:
@@ -320,7 +320,7 @@ def revisions(view: View, d: Desk) -> None:
     ui.label("Revisions are only appended: nothing that was tried is lost.").classes("soft")
 
 
-def one_revision(view: View, d: Desk, row: RevisionRow) -> None:
+def one_revision(view: View, d: Snapshot, row: RevisionRow) -> None:
     """Draw one revision."""
     marks = [word for word, holds in (("shown", row.number == d.number),
                                       ("used by every command", row.number == d.in_use))
@@ -342,14 +342,14 @@ def one_revision(view: View, d: Desk, row: RevisionRow) -> None:
                    lambda: view.go_back(row.number), "outline dense")  # fmt: skip
 
 
-def compared(view: View, d: Desk) -> None:
+def compared(view: View, d: Snapshot) -> None:
     """Draw what was measured against what is predicted."""
     title("Model and measurement")
     ui.label(text.misses(d.fit)).classes("soft")
     chart(view, measured_predicted.measured_predicted(d.story, d.revision))
 
 
-def next_measurement(view: View, d: Desk) -> None:
+def next_measurement(view: View, d: Snapshot) -> None:
     """Draw what asks for the next measurement."""
     title("Measure next")
     ui.label("Plan the poses and loads that tell apart what these readings leave open.").classes(

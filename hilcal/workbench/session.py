@@ -1,8 +1,8 @@
 """The state of a workbench, and what can be done at it; every number is one of the library.
 
 One session serves all tabs. Its methods take seconds and are run one at a time (`work`). Each
-change names the desk that it was asked for at: where the session has gone on since, by another tab
-or a second click, it is refused and nothing is appended.
+change names the snapshot on which it was asked for: where the session has gone on since, by another
+tab or a second click, it is refused and nothing is appended.
 """
 
 import shlex
@@ -30,7 +30,7 @@ from hilcal.report.build_story import Chapter, build_story, regressor
 from hilcal.report.story import Regressor
 from hilcal.revisions import chain, mode_of
 from hilcal.types import Ints
-from hilcal.workbench.desk import Desk, Stamp, require_judged, row_of
+from hilcal.workbench.snapshot import Snapshot, Stamp, require_judged, row_of
 
 Say = Callable[[str], None]
 
@@ -44,23 +44,23 @@ class Session:
 
     Attributes:
         path: the file.
-        desk: what is shown; None before `load`.
+        snapshot: what is shown; None before `load`.
         changed: what the last change did; None before any, and after another revision was chosen.
-        planned: the next measurements and their file, of the shown desk.
-        count: grows whenever another desk is shown.
+        planned: the next measurements and their file, of the shown snapshot.
+        count: grows whenever another snapshot is shown.
     """
 
     def __init__(self, path: str | Path, catalogue: Catalogue | None = None) -> None:
         """Take a file; nothing is read yet."""
         self.path, self._catalogue = Path(path), catalogue
-        self.desk: Desk | None = None
+        self.snapshot: Snapshot | None = None
         self.changed: Changed | None = None
         self.planned: tuple[NextPlan, Path] | None = None
         self.count = 0
         self._known: dict[int, Chapter] = {}
         self._hash = ""
 
-    def load(self, say: Say = silent, revision: int | None = None) -> Desk:
+    def load(self, say: Say = silent, revision: int | None = None) -> Snapshot:
         """Read the file, judge a revision and those that it was made from, and show it.
 
         Nothing is written to the file, nor beside it.
@@ -77,62 +77,62 @@ class Session:
         with self._open(read_only=True) as o:
             self._forget_others(o)
             chapters = self._chapters(o, revision, say)
-            desk = self._desk(o, None if o.in_use(revision) is None else chapters[-1].number,
-                              chapters, stamp)  # fmt: skip
-        return self._show(desk)
+            number = None if o.in_use(revision) is None else chapters[-1].number
+            snapshot = self._snapshot(o, number, chapters, stamp)
+        return self._show(snapshot)
 
-    def add(self, desk: Desk, effect: str, say: Say = silent) -> Desk:
+    def add(self, snapshot: Snapshot, effect: str, say: Say = silent) -> Snapshot:
         """Add an effect, written as for `hilcal add`, to the shown model; see `changes`.
 
         Raises:
-            InputError: not one effect, one that cannot be added, or a desk that is gone.
+            InputError: not one effect, one that cannot be added, or an outdated snapshot.
             CannotAnswerError: the readings do not determine it.
         """
-        with self._writing(desk) as o:
+        with self._writing(snapshot) as o:
             wanted = read_effects_text(effect, "effect", o.catalogue)
             if len(wanted) != 1:
                 raise InputError(f"effect {effect!r} has {len(wanted)} effects; valid: one")
             ((name, options),) = wanted.items()
             o.catalogue.make(name, o.cell, o.readings.states, options).prior_std()
-            of = desk.number, desk.fit
-            return self._changed(o, add_effect(o, *of, name, options, say, desk.diagnosis))
+            of = snapshot.number, snapshot.fit
+            return self._changed(o, add_effect(o, *of, name, options, say, snapshot.diagnosis))
 
-    def remove(self, desk: Desk, effect: str, say: Say = silent) -> Desk:
+    def remove(self, snapshot: Snapshot, effect: str, say: Say = silent) -> Snapshot:
         """Take an effect out of the shown model; raises as `add`."""
-        with self._writing(desk) as o:
-            of = desk.number, desk.fit
-            return self._changed(o, remove_effect(o, *of, effect, say, desk.diagnosis))
+        with self._writing(snapshot) as o:
+            of = snapshot.number, snapshot.fit
+            return self._changed(o, remove_effect(o, *of, effect, say, snapshot.diagnosis))
 
-    def accept(self, desk: Desk, number: int | None) -> Desk:
+    def accept(self, snapshot: Snapshot, number: int | None) -> Snapshot:
         """Let every command use a revision from now on; None: the latest one.
 
         Raises:
-            InputError: no such revision, or a desk that is gone.
+            InputError: no such revision, or an outdated snapshot.
         """
-        with self._writing(desk) as o:
+        with self._writing(snapshot) as o:
             o.accept(number)
-            return self._show(replace(desk, accepted=number, stamp=self._stamp()), self.changed)
+            return self._show(replace(snapshot, accepted=number, stamp=self._stamp()), self.changed)
 
-    def go_back(self, desk: Desk, number: int, say: Say = silent) -> Desk:
+    def go_back(self, snapshot: Snapshot, number: int, say: Say = silent) -> Snapshot:
         """Show a revision, and let every command use it; nothing is taken away.
 
         Raises:
-            InputError: no such revision, one that cannot be restored, or a desk that is gone.
+            InputError: no such revision, one that cannot be restored, or an outdated snapshot.
         """
-        with self._writing(desk) as o:
+        with self._writing(snapshot) as o:
             chapters = self._chapters(o, number, say)
             o.accept(None if number == len(o.file.revisions()) else number)
-            found = self._desk(o, number, chapters, self._stamp())
+            found = self._snapshot(o, number, chapters, self._stamp())
         return self._show(found)
 
-    def fit_anew(self, desk: Desk | None, say: Say = silent) -> Desk:
+    def fit_anew(self, snapshot: Snapshot | None, say: Say = silent) -> Snapshot:
         """Fit the model of the revision in use to all readings, those appended later included.
 
         Raises:
-            InputError: no revision, or a desk that is gone.
+            InputError: no revision, or an outdated snapshot.
             CannotAnswerError: the readings do not determine it.
         """
-        with self._writing(desk, changed=True) as o:
+        with self._writing(snapshot, changed=True) as o:
             record = o.in_use()
             if record is None:
                 raise InputError(f"{o.path}: no revision yet")
@@ -144,14 +144,16 @@ class Session:
             number = self._store(o, found)
             if o.file.accepted() is not None:
                 o.accept(None)  # it cannot be used any more
-            desk = self._desk(o, number, (self._known[number],), self._stamp())
-        return self._show(desk)
+            snapshot = self._snapshot(o, number, (self._known[number],), self._stamp())
+        return self._show(snapshot)
 
-    def plan(self, desk: Desk, poses: int | None, output: Path, say: Say = silent) -> NextPlan:
+    def plan(
+        self, snapshot: Snapshot, poses: int | None, output: Path, say: Say = silent
+    ) -> NextPlan:
         """Plan the measurements that settle what the shown diagnosis leaves open, and save them.
 
         Args:
-            desk: what is shown.
+            snapshot: what is shown.
             poses: as many readings as so many poses take; what the doubt needs where None.
             output: the plan's file; it must not exist.
             say: takes progress, one line each.
@@ -162,9 +164,9 @@ class Session:
         """
         if output.exists():
             raise InputError(f"{output}: the file exists; choose another name")
-        self._require(desk)
+        self._require(snapshot)
         with self._open(read_only=True) as o:
-            doubt = doubt_to_settle(o, desk.diagnosis, say)
+            doubt = doubt_to_settle(o, snapshot.diagnosis, say)
             rng = np.random.default_rng(0)
             found = next_plan(o, doubt, poses, rng, say, quick=True)
         found.made.save(output)
@@ -182,41 +184,41 @@ class Session:
     def stale(self) -> bool:
         """Whether another command has changed the file since it was read."""
         try:
-            return self.desk is not None and self._stamp() != self.desk.stamp
+            return self.snapshot is not None and self._stamp() != self.snapshot.stamp
         except InputError:
             return True
 
-    def evidence(self, desk: Desk, effect: str) -> Regressor | None:
+    def evidence(self, snapshot: Snapshot, effect: str) -> Regressor | None:
         """Return residual and regressor of a suspect, for its added-variable plot."""
-        found = next((s for s in desk.diagnosis.suspects if s.effect == effect), None)
-        return None if found is None else regressor(desk.fit, found)
+        found = next((s for s in snapshot.diagnosis.suspects if s.effect == effect), None)
+        return None if found is None else regressor(snapshot.fit, found)
 
-    def recorded(self, desk: Desk) -> dict[str, Recorded]:
+    def recorded(self, snapshot: Snapshot) -> dict[str, Recorded]:
         """Return what was recorded of each measurement of the story (D,), by name."""
-        rows = full_prediction(desk.fit).whitening.reading
-        found = recorded_values(desk.fit)
+        rows = full_prediction(snapshot.fit).whitening.reading
+        found = recorded_values(snapshot.fit)
         return {v.name: replace(v, values=v.values[rows]) for v in found}
 
-    def differences(self, desk: Desk, measurements: Ints) -> tuple[Difference, ...]:
+    def differences(self, snapshot: Snapshot, measurements: Ints) -> tuple[Difference, ...]:
         """Return what sets some measurements of the story apart, the clearest first."""
-        picked = np.zeros(len(desk.fit.readings), dtype=bool)
-        picked[full_prediction(desk.fit).whitening.reading[measurements]] = True
-        return distinguish(desk.fit, picked)
+        picked = np.zeros(len(snapshot.fit.readings), dtype=bool)
+        picked[full_prediction(snapshot.fit).whitening.reading[measurements]] = True
+        return distinguish(snapshot.fit, picked)
 
     def _open(self, *, read_only: bool) -> Campaign:
         return Campaign.open(self.path, self._catalogue, read_only=read_only)
 
-    def _writing(self, desk: Desk | None, *, changed: bool = False) -> Campaign:
-        """Open the file for a change that was asked for at a desk.
+    def _writing(self, snapshot: Snapshot | None, *, changed: bool = False) -> Campaign:
+        """Open the file for a change that was asked for on a snapshot.
 
         Args:
-            desk: it.
+            snapshot: it.
             changed: whether another command may have changed the file since.
 
         Raises:
             InputError: the session, or the file, has gone on since.
         """
-        self._require(desk, changed=changed)
+        self._require(snapshot, changed=changed)
         o = self._open(read_only=False)
         try:
             refuse_fitting(o.file)
@@ -226,8 +228,8 @@ class Session:
             raise
         return o
 
-    def _require(self, desk: Desk | None, *, changed: bool = False) -> None:
-        if desk is not self.desk:
+    def _require(self, snapshot: Snapshot | None, *, changed: bool = False) -> None:
+        if snapshot is not self.snapshot:
             raise InputError("the workbench has gone on since that click; nothing was changed")
         if self.stale and not changed:
             raise InputError(
@@ -269,17 +271,17 @@ class Session:
         self._known[number] = Chapter(number, None, found.fit, found)
         return number
 
-    def _changed(self, o: Campaign, c: Changed) -> Desk:
+    def _changed(self, o: Campaign, c: Changed) -> Snapshot:
         if c.before_number not in self._known:  # the baseline, kept now
             self._known[c.before_number] = self._known[0]
         self._known[c.number] = Chapter(c.number, c.added, c.fit, c.diagnosis, c.removed)
         chapters = self._chapters(o, c.number, silent)
-        return self._show(self._desk(o, c.number, chapters, self._stamp()), c)
+        return self._show(self._snapshot(o, c.number, chapters, self._stamp()), c)
 
-    def _desk(
+    def _snapshot(
         self, o: Campaign, number: int | None, chapters: tuple[Chapter, ...], stamp: Stamp
-    ) -> Desk:
-        return Desk(
+    ) -> Snapshot:
+        return Snapshot(
             name=self.path.name,
             arm=o.cell.arm.name,
             n_readings=len(o.readings),
@@ -291,10 +293,10 @@ class Session:
             stamp=stamp,
         )
 
-    def _show(self, desk: Desk, changed: Changed | None = None) -> Desk:
-        self.desk, self.changed, self.planned = desk, changed, None
+    def _show(self, snapshot: Snapshot, changed: Changed | None = None) -> Snapshot:
+        self.snapshot, self.changed, self.planned = snapshot, changed, None
         self.count += 1
-        return desk
+        return snapshot
 
     def _stamp(self) -> Stamp:
         """Return what tells whether the file was changed.

@@ -27,18 +27,18 @@ def revisions(path: Path) -> list[tuple[str | None, str | None, int | None]]:
 def test_an_operator_adds_removes_and_goes_back(run: Path) -> None:
     before = run.read_bytes()
     session = Session(run, few_effects())
-    desk = session.load()
+    snapshot = session.load()
     assert (run.read_bytes(), list(run.parent.iterdir())) == (before, [run])  # only looked at
-    assert (desk.number, desk.rows, desk.in_use) == (None, (), None)
+    assert (snapshot.number, snapshot.rows, snapshot.in_use) == (None, (), None)
     with Campaign.open(run, few_effects(), read_only=True) as o:
-        assert to_json(desk.diagnosis) == to_json(diagnose(o.fit_in_use()[1]))
-    assert desk.diagnosis.significant[0] == BASE
-    assert desk.removable == ("joint_compliance",)
+        assert to_json(snapshot.diagnosis) == to_json(diagnose(o.fit_in_use()[1]))
+    assert snapshot.diagnosis.significant[0] == BASE
+    assert snapshot.removable == ("joint_compliance",)
 
-    r = session.evidence(desk, BASE)
+    r = session.evidence(snapshot, BASE)
     assert r is not None
     assert 0.5 < float(r.x @ r.y / (r.x @ r.x)) < 2.0
-    assert session.evidence(desk, "no_such_effect") is None
+    assert session.evidence(snapshot, "no_such_effect") is None
 
     for effect, why in (
         ("no_such_effect", "unknown"),
@@ -46,28 +46,28 @@ def test_an_operator_adds_removes_and_goes_back(run: Path) -> None:
         (f"{BASE}, joint_tilt_compliance", "has 2 effects; valid: one"),
     ):
         with pytest.raises(InputError, match=why):
-            session.add(desk, effect)
+            session.add(snapshot, effect)
     with pytest.raises(InputError, match="no revision 7"):
-        session.go_back(desk, 7)
+        session.go_back(snapshot, 7)
     assert revisions(run) == []
 
-    added = session.add(desk, BASE)
+    added = session.add(snapshot, BASE)
     assert session.changed is not None
     assert (added.number, [row.change for row in added.rows]) == (2, ["", f"+ {BASE}"])
-    assert added.fit.holdout.rms_m < 0.8 * desk.fit.holdout.rms_m
+    assert added.fit.holdout.rms_m < 0.8 * snapshot.fit.holdout.rms_m
     assert [c.number for c in added.chapters] == [1, 2]
     assert added.rows[1].left_out_m == added.fit.holdout.rms_m
     assert added.rows[1].verdict == added.diagnosis.verdict
-    assert added.rows[0].verdict == desk.diagnosis.verdict
+    assert added.rows[0].verdict == snapshot.diagnosis.verdict
 
     with pytest.raises(InputError, match="has gone on since that click; nothing was changed"):
-        session.add(desk, BASE)  # the second of a double click
+        session.add(snapshot, BASE)  # the second of a double click
     with pytest.raises(InputError, match="has gone on"):
-        session.plan(desk, None, run.with_name("p.json"))
+        session.plan(snapshot, None, run.with_name("p.json"))
     assert len(revisions(run)) == 2
 
     removed = session.remove(added, BASE)
-    assert removed.fit.holdout.rms_m == pytest.approx(desk.fit.holdout.rms_m, rel=1e-3)
+    assert removed.fit.holdout.rms_m == pytest.approx(snapshot.fit.holdout.rms_m, rel=1e-3)
     back = session.go_back(removed, 2)
     assert (back.number, back.accepted, back.in_use) == (2, 2, 2)
     assert revisions(run) == [(None, None, None), (BASE, None, 1), (None, BASE, 2)]
@@ -93,27 +93,27 @@ def test_an_operator_adds_removes_and_goes_back(run: Path) -> None:
 
 def test_readings_that_came_later_are_fitted_anew(run: Path) -> None:
     session = Session(run, few_effects())
-    desk = session.load()
+    snapshot = session.load()
     with Campaign.open(run, few_effects()) as o:
-        o.append(desk.fit)
+        o.append(snapshot.fit)
         o.file.append_readings(o.file.readings()[:6])
     with pytest.raises(InputError, match="was fitted before readings were appended"):
         session.load()
-    found = session.fit_anew(desk)  # at a desk that the file has left behind
-    assert session.desk is found
+    found = session.fit_anew(snapshot)  # on a snapshot older than the file
+    assert session.snapshot is found
     assert not session.stale
-    assert (found.number, found.fit.model.names) == (2, desk.fit.model.names)
-    assert len(found.fit.readings) == len(desk.fit.readings) + 6
+    assert (found.number, found.fit.model.names) == (2, snapshot.fit.model.names)
+    assert len(found.fit.readings) == len(snapshot.fit.readings) + 6
 
 
 def test_a_plan_names_what_it_separates_or_why_there_is_none(run: Path) -> None:
     session = Session(run, few_effects())
-    desk = session.load()
+    snapshot = session.load()
     exists = run.with_name("there.json")
     exists.touch()
     with pytest.raises(InputError, match="the file exists; choose another name"):
-        session.plan(desk, None, exists)
-    kept = session.remove(desk, "joint_compliance")
+        session.plan(snapshot, None, exists)
+    kept = session.remove(snapshot, "joint_compliance")
     assert kept.diagnosis.verdict != "ambiguous"
     with pytest.raises(CannotAnswerError, match="no suspects to separate"):
         session.plan(kept, None, run.with_name("plan.json"))
@@ -121,14 +121,14 @@ def test_a_plan_names_what_it_separates_or_why_there_is_none(run: Path) -> None:
 
 def test_the_readings_that_were_picked_are_told_apart(run: Path) -> None:
     session = Session(run, few_effects())
-    desk = session.load()
-    story = desk.story
+    snapshot = session.load()
+    story = snapshot.story
     pulled = np.flatnonzero(np.array(story.load_names) == "pull y")
-    told = {d.variable: d for d in session.differences(desk, pulled)}
+    told = {d.variable: d for d in session.differences(snapshot, pulled)}
     mine = told["load pull y"]
     assert (mine.picked, mine.others, mine.larger, mine.clear) == (1.0, 0.0, 1.0, True)
-    reach = session.recorded(desk)["distance from the base axis"].values
+    reach = session.recorded(snapshot)["distance from the base axis"].values
     far = np.flatnonzero(reach > np.median(reach))
-    told = {d.variable: d for d in session.differences(desk, far)}
+    told = {d.variable: d for d in session.differences(snapshot, far)}
     assert told["distance from the base axis"].larger == 1.0
-    assert session.differences(desk, np.arange(len(story))) == ()  # no others
+    assert session.differences(snapshot, np.arange(len(story))) == ()  # no others

@@ -40,7 +40,7 @@ class RevisionRow:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Desk:
+class Snapshot:
     """A campaign with one of its revisions, and the way to it.
 
     Attributes:
@@ -75,7 +75,7 @@ class Desk:
         """The judgement of it."""
         found = self.chapters[-1].diagnosis
         if found is None:
-            raise ValueError("a desk without a diagnosis")
+            raise ValueError("a snapshot without a diagnosis")
         return found
 
     @property
