@@ -21,14 +21,14 @@ from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.fit import Fit, fit
 from hilcal.procedure.state import IMPROVED, Files
 from hilcal.report.build_story import Chapter, build_story
-from hilcal.report.html.material import Material, Tested
+from hilcal.report.html.content import ReportContent, Tested
 from hilcal.validate import validate
 
 Say = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Written:
+class ReportSummary:
     """What a page says first.
 
     Attributes:
@@ -100,7 +100,7 @@ def write_report(
     operator: str = "",
     revision: int | None = None,
     say: Say = lambda text: None,
-) -> Written:
+) -> ReportSummary:
     """Write a page as `report` does, and return what it says first."""
     if path.resolve() in {c.path.resolve() for c in (run, later, validation) if c is not None}:
         raise InputError(f"{path}: this is the campaign itself; name another file for the page")
@@ -126,22 +126,22 @@ def write_report(
                 say(f"taking {beside.name}, which stands beside it, as validation campaign")
                 opened = Campaign.open(beside, run.catalogue, read_only=True)
                 validation = stack.enter_context(opened)
-            m = material(run, validation, limit_m, operator, revision, say)
+            m = content_of(run, validation, limit_m, operator, revision, say)
         say("writing the page")
         html, first = page(m), first_screen(m)
         verdict = None if m.diagnosis is None else m.diagnosis.verdict
     _write(path, html)
-    return Written(first.headline, first.limit, first.passed, verdict)
+    return ReportSummary(first.headline, first.limit, first.passed, verdict)
 
 
-def material(
+def content_of(
     run: Campaign,
     validation: Campaign | None = None,
     limit_m: float | None = None,
     operator: str = "",
     revision: int | None = None,
     say: Say = lambda text: None,
-) -> Material:
+) -> ReportContent:
     """Collect what a report says; arguments and errors as of `report`."""
     record = run.in_use(revision)
     chapters = run.chapters(say, revision)
@@ -162,7 +162,7 @@ def material(
             found.shares,
         )
         commands.append(f"hilcal validate {run.path.name} {validation.path.name}{number}")
-    return Material(
+    return ReportContent(
         name=run.path.name,
         sha256=_sha256(run.path),
         made=utc_now(),

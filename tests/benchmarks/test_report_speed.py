@@ -9,7 +9,7 @@ from hilcal.report.charts.readings_drawn import MOST
 from hilcal.report.html.page import page as page_of
 from tests.benchmarks.conftest import Claim
 from tests.support.browser import DESKTOP, needs_chromium, open_browser
-from tests.support.report_pages import opened, small_material
+from tests.support.report_pages import opened, small_content
 from tests.support.viewer_story import story
 
 pytestmark = pytest.mark.slow
@@ -20,7 +20,7 @@ LOADED = "performance.timing.loadEventEnd - performance.timing.navigationStart"
 def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A page of 10,002 readings and four revisions; what a fit alone says is of a small one."""
     folder = tmp_path_factory.mktemp("report")
-    m = replace(small_material(folder), story=story(poses=3334, loads=3))
+    m = replace(small_content(folder), story=story(poses=3334, loads=3))
     path = folder / "large.html"
     path.write_text(page_of(m), encoding="utf-8")
     return path

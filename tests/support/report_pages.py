@@ -1,4 +1,4 @@
-"""What the tests of report pages share: a small campaign, its material, pages in a browser."""
+"""What the tests of report pages share: a small campaign, what its page says, a browser."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,8 +10,8 @@ from playwright.sync_api import Browser, Page, Route
 
 from hilcal.campaign import Campaign
 from hilcal.data.campaign_file import CampaignFile
-from hilcal.report.html.material import Material
-from hilcal.reporting import material
+from hilcal.report.html.content import ReportContent
+from hilcal.reporting import content_of
 from hilcal.robot.catalogue import configs_dir
 from tests.support.campaigns import campaign, configuration
 
@@ -30,12 +30,12 @@ def write_campaign(path: Path, poses: int = 6) -> None:
 
 
 @cache
-def small_material(folder: Path) -> Material:
-    """The material of a page on that campaign, without any revision, with a limit."""
+def small_content(folder: Path) -> ReportContent:
+    """The content of a page on that campaign, without any revision, with a limit."""
     path = folder / "a&<b>.hilcal"
     write_campaign(path)
     with Campaign.open(path) as run:
-        return material(run, limit_m=1e-3, operator=EVIL)
+        return content_of(run, limit_m=1e-3, operator=EVIL)
 
 
 @contextmanager

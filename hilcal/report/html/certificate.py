@@ -14,7 +14,7 @@ from hilcal.identify.fit import Fit, all_left_out
 from hilcal.identify.full_prediction import full_prediction
 from hilcal.report import numbers, text, text_validate
 from hilcal.report.covariance_words import covariance_words
-from hilcal.report.html.material import Material
+from hilcal.report.html.content import ReportContent
 from hilcal.report.html.parts import Items, Part, Section, Table, Words, from_terminal, table
 from hilcal.report.verdict_words import message
 from hilcal.types import Floats
@@ -30,7 +30,7 @@ class Card:
 
 
 @dataclass(frozen=True, slots=True)
-class First:
+class FirstScreen:
     """What the first screen says.
 
     Attributes:
@@ -50,12 +50,12 @@ class First:
     passed: bool | None
 
 
-def first_screen(m: Material) -> First:
+def first_screen(m: ReportContent) -> FirstScreen:
     """Return what the first screen says."""
     d, fit = m.diagnosis, m.fit
     headline, tone = headline_of(d)
     limit, passed = limit_words(m)
-    return First(
+    return FirstScreen(
         headline,
         tone,
         (
@@ -87,14 +87,14 @@ def headline_of(d: Diagnosis | None) -> tuple[str, str]:
     return "The stated noise is wrong: the model cannot be judged by it", "doubt"
 
 
-def how_good(m: Material) -> str:
+def how_good(m: ReportContent) -> str:
     """Say in a sentence how well the model predicts."""
     d = m.diagnosis
     good = {"adequate": "Yes. ", "missing_effect": "Not yet. ", "unknown_effect": "Not yet. "}
     return ("" if d is None else good.get(d.verdict, "")) + text.misses(m.fit)
 
 
-def where_wrong(m: Material) -> str:
+def where_wrong(m: ReportContent) -> str:
     """Say in a sentence where it is worst, and what the misfit follows."""
     d = m.diagnosis
     if d is not None and d.residual_is_noise:
@@ -123,7 +123,7 @@ def missing(d: Diagnosis | None) -> str:
     return f"{said} That is: {law.split(': ', 1)[-1]}."
 
 
-def _cards(m: Material, fit: Fit) -> Iterator[Card]:
+def _cards(m: ReportContent, fit: Fit) -> Iterator[Card]:
     before = error_before(fit)
     what = (
         "deflection under load; a rigid arm has none"
@@ -153,7 +153,7 @@ def mm(metres: float) -> str:
     return f"{1e3 * metres:.3f} mm"
 
 
-def limit_words(m: Material) -> tuple[str, bool | None]:
+def limit_words(m: ReportContent) -> tuple[str, bool | None]:
     """Say whether the limit is kept, and by what that was judged."""
     if m.limit_m is None:
         return "", None
@@ -183,7 +183,7 @@ def left_out_errors(fit: Fit) -> Floats:
     return np.asarray(np.linalg.norm(raw[:, :3], axis=1))
 
 
-def certificate(m: Material) -> Section:
+def certificate(m: ReportContent) -> Section:
     """Return the certificate for a quality manager."""
     fit = m.fit
     parts: list[Part] = [Words(text.before_and_after(fit))]
@@ -210,7 +210,7 @@ def _corrected(found: Mapping[str, Any]) -> Table:
     return table("Measured at uncorrected and at corrected joint targets", heads, rows)
 
 
-def _conditions(m: Material) -> Iterator[Part]:
+def _conditions(m: ReportContent) -> Iterator[Part]:
     o, r = m.overview, m.fit.readings
     count = f"{len(r)} readings of {len(np.unique(r.pose))} poses"
     loads = ", ".join(
@@ -231,7 +231,7 @@ def _conditions(m: Material) -> Iterator[Part]:
     )
 
 
-def _limit(m: Material) -> Iterator[Part]:
+def _limit(m: ReportContent) -> Iterator[Part]:
     words, passed = limit_words(m)
     if passed is None:
         yield Words(
@@ -252,7 +252,7 @@ def _limit(m: Material) -> Iterator[Part]:
         yield _by_load(m)
 
 
-def _by_load(m: Material) -> Table:
+def _by_load(m: ReportContent) -> Table:
     """Errors of poses left out by load."""
     fit = m.fit
     raw, w = all_left_out(fit)
@@ -319,7 +319,7 @@ def _rms(x: Floats) -> float:
     return float(np.sqrt(np.mean(x**2)))
 
 
-def not_tested(m: Material) -> Iterator[str]:
+def not_tested(m: ReportContent) -> Iterator[str]:
     """Yield what these readings say nothing of."""
     s, fit = m.fit.readings.states, m.fit
     if m.tested is None:
@@ -350,7 +350,7 @@ def not_tested(m: Material) -> Iterator[str]:
         yield f"These readings cannot show, however strong: {numbers.names(list(hidden))}."
 
 
-def _instruments(m: Material) -> Iterator[Part]:
+def _instruments(m: ReportContent) -> Iterator[Part]:
     o = m.overview
     if o.instruments:
         yield table(

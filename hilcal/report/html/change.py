@@ -4,7 +4,7 @@ from hilcal.diagnose.change import LEVEL
 from hilcal.diagnose.comparison import Comparison
 from hilcal.report import numbers
 from hilcal.report.charts.change import changes_chart, error_by_pose
-from hilcal.report.html.certificate import Card, First, mm
+from hilcal.report.html.certificate import Card, FirstScreen, mm
 from hilcal.report.html.page import render
 from hilcal.report.html.parts import Part, Section, Words, chart, from_terminal, table
 from hilcal.report.text_change import comparison_report, next_step, sentence
@@ -53,7 +53,7 @@ def page(c: Comparison, files: tuple[Named, Named], operator: str, made: str, ve
                   first_screen(c, earlier), sections)  # fmt: skip
 
 
-def first_screen(c: Comparison, earlier: str) -> First:
+def first_screen(c: Comparison, earlier: str) -> FirstScreen:
     """Return what the first screen says."""
     found, t = c.changes, c.today
     error = t.prediction.error
@@ -84,4 +84,4 @@ def first_screen(c: Comparison, earlier: str) -> First:
         ("What has changed?", what),
         ("What to do?", numbers.sentence(next_step(c, earlier))),
     )
-    return First(headline, tone, answers, tuple(cards), "", None)
+    return FirstScreen(headline, tone, answers, tuple(cards), "", None)

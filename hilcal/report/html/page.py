@@ -9,21 +9,21 @@ from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
 from hilcal.report.charts import style
-from hilcal.report.html.certificate import First, certificate, first_screen
-from hilcal.report.html.material import Material
+from hilcal.report.html.certificate import FirstScreen, certificate, first_screen
+from hilcal.report.html.content import ReportContent
 from hilcal.report.html.parts import Section, in_script
 from hilcal.report.html.sections import sections
 
 HERE = Path(__file__).parent
 
 
-def page(m: Material) -> str:
+def page(m: ReportContent) -> str:
     """Return the report of one campaign as HTML."""
     about = f"{m.overview.config.robot.model}, {m.name}, {m.made[:10]}"
     return render("Calibration report", about, first_screen(m), (certificate(m), *sections(m)))
 
 
-def render(title: str, about: str, first: First, parts: tuple[Section, ...]) -> str:
+def render(title: str, about: str, first: FirstScreen, parts: tuple[Section, ...]) -> str:
     """Return a page.
 
     Args:

@@ -22,7 +22,7 @@ from hilcal.report.charts.scalings import scalings
 from hilcal.report.charts.suspects import evidence, suspects
 from hilcal.report.charts.workspace import workspace
 from hilcal.report.covariance_words import covariance_words
-from hilcal.report.html.material import Material
+from hilcal.report.html.content import ReportContent
 from hilcal.report.html.parts import Part, Section, Table, Words, chart, from_terminal, table
 from hilcal.report.text_info import info_report, revisions_table
 from hilcal.report.text_prior import prior_lines
@@ -36,7 +36,7 @@ MOST_LISTED = 8
 """Suspects that are not folded away; a choice."""
 
 
-def sections(m: Material) -> tuple[Section, ...]:
+def sections(m: ReportContent) -> tuple[Section, ...]:
     """Return all sections after the certificate."""
     found = (
         _measured(m),
@@ -52,7 +52,7 @@ def sections(m: Material) -> tuple[Section, ...]:
     return tuple(s for s in found if s is not None)
 
 
-def _measured(m: Material) -> Section:
+def _measured(m: ReportContent) -> Section:
     last = m.story.revisions[-1]
     return Section(
         "measured",
@@ -64,7 +64,7 @@ def _measured(m: Material) -> Section:
     )
 
 
-def _where(m: Material) -> Section:
+def _where(m: ReportContent) -> Section:
     story, last, d = m.story, m.story.revisions[-1], m.diagnosis
     parts: list[Part] = []
     if d is not None:
@@ -89,7 +89,7 @@ def _where(m: Material) -> Section:
     return Section("where", "Where it fails", tuple(parts), joints)
 
 
-def _evidence(m: Material) -> Section:
+def _evidence(m: ReportContent) -> Section:
     d = m.diagnosis
     if d is None:
         words = Words("Not diagnosed: only a model fitted with scaling gc can be.")
@@ -131,7 +131,7 @@ def _suspects(rows: Sequence[Suspect], caption: str) -> Table:
     )
 
 
-def _revisions(m: Material) -> Section:
+def _revisions(m: ReportContent) -> Section:
     parts: list[Part] = [
         chart("Error per revision", error_per_revision(m.story), wide=True),
         table(
@@ -162,7 +162,7 @@ def _revisions(m: Material) -> Section:
     return Section("revisions", "How the error fell", tuple(parts))
 
 
-def _parameters(m: Material) -> Section:
+def _parameters(m: ReportContent) -> Section:
     fit = m.fit
     parts: list[Part] = [*from_terminal(prior_lines(fit))]
     parts += [
@@ -175,7 +175,7 @@ def _parameters(m: Material) -> Section:
     return Section("parameters", "Parameters", tuple(parts), details)
 
 
-def _noise(m: Material) -> Section:
+def _noise(m: ReportContent) -> Section:
     d = m.diagnosis
     parts: list[Part] = [chart("Whitened residuals", noise_check(m.fit), wide=True)]
     if d is not None:
@@ -194,7 +194,7 @@ def _noise(m: Material) -> Section:
     return Section("noise", "Noise check", tuple(parts))
 
 
-def _scalings(m: Material) -> Section | None:
+def _scalings(m: ReportContent) -> Section | None:
     if len(m.scalings) < 2:
         return None
     parts: list[Part] = [chart("Scaling none, gu, gc", scalings(m.scalings), wide=True)]
@@ -202,7 +202,7 @@ def _scalings(m: Material) -> Section | None:
     return Section("scalings", "Scaling none, gu and gc", tuple(parts), details)
 
 
-def _plan(m: Material) -> Section:
+def _plan(m: ReportContent) -> Section:
     title = "The plan and its certificate"
     if m.plan is None:
         words = "The readings were imported; the file holds no plan, so nothing proves the choice."
@@ -211,7 +211,7 @@ def _plan(m: Material) -> Section:
     return Section("plan", title, tuple(_plan_parts(m, about)))
 
 
-def _plan_parts(m: Material, about: dict[str, object]) -> Iterator[Part]:
+def _plan_parts(m: ReportContent, about: dict[str, object]) -> Iterator[Part]:
     plan = m.plan
     if plan is None:
         return
@@ -252,7 +252,7 @@ def _plan_parts(m: Material, about: dict[str, object]) -> Iterator[Part]:
             )
 
 
-def _provenance(m: Material) -> Section:
+def _provenance(m: ReportContent) -> Section:
     o = m.overview
     rows = [("campaign", m.name, m.sha256)]
     if m.tested is not None:

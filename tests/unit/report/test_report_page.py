@@ -14,18 +14,18 @@ from playwright.sync_api import Browser
 
 from hilcal.calibration.budget import budget
 from hilcal.report.html.certificate import left_out_errors, limit_words, mm
-from hilcal.report.html.material import Material
+from hilcal.report.html.content import ReportContent
 from hilcal.report.html.page import page as page_of
 from tests.support.browser import DESKTOP, PHONE, needs_chromium, open_browser
-from tests.support.report_pages import EVIL, opened, small_material
+from tests.support.report_pages import EVIL, opened, small_content
 
 DRAW_ALL = "charts.forEach(draw)"
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Material, Path]:
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[ReportContent, Path]:
     folder = tmp_path_factory.mktemp("report")
-    m = small_material(folder)
+    m = small_content(folder)
     path = folder / "report.html"
     path.write_text(page_of(m), encoding="utf-8")
     return m, path

@@ -39,7 +39,7 @@ class Tested:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Material:
+class ReportContent:
     """Everything that a report says.
 
     Attributes:
