@@ -1,6 +1,7 @@
 """What the benchmarks measured, against what is claimed: printed at the end of `make bench`."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
@@ -28,3 +29,11 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
         terminalreporter.section("claims of the benchmarks: measured (limit)")
         for line in claims:
             terminalreporter.write_line(line)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Refuse what `make bench` would skip without a word."""
+    for item in items:
+        mine = item.path.parent == Path(__file__).parent
+        if mine and "benchmark" not in getattr(item, "fixturenames", ()):
+            raise pytest.UsageError(f"{item.nodeid} does not use the fixture `benchmark`")

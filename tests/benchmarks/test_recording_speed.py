@@ -2,6 +2,7 @@
 
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rerun.chunk import RrdReader
@@ -17,14 +18,17 @@ pytestmark = pytest.mark.slow
 ROUNDS = 4
 
 
-def test_recording_of_ten_thousand_readings(tmp_path: Path, claim: Claim) -> None:
+def test_recording_of_ten_thousand_readings(tmp_path: Path, benchmark: Any, claim: Claim) -> None:
     told, path = story(poses=2500, loads=4), tmp_path / "x.rrd"
     walls, works = [], []
-    for _ in range(ROUNDS):
+
+    def written() -> None:
         begun, work = time.perf_counter(), time.process_time()
         save(told, path)
         walls.append(time.perf_counter() - begun)
         works.append(time.process_time() - work)
+
+    benchmark.pedantic(written, rounds=ROUNDS)
     chunks = RrdReader(path).stream().filter(content="/world/arm/body1").to_chunks()
     assert sum(c.to_record_batch().num_rows for c in chunks) >= 2500
     size = path.stat().st_size / 1e6
@@ -35,15 +39,19 @@ def test_recording_of_ten_thousand_readings(tmp_path: Path, claim: Claim) -> Non
     )
 
 
-def test_telling_a_live_viewer(tmp_path: Path, claim: Claim) -> None:
+def test_telling_a_live_viewer(tmp_path: Path, benchmark: Any, claim: Claim) -> None:
     live = LiveViewer(tmp_path / "x.live.rrd", print)
     live.start()
     each = []
-    try:
+
+    def tell() -> None:
         for wall, what in events(measuring(plan(100))):
             begun = time.perf_counter()
             live._tell(wall, what)
             each.append(time.perf_counter() - begun)
+
+    try:
+        benchmark.pedantic(tell, rounds=1)
     finally:
         live.close()
     assert live.dropped == 0
