@@ -1,11 +1,30 @@
 // Draws each chart when it comes near the screen, in the colours of the page, and all of them
-// before the page is printed.
+// before the page is printed. The page is shown first; then the text of plotly.js gets an address
+// of its own, for a script with an address is compiled beside the page, one within it is not.
 "use strict";
 const dark = window.matchMedia("(prefers-color-scheme: dark)");
 const paper = window.matchMedia("print");
 const charts = [...document.querySelectorAll(".chart")];
+const waiting = new Set(); // charts near the screen that are not drawn yet
 let onPaper = false;
 const look = () => (dark.matches && !onPaper && !paper.matches ? LOOKS.dark : LOOKS.light);
+
+const afterPicture = (act) => requestAnimationFrame(() => setTimeout(act));
+
+function load() {
+  const script = document.createElement("script");
+  const text = document.getElementById("plotly").textContent;
+  script.src = URL.createObjectURL(new Blob([text], { type: "text/javascript" }));
+  script.onload = next;
+  script.onerror = () => { loadNow(); next(); };
+  document.head.append(script);
+}
+function loadNow() {
+  if (window.Plotly) return;
+  const script = document.createElement("script");
+  script.textContent = document.getElementById("plotly").textContent;
+  document.head.append(script);
+}
 
 function draw(at) {
   if (at.dataset.drawn) return;
@@ -16,6 +35,29 @@ function draw(at) {
   Plotly.newPlot(at, figure.data, figure.layout, CONFIG);
 }
 
+function drawAll() {
+  loadNow();
+  charts.forEach(draw);
+}
+
+// One chart per picture, that nearest to the middle of the screen first.
+let drawing = false;
+function next() {
+  if (drawing || !window.Plotly || !waiting.size) return;
+  drawing = true;
+  afterPicture(() => {
+    const far = (at) => {
+      const box = at.getBoundingClientRect();
+      return Math.abs(box.top + box.bottom - window.innerHeight);
+    };
+    const [at] = [...waiting].sort((a, b) => far(a) - far(b));
+    waiting.delete(at);
+    if (at) draw(at);
+    drawing = false;
+    next();
+  });
+}
+
 function dress() {
   for (const at of charts) {
     if (at.dataset.drawn) Plotly.relayout(at, { template: look() });
@@ -23,11 +65,18 @@ function dress() {
 }
 
 const near = new IntersectionObserver(
-  (entries) => entries.filter((e) => e.isIntersecting).forEach((e) => { near.unobserve(e.target); draw(e.target); }),
+  (entries) => {
+    for (const e of entries) {
+      if (e.isIntersecting) waiting.add(e.target);
+      else waiting.delete(e.target);
+    }
+    next();
+  },
   { rootMargin: "400px" },
 );
 charts.forEach((at) => near.observe(at));
 dark.addEventListener("change", dress);
+afterPicture(load);
 
 const folded = [...document.querySelectorAll("details")];
 let wereOpen = [];
@@ -36,7 +85,7 @@ function printing() {
   wereOpen = folded.map((d) => d.open);
   folded.forEach((d) => { d.open = true; });
   document.documentElement.classList.add("printing");  // as wide as the paper
-  charts.forEach(draw);
+  drawAll();
   dress();
   for (const at of charts) Plotly.Plots.resize(at);
 }

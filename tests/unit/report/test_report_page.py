@@ -19,7 +19,7 @@ from hilcal.report.html.page import page as page_of
 from tests.support.browser import DESKTOP, PHONE, needs_chromium, open_browser
 from tests.support.report_pages import EVIL, opened, small_content
 
-DRAW_ALL = "charts.forEach(draw)"
+DRAW_ALL = "drawAll()"
 
 
 @pytest.fixture(scope="module")
