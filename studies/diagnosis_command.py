@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from hilcal.cli.demo import CELL
+from hilcal.cli.engine import Scheduler
 from hilcal.cli.terminal import Json, terminal
 from hilcal.config import CellConfig, load_config
 from hilcal.data.readings import Readings
@@ -67,7 +68,10 @@ def diagnosis(
         bool,
         typer.Option("--next", help="At 0.5 σ, also plan and measure what separates suspects."),
     ] = False,
-    jobs: Annotated[int, typer.Option("--jobs", help="Processes.")] = 2,
+    jobs: Annotated[
+        int | None, typer.Option("--jobs", help="Processes; one per processor by default.")
+    ] = None,
+    scheduler: Scheduler = None,
     keep_file: Keep = None,
     as_json: Json = False,
 ) -> None:
@@ -97,7 +101,7 @@ def diagnosis(
     begun = time.monotonic()
     with counting(t.progress, "campaigns", len(asked)) as advance:
         run = partial(run_case, simulate=simulate, more=more, refined=refine)
-        outcomes, complete = run_all(asked, run, jobs, advance)
+        outcomes, complete = run_all(asked, run, jobs, advance, scheduler)
     t.notice(f"{len(outcomes)} of {len(asked)} campaigns in {time.monotonic() - begun:.0f} s")
     if outcomes:
         t.show(report(outcomes))
@@ -148,7 +152,7 @@ def _check_numbers(
     noise: int,
     pairs: int,
     first_seed: int,
-    jobs: int,
+    jobs: int | None,
     strength: list[float] | None,
 ) -> None:
     counts = {
@@ -156,7 +160,7 @@ def _check_numbers(
         "--nothing": nothing,
         "--noise": noise,
         "--pairs": pairs,
-        "--jobs": jobs,
+        "--jobs": 1 if jobs is None else jobs,
     }
     for name, value in counts.items():
         if value < 1:

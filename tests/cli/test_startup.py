@@ -9,7 +9,7 @@ import pytest
 from hilcal.cli.commands import COMMANDS, Command, load
 from tests.support.paths import ROOT
 
-HEAVY = ("numpy", "scipy", "pydantic", "pinocchio", "rerun", "sklearn", "rich.console")
+HEAVY = ("numpy", "scipy", "pydantic", "pinocchio", "rerun", "sklearn", "rich.console", "dask")
 
 
 def loaded(code: str) -> set[str]:

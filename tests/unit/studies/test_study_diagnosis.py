@@ -204,7 +204,7 @@ def test_a_campaign_that_cannot_be_does_not_count() -> None:
     assert "1 campaigns cannot be" in written([outcome(), o])
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
+@pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_results_come_in_order_of_the_questions(jobs: int) -> None:
     every = tuple(asked(seed=s) for s in range(30))
     told: list[int] = []
@@ -214,7 +214,7 @@ def test_results_come_in_order_of_the_questions(jobs: int) -> None:
     assert sum(told) == 30
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
+@pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_ctrl_c_leaves_what_there_is(jobs: int) -> None:
     every = tuple(asked(seed=s) for s in range(200))
     done: list[int] = []
@@ -230,6 +230,7 @@ def test_ctrl_c_leaves_what_there_is(jobs: int) -> None:
     assert all(o.asked in every for o in outcomes)
 
 
+@pytest.mark.slow
 def test_an_error_of_a_case_ends_the_study_and_its_processes() -> None:
     every = tuple(asked(seed=s) for s in (1, 2, -1, 3))
     with pytest.raises(RuntimeError, match="below 0"):
@@ -268,6 +269,7 @@ SMALL = (
 )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_the_command_gives_the_same_on_any_number_of_processes(capsys: Capsys) -> None:
     one = ok(capsys, *SMALL, "--jobs", "1").document
     two = ok(capsys, *SMALL, "--jobs", "2").document
