@@ -19,7 +19,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import f as f_distribution
 
 from hilcal.diagnose.change_candidates import Candidate, candidates
 from hilcal.diagnose.effect_ranking import SAME_EVIDENCE
@@ -27,6 +26,7 @@ from hilcal.effects.changed import Changeable
 from hilcal.errors import CannotAnswerError
 from hilcal.identify.earlier import Earlier
 from hilcal.identify.remeasured import Remeasured, Setting, remeasure
+from hilcal.regression.distributions import f as f_distribution
 from hilcal.regression.evidence import FamilyScore, log_evidence, score_family, visible
 from hilcal.regression.power import noncentrality_of_power
 from hilcal.types import Floats

@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import f as f_distribution
 
 from hilcal.data.whitening import Mode
 from hilcal.diagnose.change import Changes
@@ -13,6 +12,7 @@ from hilcal.identify.fit import Fit
 from hilcal.identify.parameter_differences import Differences
 from hilcal.identify.remeasured import Setting, beside_frames, frames_alone, remeasure
 from hilcal.identify.validation import Validation
+from hilcal.regression.distributions import f as f_distribution
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,8 +10,6 @@ the beam than across it, and as a multiple of that noise it would look like a ch
 
 from collections.abc import Callable, Collection
 
-from scipy.stats import chi2
-
 from hilcal.diagnose.effect_ranking import SAME_EVIDENCE
 from hilcal.diagnose.stepwise import add
 from hilcal.errors import HilcalError
@@ -19,6 +17,7 @@ from hilcal.identify.arm_scatter import estimate_arm_scatter, with_arm_scatter
 from hilcal.identify.fit import Fit
 from hilcal.identify.fit import fit as solve
 from hilcal.identify.linearisation import effect_columns, linearise
+from hilcal.regression.distributions import chi2
 
 LEVEL = 0.01
 """Level of the test, over all effects together; a choice."""

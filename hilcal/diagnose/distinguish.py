@@ -7,7 +7,6 @@ are of one pose, are no random choice, so no p-value would be one.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import rankdata
 
 from hilcal.diagnose.recorded import recorded
 from hilcal.identify.fit import Fit
@@ -108,5 +107,7 @@ def distinguish(fit: Fit, picked: Bools) -> tuple[Difference, ...]:
 
 def _larger(a: Floats, b: Floats) -> float:
     """Probability that a value of a (K,) is larger than one of b (L,), ties counted half."""
+    from scipy.stats import rankdata  # slow to import
+
     ranks = rankdata(np.concatenate([a, b]))[: len(a)]
     return float((ranks.sum() - len(a) * (len(a) + 1) / 2) / (len(a) * len(b)))

@@ -3,8 +3,6 @@
 from collections.abc import Callable, Collection
 from functools import cached_property
 
-from scipy.stats import chi2
-
 from hilcal.data.arm_scatter import ArmScatter
 from hilcal.diagnose.arm_repeatability import instrument_instead
 from hilcal.diagnose.backward_elimination import backward_elimination, spoken_against
@@ -28,6 +26,7 @@ from hilcal.errors import InputError
 from hilcal.identify.arm_scatter import estimate_arm_scatter, with_arm_scatter
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.linearisation import Linearisation, linearise
+from hilcal.regression.distributions import chi2
 
 
 class Evidence:

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.stats import chi2, pearson3
 
 from hilcal.diagnose.repeats import Contrasts
 from hilcal.identify.fit import Fit
+from hilcal.regression.distributions import chi2
 from hilcal.types import Floats
 
 Kind = Literal["axis", "joint", "load"]
@@ -95,6 +95,8 @@ def _p(ratio: Floats) -> float:
         return 1.0
     skew = float(np.mean(((root[1:] - mean) / spread) ** 3))
     z = (float(root[0]) - mean) / spread
+    from scipy.stats import pearson3  # slow to import
+
     return float(min(2 * min(pearson3.sf(z, skew), pearson3.cdf(z, skew)), 1.0))
 
 

@@ -16,13 +16,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
-from scipy.stats import f as f_distribution
 
 from hilcal.diagnose.more_poses import enough
 from hilcal.diagnose.noise_verdict import MISFIT_ALARM
 from hilcal.effects.protocol import Effect
 from hilcal.identify.linearisation import Linearisation, effect_columns
+from hilcal.regression.distributions import chi2
+from hilcal.regression.distributions import f as f_distribution
 from hilcal.types import Floats
 
 LEAST = 0.9

@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.stats import chi2
 
 from hilcal.diagnose.effect_ranking import FALSE_ALARM, catalogue_columns
 from hilcal.diagnose.noise_verdict import MISFIT_ALARM, PREDICTABLE
@@ -39,6 +38,7 @@ from hilcal.errors import HilcalError, InputError
 from hilcal.identify.fit import Fit
 from hilcal.identify.linearisation import left_out_by_pose, linearise
 from hilcal.regression import forward_selection as selection
+from hilcal.regression.distributions import chi2
 from hilcal.regression.evidence import score_family
 from hilcal.regression.forward_selection import families_beside
 from hilcal.regression.leave_out import left_out_residuals

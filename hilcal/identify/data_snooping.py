@@ -16,7 +16,6 @@ Source: Baarda, *A testing procedure for use in geodetic networks* (1968).
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import binom
 
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Whitening
@@ -24,6 +23,7 @@ from hilcal.identify.gauss_newton import Solution
 from hilcal.identify.outliers import bulk, limit
 from hilcal.identify.smooth_nuisance import smooth_nuisance_columns
 from hilcal.model import Model
+from hilcal.regression.distributions import binom
 from hilcal.regression.projection import projection
 from hilcal.regression.small_forms import quadratic_forms
 from hilcal.types import Bools, Floats, Ints

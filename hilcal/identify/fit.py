@@ -5,7 +5,6 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from scipy.stats import chi2
 
 from hilcal.data.readings import Readings, States
 from hilcal.data.whitening import Mode, Scaling, Whitening, inverse_root, whitening
@@ -23,6 +22,7 @@ from hilcal.identify.summary import summary
 from hilcal.identify.uncertainty import Uncertainty, uncertainty
 from hilcal.model import Model
 from hilcal.observe import Observation
+from hilcal.regression.distributions import chi2
 from hilcal.types import Bools, Floats, Ints
 
 Frame = Literal["sensor", "base"]

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import qmc
 
 from hilcal.data.plan import UNLOADED
 from hilcal.errors import CannotAnswerError
@@ -77,6 +76,8 @@ def draw(
     if np.any(low >= high):
         j = int(np.argmax(low - high)) + 1
         raise CannotAnswerError(f"joint_margin_rad leaves joint {j} no range; lower it")
+    from scipy.stats import qmc  # slow to import
+
     sequence = qmc.Sobol(len(low), scramble=False)
     shift = rng.random(len(low))
     left = dict.fromkeys(_FUNNEL, 0)

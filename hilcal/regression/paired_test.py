@@ -1,8 +1,8 @@
 """Paired test of the errors on poses left out, before and after a change of the model."""
 
 import numpy as np
-from scipy.stats import norm, wilcoxon
 
+from hilcal.regression.distributions import norm
 from hilcal.types import Floats
 
 LEAST_GAIN = 0.002
@@ -34,4 +34,6 @@ def improves(before: Floats, after: Floats, sure: float = SURE) -> bool:
         return True
     if np.count_nonzero(gain) < FEWEST:
         return False
+    from scipy.stats import wilcoxon  # slow to import
+
     return bool(wilcoxon(gain, alternative="greater").pvalue < norm.sf(sure))

@@ -8,9 +8,9 @@ noise is known (ν infinite) the test is the χ² test.
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.stats import chi2, ncf, ncx2
-from scipy.stats import f as f_distribution
 
+from hilcal.regression.distributions import chi2
+from hilcal.regression.distributions import f as f_distribution
 from hilcal.regression.evidence import visible
 from hilcal.types import Floats
 
@@ -37,6 +37,8 @@ def power_of_test(noncentrality: float, rank: int, rest: float, level: float) ->
     """Return the power of the F-test with `rank` and `rest` degrees of freedom."""
     if noncentrality <= 0.0:  # SciPy's noncentral F is wrong at 0
         return level
+    from scipy.stats import ncf, ncx2  # slow to import
+
     if np.isinf(rest):
         return float(ncx2.sf(chi2.isf(level, rank), rank, noncentrality))
     return float(ncf.sf(f_distribution.isf(level, rank, rest), rank, rest, noncentrality))

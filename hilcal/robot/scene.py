@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from scipy.stats import qmc
 
 from hilcal.config import Obstacle
 from hilcal.robot.arm import Arm
@@ -176,6 +175,8 @@ class Scene:
     def _not_always(self, arm: Arm, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
         """Leave out what touches in many states, whatever the arm does."""
         group = self._group(pairs)
+        from scipy.stats import qmc  # slow to import
+
         drawn = qmc.Sobol(arm.n, scramble=False).random_base2(_SAMPLES)
         low, high = np.maximum(arm.q_min, -np.pi), np.minimum(arm.q_max, np.pi)
         often = group.how_often(low + drawn * (high - low))

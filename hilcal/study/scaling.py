@@ -10,11 +10,11 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from scipy import stats
 from scipy.linalg import solve_triangular
 
 from hilcal.data.whitening import SCALINGS, Scaling, Whitening, whitening
 from hilcal.errors import InputError
+from hilcal.regression import distributions
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm
 from hilcal.study.scaling_design import Design, bound, make_design, make_readings
@@ -207,9 +207,9 @@ def _fit(w: Whitening, blocks: Floats, noise: Floats) -> _Fit:
     dof = w.rank - len(r)
     factor = (np.sum(e * e, axis=0) - np.sum(projected * projected, axis=0)) / dof
     if w.scaling == "none":  # no noise is stated: the residual's own variance
-        half = stats.t.ppf((1 + LEVEL) / 2, dof) * spread * np.sqrt(factor)
+        half = distributions.t.ppf((1 + LEVEL) / 2, dof) * spread * np.sqrt(factor)
         return _Fit(error, half, None)
-    half = np.broadcast_to(stats.norm.ppf((1 + LEVEL) / 2) * spread, error.shape)
+    half = np.broadcast_to(distributions.norm.ppf((1 + LEVEL) / 2) * spread, error.shape)
     return _Fit(error, half, float(factor.mean()))
 
 
