@@ -147,9 +147,7 @@ def restore_model(
     cell = replace(cell.with_targets(targets), registration=np.array(stored["registration"]))
     options, known = record.options["effects"], catalogue or installed()
     effects = (known.make(e, cell, readings.states, options.get(e)) for e in record.effects)
-    carried = stored.get(CARRIED)
-    prior = None if carried is None else CarriedPrior.from_json(carried)
-    model = Model(cell, tuple(effects), known, readings, prior)
+    model = Model(cell, tuple(effects), known, readings, carried_of(record))
     names = [f"{e.name}.{p.name}" for e in model.effects for p in e.parameters]
     if names != stored["names"]:
         raise InputError(
@@ -157,6 +155,12 @@ def restore_model(
             "have other parameters; run hilcal identify again"
         )
     return model, np.array(stored["theta"], dtype=float)
+
+
+def carried_of(record: RevisionRecord) -> CarriedPrior | None:
+    """Return the prior of another campaign that a revision was fitted with; None without."""
+    carried = record.parameters_json.get(CARRIED)
+    return None if carried is None else CarriedPrior.from_json(carried)
 
 
 def restore_predictive(

@@ -221,13 +221,13 @@ class View:
         snapshot = self.session.snapshot
         self.work.start("Fitting anew", lambda say: self.session.fit_anew(snapshot, say))
 
-    def plan(self, poses: float | None, file: str) -> None:
+    def plan(self, poses: float | None, file: str, *, quick: bool) -> None:
         """Plan the next measurements."""
         output = self.session.path.parent / Path(file).name
         count = None if poses is None else int(poses)
         self.do(
             "Planning the next measurements",
-            lambda snapshot, say: self.session.plan(snapshot, count, output, say),
+            lambda snapshot, say: self.session.plan(snapshot, count, output, say, quick=quick),
         )
 
     def open_viewer(self) -> None:

@@ -361,8 +361,12 @@ def next_measurement(view: View, d: Snapshot) -> None:
         poses.style("width: 190px")
         file = ui.input("plan file", value=f"{stem}-next-{d.number or 0}.json")
         file.props("dense outlined").style("flex: 1 1 180px")
-    button(view, "Plan the next measurements", lambda: view.plan(poses.value, file.value),
-           "unelevated")  # fmt: skip
+    compare = ui.checkbox("Compare criteria and numbers of poses first; takes longer")
+
+    def plan() -> None:
+        view.plan(poses.value, file.value, quick=not compare.value)
+
+    button(view, "Plan the next measurements", plan, "unelevated")
 
 
 def planned(session: Session) -> None:

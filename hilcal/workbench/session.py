@@ -22,13 +22,14 @@ from hilcal.diagnose.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.written import read_effects_text
 from hilcal.errors import InputError
+from hilcal.identify.arm_scatter import with_prior_scatter
 from hilcal.identify.baseline import with_effects
 from hilcal.identify.fit import fit
 from hilcal.identify.full_prediction import full_prediction
 from hilcal.procedure.next_plan import NextPlan, doubt_to_settle, next_plan
 from hilcal.report.build_story import Chapter, build_story, regressor
 from hilcal.report.story import Regressor
-from hilcal.revisions import chain, mode_of
+from hilcal.revisions import carried_of, chain, mode_of
 from hilcal.types import Ints
 from hilcal.workbench.snapshot import Snapshot, Stamp, require_judged, row_of
 
@@ -128,6 +129,8 @@ class Session:
     def fit_anew(self, snapshot: Snapshot | None, say: Say = silent) -> Snapshot:
         """Fit the model of the revision in use to all readings, those appended later included.
 
+        A prior that the revision was fitted with is kept.
+
         Raises:
             InputError: no revision, or an outdated snapshot.
             CannotAnswerError: the readings do not determine it.
@@ -138,9 +141,10 @@ class Session:
                 raise InputError(f"{o.path}: no revision yet")
             options, mode = record.options["effects"], mode_of(record)
             say(f"fitting {' + '.join(record.effects)} to all {len(o.readings)} readings")
-            names = record.effects
-            model = with_effects(o.cell, o.readings, mode, names, options, o.catalogue)
-            found = diagnose(fit(model, o.readings, mode), say=say)
+            names, prior = record.effects, carried_of(record)
+            model = with_effects(o.cell, o.readings, mode, names, options, o.catalogue, prior)
+            fitted = with_prior_scatter(model, o.readings)
+            found = diagnose(fit(model, fitted, mode), say=say)
             number = self._store(o, found)
             if o.file.accepted() is not None:
                 o.accept(None)  # it cannot be used any more
@@ -148,7 +152,13 @@ class Session:
         return self._show(snapshot)
 
     def plan(
-        self, snapshot: Snapshot, poses: int | None, output: Path, say: Say = silent
+        self,
+        snapshot: Snapshot,
+        poses: int | None,
+        output: Path,
+        say: Say = silent,
+        *,
+        quick: bool = True,
     ) -> NextPlan:
         """Plan the measurements that settle what the shown diagnosis leaves open, and save them.
 
@@ -157,6 +167,7 @@ class Session:
             poses: as many readings as so many poses take; what the doubt needs where None.
             output: the plan's file; it must not exist.
             say: takes progress, one line each.
+            quick: without comparing criteria and numbers of poses, as `hilcal next --quick`.
 
         Raises:
             InputError: a file that cannot be written, or a plan that may not be run.
@@ -168,7 +179,7 @@ class Session:
         with self._open(read_only=True) as o:
             doubt = doubt_to_settle(o, snapshot.diagnosis, say)
             rng = np.random.default_rng(0)
-            found = next_plan(o, doubt, poses, rng, say, quick=True)
+            found = next_plan(o, doubt, poses, rng, say, quick=quick)
         found.made.save(output)
         self.planned = found, output
         return found

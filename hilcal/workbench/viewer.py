@@ -1,8 +1,8 @@
 """The rerun web viewer as a part of the page, served behind the same guard as the rest.
 
-rerun serves its web viewer on every interface of the machine, and its page asks other hosts for
-fonts. So a short-lived process of it is asked for the viewer's files once; they and the recording
-are then served by the workbench, on the loopback address and to the operator's browser alone.
+rerun's own server lets in every program of this machine, and its page asks other hosts for fonts.
+So a short-lived process of it, on the loopback address, is asked for the viewer's files once; they
+and the recording are then served by the workbench, to the operator's browser alone.
 """
 
 import re
@@ -35,10 +35,17 @@ _HERE = (
     '? asked(to, {...how, credentials: "same-origin"}) '
     ": Promise.resolve(new Response(null, {status: 204}));</script>"
 )
-_SERVE = (
-    "import sys, rerun; rerun.serve_web_viewer(web_port=int(sys.argv[1]), open_browser=False); "
-    "sys.stdin.read()"
-)
+_SERVE = """
+import os, signal, subprocess, sys, threading
+def end():
+    sys.stdin.read()
+    os.killpg(0, signal.SIGKILL)
+threading.Thread(target=end, daemon=True).start()
+sys.exit(subprocess.call(sys.argv[1:], stdin=subprocess.DEVNULL))
+"""
+"""Runs a command until standard input ends, however the program that holds it has ended."""
+_NOBODY = "rerun+http://127.0.0.1:9/proxy"
+"""What the viewer would show: given something, rerun opens no port for recordings."""
 
 Say = Callable[[str], None]
 
@@ -92,19 +99,24 @@ class WebViewer:
 
 def _fetched() -> dict[str, bytes]:
     """Return the files of the web viewer that came with rerun-sdk."""
+    from hilcal.report.viewer.stream import executable  # loads the viewer's library
+
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = int(probe.getsockname()[1])
+    serve = ("--serve-web", "--bind", "127.0.0.1", "--web-viewer-port", str(port), _NOBODY)
     process = subprocess.Popen(  # noqa: S603 (our own arguments)
-        [sys.executable, "-c", _SERVE, str(port)],
+        [sys.executable, "-c", _SERVE, executable(), *serve],
         stdin=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
+        start_new_session=True,
     )
     try:
         found = {name: _get(port, name, process) for name in FILES}
     finally:
-        process.kill()
+        if process.stdin is not None:
+            process.stdin.close()
         process.wait()
     page = _ELSEWHERE.sub("", found["index.html"].decode("utf-8"))
     page = page.replace(_HEAD, _HEAD + _HERE, 1)

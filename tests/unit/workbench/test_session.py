@@ -7,11 +7,15 @@ import numpy as np
 import pytest
 
 from hilcal.campaign import Campaign
+from hilcal.cli.prior import fitted_with
+from hilcal.data.campaign_file import CampaignFile
 from hilcal.diagnose.verdict import diagnose
 from hilcal.errors import CannotAnswerError, InputError
+from hilcal.identify.carried import carried_prior
 from hilcal.report.diagnosis_document import to_json
 from hilcal.workbench.session import Session
 from tests.support.bench_cases import BASE, few_effects, stored
+from tests.support.campaigns import campaign, configuration
 
 
 @pytest.fixture
@@ -104,6 +108,25 @@ def test_readings_that_came_later_are_fitted_anew(run: Path) -> None:
     assert not session.stale
     assert (found.number, found.fit.model.names) == (2, snapshot.fit.model.names)
     assert len(found.fit.readings) == len(snapshot.fit.readings) + 6
+
+
+def test_fitting_anew_keeps_the_prior_of_another_campaign(run: Path) -> None:
+    earlier, later = run.with_name("earlier.hilcal"), run.with_name("later.hilcal")
+    found = campaign(BASE, "deflection", poses=16).readings
+    for path, part in ((earlier, found.pose < 8), (later, found.pose >= 8)):
+        with CampaignFile.create(path, configuration().to_json(), "", "a test") as file:
+            file.append_readings(found[part])
+    with Campaign.open(earlier, few_effects()) as o:
+        o.append(o.fit_in_use()[1])
+        prior = carried_prior(o.posterior(), "arm", {}, o.catalogue)
+    with Campaign.open(later, few_effects()) as o:
+        o.append(fitted_with(prior, o, o.fit_in_use()[1]))
+    anew = Session(later, few_effects()).fit_anew(None)
+    kept = anew.fit.model.prior
+    assert kept is not None
+    assert kept.with_drift(None).to_json() == prior.to_json()  # the drift is chosen anew
+    with Campaign.open(later, few_effects(), read_only=True) as o:
+        assert o.fit(2).model.prior is not None
 
 
 def test_a_plan_names_what_it_separates_or_why_there_is_none(run: Path) -> None:
