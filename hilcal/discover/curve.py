@@ -117,7 +117,7 @@ def _curve(
         told = [theta[p.coefficient] * f.shape.value(at, f.numbers) for p, f in own]
         return np.asarray(np.sum(told, axis=0))
 
-    said, std = _said(after, motion)
+    said, std = said_by_readings(after, motion)
     size = np.abs(other)
     kept = np.flatnonzero(np.isfinite(std) & (size > LEAST * float(size.max())))
     if len(kept) > MOST_POINTS:
@@ -132,7 +132,7 @@ def _curve(
         unit = unit if divided == "1" else f"{unit}/({divided})"
     return Curve(
         site.words, _over(site.symbol, inner), unit, name, v.unit,
-        x, y, std, _binned(x, y, std), np.vstack([ends, law(ends)]),
+        x, y, std, binned(x, y, std), np.vstack([ends, law(ends)]),
     )  # fmt: skip
 
 
@@ -142,7 +142,7 @@ def _over(symbol: str, inner: str) -> str:
     return f"{symbol}/({inner})" if "·" in inner else f"{symbol}/{inner}"
 
 
-def _said(after: Fit, motion: Floats) -> tuple[Floats, Floats]:
+def said_by_readings(after: Fit, motion: Floats) -> tuple[Floats, Floats]:
     """What the residual of each reading says of the site's motion (N,), and its std."""
     w, white = after.whitening, after.white
     said, square = np.zeros(len(motion)), np.zeros(len(motion))
@@ -157,7 +157,7 @@ def _said(after: Fit, motion: Floats) -> tuple[Floats, Floats]:
     return said / safe, np.where(seen, 1.0 / np.sqrt(safe), np.inf)
 
 
-def _binned(x: Floats, y: Floats, std: Floats) -> Floats:
+def binned(x: Floats, y: Floats, std: Floats) -> Floats:
     """(4, B) weighted means in bins of equally many readings."""
     out = []
     order = np.argsort(x, kind="stable")

@@ -13,6 +13,8 @@ from hilcal.data.whitening import Mode
 from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.diagnose.effect_ranking import FALSE_ALARM, Suspect, candidates
 from hilcal.diagnose.residual_regression import Dependence
+from hilcal.discover.drawn_law import drawn_laws
+from hilcal.discover.law import Coefficient
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit, mahalanobis2
 from hilcal.identify.fit_document import finite
@@ -24,12 +26,14 @@ from hilcal.report.story import (
     Regressor,
     Story,
     StoryCurve,
+    StoryLaw,
     StoryLimit,
     StoryParameter,
     StoryRevision,
     StoryRival,
     StorySuspect,
 )
+from hilcal.report.text_discover import coefficient
 from hilcal.report.text_seen import own_units
 from hilcal.report.verdict_words import message
 from hilcal.types import Floats, Ints
@@ -167,7 +171,39 @@ def _revision(c: Chapter, e: FullPrediction, axes: Floats, measured: Floats) -> 
         limits=() if d is None else _limits(d),
         tested=0 if d is None else d.tested,
         level=FALSE_ALARM,
+        laws=story_laws(c.fit),
     )
+
+
+def story_laws(fit: Fit) -> tuple[StoryLaw, ...]:
+    """Return the curves of laws from files, in units for people; see `drawn_laws`."""
+    found, out = story_parameters(fit), []
+    for law in drawn_laws(fit):
+        mine = [p for p in found if p.name.startswith(f"{law.name}.") and p.value is not None]
+        told = [
+            f"{name} = {coefficient(Coefficient(name, p.value or 0.0, p.std or 0.0, p.unit))}"
+            for name, p in zip([p.name.partition(".")[2] for p in mine], mine, strict=True)
+        ]
+        for c in law.curves:
+            x, y, error, _ = c.binned
+            to_people = 180.0 / np.pi if c.quantity_unit == "rad" else 1.0
+            x_unit = "°" if c.quantity_unit == "rad" else c.quantity_unit
+            y_unit, factor = numbers.unit_for(c.unit, list(c.line[1]))
+            out.append(
+                StoryLaw(
+                    law.name,
+                    law.formula,
+                    ", ".join(law.acts_on),
+                    ", ".join(told),
+                    to_people * x,
+                    factor * y,
+                    factor * error,
+                    np.vstack([to_people * c.line[0], factor * c.line[1]]),
+                    c.quantity if x_unit == "1" else f"{c.quantity} [{x_unit}]",
+                    f"{c.of} of {c.site} [{y_unit}]",
+                )
+            )
+    return tuple(out)
 
 
 def _shown(d: Diagnosis) -> tuple[Suspect, ...]:

@@ -85,6 +85,35 @@ class StoryCurve:
     names: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class StoryLaw:
+    """A law of the model that the catalogue does not have; units as the labels name them.
+
+    Attributes:
+        name: of its effect.
+        formula: it.
+        acts_on: where it acts.
+        coefficients: with their standard uncertainties, in words.
+        x: (K,) mean of a quantity that it depends on, in bins of readings.
+        y: (K,) what the readings of the bin say by themselves.
+        error: (K,) its standard uncertainty.
+        line: (2, L) the same quantity, and the law.
+        x_label: the quantity with its unit.
+        y_label: what the law moves, with its unit.
+    """
+
+    name: str
+    formula: str
+    acts_on: str
+    coefficients: str
+    x: Floats
+    y: Floats
+    error: Floats
+    line: Floats
+    x_label: str
+    y_label: str
+
+
 @dataclass(frozen=True, slots=True)
 class StoryLimit:
     """The smallest strength at which an effect that was not found would have been named.
@@ -140,6 +169,7 @@ class StoryRevision:
         limits: from which strength the effects that were not found would have been named.
         tested: how many effects were tested; 0 where it was not diagnosed.
         level: chance of naming any of them where none is missing.
+        laws: of the model, which the catalogue does not have; one entry per curve.
     """
 
     revision: int
@@ -161,6 +191,7 @@ class StoryRevision:
     limits: tuple[StoryLimit, ...] = ()
     tested: int = 0
     level: float = 1.0
+    laws: tuple[StoryLaw, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,6 +16,7 @@ from hilcal.diagnose.effect_ranking import Suspect
 from hilcal.report import numbers, text, text_next, text_refine
 from hilcal.report.charts import error_per_revision, measured_predicted, misfit, residuals
 from hilcal.report.charts.added_variable import added_variable
+from hilcal.report.charts.law import law
 from hilcal.report.charts.residual_over import residual_over
 from hilcal.report.verdict_words import message
 from hilcal.workbench.elements import button, chart, number, plain, point, title
@@ -63,6 +64,9 @@ def snapshot(view: View, d: Snapshot) -> None:
                 fell(view, d)
             with ui.column().classes("part"):
                 compared(view, d)
+            if d.revision.laws:
+                with ui.column().classes("part"):
+                    laws(view, d)
         with ui.column().classes("stack"):
             with ui.column().classes("part"):
                 revisions(view, d)
@@ -347,6 +351,16 @@ def compared(view: View, d: Snapshot) -> None:
     title("Model and measurement")
     ui.label(text.misses(d.fit)).classes("soft")
     chart(view, measured_predicted.measured_predicted(d.story, d.revision))
+
+
+def laws(view: View, d: Snapshot) -> None:
+    """Draw the laws of the model that the catalogue does not have."""
+    title("Laws beyond the catalogue")
+    for one in d.revision.laws:
+        ui.label(f"{one.name}: {one.formula}; {one.coefficients}; acts on {one.acts_on}").classes(
+            "soft"
+        )
+        chart(view, law(one)).props("data-part=law")
 
 
 def next_measurement(view: View, d: Snapshot) -> None:

@@ -8,6 +8,7 @@ from hilcal.report import numbers, text
 from hilcal.report.build_story import curve, regressor
 from hilcal.report.charts.added_variable import added_variable
 from hilcal.report.charts.error_per_revision import error_per_revision
+from hilcal.report.charts.law import law
 from hilcal.report.charts.measured_predicted import measured_predicted
 from hilcal.report.charts.misfit import misfit_curve, misfit_shares
 from hilcal.report.charts.noise_check import noise_check
@@ -42,6 +43,7 @@ def sections(m: ReportContent) -> tuple[Section, ...]:
         _measured(m),
         _where(m),
         _evidence(m),
+        _laws(m),
         _revisions(m),
         _parameters(m),
         _noise(m),
@@ -109,6 +111,36 @@ def _evidence(m: ReportContent) -> Section:
         details.append(_suspects(d.suspects[MOST_LISTED:], "Other suspects"))
     details += from_terminal(could_have_been_seen(d), "What could have been seen")
     return Section("evidence", "What is missing, with its evidence", tuple(parts), tuple(details))
+
+
+def _laws(m: ReportContent) -> Section | None:
+    found = m.story.revisions[-1].laws
+    if not found:
+        return None
+    parts: list[Part] = []
+    for name in dict.fromkeys(one.name for one in found):
+        curves = [one for one in found if one.name == name]
+        first = curves[0]
+        parts.append(
+            table(
+                f"{name}, an effect of a file",
+                ("", ""),
+                (
+                    ("law", first.formula),
+                    ("acts on", first.acts_on),
+                    ("coefficients", first.coefficients),
+                ),
+            )
+        )
+        parts += [chart(f"{name}: {one.y_label}", law(one), wide=True) for one in curves]
+    parts.append(
+        Words(
+            "Each point is the mean over readings of the law's value plus what it leaves of them. "
+            "Nothing is known outside of the range that is drawn.",
+            "note",
+        )
+    )
+    return Section("laws", "Laws beyond the catalogue", tuple(parts))
 
 
 def _suspects(rows: Sequence[Suspect], caption: str) -> Table:

@@ -8,7 +8,7 @@ from hilcal.report.viewer import style
 from hilcal.report.viewer.digest import Digest
 from hilcal.report.viewer.errors import error_now
 from hilcal.report.viewer.flat import BELOW, FOOT, HEIGHT, RAISED, WIDTH, nothing, write
-from hilcal.report.viewer.residuals import residual_chart
+from hilcal.report.viewer.residuals import law_chart, residual_chart
 from hilcal.types import Floats, Ints
 
 _FOREST_SIGMAS = 10.0
@@ -21,6 +21,8 @@ def revision_charts(rec: rr.RecordingStream, d: Digest, r: StoryRevision) -> Non
     pose_bars(rec, d, r)
     residual_chart(rec, d, r)
     parameter_chart(rec, r)
+    if any(one.laws for one in d.story.revisions):
+        law_chart(rec, r)
 
 
 def pose_charts(rec: rr.RecordingStream, d: Digest) -> None:

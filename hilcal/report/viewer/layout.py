@@ -10,6 +10,7 @@ from hilcal.report.viewer.digest import Digest
 from hilcal.report.viewer.scene import center, seen
 
 FOLLOWS = "Residual against suspect"
+LAW = "Law beyond the catalogue"
 LIMITS = "Could have been seen"
 ERRORS = "Error of each revision [µm, logarithmic]; framed: this one"
 EYE = np.array([1.05, -1.35, 0.55])
@@ -36,6 +37,7 @@ def blueprint(d: Digest) -> rrb.Blueprint:
         ),
         row_shares=[11, 4],
     )
+    laws = [_flat("law", LAW)] if any(r.laws for r in d.story.revisions) else []
     right = rrb.Vertical(
         rrb.Tabs(
             rrb.TextDocumentView(origin="words/verdict", name="Verdict"),
@@ -45,6 +47,7 @@ def blueprint(d: Digest) -> rrb.Blueprint:
         ),
         rrb.Tabs(
             _flat("regressor", FOLLOWS),
+            *laws,
             _flat("parameters", "Parameters in σ (whiskers ±2 σ)"),
             rrb.TextDocumentView(origin="words/parameters", name="Parameters ± σ"),
             rrb.TextDocumentView(origin="words/revisions", name="Table"),

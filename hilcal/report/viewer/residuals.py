@@ -87,6 +87,46 @@ def _curve(rec: rr.RecordingStream, c: StoryCurve, name: str) -> None:
     _axes(rec, frame, x, names, f"{name}: mean ±2 σ", f"{c.y_label} against {c.x_label}")
 
 
+def law_chart(rec: rr.RecordingStream, r: StoryRevision) -> None:
+    """Log the first law that the catalogue does not have, beside what the readings say."""
+    if not r.laws:
+        for part in ("bars", "line", "axes"):
+            rec.log(f"law/{part}", nothing())
+        rec.log("law/points", rr.Points2D([]))
+        write(rec, "law/labels", [(WIDTH / 2, HEIGHT / 2)], ["no law beyond the catalogue yet"])
+        return
+    c = r.laws[0]
+    reach = _SIGMAS * c.error
+    frame = Frame(
+        around(np.concatenate([c.x, c.line[0]])),
+        around(np.concatenate([c.y - reach, c.y + reach, c.line[1], np.zeros(1)])),
+    )
+    ends = np.stack([frame.place(c.x, c.y - reach), frame.place(c.x, c.y + reach)], axis=1)
+    rec.log(
+        "law/points",
+        rr.Points2D(
+            frame.place(c.x, c.y),
+            colors=[style.MEASURED],
+            radii=rr.Radius.ui_points(5.0),
+            draw_order=50.0,
+        ),
+    )
+    rec.log(
+        "law/bars",
+        rr.LineStrips2D(list(ends), colors=[style.MEASURED], radii=rr.Radius.ui_points(1.5)),
+    )
+    rec.log(
+        "law/line",
+        rr.LineStrips2D(
+            [frame.place(*c.line)], colors=[style.NOISE], radii=rr.Radius.ui_points(2.0)
+        ),
+    )
+    x = ticks(*frame.x, most=9, angle=c.x_label.endswith("[°]"))
+    above = f"{c.name}: {c.formula}; blue: readings, mean ±2 σ"
+    below = f"{c.y_label} against {c.x_label}"
+    _axes(rec, frame, x, numbers_at(x), above, below, at="law")
+
+
 def _limits(rec: rr.RecordingStream, r: StoryRevision) -> None:
     """Log bars as long as the strength at which an effect would have been named."""
     seen = [s for s in r.limits if np.isfinite(s.displacement_m)]
@@ -148,17 +188,23 @@ def _regressor(rec: rr.RecordingStream, d: Digest, r: StoryRevision, g: Regresso
 
 
 def _axes(
-    rec: rr.RecordingStream, frame: Frame, x: Floats, names: list[str], above: str, below: str
+    rec: rr.RecordingStream,
+    frame: Frame,
+    x: Floats,
+    names: list[str],
+    above: str,
+    below: str,
+    at: str = "regressor",
 ) -> None:
     """Log ticks, those of x with their names, and what is seen: a title, and what the axes are."""
     y = ticks(*frame.y, most=5)
-    rec.log("regressor/axes", frame.lines(x, y))
+    rec.log(f"{at}/axes", frame.lines(x, y))
     at_x = frame.place(x, np.full(len(x), frame.y[0]))[:, 0]
     at_y = frame.place(np.full(len(y), frame.x[0]), y)[:, 1]
     words = [((WIDTH / 2, TITLE), above), ((WIDTH / 2, BELOW), below)]
     words += [((float(a), FOOT), t) for a, t in zip(at_x, names, strict=True)]
     words += [((-7.0, float(a) + RAISED), t) for a, t in zip(at_y, numbers_at(y), strict=True)]
-    write(rec, "regressor/labels", [w[0] for w in words], [w[1] for w in words])
+    write(rec, f"{at}/labels", [w[0] for w in words], [w[1] for w in words])
 
 
 def _trend(frame: Frame, g: Regressor) -> Floats:
