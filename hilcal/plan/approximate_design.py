@@ -220,7 +220,7 @@ def _first(scan: _Scan, spread: Floats) -> tuple[Ints, Floats]:
         w *= budget / float(w @ cost)
     needed = budget / scan.cap
     order = np.argsort(-w * cost, kind="stable")
-    size = max(4 * units.size, int(np.searchsorted(np.cumsum(cost[order]), 2 * needed)) + 1)
+    size = max(units.size, int(np.searchsorted(np.cumsum(cost[order]), 2 * needed)) + 1)
     while size < len(some):
         chosen = order[:size]
         m = program.information(np.where(np.isin(np.arange(len(w)), chosen), w, 0.0))

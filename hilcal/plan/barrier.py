@@ -105,7 +105,8 @@ def _product(rows: Floats, x: Floats, y: Floats) -> Floats:
     t = np.matmul(left.reshape(n, size, -1).transpose(0, 2, 1), right.reshape(n, size, -1))
     if y is x:  # symmetric: half of each does
         up, across = np.triu_indices(t.shape[1])
-        half = t[:, up, across] * np.where(up == across, 1.0, np.sqrt(2.0))
+        half = np.take(t.reshape(n, -1), up * t.shape[1] + across, axis=1)
+        half *= np.where(up == across, 1.0, np.sqrt(2.0))
         return _gram(half)
     return _gram(t.reshape(n, -1))
 
