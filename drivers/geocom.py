@@ -15,7 +15,7 @@ from pydantic import Field
 
 from drivers import geocom_codes as geo
 from drivers.geocom_line import ANSWER_S, DEVICE, Link
-from drivers.geocom_reading import PolarReading, numbers, usable
+from drivers.geocom_reading import PolarReading, numbers, plausible, usable
 from hilcal.acquire.clock import Clock
 from hilcal.acquire.devices import Report, TargetLostError, TrackerSample
 from hilcal.config import CellConfig
@@ -209,7 +209,7 @@ class GeoComTracker:
                 f"{DEVICE}: measuring: the distance {polar.distance:.4g} m is not within "
                 f"{nearest:g} to {farthest:g} m; does it aim at something else?"
             )
-        return polar
+        return plausible(polar)
 
     def _full(self, until: float, measuring: float) -> PolarReading | None:
         """Measurement with the standard deviation of the angles; None if it is unknown."""

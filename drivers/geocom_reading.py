@@ -10,6 +10,13 @@ from drivers.geocom_line import DEVICE, Reply
 from hilcal.errors import DeviceError
 from hilcal.types import Floats
 
+TURN = 2.0 * np.pi + 1e-6
+"""Of a full circle, rad, with what rounding adds."""
+LARGEST_STD = 0.01
+"""rad; a choice, a thousand times what the poorest total station states (2 mgon)."""
+LARGEST_TILT = 0.5 * np.pi
+"""rad; no station measures upside down."""
+
 
 @dataclass(frozen=True, slots=True)
 class PolarReading:
@@ -62,6 +69,22 @@ def numbers(answer: Reply, count: int) -> Floats:
     if not np.all(np.isfinite(numbers)):
         _strange("values that are no numbers")
     return numbers
+
+
+def plausible(polar: PolarReading) -> PolarReading:
+    """Return a measurement whose angles are some that an instrument can have.
+
+    Raises:
+        DeviceError: an angle beyond a full turn (`TURN`), or a standard deviation or inclination
+            of angles beyond `LARGEST_STD`, `LARGEST_TILT`.
+    """
+    if not (abs(polar.hz) <= TURN and 0.0 <= polar.v <= TURN):
+        _strange(f"angles of {polar.hz:.6g} and {polar.v:.6g} rad")
+    if not 0.0 <= polar.angle_std <= LARGEST_STD:
+        _strange(f"a standard deviation of its angles of {polar.angle_std:.3g} rad")
+    if polar.tilt is not None and max(map(abs, polar.tilt)) > LARGEST_TILT:
+        _strange(f"an inclination of {max(map(abs, polar.tilt)):.3g} rad")
+    return polar
 
 
 def _strange(what: str) -> NoReturn:

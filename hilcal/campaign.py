@@ -42,6 +42,7 @@ from hilcal.revisions import (
     restore,
     restore_model,
     restore_predictive,
+    sound,
     to_record,
 )
 from hilcal.types import Floats
@@ -199,7 +200,8 @@ class Campaign:
 
     def fitted_readings(self, record: RevisionRecord) -> Readings:
         """Return the readings that a revision was fitted to; later ones come after them."""
-        return self.readings[: int(record.result_json["identify"]["n_readings"])]
+        with sound(record):
+            return self.readings[: int(record.result_json["identify"]["n_readings"])]
 
     def restore_model(self, record: RevisionRecord) -> tuple[Model, Floats]:
         """Return model and parameters (P,) of a stored revision; raises as `fit` does."""

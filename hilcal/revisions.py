@@ -1,6 +1,7 @@
 """Fits as revisions of a campaign file: what is stored, and how the fit comes back."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,8 @@ STORED = "stored_sha256"
 
 `data_hash` is that of the readings with the arm's scatter in their covariance, which is computed:
 its last bits depend on the machine."""
+_LARGEST = 1e9
+"""No parameter and no length of a frame is as large, in SI units."""
 SOURCES = "effects_from"
 """Key among the options of a revision: the files that its effects are from."""
 
@@ -114,13 +117,36 @@ def restore(
             "run hilcal identify again"
         )
     model, theta = restore_model(record, cell, readings, catalogue)
-    prior = np.array(
-        [np.inf if s is None else float(s) for s in record.parameters_json["prior"]], dtype=float
-    )
-    scatter = record.parameters_json.get("arm_scatter")
-    if scatter is not None:
-        readings = with_arm_scatter(model.cell, readings, ArmScatter.from_json(scatter))
-    return fit(model, readings, mode_of(record), scaling_of(record), theta, prior)
+    with sound(record):
+        prior = _prior(record)
+        mode, scaling = mode_of(record), scaling_of(record)
+        scatter = record.parameters_json.get("arm_scatter")
+        if scatter is not None:
+            readings = with_arm_scatter(model.cell, readings, ArmScatter.from_json(scatter))
+    return fit(model, readings, mode, scaling, theta, prior)
+
+
+@contextmanager
+def sound(record: RevisionRecord) -> Iterator[None]:
+    """Say that a revision is damaged where its entries are not what this program stores.
+
+    Raises:
+        InputError: names the revision.
+    """
+    try:
+        yield
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        words = " ".join(str(error).split())[:80]
+        raise InputError(f"revision {record.number} is damaged ({words})") from error
+
+
+def _prior(record: RevisionRecord) -> Floats:
+    """Standard deviations (P,) of the priors of a stored fit; infinite for none."""
+    stored = record.parameters_json["prior"]
+    prior = np.array([np.inf if s is None else float(s) for s in stored], dtype=float)
+    if len(prior) != len(record.parameters_json["theta"]) or not np.all(prior >= 0.0):
+        raise ValueError("priors that are no standard deviations of its parameters")
+    return prior
 
 
 def restore_model(
@@ -137,14 +163,27 @@ def restore_model(
     Raises:
         InputError: the parameters are not those of the model.
     """
+    with sound(record):
+        return _restored(record, cell, readings, catalogue)
+
+
+def _restored(
+    record: RevisionRecord, cell: Cell, readings: Readings, catalogue: Catalogue | None
+) -> tuple[Model, Floats]:
+    """Do so; other errors than its own tell of a damaged record."""
     stored: Mapping[str, Any] = record.parameters_json
-    targets = np.array(stored.get("targets", [stored["target"]]))
+    targets = np.array(stored.get("targets", [stored["target"]]), dtype=float)
+    registration = np.array(stored["registration"], dtype=float)
+    if registration.shape != (4, 4) or targets.shape[1:] != (4, 4):
+        raise ValueError("frames that are none")
+    if not all(_is_frame(frame) for frame in (registration, *targets)):
+        raise ValueError("frames that are none")
     if len(targets) != len(cell.known_targets):
         raise InputError(
             f"revision {record.number} is of {len(targets)} targets, the cell has "
             f"{len(cell.known_targets)}; run hilcal identify again"
         )
-    cell = replace(cell.with_targets(targets), registration=np.array(stored["registration"]))
+    cell = replace(cell.with_targets(targets), registration=registration)
     options, known = record.options["effects"], catalogue or installed()
     effects = (known.make(e, cell, readings.states, options.get(e)) for e in record.effects)
     model = Model(cell, tuple(effects), known, readings, carried_of(record))
@@ -154,7 +193,20 @@ def restore_model(
             f"revision {record.number} was made by hilcal {record.program_version}, whose effects "
             "have other parameters; run hilcal identify again"
         )
-    return model, np.array(stored["theta"], dtype=float)
+    theta = np.array(stored["theta"], dtype=float)
+    if theta.shape != (len(names),) or not np.all(np.abs(theta) < _LARGEST):
+        raise ValueError("parameters that are none")
+    return model, theta
+
+
+def _is_frame(frame: Floats) -> bool:
+    """Whether a matrix is a rotation and a translation, to rounding."""
+    turn = frame[:3, :3]
+    return bool(
+        np.all(np.abs(frame) < _LARGEST)
+        and np.allclose(turn @ turn.T, np.eye(3), atol=1e-6)
+        and np.array_equal(frame[3], [0.0, 0.0, 0.0, 1.0])
+    )
 
 
 def carried_of(record: RevisionRecord) -> CarriedPrior | None:
@@ -175,10 +227,11 @@ def restore_predictive(
         readings: all readings that it was fitted to.
     """
     stored: Mapping[str, Any] = record.parameters_json
-    prior = np.array([np.inf if s is None else float(s) for s in stored["prior"]], dtype=float)
-    used = np.delete(np.arange(len(readings)), np.array(stored["outliers"], dtype=int))
-    sigma = float(record.result_json["identify"]["error"]["holdout"]["rms_sigma"])
-    return predictive(model, theta, prior, readings[used], mode_of(record), sigma)
+    with sound(record):
+        prior, mode = _prior(record), mode_of(record)
+        used = np.delete(np.arange(len(readings)), np.array(stored["outliers"], dtype=int))
+        sigma = float(record.result_json["identify"]["error"]["holdout"]["rms_sigma"])
+    return predictive(model, theta, prior, readings[used], mode, sigma)
 
 
 def mode_of(record: RevisionRecord) -> Mode:

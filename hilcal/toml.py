@@ -56,6 +56,8 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: not UTF-8 text (byte {error.start}); expected TOML") from None
     try:
         return tomllib.loads(text)
+    except RecursionError:
+        raise InputError(f"{path.name}: nested too deeply; valid: TOML with sections") from None
     except tomllib.TOMLDecodeError as error:
         where = f"(at line {max(1, len(text.splitlines()))}, end of document)"
         message = str(error).replace("(at end of document)", where)
@@ -80,11 +82,33 @@ def check_json(text: str, section: type[S], where: str) -> S:
     Raises:
         InputError: not JSON, unknown key, missing key or bad value.
     """
+    return check_section(read_json(text, where), section, where)
+
+
+def read_json(text: str, where: str) -> Any:
+    """Return what a JSON document holds; `where` names it in messages.
+
+    Raises:
+        InputError: not JSON, or nested too deeply.
+    """
     try:
-        data = json.loads(text)
+        return parse_json(text)
     except json.JSONDecodeError as error:
         raise InputError(f"{where}: not JSON: {error.msg} (line {error.lineno})") from None
-    return check_section(data, section, where)
+    except ValueError as error:
+        raise InputError(f"{where}: not JSON: {error}") from None
+
+
+def parse_json(text: str) -> Any:
+    """Return what a JSON document holds.
+
+    Raises:
+        ValueError: not JSON, nested too deeply, or a whole number of thousands of digits.
+    """
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
 
 
 def suggest(name: str, valid: Sequence[str]) -> str:

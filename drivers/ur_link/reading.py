@@ -22,6 +22,28 @@ OPTIONAL = frozenset({"target_speed_fraction", "payload", "payload_cog", "ft_raw
 with 5.9)."""
 
 
+LARGEST = {
+    "timestamp": 1e10,
+    "actual_q": 100.0,
+    "target_q": 100.0,
+    "actual_qd": 100.0,
+    "target_moment": 1e5,
+    "actual_current": 1e4,
+    "target_current": 1e4,
+    "joint_temperatures": 200.0,
+    "actual_TCP_pose": 100.0,
+    "actual_TCP_force": 1e5,
+    "ft_raw_wrench": 1e5,
+    "payload": 1e3,
+    "payload_cog": 100.0,
+    "speed_scaling": 10.0,
+    "target_speed_fraction": 10.0,
+}
+"""Magnitudes beyond which a field cannot be what an arm of this maker measures (s, rad, rad/s, N·m,
+A, °C, m, N, kg); choices, ten times and more beyond the largest of them. A packet that a fault on
+the way has changed is as a rule far outside."""
+
+
 class ReadingError(Exception):
     """The packet cannot be what the controller sent."""
 
@@ -47,19 +69,19 @@ def read(answer: dict[str, Any]) -> Reading:
     """Return the reading in the answer of the receive worker.
 
     Raises:
-        ReadingError: a field has a wrong length or is not finite.
+        ReadingError: a field has a wrong length, is not finite, or larger than can be.
     """
     fields, host_ns = answer["fields"], int(answer["host_ns"])
 
     def number(name: str) -> float:
         value = float(fields[name])
-        if not math.isfinite(value):
+        if not math.isfinite(value) or abs(value) > LARGEST[name]:
             raise ReadingError(f"{name} is {value}")
         return value
 
     def vector(name: str, n: int) -> Floats:
         value = np.asarray(fields[name], dtype=np.float64)
-        if value.shape != (n,) or not np.isfinite(value).all():
+        if value.shape != (n,) or not (np.abs(value) <= LARGEST[name]).all():
             raise ReadingError(f"{name} is {fields[name]}")
         return value
 

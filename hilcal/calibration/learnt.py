@@ -11,6 +11,7 @@ and its eigenvectors takes seconds, once, when an uncertainty is first asked for
 """
 
 import base64
+import math
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -80,6 +81,8 @@ class Learnt:
     def from_json(cls, content: Mapping[str, Any]) -> "Learnt":
         """Return what `to_json` wrote."""
         m = int(content["elements"])
+        if m not in (3, 6):
+            raise ValueError(f"readings of {m} elements")
         states = States(**{name: _unpacked(a) for name, a in content["states"].items()})
         pose, load, cycle = _unpacked(content["index"])
         i, j = np.triu_indices(m)
@@ -112,7 +115,15 @@ def _packed(a: np.ndarray) -> dict[str, object]:
 
 def _unpacked(content: Mapping[str, Any]) -> Any:
     shape = [int(k) for k in content["shape"]]
-    data = zlib.decompress(base64.b85decode(content["zlib_base85"]))
+    if content["type"] not in ("<i4", "<f4") or not shape or min(shape) < 0:
+        raise ValueError(f"numbers of type {content['type']!r} and shape {shape}")
+    size = 4 * math.prod(shape)
+    try:
+        data = zlib.decompressobj().decompress(base64.b85decode(content["zlib_base85"]), size + 1)
+    except zlib.error as error:
+        raise ValueError(str(error)) from error
+    if len(data) != size:
+        raise ValueError(f"{len(data)} bytes for shape {shape}")
     flat = np.frombuffer(data, dtype=content["type"]).reshape([*shape[1:], shape[0]])
     whole = np.int64 if content["type"] == "<i4" else np.float64
     return np.ascontiguousarray(np.moveaxis(flat, -1, 0).astype(whole))

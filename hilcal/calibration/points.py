@@ -38,6 +38,10 @@ from hilcal.types import Floats, Ints
 NO_LOAD = "none"
 
 
+LARGEST = 4.0 * np.pi
+"""rad; a choice, twice what the joints of most arms turn: degrees in a column of rad are beyond."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Points:
     """N points.
@@ -83,6 +87,12 @@ def read_points(path: Path, arm: Arm, loads: Mapping[str, Floats]) -> Points:
     q = found.pop("q_rad", None)
     if "q_deg" in found:
         q = np.radians(found.pop("q_deg"))
+    if q is not None and np.any(np.abs(q) > LARGEST):
+        k = int(np.argmax(np.any(np.abs(q) > LARGEST, axis=1)))
+        raise InputError(
+            f"{table.at(k)}: a joint at {np.abs(q[k]).max():.4g} rad; columns q1_rad … are in rad, "
+            "q1_deg … in degrees"
+        )
     named = table.text.get("pose")
     names = tuple(named) if named else tuple(str(k + 1) for k in range(len(table.rows)))
     wrench, sensed = found.pop("wrench", None), found.pop("sensed", None)

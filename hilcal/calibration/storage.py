@@ -17,6 +17,7 @@ import numpy as np
 
 from hilcal import __version__
 from hilcal.calibration.calibration import Calibration
+from hilcal.calibration.check_stored import check_arm, check_cell, check_numbers, check_spread
 from hilcal.calibration.learnt import Learnt
 from hilcal.calibration.measured import Measured
 from hilcal.calibration.scatter import Scatter
@@ -28,6 +29,7 @@ from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError
 from hilcal.model import Model
 from hilcal.robot.arm import Arm
+from hilcal.toml import parse_json
 from hilcal.types import Floats
 
 FORMAT, VERSION = "hilcal-calibration", 2
@@ -60,14 +62,14 @@ def read(path: Path, catalogue: Catalogue | None = None) -> Calibration:
         InputError: see `from_json`; or the file cannot be read.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = parse_json(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: no calibration: {error}") from None
     try:
         return from_json(content, catalogue)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    except (LookupError, TypeError, ValueError, AttributeError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         raise InputError(f"{path}: a damaged calibration: {error!r}") from None
 
 
@@ -120,7 +122,10 @@ def from_json(content: Mapping[str, Any], catalogue: Catalogue | None = None) ->
             f"{content['hilcal']}; this program reads versions {BY_FACTOR} and {VERSION}"
         )
     known = catalogue or installed()
-    cell = _cell(content["cell"], _arm(content["arm"]))
+    arm = _arm(content["arm"])
+    check_arm(arm)
+    cell = _cell(content["cell"], arm)
+    check_cell(cell)
     effects = []
     for e in content["effects"]:
         if e["name"] not in known.names:
@@ -136,12 +141,27 @@ def from_json(content: Mapping[str, Any], catalogue: Catalogue | None = None) ->
             f"written by hilcal {content['hilcal']}, whose effects have other parameters"
         )
     theta, std = (np.array(content[k], dtype=float) for k in ("theta", "std"))
+    check_numbers("theta", theta, (len(names),))
+    check_numbers("std", std, (len(names),), least=0.0)
     root = learnt = None
     if "learnt" in content:
         learnt = Learnt.from_json(content["learnt"])
     else:
         flat = np.frombuffer(base64.b64decode(content["covariance_root"]), dtype="<f4")
         root = flat.reshape(len(std), -1).astype(float) * std[:, None]
+        check_numbers("covariance_root", root, root.shape)
+    check_numbers("misfit_m2", float(content["misfit_m2"]), least=0.0)
+    scatter, measured = (
+        Scatter.from_json(content["scatter"]),
+        Measured.from_json(content["measured"]),
+    )
+    check_spread(scatter, measured, arm.n)
+    loads = {name: _array(wrench) for name, wrench in content["loads"].items()}
+    for name, wrench in loads.items():
+        check_numbers(f"load {name}", wrench, (6,))
+    sensor = SensorMount.from_json(content.get("force_sensor"))
+    if sensor is not None:
+        check_numbers("force_sensor", np.array([sensor.origin, sensor.rotvec]), (2, 3))
     return Calibration(
         model=model,
         theta=theta,
@@ -149,11 +169,11 @@ def from_json(content: Mapping[str, Any], catalogue: Catalogue | None = None) ->
         root=root,
         learnt=learnt,
         misfit=float(content["misfit_m2"]),
-        scatter=Scatter.from_json(content["scatter"]),
-        measured=Measured.from_json(content["measured"]),
-        loads={name: _array(wrench) for name, wrench in content["loads"].items()},
+        scatter=scatter,
+        measured=measured,
+        loads=loads,
         source=content["source"],
-        sensor=SensorMount.from_json(content.get("force_sensor")),
+        sensor=sensor,
     )
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from hilcal import __version__
 from hilcal.data import rows, schema
 from hilcal.data.readings import Readings
-from hilcal.data.records import Layout, content_hash, layout_of
+from hilcal.data.records import Layout, content_hash, layout_of, read_layout
 from hilcal.data.revision import RevisionRecord, from_text, to_text, utc_now
 from hilcal.data.stored_priors import join, split
 from hilcal.errors import InputError
@@ -201,7 +201,7 @@ class CampaignFile:
         if layout is None:
             raise InputError(f"{self.path}: the campaign holds no readings yet")
         with schema.sqlite_errors(self.path):
-            names = json.loads(self._read_meta().get(_TARGETS, "[]"))
+            names = self._target_names()
             return rows.fetch_readings(self._connection, self.path, layout, names)
 
     def data_hash(self) -> str:
@@ -261,7 +261,10 @@ class CampaignFile:
             meta = self._read_meta()
         found: list[int | None] = []
         while (text := meta.get(_ACCEPTED.format(len(found) + 1))) is not None:
-            found.append(json.loads(text))
+            number = rows.stored_json(self.path, text)
+            if number is not None and not isinstance(number, int):
+                raise InputError(f"{self.path}: the campaign file is damaged (an acceptance)")
+            found.append(number)
         return found
 
     def revisions(self) -> tuple[RevisionRecord, ...]:
@@ -305,7 +308,19 @@ class CampaignFile:
     def _layout(self) -> Layout | None:
         with schema.sqlite_errors(self.path):
             text = self._read_meta().get("layout")
-        return None if text is None else tuple((str(n), int(w)) for n, w in json.loads(text))
+        try:
+            return None if text is None else read_layout(text)
+        except ValueError as e:
+            raise InputError(f"{self.path}: the campaign file is damaged ({e})") from e
+
+    def _target_names(self) -> list[str]:
+        return self._names_in(self._read_meta().get(_TARGETS, "[]"))
+
+    def _names_in(self, text: str) -> list[str]:
+        names = rows.stored_json(self.path, text)
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise InputError(f"{self.path}: the campaign file is damaged (its targets)")
+        return names
 
     def _claim_layout(self, layout: Layout) -> None:
         """Fix the quantities of a reading with the first ones; refuse others later."""
@@ -328,7 +343,7 @@ class CampaignFile:
             text = json.dumps(readings.target_names)
             rows.insert_meta(self._connection, _TARGETS, text)
             schema.require(self._connection, schema.SEVERAL_TARGETS)
-        names = list(json.loads(text))
+        names = self._names_in(text)
         new = [name for name in readings.target_names if name not in names]
         if new:
             raise InputError(

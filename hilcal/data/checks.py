@@ -6,7 +6,7 @@ from hilcal.data.columns import POSITION, ROTATION, WRENCH
 from hilcal.data.csvfile import CsvTable
 from hilcal.errors import InputError
 from hilcal.robot.arm import Arm
-from hilcal.types import Floats, Ints
+from hilcal.types import Bools, Floats, Ints
 
 MAX_DISTANCE = 100.0  # m; no instrument measures an arm from further away
 MAX_STD = 3e-3  # m; cameras do better; micrometres given 1000 times too large are above it
@@ -124,11 +124,8 @@ def check_covariances(table: CsvTable, covariance: Floats) -> None:
             f"{table.at(int(i))}: the covariance is zero; give the reading's covariance in m², or "
             f"leave out all covariance columns to use the tracker's specification"
         )
-    scale = 1.0 / np.sqrt(np.where(variance > 0, variance, 1.0))
-    correlation = scale[:, :, None] * covariance * scale[:, None, :]
-    undefined = (variance == 0)[:, :, None] & (covariance != 0)
-    smallest = np.linalg.eigvalsh(correlation)[:, 0]
-    for i in np.flatnonzero((smallest < -1e-9) | np.any(undefined, axis=(1, 2)))[:1]:
+    smallest = smallest_correlation(covariance)
+    for i in np.flatnonzero(smallest < -1e-9)[:1]:
         raise InputError(
             f"{table.at(int(i))}: the covariance is not positive semi-definite "
             f"(smallest eigenvalue of the correlation matrix {smallest[i]:.3g})"
@@ -145,6 +142,27 @@ def check_covariances(table: CsvTable, covariance: Floats) -> None:
             f"{table.at(int(i))}: a standard deviation of {turn[i]:.3g} rad cannot calibrate an "
             f"arm; covariances must be in m², m·rad and rad² (1 deg² = 3.05e-4 rad²)"
         )
+
+
+def smallest_correlation(covariance: Floats) -> Floats:
+    """Return the smallest eigenvalue (N,) of the correlation matrices of covariances (N, m, m).
+
+    −∞ where a variable without variance has a covariance with another, or a variance is negative.
+    """
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    scale = 1.0 / np.sqrt(np.where(variance > 0, variance, 1.0))
+    correlation = scale[:, :, None] * covariance * scale[:, None, :]
+    undefined = (variance <= 0)[:, :, None] & (covariance != 0)
+    smallest = np.linalg.eigvalsh(correlation)[:, 0]
+    return np.where(np.any(undefined, axis=(1, 2)), -np.inf, smallest)
+
+
+def is_covariance(covariance: Floats) -> Bools:
+    """Return (N,) whether matrices (N, m, m) are symmetric and positive semi-definite."""
+    std = np.sqrt(np.abs(np.diagonal(covariance, axis1=1, axis2=2)))
+    differs = np.abs(covariance - np.swapaxes(covariance, 1, 2))
+    symmetric = np.all(differs <= 1e-9 * std[:, :, None] * std[:, None, :], axis=(1, 2))
+    return np.asarray(symmetric & (smallest_correlation(covariance) >= -1e-9))
 
 
 def check_wrenches(table: CsvTable, wrench: Floats, load: Ints, names: list[str], arm: Arm) -> None:

@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 
 from hilcal.errors import InputError
-from hilcal.toml import suggest
+from hilcal.toml import read_json, suggest
 from hilcal.types import Floats
 
+LARGEST = 1e3
+"""rad; a choice: no joint turns so far, and finite numbers beyond it are damage."""
 FORMAT = "hilcal-plan"
 VERSION = 1
 UNLOADED = "none"
@@ -98,10 +100,7 @@ def read_plan(text: str, where: str) -> Plan:
     Raises:
         InputError: not a plan, or something in it that cannot be.
     """
-    try:
-        data = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise InputError(f"{where}: not JSON: {error.msg} (line {error.lineno})") from None
+    data = read_json(text, where)
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         raise InputError(f'{where}: not a plan; a plan has "format": "{FORMAT}"')
     if data.get("version") != VERSION:
@@ -128,12 +127,13 @@ def _poses(data: object, where: str) -> tuple[tuple[str, ...], Floats]:
         if name in names:
             raise InputError(f"{where}: two poses have the name {name!r}; names must differ")
         numbers = isinstance(q, list) and all(
-            isinstance(x, int | float) and not isinstance(x, bool) and np.isfinite(x) for x in q
+            isinstance(x, int | float) and not isinstance(x, bool) and abs(x) < LARGEST for x in q
         )
         if not numbers or not q or (rows and len(q) != len(rows[0])):
             count = f"{len(rows[0])} " if rows else ""
             raise InputError(
-                f"{where}: pose {name!r}: q_rad must be a list of {count}finite numbers, rad"
+                f"{where}: pose {name!r}: q_rad must be a list of {count}finite numbers, rad, "
+                f"below {LARGEST:g}"
             )
         names.append(name)
         rows.append([float(x) for x in q])

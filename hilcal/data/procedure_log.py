@@ -35,7 +35,7 @@ class ProcedureLog:
             meta = rows.fetch_meta(self._campaign.connection, self._campaign.path)
         found: list[dict[str, Any]] = []
         while (text := meta.get(ENTRY.format(len(found) + 1))) is not None:
-            found.append(json.loads(text))
+            found.append(rows.stored_json(self._campaign.path, text))
         return tuple(found)
 
     def last(self, kind: str) -> dict[str, Any] | None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from hilcal.data.readings import Readings, States
 from hilcal.errors import InputError
+from hilcal.toml import parse_json
 from hilcal.types import Floats, Ints
 
 Layout = tuple[tuple[str, int], ...]
@@ -32,6 +33,29 @@ def layout_of(readings: Readings) -> Layout:
     width = {name: 1 if rank == 1 else n for name, rank in _STATE.items()} | {"wrench": 6}
     state = [(k, w) for k, w in width.items() if getattr(readings.states, k) is not None]
     return (*state, ("value", m), ("covariance", m * m))
+
+
+def read_layout(text: str) -> Layout:
+    """Return the fields of a record from their JSON text.
+
+    Raises:
+        ValueError: fields that no reading has.
+    """
+    try:
+        found = tuple((str(name), int(width)) for name, width in parse_json(text))
+    except (TypeError, OverflowError) as error:
+        raise ValueError(str(error)) from error
+    width = dict(found)
+    n, m = width.get("q", 0), width.get("value", 0)
+    expected = {name: 1 if rank == 1 else n for name, rank in _STATE.items()} | {"wrench": 6}
+    expected |= {"value": m, "covariance": m * m}
+    in_order = [name for name in expected if name in width]
+    wanted = {"q", "wrench", "value", "covariance"} <= set(width)
+    if not wanted or [name for name, _ in found] != in_order or m not in (3, 6):
+        raise ValueError("fields that no reading has")
+    if n < 1 or any(width[name] != expected[name] for name in width):
+        raise ValueError("fields of a wrong width")
+    return found
 
 
 def pack(readings: Readings) -> Floats:

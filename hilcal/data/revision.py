@@ -6,6 +6,8 @@ from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
 from typing import Any
 
+from hilcal.toml import parse_json
+
 
 def utc_now() -> str:
     """Present time, ISO 8601, UTC, to the second."""
@@ -95,8 +97,23 @@ def from_text(text: str, number: int) -> RevisionRecord:
         ValueError: not such a text.
     """
     try:
-        content = json.loads(text)
+        content = parse_json(text)
         content["effects"] = tuple(content["effects"])
-        return RevisionRecord(**content, number=number)
-    except (KeyError, TypeError) as e:
+        record = RevisionRecord(**content, number=number)
+        _check(record)
+        return record
+    except (LookupError, TypeError, AttributeError) as e:
         raise ValueError(str(e)) from e
+
+
+def _check(record: RevisionRecord) -> None:
+    """Refuse a record whose entries are of other kinds."""
+    for name in ("options", "parameters_json", "result_json"):
+        if not isinstance(getattr(record, name), dict):
+            raise TypeError(f"{name} is no document")
+    texts = (*record.effects, record.data_hash, record.program_version, record.created)
+    named = (t for t in (record.added, record.removed) if t is not None)
+    if not all(isinstance(text, str) for text in (*texts, *named)):
+        raise TypeError("a name is no text")
+    if record.parent is not None and not isinstance(record.parent, int):
+        raise TypeError("parent is no number")

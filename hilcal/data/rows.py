@@ -4,15 +4,19 @@ import sqlite3
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from hilcal.data.checks import SAME_POSE
+from hilcal.data.checks import SAME_POSE, is_covariance
 from hilcal.data.readings import Readings
 from hilcal.data.records import Layout, pack, unpack
 from hilcal.errors import InputError
+from hilcal.toml import parse_json
 from hilcal.types import Ints
 
+LARGEST = 1e12
+"""No quantity of a reading is as large, in SI units: times in s are below 1e11."""
 _NAMES = {
     "poses": "SELECT name FROM poses ORDER BY id",
     "loads": "SELECT name FROM loads ORDER BY id",
@@ -109,10 +113,33 @@ def fetch_readings(
         if not whole:
             raise InputError(f"{path}: the campaign file is damaged at reading {number}")
     records = np.frombuffer(b"".join(row[4] for row in rows), dtype="<f8").reshape(len(rows), -1)
+    if bad := np.flatnonzero(~(np.abs(records) < LARGEST).all(axis=1))[:1].tolist():
+        raise InputError(f"{path}: the campaign file is damaged at reading {bad[0] + 1}")
     index = np.array([row[1:4] for row in rows], dtype=np.int64)
-    if np.any(index[:, :2].max(axis=0) >= [len(n) for n in names]):
+    if index[:, :2].min() < 0 or np.any(index[:, :2].max(axis=0) >= [len(n) for n in names]):
         raise InputError(f"{path}: the campaign file is damaged (names are missing)")
-    return unpack(records, layout, index, names[0], names[1], target_names)
+    readings = unpack(records, layout, index, names[0], names[1], target_names)
+    if bad := np.flatnonzero(~is_covariance(readings.covariance))[:1].tolist():
+        raise InputError(
+            f"{path}: the campaign file is damaged at reading {bad[0] + 1}: its covariance is not "
+            "positive semi-definite"
+        )
+    target = readings.states.target
+    if target is not None and not 0 <= target.min() <= target.max() < len(target_names):
+        raise InputError(f"{path}: the campaign file is damaged (targets are missing)")
+    return readings
+
+
+def stored_json(path: Path, text: str) -> Any:
+    """Return what a stored JSON text holds.
+
+    Raises:
+        InputError: it is none.
+    """
+    try:
+        return parse_json(text)
+    except ValueError as error:
+        raise InputError(f"{path}: the campaign file is damaged ({error})") from error
 
 
 def check_poses(connection: sqlite3.Connection, path: Path, readings: Readings) -> None:

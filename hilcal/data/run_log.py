@@ -198,7 +198,7 @@ class RunLog:
     def done(self) -> frozenset[Step]:
         """Return the steps that have been measured."""
         stored = self._select("SELECT step FROM details")
-        return frozenset(Step(*json.loads(key)[:3]) for (key,) in stored)
+        return frozenset(Step(*self._step(key)) for (key,) in stored)
 
     def details(self) -> list[dict[str, Any]]:
         """Return the raw details of all readings, in order, each with its "step".
@@ -213,8 +213,10 @@ class RunLog:
                     f"{self._campaign.path}: the campaign is damaged at the details of "
                     f"reading {number}"
                 )
-            pose, load, cycle = json.loads(key)[:3]
-            out.append({**json.loads(text), "step": {"pose": pose, "load": load, "cycle": cycle}})
+            pose, load, cycle = self._step(key)
+            out.append(
+                {**self._document(text), "step": {"pose": pose, "load": load, "cycle": cycle}}
+            )
         return out
 
     def events(self) -> list[dict[str, Any]]:
@@ -229,12 +231,24 @@ class RunLog:
                 raise InputError(
                     f"{self._campaign.path}: the campaign is damaged at event {number}"
                 )
-            out.append(json.loads(text))
+            out.append(self._document(text))
         return out
 
     def readings(self) -> Readings | None:
         """Return all readings, None before the first."""
         return self._campaign.readings() if self._campaign.n_readings else None
+
+    def _step(self, key: str) -> tuple[str, str, int]:
+        found = rows.stored_json(self._campaign.path, key)
+        if not isinstance(found, list) or [type(x) for x in found[:3]] != [str, str, int]:
+            raise InputError(f"{self._campaign.path}: the campaign is damaged (step {key})")
+        return found[0], found[1], found[2]
+
+    def _document(self, text: str) -> dict[str, Any]:
+        found = rows.stored_json(self._campaign.path, text)
+        if not isinstance(found, dict):
+            raise InputError(f"{self._campaign.path}: the campaign is damaged (its log)")
+        return found
 
     def _select(self, statement: str) -> list[Any]:
         with schema.sqlite_errors(self._campaign.path):

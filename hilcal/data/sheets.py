@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from hilcal.data import matfile
 from hilcal.data.grid import Cell, Grid, content_of, joined, read_text, table, unique
 from hilcal.data.mapping import FileFormat, Mapping
 from hilcal.errors import InputError
@@ -206,17 +207,14 @@ def _mat(path: str, how: FileFormat) -> Grid:
     A matrix A of k > 1 columns gives "A(1)" ... "A(k)", poses T of shape (4, 4, N) give
     "T(1,1)" ..., fields of a structure "s.field".
     """
-    from scipy.io import loadmat
-
-    found = loadmat(path, appendmat=False, squeeze_me=False, struct_as_record=True)
-    variables = [name for name in found if not name.startswith("__")]
+    variables, found = matfile.read(path)
     if how.variable is not None and how.variable not in variables:
         raise InputError(
             f"{path}: no variable '{how.variable}'{suggest(how.variable, variables)}; it has "
             f"{', '.join(variables)}"
         )
     chosen = [how.variable] if how.variable else variables
-    blocks = [b for name in chosen for b in _blocks(name, np.asarray(found[name]))]
+    blocks = [(name, values) for variable, name, values in found if variable in chosen]
     lengths = [len(values) for _, values in blocks]
     if not blocks:
         raise InputError(
@@ -228,24 +226,6 @@ def _mat(path: str, how: FileFormat) -> Grid:
         part for name, values in blocks if len(values) == rows for part in _split(name, values)
     ]
     return _columns(path, named, how)
-
-
-def _blocks(name: str, value: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
-    """Matrices (N, k) of a variable, N > 1, by name."""
-    if value.dtype.names and value.size == 1:
-        for field in value.dtype.names:
-            yield from _blocks(f"{name}.{field}", np.asarray(value[field].flat[0]))
-    elif value.dtype.kind in "fiu" and value.ndim == 3:
-        last = value.shape[2]
-        flat = np.moveaxis(value, 2, 0).reshape(last, -1)
-        for k, at in enumerate(np.ndindex(value.shape[:2])):
-            yield f"{name}({at[0] + 1},{at[1] + 1})", flat[:, k : k + 1]
-    elif value.dtype.kind in "fiu" and value.ndim == 2 and value.size > 1:
-        yield name, value.T if value.shape[0] == 1 else value
-    elif value.dtype.kind == "O" and value.ndim == 2 and min(value.shape) == 1:
-        cells = [v.item() if isinstance(v, np.ndarray) and v.size == 1 else v for v in value.flat]
-        if len(cells) > 1 and all(isinstance(c, str) for c in cells):
-            yield name, np.array(cells, dtype=object)[:, None]
 
 
 def _split(name: str, values: np.ndarray) -> Iterator[tuple[str, list[Cell]]]:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from hilcal.data.revision import RevisionRecord
+from hilcal.toml import parse_json
 
 CARRIED = "carried_prior"
 """Key among the parameters of a revision: the prior that it was fitted with, as JSON."""
@@ -40,11 +41,13 @@ def join(record: RevisionRecord, stored: Mapping[str, str]) -> RevisionRecord:
     Raises:
         ValueError: the posterior is not among them.
     """
-    carried: Mapping[str, Any] | None = record.parameters_json.get(CARRIED)
+    carried: Any = record.parameters_json.get(CARRIED)
     if carried is None:
         return record
+    if not isinstance(carried, Mapping):
+        raise ValueError("a prior is no document")
     text = stored.get(key_of(str(carried.get(_HASH))))
     if text is None:
         raise ValueError("a prior is missing")
-    whole = {k: v for k, v in carried.items() if k != _HASH} | {_POSTERIOR: json.loads(text)}
+    whole = {k: v for k, v in carried.items() if k != _HASH} | {_POSTERIOR: parse_json(text)}
     return replace(record, parameters_json={**record.parameters_json, CARRIED: whole})

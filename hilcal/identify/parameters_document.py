@@ -1,7 +1,6 @@
 """The parameters of a fit with their covariance as one JSON document, and back."""
 
 import base64
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 from hilcal import __version__
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit
+from hilcal.toml import parse_json
 from hilcal.types import Bools, Floats
 
 FORMAT, VERSION = "hilcal-parameters", 1
@@ -133,7 +133,7 @@ def read(path: str | Path) -> Parameters:
         InputError: no such file, or another kind of document.
     """
     try:
-        return from_json(json.loads(Path(path).read_text(encoding="utf-8")))
+        return from_json(parse_json(Path(path).read_text(encoding="utf-8")))
     except (OSError, LookupError, TypeError, ValueError) as error:
         raise InputError(f"{path}: no parameters: {error!r}") from None
     except InputError as error:

@@ -15,6 +15,7 @@ from hilcal.data.ranges import Range
 from hilcal.data.whitening import MODES
 from hilcal.errors import InputError
 from hilcal.identify.posterior import LearntEffect, Posterior, Source
+from hilcal.toml import parse_json
 from hilcal.types import Floats
 
 FORMAT, VERSION = "hilcal-posterior", 1
@@ -69,7 +70,7 @@ def read(path: Path) -> Posterior:
         InputError: see `from_json`; or the file cannot be read.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = parse_json(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: no prior: {error}") from None
     try:

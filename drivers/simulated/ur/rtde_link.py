@@ -203,6 +203,6 @@ class RtdeLink:
                 arm.registers.written_ns[k] = now
             elif name.startswith(_DOUBLE):
                 arm.registers.in_double[int(name.removeprefix(_DOUBLE))] = value
-        if values.get("speed_slider_mask"):
+        if values.get("speed_slider_mask") and "speed_slider_fraction" in values:
             arm.slider = min(1.0, max(0.0, values["speed_slider_fraction"]))
         self._links.taken()

@@ -1,0 +1,147 @@
+"""Ways to damage bytes, texts and documents; every one returns what a parser is then given."""
+
+import json
+from collections.abc import Callable, Sequence
+from copy import deepcopy
+from random import Random
+from typing import Any
+
+NUMBERS: tuple[object, ...] = (
+    0, -0.0, -1, 1, 2, 255, 65535, 2**31 - 1, -(2**31), 2**63, 10**30, 1e-320, 1e-12, 1e12, 1e154,
+    1e300, -1e300, 1.7976931348623157e308, float("nan"), float("inf"), float("-inf"),
+)  # fmt: skip
+ODD: tuple[object, ...] = (
+    *NUMBERS, None, True, False, "", "x", "nan", "1e999", "../../x", "/etc/passwd",
+    "\x00", "\ud800",
+    "a" * 300, [], {}, [[]], [None], {"": None}, [0.0] * 6, [0.0] * 37, "é\u202e",
+)  # fmt: skip
+WORDS = (
+    "nan", "inf", "-inf", "1e308", "-1e308", "1e999", "1e-320", "0", "-1", "0x10", "99999999999999",
+    "", " ", "\x00", "\"", "'", ",", ";", "\t", "\n", "\r\n", "=", "[", "]", "[[", "{", "}", "#",
+    "null", "true", "é", "１", "1_0", "../../x", "$(x)", "<!ENTITY a 'b'>", "&a;", "<", ">", "/",
+)  # fmt: skip
+
+
+def bytes_damaged(data: bytes, rng: Random, others: Sequence[bytes] = ()) -> bytes:
+    """Bits flipped, pieces cut, doubled, moved, overwritten, or spliced with another input's."""
+    out = bytearray(data)
+    for _ in range(1 if rng.random() < 0.6 else rng.randint(2, 6)):
+        n = len(out)
+        at, to = (rng.randrange(n), rng.randrange(n)) if n else (0, 0)
+        match rng.randrange(9):
+            case 0 | 1 if n:
+                out[at] ^= 1 << rng.randrange(8)
+            case 2 if n:
+                out[at] = rng.choice((0, 1, 0x7F, 0x80, 0xFE, 0xFF, 10, 13, 32, 44))
+            case 3:
+                del out[at:]
+            case 4:
+                del out[at : at + rng.randint(1, 16)]
+            case 5:
+                out[at:at] = out[to : to + rng.randint(1, 64)]
+            case 6:
+                out[at:at] = rng.randbytes(rng.randint(1, 16))
+            case 7 if n:
+                size = rng.choice((2, 4, 8))
+                value = rng.choice((0, 1, -1, 1 << (8 * size - 1), (1 << (8 * size - 1)) - 1))
+                order = rng.choice(("little", "big"))
+                out[at : at + size] = (value % (1 << 8 * size)).to_bytes(size, order)
+            case _ if others:
+                other = rng.choice(others)
+                cut = rng.randrange(len(other) + 1)
+                out[at:] = other[cut:]
+    return bytes(out)
+
+
+def words_damaged(text: str, rng: Random) -> str:
+    """Numbers and words of a text replaced, lines dropped, doubled and swapped."""
+    for _ in range(1 if rng.random() < 0.6 else rng.randint(2, 6)):
+        lines = text.split("\n")
+        at, to = rng.randrange(len(lines)), rng.randrange(len(lines))
+        match rng.randrange(7):
+            case 0:
+                del lines[at]
+            case 1:
+                lines.insert(to, lines[at])
+            case 2:
+                lines[at], lines[to] = lines[to], lines[at]
+            case 3:
+                cut = rng.randrange(len(lines[at]) + 1)
+                lines[at] = lines[at][:cut] + rng.choice(WORDS) + lines[at][cut:]
+            case 4:
+                lines[at] = lines[at] * rng.randint(2, 40)
+            case _:
+                sign = rng.choice(" ,;=\t")
+                parts = lines[at].split(sign)
+                parts[rng.randrange(len(parts))] = rng.choice(WORDS)
+                lines[at] = sign.join(parts)
+        text = "\n".join(lines) if lines else ""
+    return text
+
+
+def _places(node: Any) -> list[tuple[Any, Any]]:
+    """Every (container, key) in a document."""
+    out: list[tuple[Any, Any]] = []
+    stack = [node]
+    while stack:
+        now = stack.pop()
+        keys = list(now) if isinstance(now, dict) else range(len(now))
+        for key in keys:
+            out.append((now, key))
+            if isinstance(now[key], dict | list) and now[key]:
+                stack.append(now[key])
+    return out
+
+
+def document_damaged(document: str, rng: Random) -> bytes:
+    """A JSON document with values, types, lengths and keys changed, or its text damaged."""
+    kind = rng.random()
+    if kind < 0.1:
+        return bytes_damaged(document.encode(), rng)
+    if kind < 0.12:
+        deep = rng.choice((50, 2000, 100_000))
+        return ("[" * deep + "]" * deep).encode()
+    root = [json.loads(document)]
+    for _ in range(1 if rng.random() < 0.6 else rng.randint(2, 5)):
+        places = _places(root)
+        holder, key = rng.choice(places)
+        value = holder[key]
+        match rng.randrange(8):
+            case 0 if isinstance(holder, dict):
+                del holder[key]
+            case 1 if isinstance(holder, dict):
+                holder[rng.choice(("x", "", str(key) + "_", "version"))] = deepcopy(value)
+            case 2 if isinstance(value, list) and value:
+                value.pop(rng.randrange(len(value)))
+            case 3 if isinstance(value, list) and value:
+                value.append(deepcopy(value[rng.randrange(len(value))]))
+            case 4 if isinstance(value, list) and value:
+                _all_to(value, rng.choice(NUMBERS))
+            case 5 if isinstance(value, int | float) and not isinstance(value, bool):
+                holder[key] = value * rng.choice((-1, 0, 1e6, 1e-6, 1e200))
+            case 6:
+                other, name = rng.choice(places)
+                if name in other if isinstance(other, dict) else name < len(other):
+                    holder[key] = deepcopy(other[name])
+            case _:
+                holder[key] = deepcopy(rng.choice(ODD))
+        if not isinstance(root, list) or not root:
+            break
+    text = json.dumps(root[0] if root else None)
+    if rng.random() < 0.05 and text.startswith("{") and len(text) > 2:  # duplicate keys
+        text = text[:-1] + "," + text[1:]
+    return text.encode()
+
+
+def _all_to(values: list[Any], to: object) -> None:
+    """A zero matrix, one of infinities, ..."""
+    for k, value in enumerate(values):
+        if isinstance(value, list):
+            _all_to(value, to)
+        else:
+            values[k] = to
+
+
+def some(ways: Sequence[Callable[[Random], bytes]]) -> Callable[[Random], bytes]:
+    """One of several ways, by chance."""
+    return lambda rng: rng.choice(ways)(rng)

@@ -1,0 +1,506 @@
+"""Parsers of files, given damaged ones."""
+
+import csv
+import io
+import json
+import os
+import shutil
+import sqlite3
+import tempfile
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import numpy as np
+
+import hilcal as hc
+from hilcal.calibration.calibration import Calibration
+from hilcal.calibration.handover import urdf
+from hilcal.calibration.points import read_points
+from hilcal.campaign import Campaign
+from hilcal.config import CellConfig, load_config
+from hilcal.data import matfile
+from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.covariance import INSTRUMENT
+from hilcal.data.importing import import_readings
+from hilcal.data.mapping import FileFormat, load_mapping
+from hilcal.data.plan import Plan, Step, load_plan
+from hilcal.data.rows import _reading_crc, text_crc
+from hilcal.data.sheets import open_grid
+from hilcal.data.table import write_table
+from hilcal.errors import InputError
+from hilcal.identify import parameters_document, posterior_document
+from hilcal.robot.catalogue import configs_dir, load_arm
+from hilcal.robot.dh import arm_from_dh
+from hilcal.robot.urdf import arm_from_urdf
+from tests.fuzz.damage import NUMBERS, ODD, bytes_damaged, document_damaged, words_damaged
+from tests.fuzz.harness import MEMORY_DISK, Accepted, Parser
+from tests.fuzz.wire import instead
+from tests.support.campaigns import campaign, configuration
+
+_CELL = configs_dir() / "cells" / "demo_ur10e.toml"
+
+
+@dataclass
+class _Bench:
+    """Sound files to begin with."""
+
+    folder: Path
+
+    @cached_property
+    def readings(self) -> hc.Readings:
+        return campaign("joint_tilt_compliance", "deflection", 3, poses=6).readings
+
+    @cached_property
+    def table(self) -> bytes:
+        path = self.folder / "sound.csv"
+        write_table(self.readings, path, INSTRUMENT)
+        return path.read_bytes()
+
+    @cached_property
+    def rows(self) -> list[list[str]]:
+        return list(csv.reader(io.StringIO(self.table.decode())))
+
+    @cached_property
+    def run(self) -> bytes:
+        path = self.folder / "sound.hilcal"
+        with CampaignFile.create(
+            path, configuration().to_json(), str(self.folder), "fuzz", overwrite=True
+        ) as file:
+            file.append_readings(self.readings)
+        with Campaign.open(path) as run:
+            found = hc.fit(hc.baseline(run.cell, run.readings), run.readings)
+            run.append(found)
+            self.calibration = self.folder / "sound.json"
+            run.calibration().save(self.calibration)
+            self.posterior = json.dumps(run.posterior().to_json())
+            self.parameters = json.dumps(parameters_document.to_json(found, {"x": 1}))
+        return path.read_bytes()
+
+    @cached_property
+    def plan(self) -> str:
+        q = self.readings.states.q[:2]
+        steps = tuple(Step(p, load, 1) for p in ("a", "b") for load in ("none", "5kg"))
+        return Plan(("a", "b"), q, steps).to_json()
+
+    def path(self, name: str, data: bytes) -> Path:
+        path = self.folder / name
+        path.write_bytes(data)
+        return path
+
+
+def _plain(readings: hc.Readings) -> None:
+    """Refuse readings that no instrument and no arm can have given."""
+    values = (readings.value, readings.covariance, readings.states.q)
+    if not all(np.all(np.isfinite(v)) for v in values):
+        raise Accepted("readings that are not finite")
+    lowest = np.linalg.eigvalsh(readings.covariance)
+    if np.any(lowest[:, 0] < -1e-9 * np.abs(lowest).max(axis=1)):
+        raise Accepted("a covariance that is none")
+
+
+def _cell_damaged(rows: list[list[str]], by: Random) -> list[list[str]]:
+    """A table with cells, columns or rows changed as people and programs do."""
+    out = [list(row) for row in rows]
+    for _ in range(by.randint(1, 3)):
+        col, row = by.randrange(len(out[0])), by.randrange(1, len(out))
+        match by.randrange(9):
+            case 0:
+                for r in out[1:]:
+                    r[col] = out[1][col]  # a constant column
+            case 1:
+                factor = by.choice((0.0, -1.0, 1e3, 1e-3, 57.29, 1e8, 1e-12, 1e150))
+                for r in out[1:]:
+                    r[col] = _scaled(r[col], factor)
+            case 2:
+                for r in out:
+                    del r[col]
+            case 3:
+                out.append(list(out[row]))
+            case 4 if len(out) > 3:
+                del out[by.randrange(1, len(out)) :]
+                out = out if len(out) > 1 else [list(r) for r in rows]
+            case 5:
+                other = by.randrange(len(out[0]))
+                for r in out[1:]:
+                    r[col], r[other] = r[other], r[col]
+            case 6:
+                covariance = [k for k, name in enumerate(out[0]) if name.startswith("cov_")]
+                value = by.choice(("0", "1", "1e-30", "1e30", "-1", "1e-9"))
+                for r in out[1:]:
+                    for k in covariance:
+                        r[k] = value
+            case _:
+                word = str(by.choice((*NUMBERS, "", "none", "5kg", "p0", "1,5", "1e-5")))
+                out[row][col] = word
+        if not out[0]:
+            return [list(r) for r in rows]
+    return out
+
+
+def _scaled(text: str, factor: float) -> str:
+    try:
+        return repr(float(text) * factor)
+    except ValueError:
+        return text
+
+
+def _csv(rows: list[list[str]]) -> bytes:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue().encode()
+
+
+def _table(bench: _Bench) -> Parser:
+    config = load_config(_CELL)
+    arm = load_arm(config.robot.model)
+
+    def make(by: Random) -> bytes:
+        kind = by.random()
+        if kind < 0.3:
+            return bytes_damaged(bench.table, by)
+        if kind < 0.5:
+            return words_damaged(bench.table.decode(), by).encode("utf-8", "replace")
+        return _csv(_cell_damaged(bench.rows, by))
+
+    def parse(data: bytes) -> bool:
+        _plain(import_readings(bench.path("t.csv", data), "table", config, arm).readings)
+        return True
+
+    return Parser("table", make, parse)
+
+
+def _points(bench: _Bench) -> Parser:
+    arm = load_arm("ur10e")
+    rows = [["pose", *(f"q{k}_rad" for k in range(1, 7)), "load"]]
+    rows += [[f"p{k}", "0.1", "-1.5", "1", "0", "0.3", "0", "none"] for k in range(5)]
+
+    def make(by: Random) -> bytes:
+        data = _csv(_cell_damaged(rows, by))
+        return bytes_damaged(data, by) if by.random() < 0.3 else data
+
+    def parse(data: bytes) -> bool:
+        found = read_points(bench.path("p.csv", data), arm, {"none": np.zeros(6)})
+        if np.any(np.isinf(found.q)) or np.abs(np.nan_to_num(found.q)).max() > 1e3:
+            raise Accepted("points: joints that cannot be")
+        return True
+
+    return Parser("points", make, parse)
+
+
+def _chain(bench: _Bench) -> Parser:
+    """A damaged table all the way: import, registration, fit, diagnosis."""
+    cell = hc.Cell.load(_CELL)
+
+    def make(by: Random) -> bytes:
+        return _csv(_cell_damaged(bench.rows, by))
+
+    def parse(data: bytes) -> bool:
+        readings = hc.read_table(bench.path("t.csv", data), cell)
+        found = hc.fit(hc.baseline(cell, readings), readings)
+        hc.diagnose(found)
+        return True
+
+    return Parser("chain", make, parse, limit_s=120.0)
+
+
+def _packed(bench: _Bench) -> list[Parser]:
+    """XLSX, Parquet and MAT: as files, and with odd things in them."""
+    import openpyxl
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+    from scipy.io import savemat
+
+    how = FileFormat()
+    numbers = np.array([[float(c) for c in row[2:8]] for row in bench.rows[1:9]])
+
+    def xlsx(cells: list[list[Any]]) -> bytes:
+        book = openpyxl.Workbook()
+        for row in cells:
+            book.active.append(row)
+        out = io.BytesIO()
+        book.save(out)
+        return out.getvalue()
+
+    def parquet(columns: dict[str, Any]) -> bytes:
+        out = io.BytesIO()
+        pq.write_table(pa.table(columns), out)
+        return out.getvalue()
+
+    def mat(content: dict[str, Any]) -> bytes:
+        out = io.BytesIO()
+        savemat(out, content)
+        return out.getvalue()
+
+    sound = {
+        "xlsx": xlsx([["a", "b"], *numbers[:, :2].tolist()]),
+        "parquet": parquet({f"c{k}": numbers[:, k] for k in range(6)}),
+        "mat": mat({"A": numbers, "s": {"x": numbers, "n": np.array(["a", "b"], dtype=object)}}),
+    }
+
+    def rezipped(data: bytes, by: Random) -> bytes:
+        """One member damaged, with its checksum mended."""
+        out = io.BytesIO()
+        with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(out, "w") as new:
+            chosen = by.choice(old.namelist())
+            for name in old.namelist():
+                content = old.read(name)
+                if name == chosen:
+                    text = content.decode("utf-8", "replace")
+                    content = (
+                        bytes_damaged(content, by)
+                        if by.random() < 0.5
+                        else words_damaged(text, by).encode("utf-8", "replace")
+                    )
+                new.writestr(name, content)
+        return out.getvalue()
+
+    def odd(kind: str, by: Random) -> bytes:
+        values = [by.choice((*NUMBERS[:8], 0.5, "x", None)) for _ in range(4)]
+        match kind:
+            case "xlsx":
+                texts = [v for v in ODD if isinstance(v, int | float | str) and v == v]
+                cells = [[by.choice(texts) for _ in range(3)] for _ in range(3)]
+                try:
+                    return xlsx(cells)
+                except Exception:  # openpyxl writes no control characters
+                    return rezipped(sound["xlsx"], by)
+            case "parquet":
+                column = by.choice(
+                    (
+                        [[1.0], [2.0]],
+                        [{"a": 1}, None],
+                        [b"x", b"y"],
+                        ["a", "b"],
+                        [True, None],
+                        [None, None],
+                        [1 << 62, -1],
+                        [float("nan"), float("inf")],
+                    )
+                )
+                return parquet({"a": column, "b": [0.0, 1.0]})
+            case _:
+                shape = by.choice(((1, 1), (0, 3), (3, 0), (2, 3, 4), (1, 1, 1, 2), (5, 1)))
+                return mat(
+                    {
+                        "A": np.zeros(shape),
+                        "o": np.array(values, dtype=object),
+                        "z": np.zeros((2, 2), dtype=complex),
+                        "e": {},
+                    }
+                    if None not in values
+                    else {"A": np.zeros(shape)}
+                )
+
+    def parser(kind: str) -> Parser:
+        def make(by: Random) -> bytes:
+            if by.random() < 0.3:
+                return odd(kind, by)
+            if kind == "xlsx" and by.random() < 0.6:
+                return rezipped(sound[kind], by)
+            return bytes_damaged(sound[kind], by)
+
+        def parse(data: bytes) -> bool:
+            path = bench.path(f"t.{kind}", data)
+            if kind != "mat":
+                return len(open_grid(path, how).rows) > 0
+            with instead(matfile, {"read": _forked}):  # as quick as that, and as safe
+                return len(open_grid(path, how).rows) > 0
+
+        return Parser(kind, make, parse)
+
+    return [parser(kind) for kind in sound]
+
+
+def _forked(path: str) -> Any:
+    """Read a MAT file in a fork, which begins at once; a new interpreter takes 0.3 s."""
+    out = Path(path + ".npz")
+    child = os.fork()
+    if not child:
+        try:
+            out.write_bytes(matfile.packed(path))
+            os._exit(0)
+        except BaseException:
+            os._exit(1)
+    if os.waitpid(child, 0)[1]:
+        raise InputError("damaged")
+    return matfile.unpacked(out.read_bytes())
+
+
+def _mapping(bench: _Bench) -> Parser:
+    texts = [p.read_text() for p in sorted((configs_dir() / "mappings").glob("*.toml"))]
+    return _toml(bench, "mapping", texts, load_mapping)
+
+
+def _toml(bench: _Bench, name: str, texts: list[str], read: Callable[[Path], object]) -> Parser:
+    def make(by: Random) -> bytes:
+        if by.random() < 0.01:
+            return (b"a = " + b"[" * 5000) if by.random() < 0.5 else b"a." * 5000 + b"b = 1"
+        text = by.choice(texts)
+        if by.random() < 0.3:
+            return bytes_damaged(text.encode(), by)
+        return words_damaged(text, by).encode("utf-8", "replace")
+
+    def parse(data: bytes) -> bool:
+        read(bench.path(f"{name}.toml", data))
+        return True
+
+    return Parser(name, make, parse)
+
+
+def _cell_toml(bench: _Bench) -> Parser:
+    texts = [p.read_text() for p in sorted((configs_dir() / "cells").glob("*.toml"))]
+    return _toml(bench, "cell", texts, hc.Cell.load)
+
+
+def _document(
+    bench: _Bench, name: str, sound: Callable[[], str], read: Callable[[Path], object]
+) -> Parser:
+    kept: list[str] = []
+
+    def make(by: Random) -> bytes:
+        if not kept:
+            kept.append(sound())
+        return document_damaged(kept[0], by)
+
+    def parse(data: bytes) -> bool:
+        read(bench.path(f"{name}.json", data))
+        return True
+
+    return Parser(name, make, parse)
+
+
+def _used(path: Path) -> None:
+    """Read a calibration and ask it."""
+    found = Calibration.load(path)
+    predicted = found.predict(np.zeros((1, found.model.cell.arm.n)), np.zeros((1, 6)))
+    if not np.all(np.isfinite(predicted.position)):
+        raise Accepted("calibration: a position that is not finite")
+
+
+def _urdf(bench: _Bench) -> Parser:
+    text = urdf(load_arm("ur10e"))
+
+    def make(by: Random) -> bytes:
+        if by.random() < 0.3:
+            return bytes_damaged(text.encode(), by)
+        return words_damaged(text.replace(" ", "\n"), by).replace("\n", " ").encode(
+            "utf-8", "replace"
+        )  # fmt: skip
+
+    def parse(data: bytes) -> bool:
+        arm = arm_from_urdf(bench.path("a.urdf", data))
+        if not np.all(np.isfinite(arm.q_min)) or not arm.n:
+            raise Accepted("urdf: an arm that cannot be")
+        return True
+
+    return Parser("urdf", make, parse)
+
+
+def _campaign(bench: _Bench) -> Parser:
+    """Bytes of the file, and rows changed with their checksums mended."""
+    work = bench.folder / "mended.hilcal"
+
+    def mended(by: Random) -> bytes:
+        work.write_bytes(bench.run)
+        with sqlite3.connect(work) as db:
+            for (name,) in db.execute("SELECT name FROM sqlite_master WHERE type='trigger'"):
+                db.execute(f"DROP TRIGGER {name}")
+            match by.randrange(6):
+                case 0 | 1:
+                    number = by.randint(1, 5)
+                    row = db.execute("SELECT * FROM readings WHERE id=?", (number,)).fetchone()
+                    key, *where, record, _ = row
+                    values = np.frombuffer(record, "<f8").copy()
+                    values[by.randrange(len(values))] = float(by.choice(NUMBERS))
+                    if by.random() < 0.3:
+                        where[by.randrange(3)] = by.choice((-1, 0, 7, 2**40, -(2**40)))
+                    data = values.tobytes()[: len(record) - by.choice((0, 0, 0, 1, 8))]
+                    row = (*where, data, _reading_crc(key, where, data), key)
+                    db.execute(
+                        "UPDATE readings SET pose=?,load=?,cycle=?,record=?,crc=? WHERE id=?", row
+                    )
+                case 2:
+                    key, value = by.choice(db.execute("SELECT key, value FROM meta").fetchall())
+                    text = (
+                        document_damaged(value, by).decode("utf-8", "replace")
+                        if value[:1] in "[{"
+                        else by.choice(("", "x", "/nonexistent", "..", "\x00"))
+                    )
+                    row = (text, text_crc(key, text), key)
+                    db.execute("UPDATE meta SET value=?, crc=? WHERE key=?", row)
+                case 3:
+                    number, content = db.execute("SELECT id, content FROM revisions").fetchone()
+                    text = document_damaged(content, by).decode("utf-8", "replace")
+                    row = (text, text_crc(str(number), text), number)
+                    db.execute("UPDATE revisions SET content=?, crc=? WHERE id=?", row)
+                case 4:
+                    table = by.choice(("meta", "poses", "loads", "readings", "revisions"))
+                    key = "key" if table == "meta" else "id"
+                    order = f"SELECT {key} FROM {table} ORDER BY random() LIMIT 1"
+                    db.execute(f"DELETE FROM {table} WHERE {key} = ({order})")
+                case _:
+                    table = by.choice(("poses", "loads"))
+                    name = by.choice(("", "a" * 10_000, "x\ny", b"\xff\xfe", 3.5))
+                    db.execute(f"UPDATE {table} SET name=? WHERE id=0", (name,))
+        db.close()
+        return work.read_bytes()
+
+    def make(by: Random) -> bytes:
+        return mended(by) if by.random() < 0.5 else bytes_damaged(bench.run, by)
+
+    def parse(data: bytes) -> bool:
+        path = bench.path("c.hilcal", data)
+        path.with_name("c.hilcal-journal").unlink(missing_ok=True)
+        with Campaign.open(path) as run:
+            _plain(run.readings)
+            run.file.revisions()
+            if run.latest() is not None:
+                run.fit()
+        return True
+
+    return Parser("campaign", make, parse, limit_s=20.0)
+
+
+def parsers() -> list[Parser]:
+    """All of them."""
+    folder = Path(tempfile.mkdtemp(prefix="hilcal-fuzz-", dir=MEMORY_DISK))
+    import atexit
+
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    bench = _Bench(folder)
+    arms = [p.read_text() for p in sorted((configs_dir() / "robots").glob("*.toml"))]
+
+    def of_run(name: str) -> Callable[[], str]:
+        def text() -> str:
+            assert bench.run
+            found = getattr(bench, name)
+            return found.read_text() if isinstance(found, Path) else str(found)
+
+        return text
+
+    return [
+        _table(bench),
+        _points(bench),
+        *_packed(bench),
+        _mapping(bench),
+        _cell_toml(bench),
+        _toml(bench, "arm", arms, arm_from_dh),
+        _document(
+            bench,
+            "config",
+            configuration().to_json,
+            lambda p: CellConfig.from_json(p.read_text(errors="replace")),
+        ),
+        _document(bench, "plan", lambda: bench.plan, load_plan),
+        _document(bench, "calibration", of_run("calibration"), _used),
+        _document(bench, "posterior", of_run("posterior"), posterior_document.read),
+        _document(bench, "parameters", of_run("parameters"), parameters_document.read),
+        _urdf(bench),
+        _campaign(bench),
+        _chain(bench),
+    ]

@@ -1,0 +1,154 @@
+"""Gives a parser damaged inputs and judges what comes out.
+
+Only the project's own errors may come out. Anything else is a finding: another exception, more time
+than a limit, more memory than a limit, or a reading accepted that was damaged (the parser's own
+check raises `Accepted`). An input of a finding is kept as a file, which `--replay` gives again.
+"""
+
+import gc
+import hashlib
+import os
+import re
+import resource
+import signal
+import time
+import traceback
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from random import Random
+
+from hilcal.errors import CannotAnswerError, DeviceError, InputError
+
+BATCH = 200
+"""Inputs of one random stream; a choice."""
+MEMORY = 3 << 30
+"""Address space beyond what the process has, bytes; a choice: a table of readings needs little."""
+
+
+MEMORY_DISK = next((d for d in ("/dev/shm",) if os.access(d, os.W_OK)), None)
+"""SQLite waits for the disk at every commit; a file in memory does not."""
+
+
+class Accepted(AssertionError):
+    """A damaged reading passed for a sound one."""
+
+
+class Hung(BaseException):
+    """An input took longer than the limit."""
+
+
+@dataclass(frozen=True, slots=True)
+class Parser:
+    """What is tried.
+
+    Attributes:
+        name: on the command line.
+        make: returns a damaged input.
+        parse: takes it; returns whether it was read, and raises what the parser raises.
+        limit_s: processor time that one input may take.
+        refusals: errors that its caller turns into one of the project's.
+    """
+
+    name: str
+    make: Callable[[Random], bytes]
+    parse: Callable[[bytes], bool]
+    limit_s: float = 2.0
+    refusals: tuple[type[Exception], ...] = ()
+
+
+@dataclass(slots=True)
+class Outcome:
+    """What became of the inputs.
+
+    Attributes:
+        inputs: how many were given.
+        read: those that were read as sound.
+        refused: those that were refused, by the name of the error.
+        findings: one line for each kind of finding, with how often it was seen.
+        kept: a file with an input for each.
+        slowest_s: processor time of the slowest input.
+    """
+
+    inputs: int = 0
+    read: int = 0
+    refused: Counter[str] = field(default_factory=Counter)
+    findings: Counter[str] = field(default_factory=Counter)
+    kept: dict[str, str] = field(default_factory=dict)
+    slowest_s: float = 0.0
+
+
+def fuzz(
+    parser: Parser, inputs: int, seed: int, keep: Path | None = None, seconds: float = float("inf")
+) -> Outcome:
+    """Give a parser so many damaged inputs, or as many as there is processor time for."""
+    out = Outcome()
+    end = time.process_time() + seconds
+    with limited(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        batch = 0
+        while out.inputs < inputs and time.process_time() < end:
+            rng = Random(f"{parser.name}/{seed}/{batch}")
+            for _ in range(min(BATCH, inputs - out.inputs)):
+                _one(parser, parser.make(rng), out, keep)
+            batch += 1
+    return out
+
+
+def _one(parser: Parser, data: bytes, out: Outcome, keep: Path | None) -> None:
+    """Give one input."""
+    out.inputs += 1
+    found, begun = "", time.process_time()
+    signal.setitimer(signal.ITIMER_PROF, parser.limit_s)
+    try:
+        out.read += parser.parse(data)
+    except (InputError, CannotAnswerError, DeviceError, *parser.refusals) as error:
+        out.refused[type(error).__name__] += 1
+    except Hung:
+        found = f"more than {parser.limit_s:g} s"
+    except Exception as error:
+        found = finding(error)
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+    out.slowest_s = max(out.slowest_s, time.process_time() - begun)
+    if found:
+        out.findings[found] += 1
+        if keep is not None and found not in out.kept:
+            keep.mkdir(parents=True, exist_ok=True)
+            path = keep / f"{parser.name}-{hashlib.sha256(data).hexdigest()[:12]}"
+            path.write_bytes(data)
+            out.kept[found] = str(path)
+    if out.inputs % 5000 == 0:
+        gc.collect()
+
+
+def finding(error: Exception) -> str:
+    """One line on an error that should not have come out, and where it came from."""
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if "/tests/" not in f.filename]
+    ours = [f for f in frames if "/hilcal/" in f.filename or "/drivers/" in f.filename]
+    at = (ours or frames or [None])[-1]
+    where = "" if at is None else f" at {'/'.join(Path(at.filename).parts[-2:])}:{at.lineno}"
+    words = re.sub(r"\d+|0x[0-9a-f]+", "#", " ".join(str(error).split()))[:100]
+    return f"{type(error).__name__}{where}: {words if isinstance(error, Accepted) else words[:60]}"
+
+
+@contextmanager
+def limited() -> Iterator[None]:
+    """Let no input use more than its share of time and memory."""
+
+    def hung(*_: object) -> None:
+        raise Hung
+
+    before = signal.signal(signal.SIGPROF, hung)
+    limits = resource.getrlimit(resource.RLIMIT_AS)
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    most = pages * resource.getpagesize() + MEMORY
+    resource.setrlimit(resource.RLIMIT_AS, (most, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, limits)
+        signal.signal(signal.SIGPROF, before)

@@ -1,0 +1,461 @@
+"""Parsers that face a wire, called on bytes: no socket, no port, no waiting.
+
+The first byte of an input tells what was done to it: 0 damaged as a line damages, so that whatever
+is accepted must be one of the sound readings; 1 with checksums mended, so that the inside is
+reached and only what is physically possible may be accepted.
+"""
+
+import math
+import struct
+import time
+from collections.abc import Callable, Sequence
+from random import Random
+from types import SimpleNamespace
+from typing import Any
+
+import minimalmodbus
+import numpy as np
+from geocompy.geo import GeoCom
+
+from drivers import bota, ft300, geocom_line, modbus_rtu, onrobot_hex
+from drivers.force_stream import ForceStream, SensorFormat
+from drivers.geocom import GeoComTracker, Options
+from drivers.geocom_line import Link
+from drivers.ur_link import dashboard, lines, probe, reading
+from drivers.ur_link.lines import LinkError
+from hilcal.acquire.clock import Clock
+from hilcal.config.cell import Tracker
+from tests.fuzz.damage import NUMBERS, bytes_damaged
+from tests.fuzz.harness import Accepted, Parser
+from tests.support.geocom_cases import crc16_arc, line
+
+
+class _Time:
+    """A clock that advances when it is read: deadlines pass without waiting."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def monotonic(self) -> float:
+        self.now += 1e-3
+        return self.now
+
+    def monotonic_ns(self) -> int:
+        return int(1e9 * self.monotonic())
+
+    def sleep(self, seconds: float) -> None:
+        self.now += max(0.0, seconds)
+
+
+class _Port:
+    """A serial port that holds some bytes and then is silent."""
+
+    is_open, baudrate, timeout, port, in_waiting = True, 115200, 0.1, "fuzz", 0
+
+    def __init__(self) -> None:
+        self.held = b""
+
+    def read(self, count: int = 1) -> bytes:
+        out, self.held = self.held[:count], self.held[count:]
+        return out
+
+    def read_until(self, end: bytes) -> bytes:
+        out, sep, self.held = self.held.partition(end)
+        return out + sep
+
+    def write(self, data: bytes) -> int:
+        return len(data)
+
+    def open(self) -> None: ...
+    def close(self) -> None: ...
+    def flush(self) -> None: ...
+    def reset_input_buffer(self) -> None: ...
+    def reset_output_buffer(self) -> None: ...
+
+
+class _Socket:
+    """A connection that gives some bytes in pieces and then closes."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+
+    def recv(self, count: int) -> bytes:
+        out, self._data = self._data[:count], self._data[count:]
+        return out
+
+    def settimeout(self, seconds: float) -> None: ...
+    def sendall(self, data: bytes) -> None: ...
+    def shutdown(self, how: int) -> None: ...
+    def __enter__(self) -> "_Socket":
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
+
+
+def _finite(rng: Random) -> float:
+    value = rng.choice(NUMBERS)
+    return float(value) if rng.random() < 0.5 else rng.uniform(-1e3, 1e3)
+
+
+# --- frames of force sensors ---
+
+
+def _sums(name: str) -> tuple[SensorFormat, int]:
+    match name:
+        case "ft300":
+            return ft300.SENSOR, 0
+        case "bota":
+            return bota.SENSOR, 0
+        case _:
+            return onrobot_hex._sensor(50.0, 2000.0, 1000.0), 0
+
+
+def _force(name: str) -> Parser:
+    sensor, _ = _sums(name)
+    form, unit = sensor.frame, sensor.unit
+    rng = np.random.default_rng(1)
+
+    def frame(k: int, wrench: Sequence[float] | None = None, **more: Any) -> bytes:
+        body = np.zeros(1, dtype=sensor.body)
+        given = rng.uniform(-80, 80, 6) / np.repeat((1, 20), 3) if wrench is None else wrench
+        with np.errstate(all="ignore"):
+            body["wrench"] = np.asarray(given) / unit
+            for field, value in ({"ticks": k, "temperature": 25.0} | more).items():
+                if field in (sensor.body.names or ()):
+                    body[field] = value
+        bare = form.header + body.tobytes()
+        return bare + form.checksum(bare)
+
+    streams = [[frame(1000 * (k + 1)) for k in range(4)] for _ in range(32)]
+    head = len(form.header)
+    sound = {f[head:-2] for frames in streams for f in frames}
+    port = _Port()
+    stream = ForceStream(port, sensor)  # type: ignore[arg-type]
+    stream.stop()
+    fresh = type(stream._deframer)
+
+    def make(by: Random) -> bytes:
+        frames = list(by.choice(streams))
+        if by.random() < 0.2:  # a value that no sensor gives, in a frame that is whole
+            k = by.randrange(4)
+            frames[k] = frame(
+                1000 * (k + 1),
+                [_finite(by) for _ in range(6)],
+                status=by.getrandbits(16),
+                temperature=_finite(by),
+                ticks=by.getrandbits(16),
+            )
+            return b"\1" + b"".join(frames)
+        return b"\0" + bytes_damaged(b"".join(frames), by, frames)
+
+    def parse(data: bytes) -> bool:
+        stream._deframer, stream._counter = fresh(form), sensor.losses()
+        stream._kept, stream._failure = 0, ""
+        at, seen = 1, []
+        push = stream._deframer.push
+
+        def noting(piece: bytes) -> list[bytes]:
+            bodies = push(piece)
+            seen.extend(bodies)
+            return bodies
+
+        stream._deframer.push = noting  # type: ignore[method-assign]
+        step = 1 + data[-1] % 64
+        while at < len(data):
+            stream._take(data[at : at + step], time.monotonic_ns())
+            at += step
+        if not data[0]:
+            for body in seen:
+                if body not in sound:
+                    raise Accepted(f"{name}: a frame that was damaged")
+        if not stream._kept:
+            return False
+        kept = stream._wrench[: stream._kept]
+        if not np.all(np.isfinite(kept)):
+            raise Accepted(f"{name}: a wrench that is not finite")
+        stream._running = True
+        sample = stream.latest()
+        warm = sample.temperature
+        if np.any(np.abs(sample.wrench) > 1e5) or (warm is not None and not -100 < warm < 200):
+            raise Accepted(f"{name}: a wrench or a temperature that cannot be")
+        return True
+
+    return Parser(name, make, parse)
+
+
+# --- GeoCOM ---
+
+
+def _geocom() -> Parser:
+    rng = np.random.default_rng(2)
+    virtual = _Time()
+    quiet: dict[str, Any] = {"drain": lambda *_: True, "time": virtual}
+    port = _Port()
+    link = Link.__new__(Link)
+    link._path, link._baud, link._port = "fuzz", 115200, port  # type: ignore[assignment]
+    link._connection = geocom_line._Connection(port)  # type: ignore[arg-type]
+    link._instrument = GeoCom.__new__(GeoCom)
+    port.held = b"".join(line(f"%R1P,0,{k}", body) for k, body in enumerate(("0", "0,15", "0")))
+    with instead(geocom_line, quiet):
+        GeoCom.__init__(link._instrument, link._connection, attempts=1, checksum=True)
+    config = Tracker(driver="geocom", port="fuzz")
+    tracker = GeoComTracker(link, config, Options(), Clock(1.0))
+
+    def answers(values: Sequence[object], code: int = 0) -> bytes:
+        text = ",".join(str(v) for v in values)
+        return line("%R1P,0,0", "0") + line("%R1P,0,1", f"{code},{text}")
+
+    readings = []
+    for k in range(32):
+        hz, v, d = rng.uniform(0, 6.2), rng.uniform(0.7, 2.2), rng.uniform(1.0, 9.0)
+        readings.append((hz, v, 1.5e-6, 1e-5, -2e-5, 1e-6, d, 1000 + k))
+    corpus = [answers(r) for r in readings]
+    sound = {
+        tuple(np.float64(r[6]) * np.array([math.sin(r[1]) * math.sin(r[0]),
+              math.sin(r[1]) * math.cos(r[0]), math.cos(r[1])])) for r in readings
+    }  # fmt: skip
+
+    def make(by: Random) -> bytes:
+        if by.random() < 0.3:
+            values: list[object] = list(by.choice(readings))
+            for _ in range(by.randint(1, 3)):
+                match by.randrange(4):
+                    case 0 if values:
+                        del values[by.randrange(len(values))]
+                    case 1:
+                        values.append(by.choice(NUMBERS))
+                    case _ if values:
+                        values[by.randrange(len(values))] = by.choice(
+                            (*NUMBERS, "", "'ff'", '"x"', "1e5", "--1", "0x1", "１")
+                        )
+            code = by.choice((0, 0, 0, 1283, 1284, 1285, 1293, 3, 3077, 99999, -1))
+            return b"\1" + answers(values, code)
+        damaged = bytes_damaged(by.choice(corpus), by, corpus)
+        if by.random() < 0.2:  # a sound checksum over a damaged line
+            head, _, rest = damaged.partition(b"\r\n")
+            words = rest.rstrip(b"\r\n").split(b":", 1)
+            bare = words[0].rsplit(b",", 1)[0].decode("latin-1")
+            body = words[-1].decode("latin-1")
+            crc = crc16_arc(f"{bare}:{body}")
+            mended = f"{bare},{crc}:{body}\r\n".encode("latin-1")
+            return b"\1" + head + b"\r\n" + mended
+        return b"\0" + damaged
+
+    def parse(data: bytes) -> bool:
+        port.held = data[1:]
+        link._instrument.transaction_counter = 0
+        tracker._full_known, tracker._last_ms = True, 0.0
+        with instead(geocom_line, quiet):
+            sample = tracker.measure()
+        distance = float(np.linalg.norm(sample.value))
+        if not np.all(np.isfinite(sample.covariance)) or not 0.1 < distance < 101.0:
+            raise Accepted("geocom: a reading that cannot be")
+        if not data[0]:
+            near = min(np.abs(np.array(s) - sample.value).max() for s in sound)
+            if near > 1e-12:
+                raise Accepted("geocom: an answer that was damaged")
+        return True
+
+    return Parser("geocom", make, parse)
+
+
+# --- Modbus ---
+
+
+def _modbus() -> Parser:
+    virtual = _Time()
+    port = _Port()
+    registers = [struct.pack(">4H", *range(k, k + 4)) for k in range(1, 3000, 97)]
+    minimalmodbus_quiet = {"time": virtual}
+
+    def answer(words: bytes, slave: int = 9, function: int = 3) -> bytes:
+        bare = bytes([slave, function, len(words) % 256]) + words
+        return bare + modbus_rtu_crc(bare)
+
+    corpus = [answer(words) for words in registers]
+    sound = {struct.unpack(">4H", words) for words in registers}
+
+    def make(by: Random) -> bytes:
+        if by.random() < 0.3:
+            words = by.randbytes(by.choice((0, 1, 2, 6, 8, 8, 9, 250)))
+            function = by.choice((3, 3, 4, 0x83, 0x84, by.randrange(256)))
+            return b"\1" + answer(words, by.choice((9, 9, by.randrange(256))), function)
+        return b"\0" + bytes_damaged(by.choice(corpus), by, corpus)
+
+    def parse(data: bytes) -> bool:
+        port.held = data[1:]
+        with (
+            instead(modbus_rtu, {"drain": lambda *_: True}),
+            instead(minimalmodbus, minimalmodbus_quiet),
+        ):
+            got = modbus_rtu.read_registers(port, 9, 500, 4)  # type: ignore[arg-type]
+        if len(got) != 4 or not all(0 <= word < 65536 for word in got):
+            raise Accepted("modbus: registers that cannot be")
+        if not data[0] and got not in sound:
+            raise Accepted("modbus: an answer that was damaged")
+        return True
+
+    return Parser("modbus", make, parse)
+
+
+def modbus_rtu_crc(data: bytes) -> bytes:
+    """Modbus over Serial Line V1.02, 6.2.2, bit by bit."""
+    crc = 0xFFFF
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = crc >> 1 ^ (0xA001 if crc & 1 else 0)
+    return crc.to_bytes(2, "little")
+
+
+# --- Universal Robots ---
+
+
+def _rtde_frame(kind: str, body: bytes) -> bytes:
+    return struct.pack(">HB", (3 + len(body)) % 65536, ord(kind)) + body
+
+
+def _rtde() -> Parser:
+    names = reading.OUTPUTS
+    kinds = ",".join("VECTOR6D" for _ in names).encode()
+    version = _rtde_frame("V", b"\1")
+    asked: list[tuple[bytes, Callable[[], object]]] = [
+        (
+            version
+            + _rtde_frame("v", struct.pack(">4I", 5, 11, 6, 0))
+            + _rtde_frame("O", b"\1" + kinds),
+            lambda: probe.controller("fuzz", names, 1.0),
+        ),
+        (
+            version
+            + _rtde_frame("M", b"\5hello\3foo\1")
+            + _rtde_frame("O", b"\1DOUBLE")
+            + _rtde_frame("S", b"\1")
+            + _rtde_frame("U", b"\1" + struct.pack(">d", 1.0)),
+            lambda: probe.check_stream("fuzz", 1.0),
+        ),
+        (
+            version + _rtde_frame("I", b"\1IN_USE,DOUBLE"),
+            lambda: probe.in_use("fuzz", ("a", "b"), 1.0),
+        ),
+    ]
+    corpus = [data for data, _ in asked]
+
+    def make(by: Random) -> bytes:
+        k = by.randrange(len(asked))
+        if by.random() < 0.2:
+            frames = [
+                _rtde_frame(by.choice("VvOSUIPM?"), by.randbytes(by.choice((0, 1, 2, 16, 17, 300))))
+                for _ in range(by.randint(1, 5))
+            ]
+            return bytes([k]) + by.choice((version, b"")) + b"".join(frames)
+        return bytes([k]) + bytes_damaged(corpus[k], by, corpus)
+
+    def parse(data: bytes) -> bool:
+        with instead(lines, _network(data[1:])):
+            asked[data[0] % len(asked)][1]()
+        return True
+
+    return Parser("rtde", make, parse, refusals=(LinkError,))
+
+
+def _dashboard() -> Parser:
+    said = (
+        b"Connected: Universal Robots Dashboard Server\n", b"UR10\n", b"20235500001\n",
+        b"URSoftware 5.11.6.1010327 (Jan 01 2023)\n", b"Robotmode: RUNNING\n",
+        b"Safetystatus: NORMAL\n", b"true\n", b"STOPPED <unnamed>\n",
+    )  # fmt: skip
+    corpus = [b"".join(said), said[0] + b"Stopped\n", said[0] + b"true\n",
+              said[0] + b"could not understand: 'is in remote control'\n"]  # fmt: skip
+    asked: list[Callable[[], object]] = [
+        lambda: dashboard.describe("fuzz", 1.0),
+        lambda: dashboard.stop("fuzz", 1.0),
+        lambda: dashboard.in_remote_control("fuzz", 1.0),
+    ]
+
+    def make(by: Random) -> bytes:
+        data = bytes_damaged(by.choice(corpus), by, corpus)
+        if by.random() < 0.001:
+            data *= 1 + 200_000 // max(1, len(data))
+        return bytes([by.randrange(len(asked))]) + data
+
+    def parse(data: bytes) -> bool:
+        with instead(lines, _network(data[1:])):
+            asked[data[0] % len(asked)]()
+        return True
+
+    return Parser("dashboard", make, parse, refusals=(LinkError,))
+
+
+def _packet() -> Parser:
+    """What the receive worker passes on: a packet whose numbers the network may have changed."""
+    width = {"payload_cog": 3}
+    single = {"timestamp", "robot_mode", "runtime_state", "safety_status_bits", "speed_scaling",
+              "target_speed_fraction", "payload"}  # fmt: skip
+    size = {name: 1 if name in single else width.get(name, 6) for name in reading.OUTPUTS}
+    layout = struct.Struct(f">{sum(size.values())}d")
+    usual = [0.5] * sum(size.values())
+
+    def make(by: Random) -> bytes:
+        values = list(usual)
+        for _ in range(by.randint(1, 4)):
+            values[by.randrange(len(values))] = _finite(by)
+        data = layout.pack(*values)
+        return bytes_damaged(data, by) if by.random() < 0.5 else data
+
+    def parse(data: bytes) -> bool:
+        values = list(struct.unpack(f">{len(data) // 8}d", data[: len(data) // 8 * 8]))
+        fields: dict[str, Any] = {}
+        for name, count in size.items():
+            taken, values = values[:count], values[count:]
+            whole = name in ("robot_mode", "runtime_state", "safety_status_bits")
+            one: Any = taken[0] if taken else 0.0
+            if whole:
+                one = int(one) if math.isfinite(one) else 0
+            fields[name] = one if name in single else taken
+        got = reading.read({"host_ns": 1, "fields": fields}).sample
+        if np.abs(got.q).max() > 100.0 or np.abs(got.joint_temperature).max() > 200.0:
+            raise Accepted("packet: joints or temperatures that cannot be")
+        return True
+
+    return Parser("packet", make, parse, refusals=(reading.ReadingError,))
+
+
+def _network(data: bytes) -> dict[str, Any]:
+    import socket
+
+    fake = SimpleNamespace(
+        create_connection=lambda *_, **__: _Socket(data),
+        gaierror=socket.gaierror,
+        SHUT_WR=socket.SHUT_WR,
+    )
+    return {"socket": fake}
+
+
+class instead:
+    """Puts other names into a module for a while."""
+
+    def __init__(self, module: Any, names: dict[str, Any]) -> None:
+        self._module, self._names = module, names
+
+    def __enter__(self) -> None:
+        self._before = {name: getattr(self._module, name) for name in self._names}
+        self._module.__dict__.update(self._names)
+
+    def __exit__(self, *_: object) -> None:
+        self._module.__dict__.update(self._before)
+
+
+def parsers() -> list[Parser]:
+    """All of them."""
+    from tests.fuzz.devices import parsers as servers
+
+    return [
+        *(_force(name) for name in ("ft300", "bota", "hex")),
+        _geocom(),
+        _modbus(),
+        _rtde(),
+        _dashboard(),
+        _packet(),
+        *servers(),
+    ]

@@ -1,0 +1,90 @@
+"""A short run of `python -m tests.fuzz`, and what longer ones have found."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from hilcal.config import CellConfig
+from hilcal.data.mapping import load_mapping
+from hilcal.data.plan import read_plan
+from hilcal.errors import HilcalError, InputError
+from hilcal.identify import parameters_document, posterior_document
+from tests.fuzz import files, harness, wire
+
+FEW = {"chain": 2, "campaign": 12, "arm": 40, "xlsx": 30, "mat": 20, "calibration": 30, "cell": 60}
+PARSERS = {parser.name: parser for parser in (*wire.parsers(), *files.parsers())}
+
+
+@pytest.mark.parametrize("name", PARSERS)
+def test_damage_ends_in_an_error_of_the_programs_own(name: str, tmp_path: Path) -> None:
+    out = harness.fuzz(PARSERS[name], FEW.get(name, 150), seed=1, keep=tmp_path)
+    assert not out.findings
+    assert out.inputs == FEW.get(name, 150)
+    if name != "chain":  # two inputs prove nothing of the following
+        assert out.read > 0, "the harness never reaches the inside"
+
+
+def test_the_harness_sees_what_it_should(tmp_path: Path) -> None:
+    def parse(data: bytes) -> bool:
+        match data[0] % 5:
+            case 0:
+                raise KeyError("a bug")
+            case 1:
+                while True:
+                    pass
+            case 2:
+                return len(bytearray(1 << 40)) > 0
+            case 3:
+                raise harness.Accepted("damage")
+            case _:
+                raise InputError("as it should")
+
+    count = iter(range(10))
+    parser = harness.Parser("wrong", lambda by: bytes([next(count)]), parse, limit_s=0.05)
+    out = harness.fuzz(parser, 10, 0, tmp_path)
+    assert sorted(line.split(":")[0].split(" at ")[0] for line in out.findings) == [
+        "Accepted", "KeyError", "MemoryError", "more than 0.05 s",
+    ]  # fmt: skip
+    assert out.refused == {"InputError": 2}
+    assert sum(out.findings.values()) == 8
+    assert len(list(tmp_path.iterdir())) == 4
+
+
+DEEP = "[" * 100_000 + "]" * 100_000
+
+
+@pytest.mark.parametrize("kind", ["plan", "cell", "posterior", "parameters", "calibration"])
+def test_documents_nested_too_deeply(kind: str, tmp_path: Path) -> None:
+    path = tmp_path / "deep.json"
+    path.write_text(DEEP)
+    from hilcal.calibration.calibration import Calibration
+
+    read = {
+        "plan": lambda: read_plan(DEEP, "x"),
+        "cell": lambda: CellConfig.from_json(DEEP),
+        "posterior": lambda: posterior_document.read(path),
+        "parameters": lambda: parameters_document.read(path),
+        "calibration": lambda: Calibration.load(path),
+    }[kind]
+    with pytest.raises(InputError, match="nested too deeply"):
+        read()
+
+
+def test_a_toml_file_nested_too_deeply(tmp_path: Path) -> None:
+    path = tmp_path / "m.toml"
+    path.write_text("a = " + "[" * 5000)
+    with pytest.raises(InputError, match="nested too deeply"):
+        load_mapping(path)
+
+
+@pytest.mark.parametrize("value", [10**400, True, "1", None, 1e300])
+def test_a_plan_with_joints_that_are_none(value: object) -> None:
+    plan = {
+        "format": "hilcal-plan",
+        "version": 1,
+        "poses": [{"name": "a", "q_rad": [value]}],
+        "steps": [{"pose": "a", "load": "none"}],
+    }
+    with pytest.raises(HilcalError, match="finite numbers"):
+        read_plan(json.dumps(plan), "x")
