@@ -44,6 +44,7 @@ _PLACES = {
     "discover": "hilcal.discover.discovery",
     "effect": "hilcal.effects.spec",
     "fit": "hilcal.library",
+    "fit_stream": "hilcal.library",
     "installed": "hilcal.effects.catalogue",
     "load_posterior": "hilcal.library",
     "plan": "hilcal.library",
@@ -75,7 +76,16 @@ if TYPE_CHECKING:
     from hilcal.identify.fit import Fit
     from hilcal.identify.posterior import Posterior
     from hilcal.identify.table_preview import preview_table
-    from hilcal.library import baseline, fit, load_posterior, plan, read_table, refine, view
+    from hilcal.library import (
+        baseline,
+        fit,
+        fit_stream,
+        load_posterior,
+        plan,
+        read_table,
+        refine,
+        view,
+    )
     from hilcal.model import Model
     from hilcal.procedure.procedure import Procedure
     from hilcal.refine import Refinement

@@ -1,6 +1,6 @@
 """The functions of `import hilcal`: thin, with defaults that suit a script."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -9,11 +9,14 @@ import numpy as np
 
 from hilcal.campaign import Campaign
 from hilcal.cell import Cell
+from hilcal.data.covariance import tracker_noise
 from hilcal.data.importing import import_readings
+from hilcal.data.parquet_stream import open_stream
 from hilcal.data.readings import Readings
 from hilcal.data.schema import HEADER
 from hilcal.data.whitening import MODES, SCALINGS, Mode, usual_mode
 from hilcal.effects.catalogue import Catalogue
+from hilcal.engine.engine import open_engine
 from hilcal.errors import InputError
 from hilcal.identify import baseline as starting_models
 from hilcal.identify import fit as fits
@@ -30,6 +33,8 @@ from hilcal.plan.summary import about, summarise
 from hilcal.refine import Refinement
 from hilcal.refine import refine as refine_model
 from hilcal.report.build_story import build_story
+from hilcal.stream import fit as streams
+from hilcal.stream.fit import StreamFit
 from hilcal.types import Floats
 
 
@@ -54,6 +59,37 @@ def read_table(path: str | Path, cell: Cell, mapping: str | Path | None = None) 
     form, config = "table" if mapping is None else mapping, cell.configured()
     found = import_readings(Path(path), form, config, cell.arm)
     return full_readings(found.readings, found.covers, cell, config)
+
+
+def fit_stream(
+    path: str | Path,
+    cell: Cell,
+    effects: Sequence[str] | None = None,
+    *,
+    prior: CarriedPrior | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+) -> StreamFit:
+    """Fit a model to readings that need not fit into memory: a Parquet file, in passes.
+
+    Args:
+        path: a Parquet file with the columns of the exchange table; `pose` and `load` are not
+            needed, each row stands alone.
+        cell: the cell that it was measured in.
+        effects: names of effects, besides unknown frames; the baseline's where None.
+        prior: what another campaign taught of the arm.
+        workers: processes of this machine, one per processor by default.
+        scheduler: address of a Dask cluster in their place, whose workers read the same path.
+
+    Raises:
+        InputError: a damaged file, or a row that cannot be right, by its number.
+        CannotAnswerError: readings that do not determine an unknown frame.
+    """
+    tracker = cell.configured().tracker
+    stream = open_stream(Path(path), cell.arm, tracker_noise(tracker), tracker.station_m)
+    named = None if effects is None else dict.fromkeys(effects, {})
+    with open_engine(workers, scheduler) as engine:
+        return streams.fit_stream(stream, cell, engine, named, prior=prior)
 
 
 def baseline(

@@ -1,11 +1,13 @@
 """`identify`: fit a model to the readings."""
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from hilcal.campaign import Campaign
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
+from hilcal.cli.engine import Scheduler, Workers
 from hilcal.cli.files import (
     check_options,
     chosen,
@@ -16,10 +18,13 @@ from hilcal.cli.files import (
     wanted_effects,
 )
 from hilcal.cli.prior import Drift, Prior, PriorOf, PriorOptions
+from hilcal.cli.streaming import identify_stream
 from hilcal.cli.terminal import Json, Run, terminal
 from hilcal.data.purpose import purpose_of, refuse_fitting, release
+from hilcal.data.tabular import is_parquet
 from hilcal.data.whitening import Scaling
 from hilcal.effects.written import write_effect
+from hilcal.errors import InputError
 from hilcal.identify.arm_scatter import with_prior_scatter
 from hilcal.identify.baseline import baseline, with_effects
 from hilcal.identify.fit import Fit, fit
@@ -63,12 +68,40 @@ def identify(
     prior_of: PriorOf = "arm",
     drift: Drift = None,
     effects_from: EffectsFrom = None,
+    cell: Annotated[
+        Path | None,
+        typer.Option(
+            "--cell", metavar="CELL.toml", help="The cell of a stream, READINGS.parquet as RUN."
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("-o", metavar="F.json", help="Of a stream: write its calibration."),
+    ] = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
     as_json: Json = False,
 ) -> None:
-    """Fit a model to the readings, and keep it as a revision."""
+    """Fit a model to the readings, and keep it as a revision.
+
+    A Parquet table in place of the campaign is read as a stream, in passes that need little memory.
+    """
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     wanted, named = scalings(scaling), wanted_effects(effects, catalogue)
     known = PriorOptions(prior, prior_of, drift).load(catalogue)
+    if run.suffix == ".parquet" or is_parquet(run):
+        if scaling != "gc" or readings not in (None, "absolute") or fit_validation:
+            raise InputError(
+                f"{run}: the readings of a stream are absolute, and their scaling is gc; leave out "
+                "--scaling, --readings and --fit-validation"
+            )
+        if effects_from and (scheduler is not None or workers not in (None, 1)):
+            raise InputError("--effects-from: other processes do not have its effects; --workers 1")
+        count = 1 if effects_from else workers
+        identify_stream(t, run, cell, named, catalogue, known, out, count, scheduler)
+        return
+    if any(option is not None for option in (cell, out, workers, scheduler)):
+        raise InputError("--cell, -o, --workers and --scheduler are of a stream, READINGS.parquet")
     with Campaign.open(run, catalogue) as o:
         if fit_validation and purpose_of(o.file) is not None:
             release(o.file, "hilcal identify --fit-validation")

@@ -95,7 +95,7 @@ def readings_of(
     pose, pose_names = _index(table.text["pose"])
     load, load_names = _index(table.text["load"])
     target = _targets(table, targets)
-    states = replace(_states(table, arm), target=target)
+    states = replace(states_of(table, arm), target=target)
     checks.check_same_pose(table, pose, pose_names, states.q)
     checks.check_wrenches(table, states.wrench, load, load_names, arm)
     value = table.matrix(columns.POSITION)
@@ -104,14 +104,15 @@ def readings_of(
         rotation = table.matrix(columns.ROTATION)
         checks.check_rotations(table, rotation)
         value = np.hstack([value, rotation])
-    stated = _stated(table, value.shape[1]) if covariance is None else covariance
+    stated = stated_covariance(table, value.shape[1]) if covariance is None else covariance
     notes: tuple[str, ...]
     if stated is None:
-        cov, notes = _instrument(table, value, noise, station), (FROM_TRACKER,)
+        cov, notes = instrument_covariance(table, value, noise, station), (FROM_TRACKER,)
     else:
         checks.check_covariances(table, stated)
         tiny = np.any(np.diagonal(stated, axis1=1, axis2=2) < min(LEAST) ** 2)
-        spec = _instrument(table, value, noise, station) if tiny and noise is not None else None
+        known = bool(tiny) and noise is not None
+        spec = instrument_covariance(table, value, noise, station) if known else None
         cov, notes = floored(table, stated, spec)
         notes = (FROM_TABLE, *notes)
     covers, included = (INSTRUMENT, False) if stated is None else _covers(table)
@@ -220,7 +221,8 @@ def _covers(table: CsvTable) -> tuple[str, bool]:
     return given[0].removesuffix(ROUNDING), given[0].endswith(ROUNDING)
 
 
-def _states(table: CsvTable, arm: Arm) -> States:
+def states_of(table: CsvTable, arm: Arm) -> States:
+    """Return the states of a table's rows; raises as `read_table` does."""
     table = with_following(table, arm)
     number, n = table.number, arm.n
     q = table.matrix(columns.joint_columns(n))
@@ -275,7 +277,7 @@ def _cycles(table: CsvTable) -> Ints:
     return cycle[:, 0].astype(np.int64)
 
 
-def _stated(table: CsvTable, m: int) -> Floats | None:
+def stated_covariance(table: CsvTable, m: int) -> Floats | None:
     """Covariances (N, m, m) that the table states, None where it states none."""
     names = columns.covariance_columns(m)
     if names[0] not in table.number:
@@ -286,7 +288,7 @@ def _stated(table: CsvTable, m: int) -> Floats | None:
     return cov
 
 
-def _instrument(
+def instrument_covariance(
     table: CsvTable,
     value: Floats,
     noise: TrackerNoise | None,

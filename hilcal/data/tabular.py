@@ -53,7 +53,7 @@ def write_columns(path: Path, columns: Mapping[str, Column], about: Mapping[str,
     plain = {k: v.tolist() if isinstance(v, np.ndarray) else list(v) for k, v in columns.items()}
     if path.suffix.lower() == ".parquet":
         table = _arrow(path, plain, about)
-        parquet = _pyarrow(path, "pyarrow.parquet")
+        parquet = pyarrow_module(path, "pyarrow.parquet")
         _replaced(path, lambda new: parquet.write_table(table, new))
         return
 
@@ -79,7 +79,7 @@ def read_parquet(
     Raises:
         InputError: no pyarrow, a damaged file, a cell without a value or of another kind.
     """
-    parquet = _pyarrow(path, "pyarrow.parquet")
+    parquet = pyarrow_module(path, "pyarrow.parquet")
     try:
         found = parquet.read_table(path)
     except Exception as e:  # what a reader makes of a damaged file is not documented
@@ -119,7 +119,7 @@ def _cell(value: object) -> object:
 
 
 def _arrow(path: Path, columns: Mapping[str, list[Any]], about: Mapping[str, object]) -> Any:
-    arrow = _pyarrow(path, "pyarrow")
+    arrow = pyarrow_module(path, "pyarrow")
     arrays = [arrow.array(values) for values in columns.values()]
     fields = []
     for name, array in zip(columns, arrays, strict=True):
@@ -157,7 +157,8 @@ def _replaced(path: Path, write: Callable[[Path], object]) -> None:
         raise InputError(f"{path}: cannot be written ({e})") from e
 
 
-def _pyarrow(path: Path, module: str) -> Any:
+def pyarrow_module(path: Path, module: str) -> Any:
+    """Import a part of pyarrow; raises InputError where it is not installed."""
     from importlib import import_module
 
     try:

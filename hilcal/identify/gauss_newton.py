@@ -13,33 +13,15 @@ import numpy as np
 
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Whitening
-from hilcal.errors import CannotAnswerError
 from hilcal.identify.coordinates import Coordinates, coordinates_of
-from hilcal.identify.priors import prior_of, scales_of
-from hilcal.identify.regularisation import (
-    LinearProblem,
-    Regularisation,
-    noise_factor,
-    regularise,
-    spent_parameters,
-)
+from hilcal.identify.minimise import Point, Problem, linear_problem, minimise
+from hilcal.identify.priors import prior_of
+from hilcal.identify.regularisation import LinearProblem, spent_parameters
 from hilcal.identify.residual import residual
 from hilcal.model import Model, Prediction
 from hilcal.regression.normal_equations import Basis, NormalEquations
 from hilcal.regression.projection import Projection, projection
 from hilcal.types import Bools, Floats, Ints
-
-MAX_ITERATIONS = 20
-"""Most Gauss-Newton steps; a choice, the tests of convergence allow 8."""
-CONVERGED = 1e-5
-"""A step that moves the whitened readings by less than this, in units of the noise; a choice."""
-SETTLED = 0.02
-"""Priors and rank are chosen at each step until the residual changes by less than this share from
-one step to the next, or is within the noise; then they are kept. A choice, no study set it."""
-DEPTH = 3
-"""Earlier steps that a step is combined with; a choice, there are as few weak directions."""
-HALVINGS = 8
-"""Most step lengths of a line search; a choice, no study set it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,7 +77,7 @@ class Solution:
 
     def coordinates(self) -> Floats:
         """Return z (K,) of the parameters that have a prior; zero for flat directions."""
-        return _coordinates(self.equations.basis, self.y, self.prior)
+        return prior_coordinates(self.equations.basis, self.y, self.prior)
 
     def projected_residual(self) -> Floats:
         """(R,) whitened residual after the model's remaining step: `white` to within that step."""
@@ -103,42 +85,33 @@ class Solution:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Point:
-    """y (P,), parameters (P,), the prediction there, the residual (D, m), also whitened (R,)."""
+class _Point(Point):
+    """A point with the prediction there, the residual (D, m), also whitened (R,)."""
 
-    y: Floats
-    theta: Floats
     prediction: Prediction
     raw: Floats
     white: Floats
 
-    def objective(self, by: Regularisation) -> float:
-        """Return ‖w‖² + β ‖y/σ‖² over the y that have a prior."""
-        held = np.isfinite(by.prior) & (by.prior > 0)
-        penalty = by.beta * float(np.sum((self.y[held] / by.prior[held]) ** 2))
-        return float(np.sum(self.white**2)) + penalty
-
-    def mean_square(self, parameters: int = 0) -> float:
-        """Return the mean square of the whitened residual with some parameters estimated."""
-        free = max(self.white.size - parameters, 1)
-        return max(float(np.sum(self.white**2)) / free, 1e-300)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Problem:
-    """A model, its coordinates, the readings that it is fitted to, and their scaling."""
+class _Problem(Problem[_Point]):
+    """Readings that fit into memory, and their scaling."""
 
-    model: Model
-    coordinates: Coordinates
     readings: Readings
     w: Whitening
 
     def at(self, y: Floats) -> _Point:
-        """Return the point of coordinates (P,)."""
         theta = self.coordinates.theta(y)
         prediction = self.model.predict(self.readings.states, theta)
         raw = residual(self.readings, prediction, self.w)
-        return _Point(y, theta, prediction, raw, self.w.whiten(raw).reshape(-1))
+        white = self.w.whiten(raw).reshape(-1)
+        return _Point(y, theta, float(np.sum(white**2)), white.size, prediction, raw, white)
+
+    def linearise(self, point: _Point, prior: Floats) -> LinearProblem:
+        live = np.flatnonzero(prior > 0)
+        noise = 1.0 if self.whitened else point.mean_square()
+        a = self.columns(point, live)
+        return linear_problem(point, prior, a, point.white, self.w.rank, noise, self.whitened)
 
     def columns(self, point: _Point, live: Ints) -> Floats:
         """Whitened derivative (R, L) by the live coordinates."""
@@ -168,15 +141,15 @@ def solve(
         prediction = model.predict(readings.states, theta)
         a = whitened_jacobian(model, prediction, theta, w, np.arange(model.size))
         coordinates = coordinates.felt(a)
-    problem = _Problem(model, coordinates, readings, w)
+    problem = _Problem(model, coordinates, w.scaling != "none", readings, w)
     y = None if start is None else coordinates.of_theta(start)
-    point, by, iterations, converged = _minimise(problem, y, prior)
+    point, by, iterations, converged = minimise(problem, y, prior)
     live = np.flatnonzero(by.prior > 0)
     rows = by.basis.rows(problem.columns(point, live))
     beta = point.mean_square(len(by.basis.singular)) if w.scaling == "none" else by.beta
     # Formed anew at the solution, so that folds can be taken out of them exactly.
-    basis = _all_parameters(by.basis, live, model.size)
-    target = point.white + rows @ _coordinates(basis, point.y, by.prior)
+    basis = over_all_parameters(by.basis, live, model.size)
+    target = point.white + rows @ prior_coordinates(basis, point.y, by.prior)
     equations = NormalEquations(basis, rows.T @ rows, rows.T @ target)
     return Solution(
         theta=point.theta,
@@ -194,57 +167,6 @@ def solve(
         iterations=iterations,
         converged=converged,
     )
-
-
-def _minimise(
-    problem: _Problem, start: Floats | None, prior: Floats | None
-) -> tuple[_Point, Regularisation, int, bool]:
-    """Return the minimum, what it was regularised by, the steps, and whether they converged."""
-    model, of = problem.model, problem.coordinates
-    sigma, groups = prior_of(model)
-    choose = prior is None and bool((groups >= 0).any())
-    sigma, scale = of.prior(sigma if prior is None else prior), of.scales(scales_of(model))
-    y = np.zeros(model.size) if start is None else start
-    point = problem.at(np.where(sigma > 0, y, 0.0))
-    by: Regularisation  # set in the first step
-    square, settled, converged = np.inf, False, False
-    path = Acceleration()
-    for iterations in range(1, MAX_ITERATIONS + 1):  # noqa: B007 - reported
-        linear = _linearise(problem, point, sigma)
-        if not settled:
-            by = regularise(linear, scale, sigma, groups, choose)
-            sigma = by.prior
-        linear = linear.restricted(sigma)
-        weighed = bool((groups[linear.live] >= 0).any()) or bool(len(of.index))
-        by, aim = _step(linear, by, weighed)
-        moved = linear.a @ (aim - point.y)[linear.live]
-        shortcut = path.accelerated(aim, moved) if settled else None
-        point = _line_search(problem, point, aim, by, shortcut)
-        before, square = square, point.mean_square(len(by.basis.singular))
-        noise = max(square, by.beta) * len(moved)
-        converged = settled and float(moved @ moved) <= CONVERGED**2 * noise
-        if converged:
-            break
-        del linear  # before the next one is made
-        settled = (problem.w.scaling != "none" and square < 1) or abs(
-            square / before - 1
-        ) <= SETTLED
-    return point, by, iterations, converged
-
-
-def _linearise(problem: _Problem, point: _Point, prior: Floats) -> LinearProblem:
-    """Return the linear problem at a point.
-
-    Flat parameters step from where they are, so that unidentifiable directions stay put; those with
-    a prior are solved for as a whole, since the prior is about zero.
-    """
-    w, live = problem.w, np.flatnonzero(prior > 0)
-    a = problem.columns(point, live)
-    origin = np.where(np.isinf(prior), point.y, 0.0)
-    target = point.white + a @ (point.y - origin)[live]
-    whitened = w.scaling != "none"
-    noise = 1.0 if whitened else point.mean_square()
-    return LinearProblem(live, origin, a, a.T @ a, target, w.rank, noise, whitened)
 
 
 def whitened_jacobian(
@@ -273,85 +195,14 @@ def columns_of(
     return coordinates.columns(a)[:, live]
 
 
-def _step(
-    linear: LinearProblem, by: Regularisation, weighed: bool
-) -> tuple[Regularisation, Floats]:
-    """Solve the linear problem for (P,) y; priors that are weighed need the noise factor first."""
-    equations = linear.equations(by.basis)
-    if weighed:
-        by = replace(by, beta=noise_factor(linear, equations, by.beta))
-    aim = linear.origin.copy()
-    aim[linear.live] += by.basis.transform @ equations.solve(by.beta)
-    return by, aim
-
-
-class Acceleration:
-    """Anderson's acceleration of the steps that follow once priors and rank are settled.
-
-    Where a residual remains, steps in a weakly determined direction shrink by a constant factor
-    only. With f_i the motion of the whitened readings by step i, and g_i where it leads to, the
-    combination Σ α_i f_i, Σ α_i = 1, of the last steps that is shortest leads to Σ α_i g_i.
-
-    Source: Walker and Ni, *Anderson acceleration for fixed-point iterations*, SIAM J. Numer. Anal.
-    49 (2011) 1715-1735.
-    """
-
-    def __init__(self) -> None:
-        """Begin without steps."""
-        self._aims: list[Floats] = []
-        self._moves: list[Floats] = []
-
-    def accelerated(self, aim: Floats, moved: Floats) -> Floats | None:
-        """Return where the steps so far lead to; None after the first.
-
-        Args:
-            aim: (P,) where the step leads to by itself.
-            moved: (R,) its motion of the whitened readings.
-        """
-        self._aims, self._moves = [*self._aims[-DEPTH:], aim], [*self._moves[-DEPTH:], moved]
-        if len(self._aims) == 1:
-            return None
-        differences = np.diff(self._moves, axis=0)
-        gamma = np.linalg.lstsq(differences.T, moved, rcond=None)[0]
-        return np.asarray(aim - gamma @ np.diff(self._aims, axis=0))
-
-
-def _line_search(
-    problem: _Problem, point: _Point, aim: Floats, by: Regularisation, shortcut: Floats | None
-) -> _Point:
-    """Go to the `shortcut` (P,), unless the objective grows; else towards `aim` (P,).
-
-    On the way to `aim` half as far each time while the objective grows: the chain may be strongly
-    nonlinear along a step in a weakly determined direction.
-    """
-    now = point.objective(by)
-    if shortcut is not None:
-        try:
-            trial = problem.at(shortcut)
-            if trial.objective(by) <= now:
-                return trial
-        except CannotAnswerError:
-            pass
-    begin = np.where(by.prior > 0, point.y, 0.0)
-    for halving in range(HALVINGS):
-        share = 0.5**halving
-        try:
-            trial = problem.at(aim if share == 1 else begin + share * (aim - begin))
-        except CannotAnswerError:
-            continue
-        if trial.objective(by) <= now * (1 + 1e-9) + 1e-12:
-            return trial
-    return problem.at(begin)
-
-
-def _coordinates(basis: Basis, y: Floats, prior: Floats) -> Floats:
+def prior_coordinates(basis: Basis, y: Floats, prior: Floats) -> Floats:
     """Return z (K,) of the y that have a prior; zero for flat directions."""
     z = np.zeros(len(basis.prior_precision))
     z[len(basis.singular) :] = y[basis.held] / prior[basis.held]
     return z
 
 
-def _all_parameters(basis: Basis, live: Ints, size: int) -> Basis:
+def over_all_parameters(basis: Basis, live: Ints, size: int) -> Basis:
     """Express a basis over the live parameters over all of them."""
     transform = np.zeros((size, basis.transform.shape[1]))
     transform[live] = basis.transform

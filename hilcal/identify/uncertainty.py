@@ -19,6 +19,7 @@ import numpy as np
 
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Whitening
+from hilcal.identify.coordinates import Coordinates
 from hilcal.identify.folds import block_folds, region_folds
 from hilcal.identify.gauss_newton import Solution, whitened_jacobian
 from hilcal.identify.holdout import changes
@@ -29,7 +30,7 @@ from hilcal.regression.hyperparameter_uncertainty import (
     dropped_group_factors,
     hyperparameter_factors,
 )
-from hilcal.regression.normal_equations import NULL_SHARE
+from hilcal.regression.normal_equations import NULL_SHARE, Basis
 from hilcal.types import Bools, Floats, Ints
 
 LEARNT = 0.7
@@ -90,8 +91,9 @@ def uncertainty(
             off = change - change.mean(axis=0)
             jackknife = np.sqrt((count - 1) / count * np.sum(off**2, axis=0))
             std = np.maximum(std, jackknife)
-    null = _ordinary(solution, basis.null, scale)
-    identifiable = _identifiable(solution, scale, std, null)
+    null = in_ordinary_magnitudes(solution.space, basis.null, scale)
+    carried = solution.space.carried(len(scale))
+    identifiable = identifiable_parameters(basis, solution.prior, carried, scale, std, null)
     std = std * _hyperparameter_factors(model, w, solution, covariance)
     return Uncertainty(
         np.where(identifiable, std, np.inf),
@@ -118,21 +120,30 @@ def _hyperparameter_factors(
     )
 
 
-def _ordinary(solution: Solution, null: Floats, scale: Floats) -> Floats:
-    """Directions (P, U) in ordinary magnitudes of the parameters, of those of y."""
-    found, index = solution.space.transform(null).copy(), solution.space.index
+def in_ordinary_magnitudes(space: Coordinates, null: Floats, scale: Floats) -> Floats:
+    """Directions (P, U) in ordinary magnitudes (P,) of the parameters, of those of y."""
+    found, index = space.transform(null).copy(), space.index
     found[index] /= scale[index, None]
     return found
 
 
-def _identifiable(solution: Solution, scale: Floats, std: Floats, null: Floats) -> Bools:
-    """(P,) parameters that unidentifiable directions hardly move, and that the data determine."""
-    basis = solution.equations.basis
+def identifiable_parameters(
+    basis: Basis, prior: Floats, carried: Bools, scale: Floats, std: Floats, null: Floats
+) -> Bools:
+    """(P,) parameters that unidentifiable directions hardly move, and that the data determine.
+
+    Args:
+        basis: identifiable coordinates of a fit.
+        prior: (P,) prior standard deviations of its y.
+        carried: (P,) parameters with a carried prior.
+        scale: (P,) ordinary magnitudes.
+        std: (P,) standard uncertainties.
+        null: (P, U) unidentifiable directions, in ordinary magnitudes.
+    """
     moved = scale * np.linalg.norm(null, axis=1)
     flat = (moved <= NULL_SHARE * std) & (std < MEANINGLESS * scale)
-    learnt = std < LEARNT * np.where(np.isinf(solution.prior), np.inf, solution.prior)
-    no_own = basis.flat | solution.space.carried(len(scale))
-    return np.where(no_own, flat, learnt & (solution.prior > 0))
+    learnt = std < LEARNT * np.where(np.isinf(prior), np.inf, prior)
+    return np.where(basis.flat | carried, flat, learnt & (prior > 0))
 
 
 def name_directions(model: Model, null: Floats, most: int = 3) -> tuple[str, ...]:

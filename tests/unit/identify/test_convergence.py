@@ -8,7 +8,7 @@ import pytest
 from hilcal.data.readings import Readings, States
 from hilcal.data.whitening import whitening
 from hilcal.identify.fit import Fit, fit
-from hilcal.identify.gauss_newton import Acceleration
+from hilcal.identify.minimise import Acceleration
 from hilcal.identify.priors import scales_of
 from hilcal.identify.residual import residual
 from hilcal.model import Model

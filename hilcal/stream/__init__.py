@@ -1,0 +1,1 @@
+"""Identification of readings that do not fit into memory."""
