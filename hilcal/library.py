@@ -16,6 +16,7 @@ from hilcal.data.readings import Readings
 from hilcal.data.schema import HEADER
 from hilcal.data.whitening import MODES, SCALINGS, Mode, usual_mode
 from hilcal.effects.catalogue import Catalogue
+from hilcal.effects.options import Options
 from hilcal.engine.engine import open_engine
 from hilcal.errors import InputError
 from hilcal.identify import baseline as starting_models
@@ -72,6 +73,11 @@ def fit_stream(
 ) -> StreamFit:
     """Fit a model to readings that need not fit into memory: a Parquet file, in passes.
 
+    >>> cell = hc.Cell.load(CELL)
+    >>> found = hc.fit_stream(STREAM, cell, ["joint_compliance"], workers=1)
+    >>> found.model.names, found.converged
+    (('base_frame', 'joint_compliance'), True)
+
     Args:
         path: a Parquet file with the columns of the exchange table; `pose` and `load` are not
             needed, each row stands alone.
@@ -87,7 +93,7 @@ def fit_stream(
     """
     tracker = cell.configured().tracker
     stream = open_stream(Path(path), cell.arm, tracker_noise(tracker), tracker.station_m)
-    named = None if effects is None else dict.fromkeys(effects, {})
+    named: dict[str, Options] | None = None if effects is None else {name: {} for name in effects}
     with open_engine(workers, scheduler) as engine:
         return streams.fit_stream(stream, cell, engine, named, prior=prior)
 

@@ -40,6 +40,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     readings = case.readings
     table, run, later = folder / "t.csv", folder / "run.hilcal", folder / "later.hilcal"
     write_table(readings, table, WHOLE)
+    write_table(readings, folder / "t.parquet", WHOLE)
     compliance = case.world.physics.joint_compliance * [1, 2, 1, 1, 1, 1]
     worn = replace(
         case.world, physics=case.world.physics.with_effect("joint_compliance", compliance)
@@ -67,6 +68,7 @@ def test_the_examples_of_a_docstring_run(name: str, site: SimpleNamespace) -> No
     known = {"hc": hc, "np": np, "CELL": site.cell, "TABLE": site.table, "RUN": site.run}
     known["LATER"] = site.later
     known["PORT"] = port
+    known["STREAM"] = site.folder / "t.parquet"
     known["REPORT"] = site.folder / "report.html"
     finder = doctest.DocTestFinder(recurse=True)
     tests = [t for t in finder.find(thing, name, module=False, globs=known) if t.examples]
