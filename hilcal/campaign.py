@@ -14,7 +14,7 @@ from hilcal.data.covariance import COVERS, INSTRUMENT, WHOLE
 from hilcal.data.purpose import refuse_fitting
 from hilcal.data.readings import Readings
 from hilcal.data.records import content_hash
-from hilcal.data.revision import RevisionRecord
+from hilcal.data.revision import STORED, RevisionRecord
 from hilcal.data.whitening import Mode, usual_mode
 from hilcal.diagnose.diagnosis import Diagnosis, History
 from hilcal.diagnose.verdict import diagnose
@@ -34,7 +34,6 @@ from hilcal.refine import Refinement
 from hilcal.report.build_story import Chapter
 from hilcal.report.diagnosis_document import to_json
 from hilcal.revisions import (
-    STORED,
     chain,
     check_sources,
     history,

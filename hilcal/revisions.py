@@ -13,7 +13,7 @@ from hilcal.cell import Cell
 from hilcal.data.arm_scatter import ArmScatter
 from hilcal.data.readings import Readings
 from hilcal.data.records import content_hash
-from hilcal.data.revision import RevisionRecord
+from hilcal.data.revision import STORED, RevisionRecord
 from hilcal.data.stored_priors import CARRIED
 from hilcal.data.whitening import MODES, SCALINGS, Mode, Scaling
 from hilcal.diagnose.diagnosis import History
@@ -27,11 +27,6 @@ from hilcal.identify.predictive import Predictive, predictive
 from hilcal.model import Model
 from hilcal.types import Floats
 
-STORED = "stored_sha256"
-"""Key among the options of a revision: hash of the readings as the file stores them.
-
-`data_hash` is that of the readings with the arm's scatter in their covariance, which is computed:
-its last bits depend on the machine."""
 _LARGEST = 1e9
 """No parameter and no length of a frame is as large, in SI units."""
 SOURCES = "effects_from"

@@ -15,7 +15,7 @@ from hilcal import __version__
 from hilcal.data import rows, schema
 from hilcal.data.readings import Readings
 from hilcal.data.records import Layout, content_hash, layout_of, read_layout
-from hilcal.data.revision import RevisionRecord, from_text, to_text, utc_now
+from hilcal.data.revision import RevisionRecord, fitted_to, from_text, to_text, utc_now
 from hilcal.data.stored_priors import join, split
 from hilcal.errors import InputError
 
@@ -107,7 +107,9 @@ class CampaignFile:
             connection = schema.connect(path, read_only)
             try:
                 schema.check_file(connection, path)
-                return cls(path, connection)
+                file = cls(path, connection)
+                file._check_hashes()
+                return file
             except BaseException:
                 connection.close()
                 raise
@@ -298,6 +300,25 @@ class CampaignFile:
             valid = f"there are 1 to {len(records)}" if records else "there are none yet"
             raise InputError(f"{self.path}: no revision {number}; {valid}")
         return records[number - 1]
+
+    def _check_hashes(self) -> None:
+        """Refuse readings that are not those which a stored revision was fitted to.
+
+        Raises:
+            InputError: readings were changed; names the revision.
+        """
+        fitted = {(r.number, told) for r in self.revisions() if (told := fitted_to(r)) is not None}
+        if not fitted:
+            return
+        readings = self.readings()
+        counts = {count for _, (count, _) in fitted}
+        hashes = {n: content_hash(readings[:n]) for n in counts if 0 <= n <= len(readings)}
+        for number, (count, stored) in sorted(fitted):
+            if hashes.get(count) != stored:
+                raise InputError(
+                    f"{self.path}: the readings were changed after revision {number} had been "
+                    "fitted to them (their SHA-256 is another); use an untouched copy of the file"
+                )
 
     def _read_meta(self) -> dict[str, str]:
         meta = rows.fetch_meta(self._connection, self.path)

@@ -8,6 +8,12 @@ from typing import Any
 
 from hilcal.toml import parse_json
 
+STORED = "stored_sha256"
+"""Key among the options of a revision: hash of the readings as the file stores them.
+
+`data_hash` is that of the readings with the arm's scatter in their covariance, which is computed:
+its last bits depend on the machine."""
+
 
 def utc_now() -> str:
     """Present time, ISO 8601, UTC, to the second."""
@@ -117,3 +123,16 @@ def _check(record: RevisionRecord) -> None:
         raise TypeError("a name is no text")
     if record.parent is not None and not isinstance(record.parent, int):
         raise TypeError("parent is no number")
+
+
+def fitted_to(record: RevisionRecord) -> tuple[int, str] | None:
+    """Return how many readings a revision was fitted to, the first ones, and their stored hash.
+
+    None where the record does not say.
+    """
+    identified = record.result_json.get("identify")
+    count = identified.get("n_readings") if isinstance(identified, dict) else None
+    stored = record.options.get(STORED)
+    if not isinstance(count, int) or not isinstance(stored, str):
+        return None
+    return count, stored

@@ -33,8 +33,9 @@ def main() -> int:
         seconds = time.process_time() - begun
         print(
             f"{name}: {out.inputs} inputs, {out.read} read, {sum(out.refused.values())} refused, "
-            f"{sum(out.findings.values())} findings; {out.inputs / max(seconds, 1e-9):.0f}/s of "
-            f"processor time, slowest {out.slowest_s:.3f} s",
+            f"{sum(out.findings.values())} findings, {out.collisions} collisions; "
+            f"{out.inputs / max(seconds, 1e-9):.0f}/s of processor time, "
+            f"slowest {out.slowest_s:.3f} s",
             flush=True,
         )
         for line, count in out.findings.most_common():
@@ -52,6 +53,7 @@ def _add(path: Path, name: str, seed: int, out: harness.Outcome, seconds: float)
     entry["inputs"] += out.inputs
     entry["read"] += out.read
     entry["refused"] += sum(out.refused.values())
+    entry["collisions"] = entry.get("collisions", 0) + out.collisions
     entry["processor_s"] = round(entry.get("processor_s", 0.0) + seconds, 1)
     entry["slowest_s"] = round(max(entry.get("slowest_s", 0.0), out.slowest_s), 3)
     entry.setdefault("seeds", []).append(seed)

@@ -26,7 +26,7 @@ from drivers.ur_link.lines import LinkError
 from hilcal.acquire.clock import Clock
 from hilcal.config.cell import Tracker
 from tests.fuzz.damage import NUMBERS, bytes_damaged
-from tests.fuzz.harness import Accepted, Parser
+from tests.fuzz.harness import Accepted, Parser, passed
 from tests.support.geocom_cases import crc16_arc, line
 
 
@@ -167,7 +167,7 @@ def _force(name: str) -> Parser:
         if not data[0]:
             for body in seen:
                 if body not in sound:
-                    raise Accepted(f"{name}: a frame that was damaged")
+                    raise passed(f"{name}: a frame", body, sound)
         if not stream._kept:
             return False
         kept = stream._wrench[: stream._kept]
@@ -253,7 +253,7 @@ def _geocom() -> Parser:
         if not data[0]:
             near = min(np.abs(np.array(s) - sample.value).max() for s in sound)
             if near > 1e-12:
-                raise Accepted("geocom: an answer that was damaged")
+                raise passed("geocom", data[1:], corpus)
         return True
 
     return Parser("geocom", make, parse)
@@ -273,7 +273,7 @@ def _modbus() -> Parser:
         return bare + modbus_rtu_crc(bare)
 
     corpus = [answer(words) for words in registers]
-    sound = {struct.unpack(">4H", words) for words in registers}
+    packed, sound = registers, {struct.unpack(">4H", words) for words in registers}
 
     def make(by: Random) -> bytes:
         if by.random() < 0.3:
@@ -292,7 +292,7 @@ def _modbus() -> Parser:
         if len(got) != 4 or not all(0 <= word < 65536 for word in got):
             raise Accepted("modbus: registers that cannot be")
         if not data[0] and got not in sound:
-            raise Accepted("modbus: an answer that was damaged")
+            raise passed("modbus", struct.pack(">4H", *got), packed)
         return True
 
     return Parser("modbus", make, parse)

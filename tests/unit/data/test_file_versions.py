@@ -1,0 +1,96 @@
+"""Campaign files of every version of the schema, as the programs of their time wrote them."""
+
+import gzip
+import sqlite3
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilcal.campaign import Campaign
+from hilcal.cli import main
+from hilcal.data import schema
+from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.rows import _reading_crc
+from hilcal.errors import InputError
+from tests.support.paths import ROOT
+
+FILES = sorted((ROOT / "tests" / "data" / "campaigns").glob("*.hilcal.gz"))
+HASHED = next(path for path in FILES if "hashed" in path.name)
+"""Its revision names the hash of the readings as they are stored."""
+HASHES = {
+    "version-5-hashed": "f91c9c4b17595fd06c9913893dded67c902babcea3f5cb885cd6e043b3e1034f",
+    "version-1": "dfcb9facd5eab32baa432c85c7a0255fbf2af611ee13ac62efa29595dd3d3874",
+    "version-2": "dfcb9facd5eab32baa432c85c7a0255fbf2af611ee13ac62efa29595dd3d3874",
+    "version-3": "167ca0438879f2c498270598303a9f81fb5d5bf701de512ebabe23992d484fc6",
+    "version-4": "f91c9c4b17595fd06c9913893dded67c902babcea3f5cb885cd6e043b3e1034f",
+    "version-5": "15e697bb8aa02ccf9025c82e5d80b2571a85f38b6de0e1a9a352eccdeb66aa73",
+}
+
+
+def unpacked(path: Path, folder: Path) -> Path:
+    out = folder / path.stem
+    out.write_bytes(gzip.decompress(path.read_bytes()))
+    return out
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.name.split(".")[0])
+def test_a_file_of_an_older_program(path: Path, tmp_path: Path) -> None:
+    old = unpacked(path, tmp_path)
+    before = old.read_bytes()
+    with Campaign.open(old, read_only=True) as run:
+        assert len(run.readings) == 30
+        assert run.file.data_hash() == HASHES[path.name.split(".")[0]]
+        (record,) = run.file.revisions()
+        found = run.fit()
+        stored = np.array(record.parameters_json["theta"])
+        assert np.allclose(found.theta, stored, rtol=1e-6, atol=2e-7)  # m, rad, rad/(N·m)
+        assert found.model.names == record.effects
+    assert old.read_bytes() == before, "reading an old file must not change it"
+
+
+def test_every_version_is_there() -> None:
+    versions = {int(path.name.split("-")[1].split(".")[0]) for path in FILES}
+    assert versions == set(range(1, schema.VERSION + 1)), "keep a file of the new version, too"
+
+
+def test_a_newer_version_is_refused_in_words(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    path = unpacked(FILES[-1], tmp_path)
+    with sqlite3.connect(path) as db:
+        db.execute(f"PRAGMA user_version = {schema.VERSION + 1}")
+    db.close()
+    before = path.read_bytes()
+    for command in (["info"], ["identify"], ["compare"], ["accept", "1"]):
+        with pytest.raises(SystemExit) as end:
+            main([command[0], str(path), *command[1:]])
+        assert end.value.code == 2
+        assert "made by a newer hilcal" in capsys.readouterr().err
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("command", ["info", "compare", "identify", "diagnose", "next", "export"])
+def test_changed_readings_are_found_by_their_hash(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    """One coordinate moved by 1 µm, and its checksum mended."""
+    path = unpacked(HASHED, tmp_path)
+    with sqlite3.connect(path) as db:
+        db.execute("DROP TRIGGER readings_no_update")
+        row = db.execute("SELECT id, pose, load, cycle, record FROM readings WHERE id = 7")
+        number, *where, record = row.fetchone()
+        values = np.frombuffer(record, "<f8").copy()
+        values[-10] += 1e-6  # of x, y, z before the covariance
+        changed = values.tobytes()
+        crc = _reading_crc(number, where, changed)
+        db.execute("UPDATE readings SET record = ?, crc = ? WHERE id = 7", (changed, crc))
+    db.close()
+    with pytest.raises(InputError, match="the readings were changed after revision 1"):
+        CampaignFile.open(path)
+    arguments = {
+        "next": ["-o", str(tmp_path / "plan.json")],
+        "export": ["--readings", str(tmp_path / "t.csv")],
+    }
+    with pytest.raises(SystemExit) as end:
+        main([command, str(path), *arguments.get(command, [])])
+    assert end.value.code == 2
+    assert "SHA-256" in " ".join(capsys.readouterr().err.split())
