@@ -55,7 +55,7 @@ class Outcome:
         variables: whether the variables are exactly those.
         correlation: of what the law explains with what was hidden, the model projected out.
         before: error at fresh poses over the noise there, of the model alone.
-        after: the same with the first law.
+        after: the same with the first law; as before, where there is none.
         p_value: of the first law.
         impossible: why there is no such campaign.
     """
@@ -118,20 +118,22 @@ def run_case(config: CellConfig, asked: Asked) -> Outcome:
     before = fit(baseline(cell, readings, asked.mode), readings, asked.mode)
     d = discover(before)
     out = Outcome(asked, d.reason, truth=asked.effect if law is None else law.words)
-    if law is None or not d.laws or d.after is None:
-        formula = d.laws[0].formula if d.laws else ""
-        return replace(out, formula=formula, p_value=d.laws[0].p_value if d.laws else 1.0)
+    if d.laws:
+        out = replace(out, formula=d.laws[0].formula, p_value=d.laws[0].p_value)
+    if law is None:
+        return out
     again = rehearsal_states(cell, asked.poses, loads, rng)
     fresh = _scaled(_measured(world, again, names, rng, law), size)
+    error = _error(before, fresh)
+    if not d.laws or d.after is None:
+        return replace(out, before=error, after=error)
     return replace(
         out,
-        formula=d.laws[0].formula,
         site=_right_site(law, d.laws[0]),
         variables=frozenset(d.laws[0].variables) == law.variables,
         correlation=agreement(before, d.after, first.moved),
-        before=_error(before, fresh),
+        before=error,
         after=_error(d.after, fresh),
-        p_value=d.laws[0].p_value,
     )
 
 

@@ -8,9 +8,10 @@ What a law costs for the search that found it is the logarithm of the number of 
 complexity, and log 2 for each unit of complexity: simple laws are few, and pay little.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from math import log
+from math import comb, log
 
 import numpy as np
 
@@ -29,8 +30,9 @@ HARMONICS = 4
 FINEST = 512
 """Highest multiple of a joint's angle, as of encoders and gears; a choice. Not more than there are
 poses: each order costs the search, and few poses do not tell hundreds of them apart."""
-FLAT = 1e-3
-"""Amplitudes whose spread is a smaller share of their size are a constant; a choice."""
+FLAT = 0.1
+"""Factors whose spread is a smaller share of their size are in no product: it would be the other
+factor's law to within that share. A choice."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,6 +112,19 @@ class Amplitude:
             out.append(f)
         return Amplitude(tuple(out))
 
+    def of_axis(self, old: int, new: int, known: list[Variable]) -> "Amplitude | None":
+        """Return the same law of another axis: vectors' components along both change places."""
+        swap, out = {old: new, new: old}, []
+        for f in self.factors:
+            v = f.variable
+            if v.vector and v.axis in swap:
+                same = [w for w in known if w.vector == v.vector and w.axis == swap[v.axis]]
+                if not same:
+                    return None
+                f = replace(f, variable=same[0])
+            out.append(f)
+        return Amplitude(tuple(out))
+
 
 def _alike(a: Variable, b: Variable) -> bool:
     return a.slot is None or b.slot is None or a.slot[1] == b.slot[1]
@@ -132,6 +147,8 @@ class Grammar:
         size: (F,) what they were divided by.
         cost: (F,) complexities.
         partner: (F,) the amplitude with sine for cosine in its first periodic factor; −1 for none.
+        situation: of the readings.
+        singles: the functions of one quantity from which products are made.
     """
 
     known: list[Variable]
@@ -140,6 +157,58 @@ class Grammar:
     size: Floats
     cost: Ints
     partner: Ints
+    situation: Situation
+    singles: tuple[Factor, ...]
+    _more: list[tuple[Amplitude, Floats, float]] = field(default_factory=list)
+    _read: dict[str, Floats] = field(default_factory=dict)
+
+    def at(self, k: int) -> Amplitude:
+        """Return an amplitude by its index."""
+        own = len(self.amplitudes)
+        return self.amplitudes[k] if k < own else self._more[k - own][0]
+
+    def rows(self, which: list[int]) -> Floats:
+        """(P, N) values of amplitudes, each with root mean square 1."""
+        own = len(self.amplitudes)
+        return np.array([self.values[k] if k < own else self._more[k - own][1] for k in which])
+
+    def index(self, amplitude: Amplitude) -> int | None:
+        """Return the index of an amplitude, added where it is new; None where it is zero."""
+        known = self.place(amplitude)
+        if known is not None:
+            return known
+        values = self.values_of(amplitude)
+        size = float(np.sqrt(np.mean(values**2)))
+        if not np.isfinite(size) or size == 0:
+            return None
+        k = len(self.amplitudes) + len(self._more)
+        self._more.append((amplitude, (values / size).astype(np.float32), size))
+        self._places[_key(amplitude)] = k
+        return k
+
+    def values_of(self, a: Amplitude) -> Floats:
+        """(N,) of an amplitude at the readings."""
+        out = np.ones(self.values.shape[1])
+        for f in a.factors:
+            out = out * f.shape.value(self.read(f.variable), f.numbers)
+        return out
+
+    def read(self, v: Variable) -> Floats:
+        """(N,) of a quantity at the readings."""
+        if v.symbol not in self._read:
+            self._read[v.symbol] = v.read(self.situation)
+        return self._read[v.symbol]
+
+    def turned(self, k: int) -> int | None:
+        """Return the amplitude with sine for cosine in its first periodic factor."""
+        if k < len(self.amplitudes):
+            return int(self.partner[k]) if self.partner[k] >= 0 else None
+        factors = list(self.at(k).factors)
+        for i, f in enumerate(factors):
+            if f.shape.name == "cos":
+                factors[i] = replace(f, shape=replace(shapes.SIN, cost=f.shape.cost))
+                return self.index(Amplitude(tuple(factors)))
+        return None
 
     def place(self, amplitude: Amplitude) -> int | None:
         """Return the index of an amplitude; None where it is not tried."""
@@ -151,7 +220,7 @@ class Grammar:
 
     def inner(self, k: int) -> list[int]:
         """Return the amplitudes with one factor less."""
-        factors = self.amplitudes[k].factors
+        factors = self.at(k).factors
         less = (Amplitude((*factors[:i], *factors[i + 1 :])) for i in range(len(factors)))
         return [at for a in less if (at := self.place(a)) is not None]
 
@@ -159,6 +228,29 @@ class Grammar:
         """(F,) log of the number of candidates of the same complexity, and of 2 per unit of it."""
         count = np.bincount(self.cost) * sites
         return np.asarray(np.log(count[self.cost]) + log(2.0) * self.cost)
+
+    def price_of(self, a: Amplitude, sites: int) -> float:
+        """Return the same of any product: as if all of its complexity had been tried."""
+        kind = a.cost, len(a.factors)
+        count = self._counts.get(kind, self._counts.get((a.cost, 0), 1))
+        return log(max(count, 1) * sites) + log(2.0) * a.cost
+
+    @cached_property
+    def _counts(self) -> dict[tuple[int, int], int]:
+        """Number of products by complexity and factors; by complexity, those of `amplitudes`."""
+        n = np.bincount([f.cost for f in self.singles], minlength=4).tolist()
+        own = np.bincount(self.cost).tolist()
+        return {
+            (4, 2): comb(n[2], 2) + n[1] * n[3],
+            (3, 3): comb(n[1], 3),
+            (4, 3): comb(n[1], 2) * n[2],
+            **{(cost, 0): count for cost, count in enumerate(own)},
+        }
+
+    @cached_property
+    def depends(self) -> tuple[frozenset[str], ...]:
+        """Names of the quantities that each amplitude depends on."""
+        return tuple(frozenset(a.names) for a in self.amplitudes)
 
 
 def _key(a: Amplitude) -> frozenset[tuple[str, str, Numbers]]:
@@ -177,12 +269,14 @@ def grammar(known: list[Variable], s: Situation, poses: int = 0) -> Grammar:
     singles += [f for v in known if v.kind == "angle" for f in _fine(v, min(poses, FINEST))]
     value = np.array([f.values(s) for f in singles]).reshape(len(singles), -1)
     cost = np.array([f.cost for f in singles])
+    flat = np.std(value, axis=1) < FLAT * np.sqrt(np.mean(value**2, axis=1))
     pairs: list[tuple[int, int]] = [(-1, -1)] + [
         (i, -1) for i in range(len(singles)) if cost[i] <= MOST
     ]
-    for i in range(len(singles)):
-        for k in range(i + 1, len(singles)):
-            if cost[i] + cost[k] <= MOST and _different(singles[i], singles[k]):
+    curved = np.flatnonzero((cost < MOST) & ~flat).tolist()
+    for at, i in enumerate(curved):
+        for k in curved[at + 1 :]:
+            if cost[i] + cost[k] <= MOST and different(singles[i], singles[k]):
                 pairs.append((i, k))
     value = np.vstack([value, np.ones(value.shape[1])])
     index = np.array(pairs)
@@ -202,10 +296,16 @@ def grammar(known: list[Variable], s: Situation, poses: int = 0) -> Grammar:
         size[kept],
         np.array([a.cost for a in amplitudes]),
         partner,
+        s,
+        tuple(
+            f
+            for f, same in zip(singles, flat.tolist(), strict=True)
+            if not same and f.shape not in (shapes.FINE_COS, shapes.FINE_SIN)
+        ),
     )
 
 
-def _different(a: Factor, b: Factor) -> bool:
+def different(a: Factor, b: Factor) -> bool:
     """Whether two factors are of different quantities."""
     return not set(a.variable.names) & set(b.variable.names) or (
         a.variable.kind == "load" and a.variable.symbol != b.variable.symbol
@@ -245,42 +345,81 @@ def _fine(v: Variable, finest: int) -> list[Factor]:
 
 def _factors(v: Variable, x: Floats) -> list[Factor]:
     """Return the functions of one quantity, with starting values of their numbers."""
-    middle = float(np.median(np.abs(x[x != 0]))) if np.any(x) else 1.0
     linear = Factor(v, shapes.LINEAR)
-    if v.kind in ("angle", "sum"):
-        most = HARMONICS if v.kind == "angle" else 1
+    if v.kind in WAVES:
         waves = [
-            Factor(v, f, (float(k),)) for k in range(1, most + 1) for f in (shapes.COS, shapes.SIN)
+            Factor(v, f, (float(k),))
+            for k in range(1, WAVES[v.kind] + 1)
+            for f in (shapes.COS, shapes.SIN)
         ]
-        return [linear, *waves] if v.kind == "angle" else waves
+        return [linear, *waves, *_bent(v, x)] if v.kind == "angle" else waves
     if v.kind == "side":
         return [linear]
+    return [linear, *_CURVED[v.kind](v, x), *_bent(v, x)]
+
+
+WAVES = {"angle": HARMONICS, "sum": 2, "sight": 2}
+"""Multiples of an angle, by the kind of quantity; a choice."""
+BENDS = (0.3, 0.7)
+"""Shares of the readings below a bend to begin with; a refinement moves it. A choice."""
+_Made = Callable[[Variable, Floats], list[Factor]]
+
+
+def _bent(v: Variable, x: Floats) -> list[Factor]:
+    """Return functions that are zero up to some value, by either side, and symmetric ones."""
+    alone = v.kind in ("force", "load", "place")  # many, and rarely with a bend: in no product
+    made = [
+        Factor(v, replace(f, cost=MOST) if alone else f, (_round(at),))
+        for at in np.quantile(x, BENDS).tolist()
+        for f in (shapes.ABOVE, shapes.BELOW)
+    ]
+    if x.min() < 0 < x.max() and v.kind in ("angle", "torque"):
+        near = _round(0.01 * _middle(x))
+        made.append(Factor(v, shapes.THRESHOLD, (_round(0.5 * _middle(x)),)))
+        made.append(Factor(v, shapes.SATURATION, (_round(_middle(x)),)))
+        made += [Factor(v, shapes.EVEN, (p, near)) for p in (1.0, 2.0)]
+    return list({(f.shape.name, f.numbers): f for f in made}.values())
+
+
+def _middle(x: Floats) -> float:
+    return float(np.median(np.abs(x[x != 0]))) if np.any(x) else 1.0
+
+
+def _wrench(v: Variable, x: Floats) -> list[Factor]:
+    middle = _middle(x)
     near = _round(0.01 * middle)
-    whole = Factor(v, shapes.EVEN, (2.0, near))
-    if v.kind in ("torque", "force", "load") and x.min() < 0 < x.max():
-        out = [linear, Factor(v, shapes.PLUS), Factor(v, shapes.MINUS)]
-        out.append(Factor(v, shapes.SATURATION, (_round(0.05 * middle),)))
-        if v.kind == "torque":
-            out.append(Factor(v, shapes.SATURATION, (_round(middle),)))
-            out.append(Factor(v, shapes.THRESHOLD, (_round(0.5 * middle),)))
-            out += [Factor(v, shapes.EVEN, (1.0, near)), whole]
-            out += [Factor(v, shapes.ODD, (p, near)) for p in (2.0, 3.0)]
-            out.append(Factor(v, shapes.ODD, (0.5, near)))
-        return out
-    if v.kind in ("torque", "force"):
-        return [linear, whole, Factor(v, shapes.ODD, (0.5, near))]
-    if v.kind == "gravity":
-        side = Factor(v, shapes.SATURATION, (_round(0.05 * middle),))
-        return [linear, side, Factor(v, shapes.EVEN, (1.0, near)), whole]
-    if v.kind == "temperature":
-        return [linear, whole, Factor(v, shapes.EVEN, (1.0, near)), Factor(v, shapes.PLUS)]
-    if v.kind == "place" and x.min() < 0:
-        return [linear, whole]
-    out = [linear, *(Factor(v, shapes.POWER, (p,)) for p in (0.5, 2.0))]
-    if v.kind not in ("time", "hanging"):
-        return out
+    if not x.min() < 0 < x.max():
+        if v.kind == "load":
+            return _grown(v, x)
+        return [Factor(v, shapes.EVEN, (2.0, near)), Factor(v, shapes.ODD, (0.5, near))]
+    out = [Factor(v, shapes.PLUS), Factor(v, shapes.MINUS)]
+    out.append(Factor(v, shapes.SATURATION, (_round(0.05 * middle),)))
+    if v.kind == "torque":
+        out += [Factor(v, shapes.ODD, (p, near)) for p in (0.5, 2.0, 3.0)]
+    return out
+
+
+def _gravity(v: Variable, x: Floats) -> list[Factor]:
+    near = _round(0.01 * _middle(x))
+    side = Factor(v, shapes.SATURATION, (_round(0.05 * _middle(x)),))
+    return [side, *(Factor(v, shapes.EVEN, (p, near)) for p in (1.0, 2.0))]
+
+
+def _temperature(v: Variable, x: Floats) -> list[Factor]:
+    near = _round(0.01 * _middle(x))
+    return [*(Factor(v, shapes.EVEN, (p, near)) for p in (2.0, 1.0)), Factor(v, shapes.PLUS)]
+
+
+def _grown(v: Variable, x: Floats) -> list[Factor]:
+    """Powers of what is never negative."""
+    if x.min() < 0:
+        return [Factor(v, shapes.EVEN, (2.0, _round(0.01 * _middle(x))))]
+    return [Factor(v, shapes.POWER, (p,)) for p in (0.5, 2.0)]
+
+
+def _lasting(v: Variable, x: Floats) -> list[Factor]:
     last = float(x.max())
-    out.append(Factor(v, shapes.LOG))
+    out = [*_grown(v, x), Factor(v, shapes.LOG)]
     out += [Factor(v, shapes.RELAXATION, (_round(k * last),)) for k in (0.03, 0.1, 0.3)]
     if v.kind == "time":
         out += [
@@ -289,6 +428,18 @@ def _factors(v: Variable, x: Floats) -> list[Factor]:
             for w in (0.02, 0.1)
         ]
     return out
+
+
+_CURVED: dict[str, _Made] = {
+    "torque": _wrench,
+    "force": _wrench,
+    "load": _wrench,
+    "gravity": _gravity,
+    "temperature": _temperature,
+    "time": _lasting,
+    "hanging": _lasting,
+    "place": _grown,
+}
 
 
 def _round(x: float) -> float:

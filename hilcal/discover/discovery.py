@@ -21,7 +21,7 @@ from hilcal.diagnose.effect_ranking import FALSE_ALARM, catalogue_columns
 from hilcal.diagnose.noise_verdict import MISFIT_ALARM, PREDICTABLE
 from hilcal.diagnose.residual_regression import residual_regression
 from hilcal.discover.curve import Curve, curves
-from hilcal.discover.folds import FoldSearch, search_by_folds, stability
+from hilcal.discover.folds import FoldSearch, found_again, search_by_folds, stability
 from hilcal.discover.law import (
     Coefficient,
     Form,
@@ -32,7 +32,7 @@ from hilcal.discover.law import (
 from hilcal.discover.problem import Problem
 from hilcal.discover.refit import at_linearisation, exact, refine
 from hilcal.discover.screen import Screen, screen
-from hilcal.discover.search import LEAST, MOST_TERMS, SAME, Selection, search
+from hilcal.discover.search import LEAST, MOST_TERMS, SAME, Selection, alternatives, search
 from hilcal.discover.write_effect import source_of_form
 from hilcal.errors import HilcalError, InputError
 from hilcal.identify.fit import Fit
@@ -292,9 +292,9 @@ def _law(
         values = v.read(situation)
         ranges.append((symbol, float(values.min()), float(values.max()), v.unit))
     others: dict[str, Form] = {}
-    for c in s.near:
-        other = form_of(problem.screen, (c.term,))
-        if len(s.terms) == 1 and c.odds > s.odds[0] - LEAST and c.term not in s.terms:
+    for terms in alternatives(problem, s):
+        other = form_of(problem.screen, terms)
+        if other.text() != form.text():
             others.setdefault(other.text(), other)
     rivals = [(f, at_linearisation(problem.screen, f)) for f in [*others.values()][:MOST_RIVALS]]
     return Law(
@@ -310,4 +310,5 @@ def _law(
         resembles=near[:3],
         ranges=tuple(ranges),
         rivals=tuple(rivals),
+        again=found_again(problem.screen, folds, s.terms),
     )

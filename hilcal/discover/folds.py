@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.discover.problem import Problem
+from hilcal.discover.law import Again
+from hilcal.discover.problem import Problem, Term
 from hilcal.discover.screen import Screen
 from hilcal.discover.search import SAME, Selection, search
 from hilcal.identify.folds import random_folds
@@ -83,6 +84,27 @@ def predicted(problem: Problem, selection: Selection | None, out: Bools) -> Floa
     ridge[: rows.shape[1]] = np.maximum(linear.projection.ridge, RIDGE)
     step = np.linalg.solve(own.T @ own + np.diag(ridge), own.T @ white[used])
     return np.asarray(white[out] - x[out] @ step)
+
+
+def found_again(screen: Screen, folds: FoldSearch, terms: tuple[Term, ...]) -> tuple[Again, ...]:
+    """Say of each site and what moves it in how many searches without a fold it was found again."""
+    searches = [_causes(screen, s.terms) for s in folds.found if s is not None]
+    count = max(len(folds.found), 1)
+    return tuple(
+        Again(place, names, sum((place, frozenset(names)) in s for s in searches) / count)
+        for (place, _), names in _causes(screen, terms).items()
+    )
+
+
+def _causes(
+    screen: Screen, terms: tuple[Term, ...]
+) -> dict[tuple[str, frozenset[str]], tuple[str, ...]]:
+    """Sites with the quantities that move them; a constant is not one where others do."""
+    named = [(screen.sites[s].words, screen.grammar.at(f).names) for t in terms for s, f in t.parts]
+    moved = {place for place, names in named if names}
+    return {
+        (place, frozenset(names)): names for place, names in named if names or place not in moved
+    }
 
 
 def stability(screen: Screen, folds: FoldSearch, fitted: Floats) -> float:

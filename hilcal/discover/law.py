@@ -129,7 +129,7 @@ def form_of(screen: Screen, terms: tuple[Term, ...]) -> Form:
     for t in terms:
         for k, (site, amplitude) in enumerate(t.parts):
             at = count if t.common else count + k
-            parts.append(Part(screen.sites[site], screen.grammar.amplitudes[amplitude], at))
+            parts.append(Part(screen.sites[site], screen.grammar.at(amplitude), at))
         count += 1 if t.common else len(t.parts)
     return Form(tuple(parts))
 
@@ -165,6 +165,21 @@ class Coefficient:
 
 
 @dataclass(frozen=True, slots=True)
+class Again:
+    """How often a cause was found again.
+
+    Attributes:
+        acts_on: the site.
+        variables: the quantities that move it.
+        share: share of the searches without some poses that find the same.
+    """
+
+    acts_on: str
+    variables: tuple[str, ...]
+    share: float
+
+
+@dataclass(frozen=True, slots=True)
 class Resemblance:
     """An effect of the catalogue, and how near a law is to what it can describe.
 
@@ -189,7 +204,8 @@ class Law:
         odds: logarithm of the odds against no law, the search paid for.
         holdout_share: share of the misfit that it explains on poses left out.
         left: variance factor that is left.
-        stability: share of the resampled searches that find the same.
+        stability: share of the resampled searches whose whole law has the same curve.
+        again: for each site and its quantities, the share of them that find these.
         alternatives: formulas that these readings do not tell from it, at odds of 20 : 1.
         resembles: effects of the catalogue that are near, the nearest first.
         ranges: least and largest of each quantity in the readings.
@@ -208,6 +224,7 @@ class Law:
     resembles: tuple[Resemblance, ...]
     ranges: tuple[tuple[str, float, float, str], ...]
     rivals: tuple[tuple[Form, tuple[Coefficient, ...]], ...] = ()
+    again: tuple[Again, ...] = ()
 
     @property
     def formula(self) -> str:

@@ -12,17 +12,23 @@ from functools import cached_property
 
 import numpy as np
 
-from hilcal.discover.screen import Screen
+from hilcal.discover.grow import grown
+from hilcal.discover.screen import LEAST_MOTION, SEEN, Screen
 from hilcal.regression.evidence import FamilyScore, score_family
 from hilcal.regression.projection import Projection, projection
-from hilcal.types import Bools, Floats
+from hilcal.types import Bools, Floats, Ints
 
 SHORT_LIST = 200
 """Candidates that are scored in full at each step; a choice."""
+OF_SITE = 60
+"""Of each site at most; a choice."""
 EXTENDED = 40
 """Of these, those that are extended to other axes and joints; a choice."""
 
 
+LEFT = 1e-3
+"""Share of a column's square that chosen terms must leave for it to count as another; a choice."""
+LOG2 = float(np.log(2.0))
 LEAST_RIDGE = 1e-6
 """Least ridge of the model's directions, not all of which some rows determine; a choice."""
 SPANNED = 1e-9
@@ -37,11 +43,13 @@ class Term:
         parts: (site, amplitude) of each column, by index.
         price: what the search costs it.
         common: whether all columns have one coefficient.
+        alone: what it would cost as the first term.
     """
 
     parts: tuple[tuple[int, int], ...]
     price: float
     common: bool = False
+    alone: float = 0.0
 
     @property
     def count(self) -> int:
@@ -65,6 +73,15 @@ class Scored:
     def odds(self) -> float:
         """Evidence less what the search costs."""
         return self.score.log_evidence - self.term.price
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A candidate of the screening: site, amplitude, and its odds."""
+
+    s: int
+    f: int
+    odds: float
 
 
 class Problem:
@@ -94,8 +111,10 @@ class Problem:
         lost = (1.0 - used.mean()) * len(used)
         self.dof = max(linear.fit.dof - lost, 1.0)
         share = float(used.mean())
-        self._square = share * screen.square
-        self._across = share * screen.across
+        self.square = share * screen.square
+        self.across = share * screen.across
+        self.across_one = share * screen.across_one
+        self.share = share
         # The screening uses some of these rows only where readings are many.
         self.screened = used & screen.rows
         self.seen = float(self.screened.sum() / used.sum())
@@ -111,21 +130,33 @@ class Problem:
         """(S, F) xᵀ r in the rows that are screened."""
         return self._inner(self._thin_residual)
 
+    def thinned(self, v: Floats) -> Floats:
+        """Rows of the screening (R',) of those of this problem that are screened."""
+        whole = np.zeros(len(self.rows))
+        whole[self.screened] = v
+        return np.asarray(whole[self.screen.rows], dtype=np.float32)
+
+    @cached_property
+    def thin(self) -> Floats:
+        """The residual likewise."""
+        return self.thinned(self._thin_residual)
+
     def _inner(self, v: Floats) -> Floats:
         """(S, F) xᵀ v, v of the rows that are screened."""
         whole = np.zeros(len(self.rows))
         whole[self.screened] = v
         return self.screen.inner(whole)
 
-    def shadows(self, x: Floats) -> tuple[list[Floats], Floats]:
+    def shadows(self, x: Floats) -> tuple[list[Floats], Floats, list[Floats]]:
         """What columns (R', P) of chosen terms take from all candidates in the screening.
 
         Returns:
-            (S, F) xᵀ u of orthonormal directions u beside the model, and uᵀ r.
+            (S, F) xᵀ u of orthonormal directions u beside the model, uᵀ r, and u.
         """
         x = x[self.screened[self.rows]]
         u = orthonormal(self._thin, x)
-        return [self._inner(d) for d in u.T], u.T @ self._thin_residual
+        told = u.T @ self._thin_residual
+        return [self._inner(d) for d in u.T], told, [self.thinned(d) for d in u.T]
 
     def columns(self, term: Term) -> Floats:
         """(R', P) whitened columns of a term in the rows that are used."""
@@ -137,51 +168,170 @@ class Problem:
         return Beside(self, tuple(chosen))
 
 
+@dataclass(frozen=True, eq=False)
+class Screened:
+    """All candidates beside some columns, as in `Screen`.
+
+    Attributes:
+        slope: (S, F) xᵀ r.
+        square: (S, F) xᵀ M x; zero where little of a column is left.
+        across: (S, F) xᵀ M x' with the partner.
+        across_one: (S, F) xᵀ M x' with a constant at the site.
+    """
+
+    slope: Floats
+    square: Floats
+    across: Floats
+    across_one: Floats
+
+
 class Beside:
     """The candidates beside a model and chosen terms, whose coefficients are free."""
 
     def __init__(self, problem: Problem, chosen: tuple[Term, ...]) -> None:
         """Project the chosen terms out."""
         self.problem, self.chosen = problem, chosen
-        p = problem
-        self.rss, self.dof, self.slope = p.rss, p.dof, p.slope
-        self._square, self._across = p._square, p._across
-        self.unit = np.zeros((len(p.residual), 0))
+        self.rss, self.dof = problem.rss, problem.dof
+        self.unit = np.zeros((len(problem.residual), 0))
         if not chosen:
             return
-        x = np.hstack([p.columns(t) for t in chosen])
-        self.unit = orthonormal(p.model, x)
-        along = self.unit.T @ p.residual
-        self.rss = max(p.rss - float(along @ along), 1e-12 * p.rss)
-        self.dof = max(p.dof - self.unit.shape[1], 1.0)
-        shadows, told = p.shadows(x)
-        partner = p.screen.grammar.partner
-        for own, size in zip(shadows, told.tolist(), strict=True):
-            self.slope = self.slope - size * own
-            self._square = self._square - own**2
-            self._across = self._across - own * own[:, partner]
-        self._square = np.where(self._square > 1e-3 * p._square, self._square, 0.0)
+        self._x = np.hstack([problem.columns(t) for t in chosen])
+        self.unit = orthonormal(problem.model, self._x)
+        along = self.unit.T @ problem.residual
+        self.rss = max(problem.rss - float(along @ along), 1e-12 * problem.rss)
+        self.dof = max(problem.dof - self.unit.shape[1], 1.0)
 
-    def odds(self) -> tuple[Floats, Floats]:
-        """(S, F) logarithm of the odds of each candidate, and with its partner (free phase)."""
+    @cached_property
+    def _shadows(self) -> tuple[list[Floats], Floats, list[Floats]]:
+        return self.problem.shadows(self._x) if self.chosen else ([], np.zeros(0), [])
+
+    @cached_property
+    def screened(self) -> "Screened":
+        """All candidates beside the model and the chosen terms."""
+        p = self.problem
+        slope, square, across, across_one = p.slope, p.square, p.across, p.across_one
+        partner, one = p.screen.grammar.partner, p.screen.one
+        for own, size in zip(*self._shadows[:2], strict=True):
+            slope = slope - np.float32(size) * own
+            square = square - own**2
+            across = across - own * own[:, partner]
+            across_one = across_one - own * own[:, [one]]
+        if self.chosen:
+            square = np.where(square > LEFT * p.square, square, np.float32(0.0))
+        return Screened(slope, square, across, across_one)
+
+    @cached_property
+    def _known(self) -> tuple[frozenset[int], frozenset[str]]:
+        """Sites and quantities of the chosen terms."""
+        screen = self.problem.screen
+        parts = [part for t in self.chosen for part in t.parts]
+        names = (n for _, f in parts for n in screen.grammar.at(f).names)
+        return frozenset(s for s, _ in parts), frozenset(names)
+
+    @cached_property
+    def _again(self) -> tuple[Bools, Floats]:
+        """(F,) which amplitudes depend on no further quantity; price of such a term by its cost."""
+        screen, (places, names) = self.problem.screen, self._known
+        same = np.fromiter((d <= names for d in screen.grammar.depends), np.bool_)
+        cost = screen.grammar.cost
+        count = np.bincount(cost[same], minlength=int(cost.max()) + 1) * len(places)
+        return same, np.log(np.maximum(count, 1)) + LOG2 * (np.arange(len(count)) + 1)
+
+    def price(self, s: int, f: int) -> float:
+        """Return the price of a candidate: less where it is of the chosen sites and quantities."""
+        full = self.problem.screen.price_of(f)
+        if not self.chosen:
+            return full
+        a = self.problem.screen.grammar.at(f)
+        if s in self._known[0] and a.cost < len(self._again[1]) and {*a.names} <= self._known[1]:
+            return float(self._again[1][a.cost])
+        return full + LOG2
+
+    def _prices(self, s: int) -> Floats:
+        """(F,) the same of all candidates at a site."""
         price = self.problem.screen.price
-        seen = self._square > 0
-        square = np.where(seen, self._square, 1.0)
-        gain = np.where(seen, self.slope**2 / square, 0.0) / self.problem.seen
-        single = np.where(seen, _evidence(gain, 1, self.rss, self.dof) - price, -np.inf)
-        partner = self.problem.screen.grammar.partner
-        both = np.full_like(single, -np.inf)
-        has = np.flatnonzero(partner >= 0)
-        a, b, c = square[:, has], square[:, partner[has]], self._across[:, has]
-        det = a * b - c**2
-        ok = seen[:, has] & seen[:, partner[has]] & (det > 1e-3 * a * b)
-        g, h = self.slope[:, has], self.slope[:, partner[has]]
-        gain2 = (b * g**2 - 2 * c * g * h + a * h**2) / np.where(ok, det, 1.0)
-        gain2 = gain2 / self.problem.seen
-        both[:, has] = np.where(
-            ok, _evidence(gain2, 2, self.rss, self.dof) - price[has] - np.log(2.0), -np.inf
+        if not self.chosen:
+            return price
+        if s not in self._known[0]:
+            return np.asarray(price + LOG2)
+        same, again = self._again
+        return np.where(same, again[self.problem.screen.grammar.cost], price + LOG2)
+
+    def term(
+        self, parts: tuple[tuple[int, int], ...], price: float = 0.0, common: bool = False
+    ) -> Term:
+        """Return a term by its first part's price and what else it costs."""
+        s, f = parts[0]
+        return Term(
+            parts, self.price(s, f) + price, common, self.problem.screen.price_of(f) + price
         )
-        return single, both
+
+    def best(self) -> dict[str, list["Found"]]:
+        """Return the candidates with the best odds, by what is free beside the coefficient.
+
+        Keys: "" for nothing; "p" for the phase: with the partner; "c" for a constant at the site,
+        and "pc" for both.
+        """
+        p, all_ = self.problem, self.screened
+        partner = p.screen.grammar.partner
+        has = np.flatnonzero(partner >= 0)
+        one = p.screen.one
+        found: dict[str, list[Found]] = {"": [], "p": [], "c": [], "pc": []}
+        for s in range(len(p.screen.sites)):
+            price = self._prices(s).astype(np.float32)
+            a, g, h = all_.square[s], all_.slope[s], all_.across[s]
+            for constant in (False, True):
+                own = ""
+                seen = a > 0
+                gain0 = 0.0
+                if constant:
+                    if not seen[one]:
+                        break
+                    own, c = "c", all_.across_one[s]
+                    gain0 = float(g[one] ** 2 / a[one])
+                    h = h - c * (c[partner] / a[one])
+                    g = g - c * (g[one] / a[one])
+                    a = a - c * (c / a[one])
+                    seen = seen & (a > LEFT * all_.square[s])
+                safe = np.where(seen, a, 1.0)
+                gain = np.where(seen, g * g / safe, 0.0)
+                odds = self._evidence(gain + gain0, 1 + constant) - price - LOG2 * constant
+                found[own] += _largest(np.where(seen, odds, -np.inf), s)
+                b, k = safe[partner[has]], g[partner[has]]
+                ah, gh, hh = safe[has], g[has], h[has]
+                det = ah * b - hh * hh
+                ok = seen[has] & seen[partner[has]] & (det > 1e-3 * ah * b)
+                both = (b * gh * gh - 2 * hh * gh * k + ah * k * k) / np.where(ok, det, 1.0)
+                odds = self._evidence(np.where(ok, both, 0.0) + gain0, 2 + constant)
+                odds = odds - price[has] - LOG2 * (1 + constant)
+                found["p" + own] += _largest(np.where(ok, odds, -np.inf), s, has)
+        return {k: sorted(v, key=lambda x: -x.odds)[:SHORT_LIST] for k, v in found.items()}
+
+    def _evidence(self, gain: Floats, count: int) -> Floats:
+        """Log evidence of columns at the best strength, by Laplace: for the short list only."""
+        share = np.clip(gain / np.float32(self.problem.seen * self.rss), 0.0, 0.99999)
+        share = share.astype(np.float32)
+        per = np.maximum(share * np.float32(self.dof / count), np.float32(1.0))
+        return np.asarray(
+            np.float32(-0.5 * self.dof) * np.log(1 - share)
+            - np.float32(0.5 * count) * (np.log(per) + np.float32(1.0))
+        )
+
+    def odds_of(self, s: int, values: Floats) -> Floats:
+        """(C,) log evidence of amplitudes (C, K) at a site, by their values; as in `best`."""
+        screen = self.problem.screen
+        form = screen.form[s]
+        thin = self.problem.thin
+        slope = values @ (form.T @ thin)
+        lifted = values @ screen.free[s]
+        square = np.float32(self.problem.share) * np.einsum("ck,ck->c", lifted, values)
+        for told, unit in zip(*self._shadows[1:], strict=True):
+            own = values @ (form.T @ unit)
+            slope, square = slope - told * own, square - own**2
+        moved = values**2 @ np.sum(form**2, axis=0)
+        seen = square > SEEN * moved + LEAST_MOTION
+        gain = np.where(seen, slope**2 / np.where(seen, square, 1.0), 0.0)
+        return np.where(seen, self._evidence(gain, 1), -np.inf)
 
     def score(self, terms: Sequence[Term]) -> list[Scored]:
         """Score terms exactly beside the chosen ones."""
@@ -211,48 +361,72 @@ class Beside:
 
     def shortlist(self) -> list[Term]:
         """Return the candidates with the best odds, extended to phases, axes and joints."""
-        single, both = self.odds()
-        price = self.problem.screen.price
-        out: dict[tuple[tuple[int, int], ...], Term] = {}
-        best = _largest(single, SHORT_LIST)
-        for s, f in best:
-            out[((s, f),)] = Term(((s, f),), float(price[f]))
-        partner = self.problem.screen.grammar.partner
-        pairs = _largest(both, EXTENDED)
-        for s, f in pairs:
-            parts = ((s, f), (s, int(partner[f])))
-            out[parts] = Term(parts, float(price[f]) + np.log(2.0))
-        for s, f in best[:EXTENDED]:
-            for t in self._extended(s, f):
-                out.setdefault((*t.parts, (-1, int(t.common))), t)
+        found, one = self.best(), self.problem.screen.one
+        turned = self.problem.screen.grammar.turned
+        out: dict[tuple[tuple[tuple[int, int], ...], bool], Term] = {}
+
+        def add(t: Term) -> None:
+            out.setdefault((tuple(sorted(t.parts)), t.common), t)
+
+        for x in found[""]:
+            add(self.term(((x.s, x.f),)))
+        for x in found["c"][:EXTENDED]:
+            add(self.term(((x.s, x.f), (x.s, one)), LOG2))
+        for key, more in (("p", ()), ("pc", (one,))):
+            for x in found[key][:EXTENDED]:
+                other = turned(x.f)
+                if other is not None:
+                    parts = ((x.s, x.f), (x.s, other), *((x.s, k) for k in more))
+                    add(self.term(parts, LOG2 * (1 + len(more))))
+        firsts = found[""][:EXTENDED]
+        for x in firsts:
+            for t in self._extended(x.s, x.f):
+                add(t)
+        for t in grown(self, sorted(firsts + found["c"][:EXTENDED], key=lambda x: -x.odds)):
+            add(t)
         return list(out.values())
 
     def _extended(self, s: int, f: int) -> Iterator[Term]:
         screen = self.problem.screen
-        site, price = screen.sites[s], float(screen.price[f]) + np.log(2.0)
-        same = [
-            k for k, o in enumerate(screen.sites) if o.group == site.group and screen.square[k, f]
-        ]
-        if len(same) > 1:
-            yield Term(tuple((k, f) for k in same), price)
-        for inner in screen.grammar.inner(f):
+        site, grammar = screen.sites[s], screen.grammar
+        amplitude, place = grammar.at(f), grammar.place
+
+        def visible(parts: list[tuple[int, int]]) -> tuple[tuple[int, int], ...]:
+            return tuple(p for p in parts if screen.square[p] > 0)
+
+        same = [k for k, o in enumerate(screen.sites) if o.group == site.group]
+        parts = visible([(k, f) for k in same])
+        if len(parts) > 1:
+            yield self.term(parts, LOG2)
+        for inner in grammar.inner(f):
             # The zero of one factor is free, as that of a temperature.
             if screen.square[s, inner]:
-                yield Term(((s, f), (s, inner)), price)
+                yield self.term(((s, f), (s, inner)), LOG2)
+        if any(x.variable.vector for x in amplitude.factors):
+            # A vector's components along all axes of the site.
+            by_axis = []
+            for k in same:
+                other = amplitude.of_axis(site.axis % 3, screen.sites[k].axis % 3, grammar.known)
+                at = None if other is None else place(other)
+                if at is not None:
+                    by_axis.append((k, at))
+            yield from self._apart_and_common(visible(by_axis))
         if site.joint < 0:
             return
-        amplitude, place = screen.grammar.amplitudes[f], screen.grammar.place
-        parts = []
+        by_joint = []
         for k, o in enumerate(screen.sites):
             if (o.field, o.axis) != (site.field, site.axis) or o.joint < 0:
                 continue
-            other = amplitude.of_joint(site.joint, o.joint, screen.grammar.known)
+            other = amplitude.of_joint(site.joint, o.joint, grammar.known)
             at = None if other is None else place(other)
-            if at is not None and screen.square[k, at] > 0:
-                parts.append((k, at))
+            if at is not None:
+                by_joint.append((k, at))
+        yield from self._apart_and_common(visible(by_joint))
+
+    def _apart_and_common(self, parts: tuple[tuple[int, int], ...]) -> Iterator[Term]:
         if len(parts) > 1:
-            yield Term(tuple(parts), price)
-            yield Term(tuple(parts), price, common=True)
+            yield self.term(parts, LOG2)
+            yield self.term(parts, LOG2, common=True)
 
 
 def orthonormal(model: Projection, x: Floats) -> Floats:
@@ -264,18 +438,12 @@ def orthonormal(model: Projection, x: Floats) -> Floats:
     return np.asarray(free @ (vectors[:, kept] / np.sqrt(values[kept])))
 
 
-def _evidence(gain: Floats, count: int, rss: float, dof: float) -> Floats:
-    """Log evidence of columns at the best strength, by Laplace: for the short list only."""
-    gain = np.clip(gain, 0.0, 0.999999 * rss)
-    per = np.maximum(gain * dof / rss / count, 1.0)
-    return np.asarray(-0.5 * dof * np.log1p(-gain / rss) - 0.5 * count * (np.log(per) + 1.0))
-
-
-def _largest(x: Floats, count: int) -> list[tuple[int, int]]:
-    flat = x.ravel()
-    count = min(count, int(np.count_nonzero(np.isfinite(flat))))
-    if not count:
-        return []
-    top = np.argpartition(-flat, count - 1)[:count]
-    top = top[np.argsort(-flat[top], kind="stable")]
-    return [tuple(map(int, np.unravel_index(k, x.shape))) for k in top]  # type: ignore[misc]
+def _largest(odds: Floats, s: int, which: Ints | None = None) -> list[Found]:
+    """Return the best candidates of a site."""
+    count = min(OF_SITE, len(odds))
+    top = np.argpartition(-odds, count - 1)[:count]
+    top = top[np.isfinite(odds[top])]
+    return [
+        Found(s, int(f if which is None else which[f]), float(x))
+        for f, x in zip(top.tolist(), odds[top].tolist(), strict=True)
+    ]

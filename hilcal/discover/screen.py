@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from hilcal.discover.amplitudes import Grammar, grammar
+from hilcal.discover.amplitudes import Amplitude, Grammar, grammar
 from hilcal.discover.sites import Site, site_motions
 from hilcal.discover.variables import variables
 from hilcal.identify.fit import Fit
@@ -44,8 +44,10 @@ class Screen:
         rows: (R,) which of the whitened rows the screening uses.
         readings: (K,) which of the fitted readings it uses.
         form: (S, R', K) T_s of these rows and readings, single precision.
+        free: (S, K, K) Q_s of these.
         square: (S, F) xᵀ M x; zero where the model explains a column.
         across: (S, F) xᵀ M x' with the partner of each amplitude.
+        across_one: (S, F) xᵀ M x' with a constant at the site.
     """
 
     linear: Linearisation
@@ -55,13 +57,26 @@ class Screen:
     rows: Bools
     readings: Ints
     form: Floats
+    free: Floats
     square: Floats
     across: Floats
+    across_one: Floats
 
     @cached_property
     def price(self) -> Floats:
         """(F,) what the search costs a candidate, see `amplitudes`."""
         return self.grammar.price(len(self.sites))
+
+    @cached_property
+    def one(self) -> int:
+        """Index of the constant amplitude."""
+        return self.grammar.amplitudes.index(Amplitude(()))
+
+    def price_of(self, amplitude: int) -> float:
+        """Return what the search costs a candidate, in no or in further products too."""
+        if amplitude < len(self.price):
+            return float(self.price[amplitude])
+        return self.grammar.price_of(self.grammar.at(amplitude), len(self.sites))
 
     @cached_property
     def values(self) -> Floats:
@@ -84,7 +99,7 @@ class Screen:
             return np.zeros((len(self.linear.residual), 0))
         w = self.linear.fit.whitening
         site, amplitude = np.array(which).T
-        raw = self.motion[:, :, site] * self.grammar.values[amplitude].T[:, None, :]
+        raw = self.motion[:, :, site] * self.grammar.rows(amplitude.tolist()).T[:, None, :]
         return w.whiten_readings(raw)
 
 
@@ -101,6 +116,8 @@ def screen(linear: Linearisation) -> Screen:
     form: Floats = np.empty((len(places), int(rows.sum()), len(readings)), dtype=np.float32)
     square: Floats = np.empty((len(places), len(words.size)), dtype=np.float32)
     across: Floats = np.zeros_like(square)
+    across_one: Floats = np.zeros_like(square)
+    every: Floats = np.empty((len(places), len(readings), len(readings)), dtype=np.float32)
     a = words.values[:, readings]
     squares = a**2
     has = np.flatnonzero(words.partner >= 0)
@@ -110,8 +127,9 @@ def screen(linear: Linearisation) -> Screen:
         spread[readings, :, np.arange(len(readings))] = motion[readings, :, k]
         t = w.whiten_readings(spread)[rows]
         form[k] = t
-        free = own.information(t).astype(np.float32)
+        every[k] = free = own.information(t).astype(np.float32)
         lifted = a @ free
+        across_one[k] = lifted.sum(axis=1)  # a constant has the value 1
         square[k] = np.einsum("fn,fn->f", lifted, a)
         across[k, has] = np.einsum("fn,fn->f", lifted[has], a[words.partner[has]])
         seen = SEEN * (squares @ np.sum(t**2, axis=0).astype(np.float32)) + LEAST_MOTION
@@ -120,7 +138,7 @@ def screen(linear: Linearisation) -> Screen:
             if not places[k].takes(kind):
                 square[k, elastic == kind] = 0.0
     return Screen(
-        linear, words, places, motion, rows, readings, form, square, across,
+        linear, words, places, motion, rows, readings, form, every, square, across, across_one,
     )  # fmt: skip
 
 

@@ -36,12 +36,10 @@ class Selection:
     Attributes:
         terms: in the order of choosing them.
         odds: that each added.
-        near: first terms whose odds are not much less than those of the best.
     """
 
     terms: tuple[Term, ...]
     odds: tuple[float, ...]
-    near: tuple[Scored, ...] = ()
 
     @property
     def total(self) -> float:
@@ -62,11 +60,10 @@ def search(problem: Problem, most: int = MOST_TERMS, beam: int = BEAM) -> list[S
     if not found or not _sure(found[0], problem):
         return []
     starts = _distinct(problem, found, beam)
-    near = tuple(c for c in found if c.odds > found[0].odds - 2 * LEAST)
     best: dict[int, Selection] = {}
     for start in starts:
-        s = Selection((start.term,), (start.odds,), near)
-        _keep(best, s)
+        s = Selection((start.term,), (start.odds,))
+        _keep(problem, best, s)
         while len(s.terms) < most:
             after = problem.beside(s.terms)
             further = _ordered(after)
@@ -79,9 +76,38 @@ def search(problem: Problem, most: int = MOST_TERMS, beam: int = BEAM) -> list[S
             grown = _pruned(problem, replace(s, terms=terms, odds=_chain(problem, terms)))
             if grown.total < s.total + LEAST:
                 break
-            s = grown
-            _keep(best, s)
+            # What was added last is the best beside the others already.
+            s = _exchanged(problem, grown, last=len(grown.terms) - 1)
+            _keep(problem, best, s)
     return [best[k] for k in sorted(best)]
+
+
+def alternatives(problem: Problem, s: Selection) -> list[tuple[Term, ...]]:
+    """Return laws with another term that the rows do not tell from it, at odds of 20 : 1."""
+    found: list[tuple[float, tuple[Term, ...]]] = []
+    for k in range(len(s.terms)):
+        others = (*s.terms[:k], *s.terms[k + 1 :])
+        beside = problem.beside(others)
+        own = beside.score([s.terms[k]])[0].odds
+        found += [
+            (c.odds - own, (*s.terms[:k], c.term, *s.terms[k + 1 :]))
+            for c in _ordered(beside)
+            if c.odds > own - LEAST and c.term.parts != s.terms[k].parts
+        ]
+    own_kind = _kind(problem.screen, s.terms)
+    kinds = {own_kind: s.terms}
+    for _, terms in sorted(found, key=lambda x: -x[0]):
+        kinds.setdefault(_kind(problem.screen, terms), terms)
+    return [*kinds.values()][1:]
+
+
+def _kind(screen: Screen, terms: tuple[Term, ...]) -> frozenset[tuple[object, ...]]:
+    """Sites and functions of a law, without the numbers in these."""
+    return frozenset(
+        (s, frozenset((f.variable.symbol, f.shape.name) for f in screen.grammar.at(a).factors))
+        for t in terms
+        for s, a in t.parts
+    )
 
 
 def _ordered(beside: Beside) -> list[Scored]:
@@ -100,7 +126,7 @@ def _simplicity(screen: Screen, t: Term) -> tuple[float, ...]:
     Of causes that the readings do not tell apart, as joints that warm alike, the one of the joint
     itself is simpler than that of another.
     """
-    amplitudes = [screen.grammar.amplitudes[a] for _, a in t.parts]
+    amplitudes = [screen.grammar.at(a) for _, a in t.parts]
     cost = max(a.cost for a in amplitudes)
     sites = max(screen.sites[s].rank for s, _ in t.parts)
     functions = max(sum(f.shape.rank for f in a.factors) for a in amplitudes)
@@ -111,10 +137,17 @@ def _simplicity(screen: Screen, t: Term) -> tuple[float, ...]:
     return t.count, cost, sites, functions, apart
 
 
-def _keep(best: dict[int, Selection], s: Selection) -> None:
+def _keep(problem: Problem, best: dict[int, Selection], s: Selection) -> None:
     count = len(s.terms)
-    if count not in best or s.total > best[count].total:
+    if count not in best or _better(problem, s, best[count]):
         best[count] = s
+
+
+def _better(problem: Problem, s: Selection, other: Selection) -> bool:
+    """Whether a law is more likely, or simpler where odds of 20 : 1 do not tell them apart."""
+    if abs(s.total - other.total) > LEAST:
+        return s.total > other.total
+    return _extent(problem, s.terms) < _extent(problem, other.terms)
 
 
 def _sure(c: Scored, problem: Problem) -> bool:
@@ -156,8 +189,37 @@ def _pruned(problem: Problem, s: Selection) -> Selection:
         if worth[weakest] >= LEAST:
             return replace(s, odds=_chain(problem, s.terms))
         terms = (*s.terms[:weakest], *s.terms[weakest + 1 :])
+        terms = (replace(terms[0], price=terms[0].alone), *terms[1:])
         s = replace(s, terms=terms, odds=_chain(problem, terms))
     return s
+
+
+def _exchanged(problem: Problem, s: Selection, last: int) -> Selection:
+    """Exchange each term, up to some, for a better one beside the others.
+
+    These were not there when it was chosen.
+    """
+    for k in range(last):
+        others = (*s.terms[:k], *s.terms[k + 1 :])
+        found = _ordered(problem.beside(others))
+        if not found or found[0].term.parts == s.terms[k].parts:
+            continue
+        terms = (replace(others[0], price=others[0].alone), *others[1:], found[0].term)
+        if sum(t.count for t in terms) > MOST_COEFFICIENTS:
+            continue
+        other = replace(s, terms=terms, odds=_chain(problem, terms))
+        if _better(problem, other, s):
+            s = other
+    return s
+
+
+def _extent(problem: Problem, terms: tuple[Term, ...]) -> tuple[float, ...]:
+    """Number of quantities, of sites, of coefficients; how simple the terms are."""
+    screen = problem.screen
+    parts = [part for t in terms for part in t.parts]
+    names = {n for _, f in parts for n in screen.grammar.at(f).names}
+    each = np.sum([_simplicity(screen, t) for t in terms], axis=0)
+    return len(names), len({s for s, _ in parts}), *each.tolist()
 
 
 def _chain(problem: Problem, terms: tuple[Term, ...]) -> tuple[float, ...]:

@@ -4,6 +4,8 @@ linear      x
 cos, sin    cos k x, sin k x
 odd, even   sign(x) |x|^p, |x|^p, rounded off at zero where p < 1
 plus, minus max(x, 0), max(−x, 0)
+above       max(x − x0, 0)
+below       max(x0 − x, 0)
 saturation  tanh(x/x0), which for a small x0 is the sign of x
 log         log10(1 + x/unit)
 approach    1 − exp(−x/T)
@@ -35,6 +37,7 @@ class Shape:
         latex: f in LaTeX, likewise.
         power: p of the unit of x that f has.
         free: which of the numbers p a refinement may change.
+        places: which of these are values of x, which may be zero or negative.
     """
 
     name: str
@@ -47,11 +50,12 @@ class Shape:
     latex: Callable[[str, list[str]], str]
     power: Callable[[Numbers], float] = lambda p: 0.0
     free: tuple[int, ...] = ()
+    places: tuple[int, ...] = ()
 
     @property
     def rank(self) -> int:
         """Order in which equally good functions are shown: smaller is simpler."""
-        return {"linear": 0, "minus": 3, "even": 2}.get(self.name, 1)
+        return {"linear": 0, "minus": 3, "above": 3, "below": 3, "even": 2}.get(self.name, 1)
 
 
 def _times(k: str, x: str) -> str:
@@ -185,6 +189,28 @@ MINUS = Shape(
     lambda x, p: rf"\max(-{x}, 0)",
     lambda p: 1.0,
 )  # fmt: skip
+ABOVE = Shape(
+    "above", 2,
+    lambda x, p: np.maximum(x - p[0], 0.0),
+    lambda x, p: np.where(x > p[0], 1.0, 0.0),
+    lambda x, p: f"np.maximum({x} - {_bracketed(p[0])}, 0.0)",
+    lambda x, p: f"np.where({x} > {p[0]}, 1.0, 0.0)",
+    lambda x, p: f"max({x} - {_bracketed(p[0])}, 0)",
+    lambda x, p: rf"\max({x} - {_bracketed(p[0])}, 0)",
+    lambda p: 1.0,
+    (0,), (0,),
+)  # fmt: skip
+BELOW = Shape(
+    "below", 2,
+    lambda x, p: np.maximum(p[0] - x, 0.0),
+    lambda x, p: np.where(x < p[0], -1.0, 0.0),
+    lambda x, p: f"np.maximum({p[0]} - {x}, 0.0)",
+    lambda x, p: f"np.where({x} < {p[0]}, -1.0, 0.0)",
+    lambda x, p: f"max({p[0]} - {x}, 0)",
+    lambda x, p: rf"\max({p[0]} - {x}, 0)",
+    lambda p: 1.0,
+    (0,), (0,),
+)  # fmt: skip
 SATURATION = Shape(
     "saturation", 2,
     lambda x, p: np.tanh(x / p[0]),
@@ -234,7 +260,12 @@ STEP = Shape(
     lambda x, p: f"tanh(({x} - {p[0]})/{p[1]})",
     lambda x, p: rf"\tanh(({x} - {p[0]})/{p[1]})",
     free=(0, 1),
+    places=(0,),
 )  # fmt: skip
+
+
+def _bracketed(x: str) -> str:
+    return f"({x})" if x.startswith("-") else x
 
 
 def _latex_times(k: str, x: str) -> str:

@@ -12,7 +12,7 @@ from hilcal.types import Floats
 
 Kind = Literal[
     "angle", "sum", "torque", "force", "load", "gravity", "temperature", "time", "hanging", "side",
-    "place",
+    "place", "sight",
 ]  # fmt: skip
 VARIES = 1e-6
 """Least spread, as a share of the largest value, of a quantity that counts as varying."""
@@ -34,6 +34,8 @@ class Variable:
         need: column of the readings that it needs; empty for none.
         slot: slot and component of the transmitted wrench that it is; None for none.
         joint: index of the joint that it belongs to; −1 for none.
+        vector: what it is a component of; empty for none.
+        axis: along which; −1 for none.
     """
 
     kind: Kind
@@ -46,6 +48,8 @@ class Variable:
     need: str = ""
     slot: tuple[int, int] | None = None
     joint: int = -1
+    vector: str = ""
+    axis: int = -1
 
 
 def variables(s: Situation) -> list[Variable]:
@@ -89,6 +93,18 @@ def _angles(n: int) -> list[Variable]:
                     lambda s, i=i, j=j, sign=sign: s.angle[:, i] + sign * s.angle[:, j],  # type: ignore[misc]
                 )
             )  # fmt: skip
+    for first, count in ((i, k) for k in range(3, n + 1) for i in range(n - k + 1)):
+        # The turn of a link against another one: of consecutive joints.
+        mine = range(first, first + count)
+        text = f"({' + '.join(f'q_{j + 1}' for j in mine)})"
+        last = first + count
+        out.append(
+            Variable(
+                "sum", tuple(f"joint {j + 1} angle" for j in mine), text, text, "rad",
+                f"s.angle[:, {first}:{last}].sum(axis=1)",
+                lambda s, a=first, b=last: s.angle[:, a:b].sum(axis=1),  # type: ignore[misc]
+            )
+        )  # fmt: skip
     return out
 
 
@@ -114,6 +130,7 @@ def _wrenches(n: int) -> list[Variable]:
                     f"{letter}_{{{short},{axis}}}", unit, f"s.wrench[:, {k}, {c}]",
                     lambda s, k=k, c=c: s.wrench[:, k, c],  # type: ignore[misc]
                     slot=(k, c), joint=k if k < n else -1,
+                    vector=f"{letter}{short}", axis=c % 3,
                 )
             )  # fmt: skip
     return out
@@ -135,6 +152,7 @@ def _loads() -> list[Variable]:
                     "load", ("load",), f"{letter}_{axis}", f"{letter}_{axis}", unit,
                     f"s.states.wrench[:, {first + c}]",
                     lambda s, c=first + c: s.states.wrench[:, c],  # type: ignore[misc]
+                    vector=letter, axis=c,
                 )
             )  # fmt: skip
     return out
@@ -155,6 +173,7 @@ def _attitude(n: int) -> list[Variable]:
             f"(s.chain.rotation[{k}][:, :, {c}]"
             " @ (s.cell.gravity / np.linalg.norm(s.cell.gravity)))",
             lambda s, k=k, c=c: read(s, k, c), joint=k if k < n else -1,  # type: ignore[misc]
+            vector="gravity" if k >= n - 1 else "", axis=c,
         )
         for k, c, name, symbol in places
     ]  # fmt: skip
@@ -221,13 +240,14 @@ def _sides(s: Situation, n: int) -> list[Variable]:
 
 def _places() -> list[Variable]:
     point = "s.chain.point(s.cell.target[:3, 3])"
+    seen = f"({point} @ s.cell.registration[:3, :3].T + s.cell.registration[:3, 3])"
 
     def base(s: Situation) -> Floats:
         return s.chain.point(s.cell.target[:3, 3])
 
-    def away(s: Situation) -> Floats:
+    def sight(s: Situation) -> Floats:
         frame = s.cell.registration
-        return np.asarray(np.linalg.norm(base(s) @ frame[:3, :3].T + frame[:3, 3], axis=1))
+        return np.asarray(base(s) @ frame[:3, :3].T + frame[:3, 3])
 
     return [
         Variable(
@@ -235,11 +255,31 @@ def _places() -> list[Variable]:
             f"np.linalg.norm({point}[:, :2], axis=1)",
             lambda s: np.asarray(np.linalg.norm(base(s)[:, :2], axis=1)),
         ),
-        Variable("place", ("height",), "z", "z", "m", f"{point}[:, 2]", lambda s: base(s)[:, 2]),
+        Variable(
+            "place", ("height",), "z", "z", "m", f"{point}[:, 2]", lambda s: base(s)[:, 2],
+            vector="target", axis=2,
+        ),
         Variable(
             "place", ("distance",), "d", "d", "m",
-            f"np.linalg.norm({point} @ s.cell.registration[:3, :3].T"
-            " + s.cell.registration[:3, 3], axis=1)",
-            away,
+            f"np.linalg.norm({seen}, axis=1)",
+            lambda s: np.asarray(np.linalg.norm(sight(s), axis=1)),
+        ),
+        *(
+            Variable(
+                "place", (f"target {axis}",), axis, axis, "m", f"{point}[:, {c}]",
+                lambda s, c=c: base(s)[:, c],  # type: ignore[misc]
+                vector="target", axis=c,
+            )
+            for c, axis in ((0, "x"), (1, "y"))
+        ),
+        Variable(
+            "sight", ("azimuth",), "az", r"\alpha", "rad",
+            f"np.arctan2({seen}[:, 1], {seen}[:, 0])",
+            lambda s: np.arctan2(sight(s)[:, 1], sight(s)[:, 0]),
+        ),
+        Variable(
+            "sight", ("elevation",), "el", r"\varepsilon", "rad",
+            f"np.arctan2({seen}[:, 2], np.hypot({seen}[:, 0], {seen}[:, 1]))",
+            lambda s: np.arctan2(sight(s)[:, 2], np.hypot(sight(s)[:, 0], sight(s)[:, 1])),
         ),
     ]  # fmt: skip

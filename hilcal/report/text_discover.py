@@ -69,7 +69,10 @@ def _law(law: Law, d: Discovery, first: bool) -> Iterator[RenderableType]:
     yield told
     yield f"  left         variance factor {law.left:.2f}, before {d.fit.variance_factor:.2f}"
     yield f"  chance       {numbers.p_equals(law.p_value)}, the search paid for"
-    yield f"  found again  in {numbers.percent(law.stability)} of the searches without some poses"
+    yield "  found again  in the searches without some poses:"
+    for a in law.again:
+        causes = f" by {', '.join(a.variables)}" if a.variables else ""
+        yield f"    {a.acts_on}{causes}: {numbers.percent(a.share)}"
     if law.alternatives:
         yield f"  or           {'; or '.join(law.alternatives[:FEW])}: not told apart here"
     near = [f"{r.effect} (cosine {r.cosine:.2f})" for r in law.resembles[:FEW]]
@@ -187,6 +190,10 @@ def law_json(law: Law) -> dict[str, object]:
         "p_value": law.p_value,
         "variance_factor": law.left,
         "stability": law.stability,
+        "found_again": [
+            {"acts_on": a.acts_on, "variables": list(a.variables), "share": a.share}
+            for a in law.again
+        ],
         "alternatives": list(law.alternatives),
         "resembles": [{"effect": r.effect, "cosine": r.cosine} for r in law.resembles],
         "ranges": [

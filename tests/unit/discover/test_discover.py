@@ -14,7 +14,7 @@ from drivers.simulated.rehearsal import measurement_noise, simulate
 from hilcal.cell import cell_from_config
 from hilcal.config import load_config
 from hilcal.data.readings import Readings
-from hilcal.discover import amplitudes, shapes
+from hilcal.discover import amplitudes, grow, shapes
 from hilcal.discover.amplitudes import Amplitude, Factor, grammar
 from hilcal.discover.curve import curves
 from hilcal.discover.discovery import Discovery, discover
@@ -51,9 +51,10 @@ LAW = "compliance by another joint"
 @pytest.fixture(autouse=True, scope="module")
 def short_products() -> Iterator[None]:
     """Products of two simple functions at most, for speed; studies search all."""
-    most, amplitudes.MOST = amplitudes.MOST, 2
+    most, grown = amplitudes.MOST, grow.MOST
+    amplitudes.MOST = grow.MOST = 2
     yield
-    amplitudes.MOST = most
+    amplitudes.MOST, grow.MOST = most, grown
 
 
 @cache
@@ -211,7 +212,7 @@ def test_candidates_beside_a_term_are_those_of_the_model_with_it() -> None:
     x, y = problem.columns(first)[:, 0], problem.columns(second)[:, 0]
     mx = s.linear.project_out(x)
     left = float(y @ s.linear.project_out(y)) - float(y @ mx) ** 2 / float(x @ mx)
-    assert beside._square[tuple(two)] == pytest.approx(left, rel=2e-2)
+    assert beside.screened.square[tuple(two)] == pytest.approx(left, rel=2e-2)
     score = beside.score([second])[0].score
     assert 0 <= score.gain <= problem.rss
 
