@@ -124,15 +124,15 @@ def run_case(config: CellConfig, asked: Asked) -> Outcome:
         return out
     again = rehearsal_states(cell, asked.poses, loads, rng)
     fresh = _scaled(_measured(world, again, names, rng, law), size)
-    error = _error(before, fresh)
+    off = _error(before, fresh)
     if not d.laws or d.after is None:
-        return replace(out, before=error, after=error)
+        return replace(out, before=off, after=off)
     return replace(
         out,
         site=_right_site(law, d.laws[0]),
         variables=frozenset(d.laws[0].variables) == law.variables,
         correlation=agreement(before, d.after, first.moved),
-        before=error,
+        before=off,
         after=_error(d.after, fresh),
     )
 

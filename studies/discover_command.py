@@ -1,7 +1,9 @@
 """`python -m studies discover`: whether a hidden law is found, and none where none is hidden."""
 
+import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -38,21 +40,35 @@ def discover(
     strength: Annotated[float, typer.Option("--strength", help="Of what is hidden, σ.")] = 3.0,
     poses: Annotated[int, typer.Option("--poses", help="Each under six loads.")] = 30,
     first_seed: Annotated[int, typer.Option("--first-seed", help="Seeds count from here.")] = 0,
+    cases: Annotated[
+        Path | None, typer.Option("--cases", help="Add each case to this file, a JSON line each.")
+    ] = None,
+    counted: Annotated[
+        list[Path] | None,
+        typer.Option("--counted", help="Count the cases of such files instead; repeatable."),
+    ] = None,
     keep_file: Keep = None,
     as_json: Json = False,
 ) -> None:
     """Hide laws that the catalogue lacks, effects that it has, or nothing, and search a law."""
     t = terminal(as_json)
     config = load_config(configs_dir() / "cells" / CELL)
-    asked = [
-        *_laws(law or list(KINDS), seeds, first_seed, strength, poses),
-        *_effects(catalogue, first_seed, strength, poses),
-        *_nothing(nothing, noise, first_seed, poses),
-    ]
-    done: list[Outcome] = []
+    asked = (
+        []
+        if counted
+        else [
+            *_laws(law or list(KINDS), seeds, first_seed, strength, poses),
+            *_effects(catalogue, first_seed, strength, poses),
+            *_nothing(nothing, noise, first_seed, poses),
+        ]
+    )
+    done = [_outcome(line) for path in counted or () for line in path.read_text().splitlines()]
     with counting(t.progress, "campaigns", len(asked)) as advance:
         for a in asked:
             done.append(run_case(config, a))
+            if cases is not None:
+                with cases.open("a", encoding="utf-8") as stream:
+                    stream.write(json.dumps(asdict(done[-1])) + "\n")
             advance(1)
     outcomes = [o for o in done if not o.impossible]
     table = text.table(
@@ -75,6 +91,12 @@ def discover(
         title = f"Laws discovered: {', '.join(law)}"
     keep(keep_file, title, figures)
     t.document({"cases": [asdict(o) for o in outcomes], "figures": [asdict(f) for f in figures]})
+
+
+def _outcome(line: str) -> Outcome:
+    """Return a case that `--cases` wrote."""
+    case = json.loads(line)
+    return Outcome(**{**case, "asked": Asked(**case["asked"])})
 
 
 def _laws(

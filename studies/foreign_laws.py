@@ -315,6 +315,68 @@ def _wrist_bundle(rng: np.random.Generator) -> Foreign:
     return Foreign(words, displaced, (f"joint {j - 1}",), names)
 
 
+def _soft_play(rng: np.random.Generator) -> Foreign:
+    """Play of a gear that the torque takes up gradually."""
+    j = int(rng.integers(2, 5))
+    share = float(rng.uniform(0.3, 1.0))
+
+    def displaced(s: Scene) -> Floats:
+        torque = s.torque[:, j - 1]
+        return s.of_joint(j, np.arctan(torque / (share * np.median(np.abs(torque)))))
+
+    words = f"dq_{j} = c atan(tau_{j}/tau0)"
+    return Foreign(words, displaced, (f"joint {j}",), frozenset({_torque(j)}))
+
+
+def _taut_hose(rng: np.random.Generator) -> Foreign:
+    """A hose from forearm to flange that pulls joint 4 once the wrist has stretched it."""
+    lever = float(rng.uniform(0.5, 0.9))
+
+    def displaced(s: Scene) -> Floats:
+        bend = np.cos(s.states.q[:, 4]) * np.cos(s.states.q[:, 5])
+        length = np.sqrt(1.0 + lever**2 - 2.0 * lever * bend)
+        return s.of_joint(4, np.maximum(length - np.quantile(length, 0.3), 0.0))
+
+    names = frozenset({_angle(5), _angle(6)})
+    words = f"dq_4 = c (a hose over joints 5 and 6, lever {lever:.1f}, taut beyond its length)"
+    return Foreign(words, displaced, ("joint 4",), names)
+
+
+def _warming_up(rng: np.random.Generator) -> Foreign:
+    """An eccentric gear whose error grows as the arm warms up."""
+    j = int(rng.integers(1, 5))
+    share = float(rng.uniform(0.05, 0.3))
+
+    def displaced(s: Scene) -> Floats:
+        time = _given(s.states.time)
+        warm = 1.0 - np.exp(-time / (share * time.max()))
+        return s.of_joint(j, warm * np.cos(s.states.q[:, j - 1]))
+
+    names = frozenset({_angle(j), "time"})
+    words = f"dq_{j} = c (1 - exp(-t/T)) cos q_{j}"
+    return Foreign(words, displaced, (f"joint {j}",), names)
+
+
+def _yielding_bench(rng: np.random.Generator) -> Foreign:
+    """A bench that sinks under the load, the more the farther the arm reaches."""
+    power = float(rng.uniform(1.5, 2.5))
+
+    def displaced(s: Scene) -> Floats:
+        reach = np.hypot(s.place[:, 0], s.place[:, 1])
+        pull = np.linalg.norm(s.states.wrench[:, :3], axis=1)
+        return s.in_base((pull * reach**power)[:, None] * np.array([0.0, 0.0, -1.0]))
+
+    words = f"the bench sinks with load × reach to the power {power:.1f}"
+    return Foreign(words, displaced, ("base",), frozenset({"load", "reach"}))
+
+
+BLIND: dict[str, tuple[str, Draw]] = {
+    "soft play": (DEFLECTION, _soft_play),
+    "taut hose": (ABSOLUTE, _taut_hose),
+    "warming up": (ABSOLUTE, _warming_up),
+    "yielding bench": (DEFLECTION, _yielding_bench),
+}
+"""Laws that were written after the search had been frozen, and tried once; as `KINDS`."""
 KINDS: dict[str, tuple[str, Draw]] = {
     "one-sided compliance": (DEFLECTION, _one_sided),
     "preload": (DEFLECTION, _dead_zone),
@@ -333,5 +395,6 @@ KINDS: dict[str, tuple[str, Draw]] = {
     "softer when warm": (DEFLECTION, _softens_warm),
     "settling gear": (DEFLECTION, _settling),
     "wrist bundle": (ABSOLUTE, _wrist_bundle),
+    **BLIND,
 }
 """Laws by name: the readings that show them, and how one is drawn."""

@@ -131,10 +131,17 @@ def _simplicity(screen: Screen, t: Term) -> tuple[float, ...]:
     sites = max(screen.sites[s].rank for s, _ in t.parts)
     functions = max(sum(f.shape.rank for f in a.factors) for a in amplitudes)
     apart = max(
-        sum(f.variable.joint not in (-1, screen.sites[s].joint) for f in amplitudes[k].factors)
+        sum(_far(f.variable.joint, screen.sites[s].joint) for f in amplitudes[k].factors)
         for k, (s, _) in enumerate(t.parts)
     )
     return t.count, cost, sites, functions, apart
+
+
+def _far(quantity: int, site: int) -> int:
+    """Whether a quantity is that of the site's own joint (0), of none (1), or of another (2)."""
+    if quantity == site:
+        return 0
+    return 1 if quantity < 0 else 2
 
 
 def _keep(problem: Problem, best: dict[int, Selection], s: Selection) -> None:

@@ -166,14 +166,14 @@ def _attitude(n: int) -> list[Variable]:
         return np.asarray(s.chain.rotation[slot][:, :, c] @ down)
 
     places = [(k, 2, f"axis of joint {k + 1} to gravity", f"g{k + 1}") for k in range(n)]
-    places += [(n, c, "flange attitude", f"gF_{_AXES[c]}") for c in (0, 1)]
+    places += [(n, c, "flange attitude", f"gF_{_AXES[c]}") for c in range(3)]
     return [
         Variable(
             "gravity", (name,), symbol, symbol.replace("g", "g_", 1).replace("_F_", "_"), "1",
             f"(s.chain.rotation[{k}][:, :, {c}]"
             " @ (s.cell.gravity / np.linalg.norm(s.cell.gravity)))",
             lambda s, k=k, c=c: read(s, k, c), joint=k if k < n else -1,  # type: ignore[misc]
-            vector="gravity" if k >= n - 1 else "", axis=c,
+            vector="gravity" if k == n else "", axis=c,
         )
         for k, c, name, symbol in places
     ]  # fmt: skip
