@@ -15,6 +15,7 @@ from hilcal.data.parquet_stream import open_stream
 from hilcal.data.readings import Readings
 from hilcal.data.schema import HEADER
 from hilcal.data.whitening import MODES, SCALINGS, Mode, usual_mode
+from hilcal.discover.proposal import LawSearch
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.options import Options
 from hilcal.engine.engine import open_engine
@@ -225,6 +226,7 @@ def refine(
     data: Readings,
     readings: str | None = None,
     prior: Posterior | CarriedPrior | None = None,
+    discover: str | Path | None = None,
 ) -> Refinement:
     """Fit, diagnose, add the leading suspect, and repeat until the model is adequate.
 
@@ -239,14 +241,23 @@ def refine(
         data: what was measured.
         readings: "deflection" or "absolute"; what the data allow where None.
         prior: as for `fit`.
+        discover: a folder; a law is then searched where no effect explains the misfit, as by
+            `hilcal refine --discover`, and the files of laws that stay are written there.
 
     Raises:
-        InputError: another kind of readings, or a prior that is not one of them.
+        InputError: another kind of readings, a prior that is not one of them, or no such folder.
         CannotAnswerError: fewer measured elements than identifiable parameters.
     """
     if prior is not None:
         model = _with_prior(model, data, prior)
-    return refine_model(model, data, _mode(readings, data))
+    if discover is None:
+        return refine_model(model, data, _mode(readings, data))
+    if not Path(discover).is_dir():
+        raise InputError(f"discover={str(discover)!r}: no such folder; valid: one for laws' files")
+    laws = LawSearch(Path(discover))
+    found = refine_model(model, data, _mode(readings, data), laws=laws)
+    laws.write(found.names)
+    return found
 
 
 def plan(

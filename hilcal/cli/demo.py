@@ -1,5 +1,6 @@
 """`demo`: the whole story on a simulated cell with a hidden effect."""
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -108,7 +109,9 @@ def demo(
     told = RehearsalSettings(
         config, wanted or RANDOM, number, output, configs_dir() / "cells", catalogue, world
     )
-    laws = LawSearch(output.absolute().parent) if wanted == INVENTED else None
+    laws = None
+    if wanted == INVENTED:
+        laws = LawSearch(output.absolute().parent, _law_name(output), replacing=True)
     asked = _Asked(wanted or RANDOM, poses, without_devices, ambiguous)
     with _campaign(t, told, asked) as (m, r, doubt):
         with working(t.progress) as say:
@@ -296,6 +299,12 @@ def _introduce(t: Terminal, r: Rehearsal, choice: str, seed: int) -> None:
     )
     kind = "deflections: loaded minus unloaded" if r.mode == "deflection" else "absolute positions"
     t.show(f"The model is fitted to {kind}.\n")
+
+
+def _law_name(output: Path) -> str:
+    """Return the name of the law that a demo finds: after its campaign, which it replaces, too."""
+    word = re.sub(r"[^a-z0-9]+", "_", output.stem.lower()).strip("_")
+    return f"law_of_{word}" if word else "law"
 
 
 def _judge_law(r: Rehearsal, found: Refinement, laws: LawSearch) -> tuple[bool, str]:

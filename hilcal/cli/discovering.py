@@ -5,15 +5,18 @@ from typing import Annotated
 
 import typer
 
+from hilcal.calibration.calibration import Calibration
 from hilcal.campaign import Campaign
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import check_options, fit_of, wanted_effects
 from hilcal.cli.terminal import Json, Revision, Run, terminal
 from hilcal.discover.discovery import discover as search
 from hilcal.discover.discovery import rival_sources
+from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.check import NAME
+from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identify.baseline import with_effects
+from hilcal.identify.baseline import baseline, with_effects
 from hilcal.identify.fit import fit
 from hilcal.report import text
 from hilcal.report.progress import working
@@ -29,8 +32,9 @@ def discover(
         str | None,
         typer.Option(
             "--against",
-            metavar="A,B",
-            help="Beside these effects instead of those of the revision in use.",
+            metavar="MODEL",
+            help="Beside this model instead of the revision in use: effects A,B; baseline; or the "
+            "file of an exported calibration, whose effects are fitted to this run.",
         ),
     ] = None,
     alternatives: Annotated[
@@ -47,7 +51,7 @@ def discover(
 ) -> None:
     """Search a law for what no effect explains, and write it as an effect."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
-    wanted = wanted_effects(against, catalogue)
+    wanted = _effects_against(against, catalogue)
     name = output.stem
     if output.suffix != ".py" or not NAME.fullmatch(name) or name in catalogue.names:
         raise InputError(
@@ -64,7 +68,11 @@ def discover(
             number, found = fit_of(t, o, say, revision)
         else:
             check_options(o, wanted)
-            model = with_effects(o.cell, o.readings, o.mode(), wanted, wanted, catalogue)
+            model = (
+                with_effects(o.cell, o.readings, o.mode(), wanted, wanted, catalogue)
+                if wanted
+                else baseline(o.cell, o.readings, o.mode(), catalogue)
+            )
             say(f"fitting {text.model_name(model.names)}")
             found = fit(model, o.readings, o.mode())
         d = search(found, say, name)
@@ -93,3 +101,22 @@ def discover(
         t.command(f"hilcal next {run} -o PLAN.json --suspects {','.join(written)} {files}")
     others = [{"name": own, "written": str(places[own])} for own in rivals]
     t.document({**document, "written": str(output), "alternatives": others})
+
+
+def _effects_against(
+    model: str | None, catalogue: Catalogue
+) -> dict[str, dict[str, object]] | None:
+    """Read `--against`: options of effects by name; none of them for the baseline.
+
+    Raises:
+        InputError: no calibration, or an unknown effect.
+    """
+    if model == "baseline":
+        return {}
+    if model is None or not model.endswith(".json"):
+        return wanted_effects(model, catalogue)
+    return {
+        e.name: {key: value for key, value in e.options.items() if not key.startswith("prior_")}
+        for e in Calibration.load(model, catalogue).model.effects
+        if e.role not in FRAME_ROLES
+    }

@@ -27,13 +27,18 @@ class LawSearch:
         files: of laws that stayed, by name; see `write`.
     """
 
-    def __init__(self, folder: Path, name: str = NAME) -> None:
+    def __init__(self, folder: Path, name: str = NAME, replacing: bool = False) -> None:
         """Laws are named after the files that they will be: found.py, found_2.py, ….
 
         Args:
             folder: of the files.
             name: of the first law.
+            replacing: whether files of these names are removed first, as those of a rehearsal
+                that is repeated; else other names are taken.
         """
+        if replacing:
+            for k in range(1, MOST_SEARCHES + 1):
+                (folder / f"{_numbered(name, k)}.py").unlink(missing_ok=True)
         self.found: list[Discovery] = []
         self.files: dict[str, Path] = {}
         self._folder, self._name = folder, name
@@ -84,9 +89,13 @@ class LawSearch:
 
     def _free(self, of: Fit) -> str:
         taken = {*of.model.catalogue.names, *of.model.names, *self._sources}
-        names = (self._name if k == 1 else f"{self._name}_{k}" for k in range(1, 10_000))
+        names = (_numbered(self._name, k) for k in range(1, 10_000))
         free = (n for n in names if n not in taken and not self.path(n).exists())
         try:
             return next(free)
         except StopIteration:
             raise InputError(f"{self._folder}: no free name for a law's file") from None
+
+
+def _numbered(name: str, k: int) -> str:
+    return name if k == 1 else f"{name}_{k}"

@@ -131,13 +131,14 @@ def test_an_invented_law_is_discovered(tmp_path: Path, capsys: Capsys) -> None:
     result = ok(capsys, "demo", FAST, "--hide", "invented", "-o", path, "--json")
     d, words = result.document, " ".join(result.err.split())
     assert (d["hidden"], d["found"], d["verdict"]) == ("invented", True, "adequate")
-    assert [r["added"] for r in d["revisions"]] == [None, "found"]
+    assert [r["added"] for r in d["revisions"]] == [None, "law_of_demo"]
     (search,) = d["discover"]
     assert search["laws"][0]["formula"] == "dq_3 = a·cos(q_5)·τ_3"
-    assert search["written"] == str(tmp_path / "found.py")
+    law = tmp_path / "law_of_demo.py"
+    assert search["written"] == str(law)
     assert "no effect of the catalogue describes" in words
-    assert f"hilcal view {path} --effects-from {tmp_path / 'found.py'}" in words
-    stored = ok(capsys, "diagnose", path, "--effects-from", tmp_path / "found.py", "--json")
+    assert f"hilcal view {path} --effects-from {law}" in words
+    stored = ok(capsys, "diagnose", path, "--effects-from", law, "--json")
     assert stored.document["verdict"] == "adequate"
 
 

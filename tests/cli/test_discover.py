@@ -24,6 +24,7 @@ SITUATION = example_situation(example_cell(), example_states(example_cell()))
 VARIABLES = {v.symbol: v for v in variables(SITUATION)}
 PRODUCT = (Factor(VARIABLES["q_5"], shapes.COS, (1.0,)), Factor(VARIABLES["τ_3"], shapes.LINEAR))
 COMPLIANCE = Form((Part(sites(6)[2], Amplitude(PRODUCT), 0),))
+BASELINE = ["base_frame", "joint_compliance"]
 Capsys = pytest.CaptureFixture[str]
 
 
@@ -82,6 +83,14 @@ def test_a_law_is_written_as_an_effect_and_told(
     (kind,) = read_effects(other).effects
     assert (kind.name, kind.summary) == ("bent_or_1", "dq_3 = a·cos(q_5)·τ_3")
     other.unlink()
+    calibration = tmp_path / "cal.json"
+    creeping = tmp_path / "creeping.hilcal"
+    creeping.write_bytes(campaign.read_bytes())
+    ok(capsys, "identify", creeping, "--effects", "joint_compliance, creep")
+    ok(capsys, "export", creeping, "--calibration", calibration)
+    for model, names in (("baseline", BASELINE), (calibration, [*BASELINE, "creep"])):
+        found = ok(capsys, "discover", campaign, "-o", out, "--against", model, "--json")
+        assert found.document["model"] == names
     found = ok(capsys, "discover", campaign, *asked)
     assert found.document["alternatives"] == []
     assert not other.exists()
@@ -138,6 +147,7 @@ def test_a_law_with_a_name_of_its_own_is_an_effect_everywhere(
         (("-o", "nowhere/found.py"), "no folder"),
         (("-o", "found.py", "--against", "creep", "--revision", "1"), "give one of them"),
         (("-o", "found.py", "--against", "crep"), "unknown effect"),
+        (("-o", "found.py", "--against", "no.json"), "no calibration"),
     ],
 )
 def test_what_cannot_be_is_refused_by_name(

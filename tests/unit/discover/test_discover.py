@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import hilcal as hc
 from drivers.simulated.injected_effects import nothing_hidden
 from drivers.simulated.rehearsal import measurement_noise, simulate
 from hilcal.cell import cell_from_config
@@ -30,6 +31,7 @@ from hilcal.discover.write_effect import effect_class, source_of_form
 from hilcal.effects.catalogue import installed
 from hilcal.effects.check import check_effect
 from hilcal.effects.example import example_cell, example_situation, example_states
+from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.linearisation import effect_columns, linearise
@@ -143,6 +145,10 @@ def test_nothing_is_searched_where_the_model_is_adequate(tmp_path: Path) -> None
     before, laws = campaign(), LawSearch(tmp_path)
     assert refine(before.model, before.readings, before.mode, laws=laws).verdict == "adequate"
     assert laws.found == []
+    assert hc.refine(before.model, before.readings, discover=tmp_path).verdict == "adequate"
+    assert [*tmp_path.iterdir()] == []
+    with pytest.raises(InputError, match="no such folder"):
+        hc.refine(before.model, before.readings, discover=tmp_path / "nowhere")
 
 
 def test_a_law_takes_a_name_and_a_file_that_are_free(
@@ -162,6 +168,10 @@ def test_a_law_takes_a_name_and_a_file_that_are_free(
     assert asked == ["found_2"]
     assert [p.name for p in tmp_path.iterdir()] == ["found.py"]
     assert "no law of this size" in "".join(map(str, refined_laws(laws)))
+    (tmp_path / "law_of_demo.py").touch()
+    (tmp_path / "law_of_demo_2.py").touch()
+    LawSearch(tmp_path, "law_of_demo", replacing=True)
+    assert [p.name for p in tmp_path.iterdir()] == ["found.py"]
 
 
 def test_the_same_readings_give_the_same_answer() -> None:
