@@ -292,10 +292,16 @@ def check_sources(record: RevisionRecord, run: Path, catalogue: Catalogue) -> No
     for name in record.effects:
         then, now = stored.get(name), catalogue.file_of(name)
         if name not in catalogue.names:
-            where = f"--effects-from {then['file']}" if then else "--effects-from FILE.py"
+            where, known = "FILE.py", ""
+            if isinstance(then, dict) and {"file", "sha256"} <= set(then):
+                where = str(then["file"])
+                known = (
+                    f" (SHA-256 {str(then['sha256'])[:16]}…; it is a program, and is run: read it "
+                    "first where somebody sent it)"
+                )
             raise InputError(
                 f"{run}: revision {record.number} has the effect {name}, which is not in the "
-                f"catalogue; give the file that defines it: {where}"
+                f"catalogue{known}; give the file that defines it: --effects-from {where}"
             )
         if then and now and then["sha256"] != now.sha256:
             raise InputError(

@@ -43,6 +43,7 @@ def serve(path: Path, handler: Handler) -> None:
     new.unlink(missing_ok=True)
     server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     server.bind(str(new))
+    new.chmod(0o600)  # of the user who started it; a bound socket does not answer yet
     server.listen(16)
     os.replace(new, path)
 

@@ -8,6 +8,7 @@ mechanics hold the target. It shows whether a campaign reveals the law, not whet
 right; `hilcal.check_effect` is for that.
 """
 
+import hashlib
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -100,12 +101,25 @@ class OwnLaw:
         """
         catalogue = installed()
         if data["file"] is not None:
+            check_hash(Path(data["file"]), data["sha256"])  # before it is run
             catalogue = catalogue.with_file(Path(data["file"]))
-            if catalogue.files[-1].sha256 != data["sha256"]:
-                raise InputError(f"{data['file']}: changed since the simulated world was made")
         states = States(**{k: np.array(v) for k, v in data["states"].items()})
         effect = catalogue.make(data["name"], cell, states, data["options"])
         return OwnLaw(effect, states, catalogue, np.array(data["theta"], dtype=np.float64))
+
+
+def check_hash(path: Path, sha256: str) -> None:
+    """Refuse a file that is not the one that a world was made with.
+
+    Raises:
+        InputError: it cannot be read, or has changed.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    if hashlib.sha256(content).hexdigest() != sha256:
+        raise InputError(f"{path}: changed since the simulated world was made")
 
 
 def own_names(catalogue: Catalogue, known: tuple[str, ...]) -> tuple[str, ...]:

@@ -396,5 +396,20 @@ def load_mapping(path: Path) -> Mapping:
     mapping = load_section(path, Mapping)
     if (second := mapping.second_file) is None or second.path is None:
         return mapping
-    second = second.model_copy(update={"path": str(path.absolute().parent / second.path)})
+    second = second.model_copy(update={"path": str(_beside(path, str(second.path)))})
     return mapping.model_copy(update={"second_file": second})
+
+
+def _beside(path: Path, name: str) -> Path:
+    """Return a file that a mapping names; it may have come from somebody else.
+
+    Raises:
+        InputError: it is outside the mapping's folder, by its name or by a link.
+    """
+    folder = path.absolute().parent
+    if not (folder / name).resolve().is_relative_to(folder.resolve()):
+        raise InputError(
+            f"{path}: [second_file] path = {name!r} leaves the folder of the mapping; a mapping "
+            "names files beside or below it, others are given by --second"
+        )
+    return folder / name

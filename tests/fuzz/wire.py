@@ -126,6 +126,9 @@ def _force(name: str) -> Parser:
         bare = form.header + body.tobytes()
         return bare + form.checksum(bare)
 
+    def framed(body: bytes) -> bytes:
+        return form.header + body + form.checksum(form.header + body)
+
     streams = [[frame(1000 * (k + 1)) for k in range(4)] for _ in range(32)]
     head = len(form.header)
     sound = {f[head:-2] for frames in streams for f in frames}
@@ -167,7 +170,8 @@ def _force(name: str) -> Parser:
         if not data[0]:
             for body in seen:
                 if body not in sound:
-                    raise passed(f"{name}: a frame", body, sound)
+                    whole = [framed(one) for one in sound] if name != "hex" else []
+                    raise passed(f"{name}: a frame", framed(body), whole)
         if not stream._kept:
             return False
         kept = stream._wrench[: stream._kept]
@@ -273,7 +277,7 @@ def _modbus() -> Parser:
         return bare + modbus_rtu_crc(bare)
 
     corpus = [answer(words) for words in registers]
-    packed, sound = registers, {struct.unpack(">4H", words) for words in registers}
+    sound = {struct.unpack(">4H", words) for words in registers}
 
     def make(by: Random) -> bytes:
         if by.random() < 0.3:
@@ -292,7 +296,7 @@ def _modbus() -> Parser:
         if len(got) != 4 or not all(0 <= word < 65536 for word in got):
             raise Accepted("modbus: registers that cannot be")
         if not data[0] and got not in sound:
-            raise passed("modbus", struct.pack(">4H", *got), packed)
+            raise passed("modbus", answer(struct.pack(">4H", *got)), corpus)
         return True
 
     return Parser("modbus", make, parse)
