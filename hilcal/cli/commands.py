@@ -37,6 +37,7 @@ SECTIONS = {
         *("identify", "compare", "diagnose", "add", "remove", "refine", "discover", "next"),
         "workbench",
     ),
+    "Many arms": ("fleet",),
     "Use the result": ("validate", "compensate", "accept", "report", "view", "export"),
     "Look up": ("effects", "study", "doctor"),
 }
@@ -96,6 +97,10 @@ COMMANDS = {
     "next": Command(
         "next:next_",
         "Plan the measurements that separate the leading suspects; exit 4 where none are in doubt.",
+    ),
+    "fleet": Command(
+        "fleeting:fleet",
+        "Pool many campaigns: a prior for other arms, arms unlike their type, drift.",
     ),
     "validate": Command(
         "validating:validate", "Predict readings of another campaign with the model."

@@ -1,0 +1,43 @@
+"""`fleet`: many campaigns of many arms."""
+
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hilcal.cli.engine import Scheduler, Workers
+from hilcal.cli.terminal import Json, terminal
+from hilcal.engine.engine import open_engine
+from hilcal.fleet.document import to_json
+from hilcal.fleet.fleet import fleet as pool_fleet
+from hilcal.fleet.members import entries
+from hilcal.identify.posterior_document import write
+from hilcal.report.progress import counting
+from hilcal.report.text_fleet import fleet_report
+
+
+def fleet(
+    directory: Annotated[
+        Path, typer.Argument(metavar="DIR", help="With campaign files, in folders below as well.")
+    ],
+    out: Annotated[
+        Path, typer.Option("-o", metavar="PRIOR.json", help="What to expect of another arm.")
+    ],
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    as_json: Json = False,
+) -> None:
+    """Pool many campaigns: a prior for other arms, arms unlike their type, drift."""
+    t = terminal(as_json)
+    entries(directory)  # refused before workers are started
+    with open_engine(workers, scheduler) as engine:
+        found = pool_fleet(directory, engine, partial(counting, t.progress))
+    t.show(fleet_report(found))
+    written = {}
+    for of in found.types:
+        path = out if len(found.types) == 1 else out.with_stem(f"{out.stem}-{of.type}")
+        write(of.prior, path)
+        written[of.type] = str(path)
+        t.show(f"\n{path}: what to expect of another {of.type}, for --prior {path}")
+    t.document(to_json(found, written))

@@ -1,0 +1,190 @@
+"""Fleets of simulated arms: from campaign files to a prior that helps another arm."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.readings import Readings
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.fleet.members import Failure, Member, entries, member_of
+from hilcal.fleet.pooled import effects_seen, pooled
+from hilcal.identify.baseline import baseline
+from hilcal.identify.carried import carried_prior
+from hilcal.identify.fit import fit
+from hilcal.identify.posterior import Posterior
+from hilcal.robot.catalogue import configs_dir
+from hilcal.types import Floats
+from tests.support.campaigns import (
+    cell_of,
+    configuration,
+    noiseless,
+    plan,
+    with_noise,
+    world_of,
+)
+from tests.support.cli_cases import ok, refused
+
+Capsys = pytest.CaptureFixture[str]
+SPREAD = 0.15
+"""Standard deviation of the arms' joint compliances, relative."""
+ARMS, ODD = 30, 4
+
+
+def compliances(rng: np.random.Generator) -> Floats:
+    """Factors (6,) of one arm's joint compliances."""
+    return np.asarray(1 + SPREAD * rng.normal(size=6))
+
+
+def readings_of(factors: Floats, seed: int, poses: int = 8) -> Readings:
+    """A campaign of an arm, by mechanics that the model does not share."""
+    world = world_of(cell_of(), np.random.default_rng(7))
+    soft = world.physics.joint_compliance * factors
+    world = replace(world, physics=world.physics.with_effect("joint_compliance", soft))
+    return with_noise(noiseless(world, plan(poses, 40 + seed)), np.random.default_rng(seed))
+
+
+def posterior_of(readings: Readings) -> Posterior:
+    model = baseline(cell_of(), readings, "deflection")
+    return Posterior.of(fit(model, readings, "deflection"))
+
+
+@pytest.fixture(scope="module")
+def one() -> Posterior:
+    return posterior_of(readings_of(np.ones(6), 1))
+
+
+def members(one: Posterior, seed: int, odd: float = 0.0) -> list[Member]:
+    """30 arms, two months each, whose fits scatter as the posterior of one says."""
+    rng = np.random.default_rng(seed)
+    scaled = one.information * (one.scale[:, None] * one.scale)
+    values, vectors = np.linalg.eigh(scaled)
+    root = vectors[:, values > 1e-6] / np.sqrt(values[values > 1e-6])
+    found = []
+    for a in range(ARMS):
+        factors = compliances(rng)
+        if a == ODD:
+            factors[2] += odd
+        for month in (1, 3):
+            noise = one.scale * (root @ rng.normal(size=root.shape[1]))
+            own = replace(one, mean=one.mean * factors + noise)
+            added = ("creep",) if a == ODD else ()
+            date = f"2026-0{month}-01"
+            name = f"arm{a}-{month}.hilcal"
+            found.append(Member(name, f"arm{a}", "list", "ur10e", date, own, added, "adequate", 0))
+    return found
+
+
+def test_the_spread_of_arms_is_recovered_and_the_odd_one_named(one: Posterior) -> None:
+    fleet = members(one, 3, odd=1.5)
+    found = pooled(fleet, effects_seen(fleet))
+    assert found.parameters
+    for p in found.parameters:
+        mean = one.mean[one.names.index(p.parameter)]
+        assert abs(p.mean - mean) < 4.5 * p.mean_std
+        assert abs(p.between - SPREAD * abs(mean)) < 4 * p.between_std
+    assert [(o.arm, o.campaign, o.parameter) for o in found.odd] == [
+        (f"arm{ODD}", "", "joint_compliance.j3")
+    ]
+    assert found.odd[0].off == pytest.approx(
+        1.5 * one.mean[one.names.index("joint_compliance.j3")], rel=0.5
+    )
+    assert [(s.effect, s.kind, s.arms) for s in found.seen] == [("creep", "defect", (f"arm{ODD}",))]
+    assert not found.wear
+
+
+def test_in_an_ordinary_fleet_nobody_is_named(one: Posterior) -> None:
+    for seed in (11, 12, 13):
+        assert pooled(members(one, seed), ()).odd == ()
+
+
+def test_two_arms_have_no_spread(one: Posterior) -> None:
+    with pytest.raises(CannotAnswerError, match="at least 3 arms"):
+        pooled(members(one, 3)[:4], ())
+
+
+def error_of(readings: Readings, factors: Floats, prior: Posterior | None) -> float:
+    """Root mean square error of the joint compliances, relative."""
+    carried = None if prior is None else carried_prior(prior)
+    model = baseline(cell_of(), readings, "deflection", prior=carried)
+    theta = fit(model, readings, "deflection").theta
+    at = model.slices()[model.names.index("joint_compliance")]
+    truth = world_of(cell_of(), np.random.default_rng(7)).physics.joint_compliance * factors
+    return float(np.sqrt(np.mean((theta[at] / truth - 1)[1:] ** 2)))
+
+
+def test_with_the_prior_a_new_arm_needs_fewer_poses(one: Posterior) -> None:
+    prior = pooled(members(one, 3), ()).prior
+    rng = np.random.default_rng(50)
+    with_it, without = [], []
+    for seed in range(4):
+        factors = compliances(rng)
+        few = readings_of(factors, 60 + seed, poses=4)
+        with_it.append(error_of(few, factors, prior))
+        without.append(error_of(few, factors, None))
+    assert np.mean(with_it) < 0.8 * np.mean(without)
+
+
+def write(folder: Path, names: Sequence[str]) -> None:
+    """Campaign files of arms, not fitted yet."""
+    rng = np.random.default_rng(5)
+    for k, name in enumerate(names):
+        path = folder / name
+        path.parent.mkdir(exist_ok=True)
+        content, base = configuration().to_json(), str(configs_dir() / "cells")
+        with CampaignFile.create(path, content, base, "a test") as file:
+            file.append_readings(readings_of(compliances(rng), k))
+
+
+@pytest.mark.slow
+def test_a_directory_of_campaigns_gives_a_prior_that_identify_takes(
+    capsys: Capsys, tmp_path: Path
+) -> None:
+    folder = tmp_path / "fleet"
+    folder.mkdir()
+    write(folder, ("a/1.hilcal", "b/1.hilcal", "c/1.hilcal", "c/2.hilcal"))
+    (folder / "broken.hilcal").write_bytes(b"no campaign")
+    prior = tmp_path / "prior.json"
+    told = ok(capsys, "fleet", folder, "-o", prior, "--json", "--workers", "2")
+    (of,) = told.document["types"]
+    assert of["arms"] == ["a", "b", "c"]
+    assert {c["arm_known_by"] for c in told.document["campaigns"]} == {"folder"}
+    assert [f["name"] for f in told.document["failed"]] == ["broken.hilcal"]
+    assert "broken.hilcal: " in told.err
+    assert "no serial number" not in told.err
+    write(tmp_path, ("new.hilcal",))
+    readings = readings_of(np.ones(6), 77, poses=4)
+    new = tmp_path / "fresh.hilcal"
+    content, base = configuration().to_json(), str(configs_dir() / "cells")
+    with CampaignFile.create(new, content, base, "a test") as file:
+        file.append_readings(readings)
+    fitted = ok(capsys, "identify", new, "--prior", prior, "--json").document
+    assert fitted["prior"]["source"]["campaign"].startswith("4 campaigns of 3 arms")
+    assert ok(capsys, "refine", new, "--prior", prior, "--json").document["verdict"]
+    again = refused(capsys, 2, "identify", folder / "a/1.hilcal", "--prior", prior)
+    assert "count twice" in again
+
+
+def test_the_list_beside_the_campaigns_names_arms_and_dates(tmp_path: Path) -> None:
+    (tmp_path / "x.hilcal").write_bytes(b"")
+    (tmp_path / "arms.csv").write_text("campaign,arm,date\nx.hilcal,left,2026-03-01\n")
+    (entry,) = entries(tmp_path)
+    assert (entry.name, entry.arm, entry.date) == ("x.hilcal", "left", "2026-03-01")
+    failed = member_of(entry)
+    assert isinstance(failed, Failure)
+    assert failed.name == "x.hilcal"
+    (tmp_path / "arms.csv").write_text("campaign,arm,date\nx.hilcal,left,March\n")
+    with pytest.raises(InputError, match=r"row 2, column 'date': 'March'"):
+        entries(tmp_path)
+    (tmp_path / "arms.csv").write_text("campaign,arm\ny.hilcal,left\n")
+    with pytest.raises(InputError, match=r"y\.hilcal: no such campaign"):
+        entries(tmp_path)
+
+
+def test_a_directory_without_campaigns_is_refused(capsys: Capsys, tmp_path: Path) -> None:
+    assert "no campaign files" in refused(capsys, 2, "fleet", tmp_path, "-o", tmp_path / "p.json")
+    told = refused(capsys, 2, "fleet", tmp_path / "none", "-o", tmp_path / "p.json")
+    assert "no directory" in told
