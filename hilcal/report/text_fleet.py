@@ -37,7 +37,7 @@ def fleet_report(fleet: "Fleet") -> Iterator[RenderableType]:
 
 def _type(t: "Pooled") -> Iterator[RenderableType]:
     yield heading(f"{t.type}: {len(t.arms)} arms, {len(t.campaigns)} campaigns")
-    columns = ["parameter", "mean", "±", "from arm to arm", "±", "between campaigns", "unit"]
+    columns = ["parameter", "mean", "±", "between arms", "±", "between campaigns", "unit"]
     repeated = any(p.within is not None for p in t.parameters)
     if not repeated:
         columns.remove("between campaigns")
@@ -46,7 +46,7 @@ def _type(t: "Pooled") -> Iterator[RenderableType]:
         rows.add_row(*_row(p, repeated))
     yield rows
     yield Text(
-        "±: standard uncertainty; from arm to arm, between campaigns of an arm: standard deviations.\n",
+        "±: standard uncertainty; between arms, between campaigns of an arm: standard deviations.\n",
         style="dim",
     )
     if not repeated:
