@@ -46,7 +46,7 @@ def _type(t: "Pooled") -> Iterator[RenderableType]:
         rows.add_row(*_row(p, repeated))
     yield rows
     yield Text(
-        "±: standard uncertainty; between arms, between campaigns of an arm: standard deviations.\n",
+        "±: standard uncertainty; between arms, and campaigns of an arm: standard deviations.\n",
         style="dim",
     )
     if not repeated:
