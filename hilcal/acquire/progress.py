@@ -106,9 +106,11 @@ class ReadingStored:
         left_cell: the same in cell seconds; differs in a simulated cell only.
         deflection: distance from the unloaded reading of the same pose and cycle, m; None for
             an unloaded reading, and where there is none yet.
-        live: the reading against a model; empty without one.
+        live: the reading, of the first target that was read, against a model; empty without one.
         settling: how long the readings took to settle, cell seconds.
         goal: status of the campaign's goal; None without one.
+        target: index of that target in the cell.
+        others: those that were read in the same arrival, each with its index.
     """
 
     step: Step
@@ -120,6 +122,8 @@ class ReadingStored:
     live: LiveResidual = LiveResidual()
     settling: float = 0.0
     goal: GoalStatus | None = None
+    target: int = 0
+    others: tuple[tuple[int, LiveResidual], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

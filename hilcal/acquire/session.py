@@ -321,10 +321,7 @@ class Session:
     ) -> None:
         number = int(reading.target[0])
         deflection = self._state.deflection(step, reading.value[0, :3], number)
-        live = LiveResidual()
-        if self._live is not None and (readings := self._store.readings()) is not None:
-            with suppress(HilcalError):  # too early for a model; nothing depends on it
-                live = self._live(readings)
+        (_, live), *others = self._compared(reading)
         self._watcher.notify(
             ReadingStored(
                 step,
@@ -336,8 +333,23 @@ class Session:
                 live,
                 settling,
                 self._goal.status,
+                number,
+                tuple(others),
             )
         )
+
+    def _compared(self, reading: Readings) -> list[tuple[int, LiveResidual]]:
+        """Each target that was read in an arrival against the readings before the arrival."""
+        out = [(int(k), LiveResidual()) for k in reading.target]
+        readings = None if self._live is None else self._store.readings()
+        if self._live is None or readings is None:
+            return out
+        before = np.arange(len(readings) - len(reading))
+        for k, (target, _) in enumerate(out):
+            with suppress(HilcalError):  # too early for a model; nothing depends on it
+                one = readings[np.append(before, len(before) + k)]
+                out[k] = target, self._live(one)
+        return out
 
     def _finish(self) -> None:
         found = self._state.repeatability()

@@ -1,29 +1,34 @@
 """How large an error is before anything is fitted but the frames."""
 
+from functools import lru_cache
+
 import numpy as np
 
+from hilcal.data.whitening import whitening
 from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.identify.errors import ErrorBlock, error_block
 from hilcal.identify.fit import Fit
 from hilcal.identify.full_prediction import full_prediction
+from hilcal.identify.gauss_newton import solve
 from hilcal.identify.residual import residual
 from hilcal.model import Model
 
 
+@lru_cache(maxsize=1)
 def error_before(fit: Fit) -> ErrorBlock:
     """Return the error of the rigid nominal arm at the readings of a fit, m.
 
     Of deflections it is the deflection itself, which a rigid arm does not have. Of absolute
-    readings it is what remains where frames (registration, target) are as fitted, and nothing else
-    is wrong with the arm.
+    readings it is what remains where the unknown frames (registration, target) are fitted to the
+    nominal arm alone: those of a fitted model make up for its other parameters, and are wrong for
+    the nominal arm by as much.
     """
     e = full_prediction(fit)
-    kept = [
-        (effect, fit.theta[s])
-        for effect, s in zip(fit.model.effects, fit.model.slices(), strict=True)
-        if effect.role in FRAME_ROLES and fit.mode == "absolute"
-    ]
-    rigid = Model(fit.model.cell, tuple(effect for effect, _ in kept), fit.model.catalogue)
-    theta = np.concatenate([np.zeros(0), *(values for _, values in kept)])
+    frames = tuple(x for x in fit.model.effects if x.role in FRAME_ROLES)
+    rigid = Model(fit.model.cell, frames if fit.mode == "absolute" else (), fit.model.catalogue)
+    theta = np.zeros(0)
+    if rigid.effects:
+        used = fit.readings[~fit.outlier]
+        theta = solve(rigid, used, whitening(used, fit.mode, fit.scaling), None, None).theta
     predicted = rigid.predict(e.readings.states, theta)
     return error_block(residual(e.readings, predicted, e.whitening), e.whitening)

@@ -18,6 +18,7 @@ class Measuring:
         targets: (T, 3) tracked targets, flange axes, m.
         plan: the whole plan.
         earlier: what earlier sessions stored, each with its time of day, s.
+        names: of the targets, where there are several.
     """
 
     name: str
@@ -25,6 +26,7 @@ class Measuring:
     targets: Floats
     plan: Plan
     earlier: tuple[tuple[float, Step], ...] = ()
+    names: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

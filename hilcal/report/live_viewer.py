@@ -127,7 +127,9 @@ class LiveViewer:
         )
         self._tell(
             time.time(),
-            Measuring(name, cell.arm, cell.all_targets[:, :3, 3], log.plan, earlier),
+            Measuring(
+                name, cell.arm, cell.all_targets[:, :3, 3], log.plan, earlier, cell.target_names
+            ),
         )
 
     def revised(self, chapter: Chapter) -> None:

@@ -162,7 +162,7 @@ def before_and_after(fit: Fit) -> str:
     was = (
         f"Deflections of {before} rms were measured"
         if fit.mode == "deflection"
-        else f"The rigid nominal arm, in the fitted frames, is off by {before} rms"
+        else f"The rigid nominal arm, its frames fitted alone, is off by {before} rms"
     )
     return f"{was}; the model leaves {numbers.length(fit.error.rms_m)} (noise alone: {floor})."
 

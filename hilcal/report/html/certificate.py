@@ -16,6 +16,7 @@ from hilcal.report import numbers, text, text_validate
 from hilcal.report.covariance_words import covariance_words
 from hilcal.report.html.content import ReportContent
 from hilcal.report.html.parts import Items, Part, Section, Table, Words, from_terminal, table
+from hilcal.report.text_prior import prior_lines
 from hilcal.report.verdict_words import message
 from hilcal.types import Floats
 
@@ -89,9 +90,16 @@ def headline_of(d: Diagnosis | None) -> tuple[str, str]:
 
 def how_good(m: ReportContent) -> str:
     """Say in a sentence how well the model predicts."""
-    d = m.diagnosis
-    good = {"adequate": "Yes. ", "missing_effect": "Not yet. ", "unknown_effect": "Not yet. "}
-    return ("" if d is None else good.get(d.verdict, "")) + text.misses(m.fit)
+    d, prior = m.diagnosis, m.fit.model.prior
+    told = text.misses(m.fit)
+    if prior is not None:
+        told += f" It also rests on a prior: {prior.posterior.source.campaign or 'a posterior'}."
+    if d is None:
+        return told
+    if d.verdict == "noise_misjudged":
+        return f"It cannot be told, for the stated noise is wrong. {told}"
+    good = d.verdict == "adequate" or d.reason == "inseparable_addition"
+    return f"{'Yes' if good else 'Not yet'}. {told}"
 
 
 def where_wrong(m: ReportContent) -> str:
@@ -110,17 +118,48 @@ def where_wrong(m: ReportContent) -> str:
 
 
 def missing(d: Diagnosis | None) -> str:
-    """Say what is missing, in the sentence of the diagnosis."""
+    """Say in few words what is missing; the whole sentence stands with the evidence."""
     if d is None:
         return "Not judged; hilcal identify --scaling gc, then hilcal diagnose, say it."
     if d.verdict == "adequate":
         return "Nothing that these readings could show."
-    said = numbers.sentence(message(d), d.significant)
+    if d.reason == "inseparable_addition":
+        return _as_good(d)
+    if d.reason == "no_suspect":
+        best = f": the best, {d.suspects[0].effect}, does not" if d.suspects else ""
+        return (
+            f"No effect of the catalogue surely explains what is left{best}. hilcal discover "
+            "searches a law for it."
+        )
     lead = d.lead
-    if lead is None:
-        return said
-    law = d.fit.model.catalogue[lead.coarse or lead.effect].summary
-    return f"{said} That is: {law.split(': ', 1)[-1]}."
+    if lead is None or d.reason == "insufficient_catalogue":
+        return numbers.sentence(message(d), d.significant)
+    explained = (
+        f"explains {numbers.percent(lead.share)} of the misfit, "
+        f"{numbers.percent(max(lead.holdout_share, 0.0))} on poses left out"
+    )
+    name = lead.coarse or lead.effect
+    law = f"{name} is: {d.fit.model.catalogue[name].summary}."
+    if d.reason == "inseparable_suspects":
+        others = numbers.few([r.effect for r in d.separability])
+        return (
+            f"{lead.effect}, which {explained}; or {others}: these readings do not separate them. "
+            f"hilcal next plans those that do. {law}"
+        )
+    what = f"joints that differ in {name}: it" if lead.coarse else f"{name}: it"
+    return numbers.sentence(f"{what} {explained}. {law}", d.significant)
+
+
+def _as_good(d: Diagnosis) -> str:
+    """Say which effects of an adequate model others could replace."""
+    doubts = [
+        f"{a.effect} could as well be "
+        + (numbers.few(a.same_as, 1) if a.same_as else f"{len(a.others)} other effects together")
+        for a in d.alternatives
+        if a.inseparable
+    ]
+    told = "; ".join(doubts)
+    return f"Nothing that lowers the error. But {told}. hilcal next plans what separates them."
 
 
 def _cards(m: ReportContent, fit: Fit) -> Iterator[Card]:
@@ -128,7 +167,7 @@ def _cards(m: ReportContent, fit: Fit) -> Iterator[Card]:
     what = (
         "deflection under load; a rigid arm has none"
         if fit.mode == "deflection"
-        else "nominal arm, uncalibrated"
+        else "nominal arm, only its frames fitted"
     )
     yield Card("Before", mm(before.rms_m), f"rms; largest {mm(before.max_m)}; {what}")
     if m.tested is not None:
@@ -219,6 +258,7 @@ def _conditions(m: ReportContent) -> Iterator[Part]:
     set_aside = int(m.fit.outlier.sum())
     gross = f"; {set_aside} set aside as gross errors" if set_aside else ""
     yield Words(f"{count}{gross}. Loads (readings): {loads}.")
+    yield from (Words(line.strip()) for line in prior_lines(m.fit))
     q = np.degrees(r.states.q)
     joints = range(q.shape[1])
     yield table(

@@ -5,6 +5,7 @@ import pickle
 import threading
 import uuid
 from collections.abc import Callable
+from datetime import timedelta
 from functools import partial
 from pathlib import Path
 from typing import BinaryIO, Protocol
@@ -13,6 +14,7 @@ import rerun as rr
 
 from hilcal.acquire.progress import ArmAt
 from hilcal.errors import HilcalError, InputError
+from hilcal.report.live_messages import Measuring, Revised
 from hilcal.report.viewer.live_scene import LiveScene
 from hilcal.report.viewer.stream import APPLICATION, Sink, disable_analytics, free
 
@@ -20,7 +22,11 @@ PORTS = 20
 """Ports that are tried, from the wanted one; a choice."""
 MEMORY = "256MiB"
 """What the server keeps for viewers that come late at most; a choice, some 5000 readings."""
+SHARE = 0.02
+"""A file is written whenever it has grown by this share, so that it consists of few, large pieces;
+what a killed process loses of it. A choice."""
 _FLUSH_S = 5.0
+_NEVER = timedelta(days=1)
 _END_S = 8.0
 
 
@@ -62,7 +68,8 @@ def follow(messages: BinaryIO, reply: Reply, record: Path, port: int) -> None:
             wall, what = pickle.load(messages)  # noqa: S301 - of the command that started us
             for outlet in outlets:
                 whole = not isinstance(what, ArmAt)  # places of the arm go on in batches
-                outlet.tell(partial(LiveScene.tell, wall=wall, what=what), whole)
+                now = isinstance(what, Measuring | Revised)
+                outlet.tell(partial(LiveScene.tell, wall=wall, what=what), whole, now=now)
     guard = threading.Thread(target=_end, args=(outlets,), daemon=True)
     guard.start()
     guard.join(_END_S)
@@ -82,7 +89,13 @@ class _Outlet:
         """Open it; `to_open`: it is a file that is read later."""
         self._reply, self._name, self._to_open = reply, name, to_open
         self._scene: LiveScene | None = None
-        self._rec = rr.RecordingStream(APPLICATION, recording_id=identifier, send_properties=False)
+        self._told, self._written = 0, 0
+        self._rec = rr.RecordingStream(
+            APPLICATION,
+            recording_id=identifier,
+            send_properties=False,
+            batcher_config=rr.ChunkBatcherConfig(flush_tick=_NEVER) if to_open else None,
+        )
         self._rec.set_log_time_enabled(False)
         self._rec.set_log_tick_enabled(False)
         try:
@@ -91,16 +104,22 @@ class _Outlet:
         except (OSError, RuntimeError, ValueError) as error:
             self._fail(error)
 
-    def tell(self, told: Callable[[LiveScene], None], flush: bool = True) -> None:
+    def tell(
+        self, told: Callable[[LiveScene], None], flush: bool = True, *, now: bool = False
+    ) -> None:
         """Draw something, and hand it on: now, or with what comes next."""
         if self._scene is None:
             return
         try:
             told(self._scene)
+            self._told += flush
+            little = self._told - self._written < max(1.0, SHARE * self._told)
+            if not flush or (self._to_open and little and not now):
+                return
+            self._written = self._told
+            self._scene.settle()
         except (InputError, ValueError, IndexError, KeyError) as error:
             self._reply(problem=f"{self._name}: not drawn: {error}")
-        if not flush:
-            return
         try:
             self._rec.flush(timeout_sec=_FLUSH_S)
         except (OSError, RuntimeError, ValueError, HilcalError) as error:
@@ -110,7 +129,7 @@ class _Outlet:
 
     def end(self) -> None:
         """End it, whole."""
-        self.tell(lambda scene: scene.end(self._to_open))
+        self.tell(lambda scene: scene.end(self._to_open), now=True)
         self._rec.disconnect()
 
     def _fail(self, error: Exception) -> None:

@@ -31,11 +31,13 @@ class Judged:
 
     Attributes:
         step: its step.
+        target: name of the target; empty where there is one.
         length: of the residual r, m.
         norm2: rᵀ V⁻¹ r, V the covariance of reading and prediction; 3 degrees of freedom.
     """
 
     step: Step
+    target: str
     length: float
     norm2: float
 
@@ -57,7 +59,7 @@ class LiveDigest:
     Attributes:
         told: what is measured.
         bodies: (P, n + 2, 4, 4) poses of the arm's bodies at each pose of the plan.
-        anchor: (P, 3) nominal position of the first target at each pose, base axes, m.
+        anchor: (P, T, 3) nominal position of each target at each pose, base axes, m.
         done: readings that are stored.
         left: real seconds that the rest takes.
         phase: what is being done.
@@ -66,6 +68,7 @@ class LiveDigest:
         outside: of these how many are outside their ball, by load; and all of them.
         worst: those that are farthest from the model.
         remarks: that people should look at, newest last.
+        places: index of each pose by its name; filled when it is first asked for.
     """
 
     told: Measuring
@@ -80,12 +83,14 @@ class LiveDigest:
     loads: dict[str, list[int]] = field(default_factory=dict)
     worst: list[Judged] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
+    places: dict[str, int] = field(default_factory=dict)
 
     @classmethod
     def of(cls, told: Measuring) -> "LiveDigest":
         """Return that of a campaign that begins, or goes on."""
         bodies = body_poses(told.arm, told.plan.q)
-        anchor = bodies[:, -1, :3, 3] + bodies[:, -1, :3, :3] @ told.targets[0]
+        flange = bodies[:, None, -1]
+        anchor = flange[..., :3, 3] + np.einsum("pkij,tj->pti", flange[..., :3, :3], told.targets)
         done = len({step for _, step in told.earlier})
         return cls(told, bodies, anchor, done)
 
@@ -94,18 +99,28 @@ class LiveDigest:
         """Readings that are planned."""
         return len(self.told.plan.steps)
 
-    def place(self, step: Step) -> Floats:
-        """(3,) where the nominal arm holds the target, m."""
-        return np.asarray(self.anchor[self.told.plan.pose_names.index(step.pose)])
+    def place(self, step: Step, target: int = 0) -> Floats:
+        """(3,) where the nominal arm holds a target, m."""
+        if not self.places:
+            self.places.update({name: k for k, name in enumerate(self.told.plan.pose_names)})
+        return np.asarray(self.anchor[self.places[step.pose], target])
 
-    def add(self, event: ReadingStored) -> Judged | None:
-        """Take note of a reading; returns it judged, None where there is no model yet."""
+    def add(self, event: ReadingStored) -> list[tuple[int, LiveResidual, Judged | None]]:
+        """Take note of a reading.
+
+        Returns:
+            Each target that was read, with its residual; judged, or None without a model yet.
+        """
         self.last, self.done, self.left = event, event.done, event.left_real
-        found = judged(event.step, event.live)
+        read = ((event.target, event.live), *event.others)
+        return [(k, live, self._judge(event.step, k, live)) for k, live in read]
+
+    def _judge(self, step: Step, target: int, live: LiveResidual) -> Judged | None:
+        found = judged(step, live, self.told.names[target] if self.told.names else "")
         if found is None:
             return None
         self.judged += 1
-        of_load = self.loads.setdefault(event.step.load, [0, 0])
+        of_load = self.loads.setdefault(step.load, [0, 0])
         of_load[0] += 1
         if found.level > 0:
             self.outside += 1
@@ -125,12 +140,12 @@ class LiveDigest:
         return any(step.load != UNLOADED for step in self.told.plan.steps)
 
 
-def judged(step: Step, live: LiveResidual) -> Judged | None:
+def judged(step: Step, live: LiveResidual, target: str = "") -> Judged | None:
     """Return a reading as `Judged`; None where it was not compared."""
     if live.vector is None or live.covariance is None:
         return None
     r, v = np.array(live.vector), np.array(live.covariance).reshape(3, 3)
-    return Judged(step, float(np.linalg.norm(r)), float(r @ np.linalg.solve(v, r)))
+    return Judged(step, target, float(np.linalg.norm(r)), float(r @ np.linalg.solve(v, r)))
 
 
 def arrow(live: LiveResidual, found: Judged) -> Floats:

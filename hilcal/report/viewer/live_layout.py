@@ -82,11 +82,11 @@ def _log() -> rrb.TextLogView:
 
 def seen(d: LiveDigest) -> Floats:
     """(K, 3) what is to be in the picture: targets and the arm in the first pose, m."""
-    return np.vstack([d.anchor, d.bodies[0, :, :3, 3]])
+    return np.vstack([d.anchor.reshape(-1, 3), d.bodies[0, :, :3, 3]])
 
 
 def _center(d: LiveDigest) -> tuple[Floats, float]:
-    points = np.vstack([d.anchor, np.zeros((1, 3))])
+    points = np.vstack([d.anchor.reshape(-1, 3), np.zeros((1, 3))])
     lo, hi = points.min(0), points.max(0)
     half = float(np.linalg.norm(hi - lo)) / 2
     return (lo + hi) / 2, max(half, 0.3 * d.told.arm.reach)

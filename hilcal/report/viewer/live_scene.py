@@ -35,10 +35,11 @@ class LiveScene:
     """What has been told so far, drawn into one recording along the time of day."""
 
     def __init__(self, rec: rr.RecordingStream, batches: bool = False) -> None:
-        """Draw into an open recording; in `batches` the arm moves with what comes after it."""
+        """Draw into an open recording; in `batches` the arm, and words, wait for `settle`."""
         self._rec, self._batches = rec, batches
         self._arm: MovingArm | None = None
         self._passed: list[tuple[float, tuple[float, ...]]] = []
+        self._since = 0  # those of them that came before the last reading
         self._now: LiveDigest | None = None
         self._acts = 0
         self._story: Story | None = None
@@ -49,14 +50,22 @@ class LiveScene:
         self._rec.set_time(live_layout.TIMELINE, timestamp=wall)
         if isinstance(what, ArmAt):
             self._passed.append((wall, what.q))
-        if not (self._batches and isinstance(what, ArmAt)):
+        if not self._batches:
             self._move()
         if isinstance(what, Measuring):
+            self.settle()
             self._measuring(wall, what)
         elif isinstance(what, Revised):
             self._revised(what.story)
         elif self._now is not None:
             self._event(self._now, what)
+
+    def settle(self) -> None:
+        """Tell what waits for a batch to be handed on: where the arm has been, words, the limit."""
+        self._move()
+        if self._batches and self._now is not None and self._now.last is not None:
+            self._words(self._now)
+            self._rec.log(f"{self._series}/limit", rr.Scalars(LIMIT))
 
     def end(self, to_open: bool) -> None:
         """Tell the story once more, whole: its words know now which revision is the last.
@@ -65,7 +74,8 @@ class LiveScene:
             to_open: let the recording open at the first revision, as a file does; else whoever
                 watches stays at the last one.
         """
-        self._move()
+        self.settle()
+        self._now = None
         if self._story is None:
             return
         self._rec.reset_time()
@@ -94,7 +104,7 @@ class LiveScene:
         rec.log("words/live_guide", _markdown(live_words.GUIDE), static=True)
         rec.log(
             f"{self._world}/planned",
-            rr.Points3D(d.anchor, colors=[style.GREY], radii=[0.006]),
+            rr.Points3D(d.anchor.reshape(-1, 3), colors=[style.GREY], radii=[0.006]),
             static=True,
         )
         for name, color in zip(style.LEVEL_NAMES, style.LEVEL_COLORS, strict=True):
@@ -131,60 +141,78 @@ class LiveScene:
 
     def _move(self) -> None:
         """Send where the arm has been since the last time."""
-        passed, self._passed = self._passed, []
+        passed, self._passed, self._since = self._passed, [], 0
         if passed and self._arm is not None and self._now is not None:
             bodies = body_poses(self._now.told.arm, np.array([q for _, q in passed]))
             self._arm.send(live_layout.TIMELINE, [wall for wall, _ in passed], bodies)
 
     def _event(self, d: LiveDigest, what: object) -> None:
         if isinstance(what, ReadingStored):
+            if (
+                self._batches and d.done > MANY
+            ):  # the arm stands at each reading, and skips its ways
+                del self._passed[self._since : -1]
+            self._since = len(self._passed)
             self._reading(d, what)
             self._log(f"{what.done}/{what.total} {what.step}{figures(what)}")
         elif isinstance(what, Phase):
             d.phase = what.text
-            if self._batches:  # a file needs no word on what is going on between two readings
-                return
         elif isinstance(what, Remark | GoalMet):
             text = what.text if isinstance(what, Remark) else met_words(what)
             d.remarks.append(text)
             self._log(text, "WARN" if isinstance(what, Remark) else "INFO")
         else:
             return
-        self._words(d)
+        if not self._batches:
+            self._words(d)
 
     def _reading(self, d: LiveDigest, event: ReadingStored) -> None:
-        """Draw a reading: its arrow in its ball, its place in time, and a label at it."""
-        rec, at, found = self._rec, d.place(event.step), d.add(event)
-        words = f"{event.step.pose}, {event.step.load}"
-        if found is None:
-            dot = rr.Points3D([at], colors=[style.MEASURED], radii=[0.01])
-            rec.log(f"{self._world}/dots", dot)
-        else:
-            words += f": {live_words.residual(found)}"
+        """Draw a reading: each target's arrow in its ball and place in time, and a label."""
+        rec, before = self._rec, d.judged
+        dots, arrows, balls = [], [], []
+        read = d.add(event)
+        for target, live, found in read:
+            at = d.place(event.step, target)
+            if found is None:
+                dots.append(at)
+                continue
             if found.level or d.judged <= MANY:
-                rec.log(
-                    f"{self._world}/arrows",
-                    rr.Arrows3D(
-                        origins=[at],
-                        vectors=[arrow(event.live, found)],
-                        colors=[style.LEVEL_COLORS[found.level]],
-                        radii=[0.0055 if found.level else 0.0035],
-                    ),
-                )
+                arrows.append((at, arrow(live, found), found.level))
             if d.judged <= (MANY if found.level else BALLS):
-                rec.log(
-                    f"{self._world}/balls",
-                    rr.Ellipsoids3D(
-                        centers=[at],
-                        half_sizes=[(BALL, BALL, BALL)],
-                        colors=[(*style.NOISE, 46)],
-                        fill_mode="solid",
-                    ),
-                )
+                balls.append(at)
             name = style.LEVEL_NAMES[found.level]
             rec.log(f"{self._series}/{name}", rr.Scalars(found.sigma))
+        if dots:
+            dot = rr.Points3D(dots, colors=[style.MEASURED], radii=[0.01])
+            rec.log(f"{self._world}/dots", dot)
+        if arrows:
+            starts, vectors, levels = zip(*arrows, strict=True)
+            rec.log(
+                f"{self._world}/arrows",
+                rr.Arrows3D(
+                    origins=starts,
+                    vectors=vectors,
+                    colors=[style.LEVEL_COLORS[level] for level in levels],
+                    radii=[0.0055 if level else 0.0035 for level in levels],
+                ),
+            )
+        if balls:
+            rec.log(
+                f"{self._world}/balls",
+                rr.Ellipsoids3D(
+                    centers=balls,
+                    half_sizes=[(BALL, BALL, BALL)] * len(balls),
+                    colors=[(*style.NOISE, 46)],
+                    fill_mode="solid",
+                ),
+            )
+        if d.judged > before and not (self._batches and before):
             rec.log(f"{self._series}/limit", rr.Scalars(LIMIT))
-        rec.log(f"{self._world}/last", scene.label(at + _ABOVE, words))
+        target, _, worst = max(read, key=lambda r: -1.0 if r[2] is None else r[2].norm2)
+        words = f"{event.step.pose}, {event.step.load}"
+        if worst is not None:
+            words += f"{', ' * bool(worst.target)}{worst.target}: {live_words.residual(worst)}"
+        rec.log(f"{self._world}/last", scene.label(d.place(event.step, target) + _ABOVE, words))
 
     def _words(self, d: LiveDigest) -> None:
         self._rec.log("words/measuring", _markdown(live_words.status(d)))

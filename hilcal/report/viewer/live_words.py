@@ -71,8 +71,8 @@ def _sentence(d: LiveDigest) -> str:
 def _worst(d: LiveDigest) -> list[str]:
     lines = ["| worst so far | load | residual | in σ |", "|---|---|---|---|"]
     lines += [
-        f"| {escaped(j.step.pose)} | {escaped(j.step.load)} | {numbers.length(j.length)} "
-        f"| {j.sigma:.1f} |"
+        f"| {escaped(f'{j.step.pose} {j.target}'.rstrip())} | {escaped(j.step.load)} "
+        f"| {numbers.length(j.length)} | {j.sigma:.1f} |"
         for j in d.worst
         if j.level > 0
     ]

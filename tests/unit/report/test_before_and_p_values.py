@@ -57,14 +57,14 @@ def test_before_a_deflection_is_what_was_measured(deflections):
     assert f"the model leaves {numbers.length(deflections.error.rms_m)} (noise" in said
 
 
-def test_before_of_positions_is_the_rigid_arm_in_the_fitted_frames(absolute):
+def test_before_of_positions_is_the_rigid_arm_in_frames_of_its_own(absolute):
     """Compliances alone are put to zero; they sag by about torque times compliance."""
     before = error_before(absolute)
     torque = absolute.solution.prediction.situation.torque
     turned = torque * typical_compliances(absolute.model.cell)
     assert absolute.error.rms_m < 0.2 * before.rms_m
     assert 0.1 * np.abs(turned).max() < before.rms_m < 3.0 * np.abs(turned).sum(axis=1).max()
-    assert "The rigid nominal arm, in the fitted frames, is off by" in shown(
+    assert "The rigid nominal arm, its frames fitted alone, is off by" in shown(
         *text.fit_report(absolute)
     )
 

@@ -1,6 +1,7 @@
 """What a live viewer draws of a campaign while it is measured, and of revisions as they come."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -8,12 +9,12 @@ import pytest
 import rerun as rr
 from rerun.chunk import RrdReader
 
-from hilcal.acquire.progress import ReadingStored, Remark
-from hilcal.report.live_messages import Revised
-from hilcal.report.viewer import live_words, style
+from hilcal.acquire.progress import ArmAt, LiveResidual, ReadingStored, Remark
+from hilcal.report.live_messages import Measuring, Revised
+from hilcal.report.viewer import live, live_words, style
 from hilcal.report.viewer.live_digest import BALL, LiveDigest, judged
 from hilcal.report.viewer.live_scene import MANY, LiveScene
-from tests.support.live_story import BLIND, events, measuring, plan
+from tests.support.live_story import BLIND, events, measuring, plan, residual
 from tests.support.picture import Shot, pictures, vulkan_available
 from tests.support.viewer_story import story
 
@@ -83,7 +84,49 @@ def test_of_many_readings_only_those_outside_are_drawn_in_space(tmp_path):
     outside = [judged(e.step, e.live).level > 0 for e in stored]
     arrows = rows(path, "/world/live/1/arrows", "Arrows3D:vectors")
     assert len(arrows) == MANY + sum(outside[MANY:]) < len(stored)
-    assert len(rows(path, "/live/1/limit", "Scalars:scalars")) == len(stored)
+    shown = [rows(path, f"/live/1/{name}", "Scalars:scalars") for name in style.LEVEL_NAMES]
+    assert sum(map(len, shown)) == len(stored)
+
+
+def test_every_target_of_an_arrival_is_drawn_where_it_is(tmp_path):
+    one = measuring()
+    targets = np.vstack([one.targets, [[-0.1, 0.05, 0.02]]])
+    told = replace(one, targets=targets, names=("left", "right"))
+    shown, rng = [], np.random.default_rng(2)
+    for wall, e in events(told, wrong=0.0):
+        if isinstance(e, ReadingStored):
+            right = residual(rng, 9.0) if e.done > BLIND else LiveResidual()
+            e = replace(e, others=((1, right),))
+        shown.append((wall, e))
+    path = recorded(tmp_path / "two.rrd", shown)
+    starts = rows(path, "/world/live/1/arrows", "Arrows3D:origins")
+    last = [e for _, e in shown if isinstance(e, ReadingStored)][-1]
+    d = LiveDigest.of(told)
+    assert np.allclose(starts[-1], [d.place(last.step, 0), d.place(last.step, 1)], atol=1e-6)
+    assert np.linalg.norm(d.place(last.step, 1) - d.place(last.step, 0)) == pytest.approx(
+        float(np.linalg.norm(targets[1] - targets[0]))
+    )
+    label = rows(path, "/world/live/1/last", "Points3D:labels")[-1][0]
+    assert "right" in label
+    for _, e in shown:
+        if isinstance(e, ReadingStored):
+            d.add(e)
+    assert d.judged == 2 * (len(told.plan.steps) - BLIND)
+    assert {j.target for j in d.worst} == {"right"}
+    assert " right |" in live_words.status(d)
+
+
+def test_a_long_campaign_is_a_small_file(tmp_path):
+    path = tmp_path / "long.rrd"
+    outlet = live._Outlet("long", print, "file", lambda: rr.FileSink(str(path)), to_open=True)
+    told = measuring(plan(250))
+    for wall, what in events(told):
+        tell = partial(LiveScene.tell, wall=wall, what=what)
+        outlet.tell(tell, not isinstance(what, ArmAt), now=isinstance(what, Measuring))
+    outlet.end()
+    assert path.stat().st_size < 2.5e6  # 5.5 MB, when each reading was handed on by itself
+    levels = [rows(path, f"/live/1/{name}", "Scalars:scalars") for name in style.LEVEL_NAMES]
+    assert sum(map(len, levels)) == 500 - BLIND
 
 
 def test_the_arm_moves_through_every_place_that_is_told(measured):

@@ -1,0 +1,98 @@
+"""`add`, `remove` and a SIGTERM while a live viewer, a real client, follows."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import psutil
+import pytest
+from rerun.chunk import RrdReader
+
+from hilcal.report.viewer.stream import executable
+from tests.support.bench_cases import BASE, stored
+
+pytestmark = pytest.mark.slow
+
+URL = re.compile(r"rerun\+http://127\.0\.0\.1:\d+/proxy")
+LONG = 120.0
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Settings of the viewer go here."""
+    for name in ("HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME"):
+        monkeypatch.setenv(name, str(tmp_path))
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+
+
+def begun(folder: Path, *words: object) -> tuple["subprocess.Popen[str]", Path]:
+    """A command with --view as a process, and what it tells."""
+    told = folder / "told.txt"
+    with told.open("w") as out:
+        line = [sys.executable, "-m", "hilcal", *map(str, words), "--view"]
+        return subprocess.Popen(line, stdout=out, stderr=out, text=True), told
+
+
+def until(what: Callable[[], bool]) -> None:
+    end = time.monotonic() + LONG
+    while not what():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def revisions(recording: Path) -> set[int]:
+    """The revisions whose verdicts a recording has."""
+    try:
+        chunks = RrdReader(recording).stream().filter(content="/words/verdict").to_chunks()
+        batches = [c.to_record_batch() for c in chunks]
+    except (ValueError, RuntimeError):  # nothing in it yet; a part of a message
+        return set()
+    found = [b["revision"].to_pylist() for b in batches if "revision" in b.schema.names]
+    return {k for one in found for k in one}
+
+
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")
+def test_added_and_removed_a_viewer_sees_both_revisions(tmp_path: Path) -> None:
+    run = stored(tmp_path / "run.hilcal")
+    for word, seen in (("add", {1, 2}), ("remove", {1, 2, 3})):
+        process, told = begun(tmp_path, word, run, BASE)
+        until(lambda told=told: URL.search(told.read_text()) is not None)
+        url = URL.search(told.read_text())
+        assert url is not None
+        late = tmp_path / f"{word}.rrd"
+        client = subprocess.Popen(
+            [executable(), "--port", "auto", "--save", str(late), url.group()],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        try:
+            assert process.wait(LONG) == 0, told.read_text()
+            until(lambda late=late: len(revisions(late)) > 0)  # what it had sent when it ended
+        finally:
+            client.kill()
+            client.wait()
+        recording = run.with_name("run.live.rrd")
+        assert revisions(recording) == seen
+        assert RrdReader(recording).store() is not None  # it has its footer: whole
+
+
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")
+def test_sigterm_completes_the_recording_and_leaves_no_process(tmp_path: Path) -> None:
+    run = stored(tmp_path / "run.hilcal")
+    process, told = begun(tmp_path, "refine", run)
+    recording = run.with_name("run.live.rrd")
+    until(lambda: recording.exists() and len(revisions(recording)) > 0)
+    children = psutil.Process(process.pid).children(recursive=True)
+    os.kill(process.pid, signal.SIGTERM)
+    code = process.wait(LONG)
+    assert code not in (0, 1), told.read_text()
+    assert "Traceback" not in told.read_text()
+    gone, alive = psutil.wait_procs(children, LONG)
+    assert gone
+    assert alive == []
+    assert RrdReader(recording).store() is not None  # it has its footer: whole
