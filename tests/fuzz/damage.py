@@ -69,7 +69,7 @@ def words_damaged(text: str, rng: Random) -> str:
                 cut = rng.randrange(len(lines[at]) + 1)
                 lines[at] = lines[at][:cut] + rng.choice(WORDS) + lines[at][cut:]
             case 4:
-                lines[at] = lines[at] * rng.randint(2, 40)
+                lines[at] = (lines[at] * rng.randint(2, 40))[:10_000]
             case _:
                 sign = rng.choice(" ,;=\t")
                 parts = lines[at].split(sign)

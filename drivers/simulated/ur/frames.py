@@ -31,6 +31,7 @@ FORMATS = {
 _OUTPUTS = {
     "DOUBLE": (
         "timestamp actual_execution_time speed_scaling target_speed_fraction actual_momentum "
+        "joint_position_deviation_ratio "
         "actual_main_voltage actual_robot_voltage actual_robot_current payload "
         "standard_analog_input0 standard_analog_input1 standard_analog_output0 "
         "standard_analog_output1"

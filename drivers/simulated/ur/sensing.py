@@ -17,6 +17,7 @@ _ENCODER_STD = 3e-6  # rad, while the arm moves
 _SPEED_STD = 2e-4  # rad/s
 # Torque per motor current at the joint, N·m/A: plausible for gear ratios of about 100.
 _TORQUE_PER_AMPERE = np.array([13.0, 13.0, 11.0, 9.0, 9.0, 9.0])
+_DEVIATION_STOP = 0.1  # rad at which a controller stops the arm (C153), a guess
 _CURRENT_STD = 0.02  # A
 _TEMPERATURES = np.array([29.0, 30.0, 30.5, 33.0, 34.0, 33.5])  # °C, a guess
 _FORCE_OFFSET = np.array([3.1, -2.4, 4.2, 0.12, -0.21, 0.08])  # N and N·m, flange axes
@@ -110,6 +111,7 @@ class Sensors:
                 (arm.robot_mode is not RobotMode.POWER_OFF) | (arm.runtime is Runtime.PLAYING) << 1,
             ),
             "runtime_state": lambda: (arm.runtime,),
+            "joint_position_deviation_ratio": self._deviation,
             "speed_scaling": lambda: (arm.scaling,),
             "target_speed_fraction": lambda: (arm.slider,),
         }
@@ -130,6 +132,11 @@ class Sensors:
         if self._at_rest:
             return np.asarray(self._truth["encoder"])
         return self._arm.trajectory.q + self._noise(_ENCODER_STD)
+
+    def _deviation(self) -> Numbers:
+        """Largest deviation of a joint from its command, over the one that stops the arm."""
+        off = np.abs(np.array(self.value("actual_q")) - np.array(self.value("target_q")))
+        return (float(off.max() / _DEVIATION_STOP),)
 
     def _qd(self) -> Floats:
         motion = self._arm.trajectory

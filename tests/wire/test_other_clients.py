@@ -1,0 +1,191 @@
+"""The simulated devices as programs of others meet them: clients written here from the protocols'
+documents alone, and byte transcripts of the makers' manuals.
+"""
+
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.frames import crc_modbus, crc_x25
+from drivers.ft300 import STREAM, STREAM_REGISTER
+from drivers.simulated.force.ft300 import Ft300
+from drivers.simulated.geocom.protocol import crc16_arc
+from tests.support.sim_ur_cases import SimulatedUr, Wire, start
+
+
+@pytest.fixture
+def arm(tmp_path: Path) -> Iterator[SimulatedUr]:
+    running = start(tmp_path)
+    yield running
+    running.close()
+
+
+# --- RTDE: recipes of the record and control-loop examples of UR's client library ---------------
+
+RECORD = {
+    "timestamp": "DOUBLE", "target_q": "VECTOR6D", "target_qd": "VECTOR6D",
+    "target_qdd": "VECTOR6D", "target_current": "VECTOR6D", "target_moment": "VECTOR6D",
+    "actual_q": "VECTOR6D", "actual_qd": "VECTOR6D", "actual_current": "VECTOR6D",
+    "joint_control_output": "VECTOR6D", "actual_TCP_pose": "VECTOR6D",
+    "actual_TCP_speed": "VECTOR6D", "actual_TCP_force": "VECTOR6D", "target_TCP_pose": "VECTOR6D",
+    "target_TCP_speed": "VECTOR6D", "actual_digital_input_bits": "UINT64",
+    "joint_temperatures": "VECTOR6D", "actual_execution_time": "DOUBLE", "robot_mode": "INT32",
+    "joint_mode": "VECTOR6INT32", "safety_mode": "INT32", "actual_tool_accelerometer": "VECTOR3D",
+    "speed_scaling": "DOUBLE", "target_speed_fraction": "DOUBLE", "actual_momentum": "DOUBLE",
+    "actual_main_voltage": "DOUBLE", "actual_robot_voltage": "DOUBLE",
+    "actual_robot_current": "DOUBLE", "actual_joint_voltage": "VECTOR6D",
+    "actual_digital_output_bits": "UINT64", "runtime_state": "UINT32",
+    "joint_position_deviation_ratio": "DOUBLE",
+}  # fmt: skip
+FORMAT = {"DOUBLE": "d", "VECTOR6D": "6d", "VECTOR3D": "3d", "UINT64": "Q", "UINT32": "I",
+          "INT32": "i", "VECTOR6INT32": "6i"}  # fmt: skip
+
+
+def test_a_recorder_gets_every_output_that_it_asks_for(arm: SimulatedUr) -> None:
+    layout = struct.Struct(">B" + "".join(FORMAT[kind] for kind in RECORD.values()))
+    with Wire(arm.host) as wire:
+        assert wire.ask("V", struct.pack(">H", 2)) == b"\x01"
+        assert len(struct.unpack(">4I", wire.ask("v"))) == 4
+        asked = struct.pack(">d", 125.0) + ",".join(RECORD).encode()
+        assert wire.ask("O", asked)[1:].decode().split(",") == list(RECORD.values())
+        assert wire.ask("S") == b"\x01"
+        stamps = []
+        for _ in range(10):
+            kind, body = wire.receive()
+            assert kind == "U"
+            values = layout.unpack(body)
+            stamps.append(values[1])
+            assert 0.0 <= values[-1] < 1.0  # joint_position_deviation_ratio; 1 stops the arm
+        assert np.all(np.diff(stamps) > 0.0)
+        wire.send("P")
+        while (came := wire.receive())[0] == "U":
+            pass
+        assert came == ("P", b"\x01")
+
+
+def test_a_control_loop_writes_and_two_cannot_hold_one_register(arm: SimulatedUr) -> None:
+    setp = ",".join(f"input_double_register_{k}" for k in range(6)).encode()
+    with Wire(arm.host) as wire, Wire(arm.host) as other:
+        wire.outputs("target_q,target_qd,output_int_register_0")
+        answer = wire.ask("I", setp)
+        assert answer == bytes([answer[0]]) + b",".join([b"DOUBLE"] * 6)
+        watchdog = wire.ask("I", b"input_int_register_0")
+        assert watchdog[1:] == b"INT32"
+        assert watchdog[0] != answer[0]
+        wire.send("U", struct.pack(">B6d", answer[0], *range(6)))
+        wire.send("U", struct.pack(">Bi", watchdog[0], -7))
+        assert wire.ask("S") == b"\x01"
+        assert wire.receive()[0] == "U"
+        assert other.ask("V", struct.pack(">H", 2)) == b"\x01"
+        assert other.ask("I", setp) == b"\0" + b",".join([b"IN_USE"] * 6)
+        assert other.ask("I", b"no_such_register") == b"\0NOT_FOUND"
+    with Wire(arm.host) as third:  # the registers are free when their holder has gone
+        assert third.ask("V", struct.pack(">H", 2)) == b"\x01"
+        for _ in range(100):
+            if third.ask("I", setp)[0]:
+                break
+        else:
+            raise AssertionError("the registers stay taken")
+
+
+def test_an_unknown_protocol_is_not_spoken(arm: SimulatedUr) -> None:
+    with Wire(arm.host) as wire:
+        assert wire.ask("V", struct.pack(">H", 3)) == b"\x00"
+        assert wire.ask("V", struct.pack(">H", 2)) == b"\x01"
+
+
+# --- Modbus RTU: MODBUS over Serial Line V1.02, and Application Protocol V1.1b3 ------------------
+
+
+def crc(data: bytes) -> bytes:
+    """CRC of Modbus over Serial Line V1.02, 6.2.2, by its generating procedure."""
+    register = 0xFFFF
+    for byte in data:
+        register ^= byte
+        for _ in range(8):
+            out = register & 1
+            register >>= 1
+            if out:
+                register ^= 0xA001
+    return bytes([register & 0xFF, register >> 8])
+
+
+class Master:
+    """Asks a slave, and takes its answers apart."""
+
+    def __init__(self, slave: Ft300) -> None:
+        self.slave = slave
+
+    def ask(self, pdu: bytes, address: int = 9) -> bytes:
+        """Return the PDU of the answer, empty for none."""
+        answer = self.slave.receive(
+            bytes([address]) + pdu + crc(bytes([address]) + pdu), np.zeros(6)
+        )
+        if not answer:
+            return b""
+        assert answer[0] == address
+        assert crc(answer[:-2]) == answer[-2:]
+        return answer[1:-2]
+
+
+def test_reading_and_writing_registers_as_any_master_does() -> None:
+    sensor = Ft300()
+    master = Master(sensor)
+    answer = master.ask(struct.pack(">BHH", 3, 500, 6))
+    assert answer[:2] == bytes([3, 12])
+    assert len(answer) == 14
+    assert master.ask(struct.pack(">BHH", 4, 180, 6)) == bytes([4, 12]) + bytes(12)
+    assert master.ask(struct.pack(">BHH", 3, 500, 0)) == b"\x83\x03"  # ILLEGAL DATA VALUE
+    assert master.ask(struct.pack(">BHH", 3, 500, 126)) == b"\x83\x03"
+    assert master.ask(struct.pack(">BHH", 3, 9999, 1)) == b"\x83\x02"  # ILLEGAL DATA ADDRESS
+    assert master.ask(b"\x2b\x0e\x01\x00\x00") == b"\xab\x01"  # ILLEGAL FUNCTION
+    assert master.ask(struct.pack(">BHH", 3, 500, 1), address=10) == b""  # of another slave
+    pdu = struct.pack(">BHHBH", 16, STREAM_REGISTER, 1, 2, STREAM)
+    assert master.ask(pdu) == struct.pack(">BHH", 16, STREAM_REGISTER, 1)
+    assert sensor.streaming
+
+
+def test_a_request_that_the_line_has_damaged_is_not_answered() -> None:
+    request = b"\x09\x03" + struct.pack(">HH", 500, 1)
+    whole = request + crc(request)
+    for bit in range(8 * len(whole)):
+        damaged = bytearray(whole)
+        damaged[bit // 8] ^= 1 << bit % 8
+        assert Ft300().receive(bytes(damaged), np.zeros(6)) == b""
+
+
+# --- transcripts ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        "09 10 01 9A 00 01 02 02 00 CD CA",  # Robotiq FT 300 manual: start of the data stream
+        "09 10 03 E8 00 03 01 30",  # Robotiq Hand-E manual: response to function 16
+        "09 04 07 D0 00 03 B1 CE",  # ... request of function 4
+        "09 03 07 D0 00 03 04 0E",  # Robotiq 2-Finger gripper manual: request of function 3
+        "09 03 06 39 00 00 FF 0E 0A F7 8B",  # ... its response
+    ],
+)
+def test_checksums_of_the_makers_transcripts(frame: str) -> None:
+    data = bytes.fromhex(frame)
+    assert crc_modbus(data[:-2]).to_bytes(2, "little") == data[-2:]
+
+
+def test_the_makers_start_of_the_stream_starts_it() -> None:
+    sensor = Ft300()
+    answer = sensor.receive(bytes.fromhex("0910019A0001020200CDCA"), np.zeros(6))
+    assert sensor.streaming
+    assert answer[:6] == bytes.fromhex("0910019A0001")
+    assert sensor.receive(b"\xff" * 50, np.zeros(6)) == b""
+    assert not sensor.streaming
+
+
+def test_check_values_of_the_checksums() -> None:
+    """Of "123456789", as the catalogue of parametrised CRC algorithms (reveng) gives them."""
+    assert crc_modbus(b"123456789") == 0x4B37
+    assert crc_x25(b"123456789") == 0x906E
+    assert crc16_arc(b"123456789") == 0xBB3D
