@@ -18,6 +18,7 @@ from hilcal.data.revision import RevisionRecord, utc_now
 from hilcal.data.run_log import PLAN, RunLog
 from hilcal.data.whitening import SCALINGS, Scaling
 from hilcal.errors import CannotAnswerError, InputError
+from hilcal.fleet.fleet import Fleet
 from hilcal.identify.fit import Fit, fit
 from hilcal.procedure.state import IMPROVED, Files
 from hilcal.report.build_story import Chapter, build_story
@@ -180,6 +181,17 @@ def content_of(
         operator=operator,
         commands=tuple(commands),
     )
+
+
+def write_fleet_report(found: Fleet, directory: Path, path: Path) -> None:
+    """Write what is known of a fleet as one HTML page.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    from hilcal.report.html.fleet import page
+
+    _write(path, page(found, directory.resolve().name, utc_now(), hilcal.__version__))
 
 
 def _scalings(last: Fit, chapters: list[Chapter], say: Say) -> dict[Scaling, Fit]:

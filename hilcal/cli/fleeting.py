@@ -15,6 +15,7 @@ from hilcal.fleet.members import entries
 from hilcal.identify.posterior_document import write
 from hilcal.report.progress import counting
 from hilcal.report.text_fleet import fleet_report
+from hilcal.reporting import write_fleet_report
 
 
 def fleet(
@@ -24,6 +25,9 @@ def fleet(
     out: Annotated[
         Path, typer.Option("-o", metavar="PRIOR.json", help="What to expect of another arm.")
     ],
+    report: Annotated[
+        Path | None, typer.Option("--report", metavar="F.html", help="Write it as one HTML page.")
+    ] = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
     as_json: Json = False,
@@ -40,4 +44,9 @@ def fleet(
         write(of.prior, path)
         written[of.type] = str(path)
         t.show(f"\n{path}: what to expect of another {of.type}, for --prior {path}")
-    t.document(to_json(found, written))
+    document = to_json(found, written)
+    if report is not None:
+        write_fleet_report(found, directory, report)
+        t.show(f"{report}: the report")
+        document["report"] = str(report)
+    t.document(document)

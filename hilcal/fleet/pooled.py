@@ -18,7 +18,15 @@ from hilcal.data.revision import utc_now
 from hilcal.errors import CannotAnswerError
 from hilcal.fleet.members import Member, seconds_of
 from hilcal.identify.posterior import LearntEffect, Posterior, Source
-from hilcal.regression.hierarchy import FALSE_ALARM, Found, Hierarchy, Unlike, hierarchy, unlike
+from hilcal.regression.hierarchy import (
+    FALSE_ALARM,
+    UNDETERMINED,
+    Found,
+    Hierarchy,
+    Unlike,
+    hierarchy,
+    unlike,
+)
 from hilcal.regression.schur import schur_complement
 from hilcal.types import Floats
 
@@ -113,6 +121,8 @@ class Pooled:
         seen: effects that diagnoses added, most frequent first.
         wear: parameters whose common drift is certain.
         prior: what to expect of another arm.
+        off: (A, K) each arm's parameters minus the mean of the type, SI.
+        off_std: (A, K) their standard uncertainties; infinite where an arm did not determine one.
     """
 
     type: str
@@ -123,6 +133,8 @@ class Pooled:
     seen: tuple[Seen, ...]
     wear: tuple[str, ...]
     prior: Posterior
+    off: Floats
+    off_std: Floats
 
 
 def effects_seen(members: Sequence[Member]) -> tuple[Seen, ...]:
@@ -195,6 +207,8 @@ def pooled(members: Sequence[Member], seen: Sequence[Seen]) -> Pooled:
         seen=tuple(seen),
         wear=tuple(n for n, p in zip(names, certain, strict=True) if timed and p < FALSE_ALARM),
         prior=_prior(members, effects, names, scale, units, h, len(arms)),
+        off=(h.arm_mean - h.mu) * scale,
+        off_std=np.where(h.arm_variance < UNDETERMINED**2, np.sqrt(h.arm_variance) * scale, np.inf),
     )
 
 

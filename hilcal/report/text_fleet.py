@@ -25,7 +25,12 @@ KINDS = {"trait": "a trait of the type", "defect": "of single arms: a defect", "
 def fleet_report(fleet: "Fleet") -> Iterator[RenderableType]:
     """Yield all that people want to know of a fleet."""
     for t in fleet.types:
-        yield from _type(t)
+        yield from type_report(t)
+    yield from closing(fleet)
+
+
+def closing(fleet: "Fleet") -> Iterator[RenderableType]:
+    """Yield how arms are known, and what was not used."""
     known = {m.known for m in fleet.members}
     yield f"Which arm a campaign is of: by {'; '.join(KNOWN[k] for k in KNOWN if k in known)}."
     if fleet.failures:
@@ -35,7 +40,8 @@ def fleet_report(fleet: "Fleet") -> Iterator[RenderableType]:
             yield f"  {f.name}: {f.reason}"
 
 
-def _type(t: "Pooled") -> Iterator[RenderableType]:
+def type_report(t: "Pooled") -> Iterator[RenderableType]:
+    """Yield what is known of one type."""
     yield heading(f"{t.type}: {len(t.arms)} arms, {len(t.campaigns)} campaigns")
     columns = ["parameter", "mean", "±", "between arms", "±", "between campaigns", "unit"]
     repeated = any(p.within is not None for p in t.parameters)
@@ -53,7 +59,7 @@ def _type(t: "Pooled") -> Iterator[RenderableType]:
         yield "No arm was measured twice: what changes with time is part of the arms' spread.\n"
     if t.odd:
         yield "Unlike the others:"
-        yield from (f"  {_odd(o)}" for o in t.odd)
+        yield from (f"  {unlike_words(o)}" for o in t.odd)
     else:
         yield "No arm is unlike the others."
     if t.wear:
@@ -83,7 +89,8 @@ def _with_unit(value: float, std: float, of: str) -> str:
     return f"{number} ± {error} {unit}"
 
 
-def _odd(o: "Odd") -> str:
+def unlike_words(o: "Odd") -> str:
+    """Say what is unlike, and by how much."""
     unit, factor = numbers.unit_for(o.unit, [o.off])
     off = f"{'+' if o.off > 0 else '−'}{numbers.digits(factor * abs(o.off))} {unit}"
     if o.campaign:

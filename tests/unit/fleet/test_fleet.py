@@ -10,12 +10,15 @@ import pytest
 from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.readings import Readings
 from hilcal.errors import CannotAnswerError, InputError
+from hilcal.fleet.fleet import Fleet
 from hilcal.fleet.members import Failure, Member, entries, member_of
 from hilcal.fleet.pooled import effects_seen, pooled
 from hilcal.identify.baseline import baseline
 from hilcal.identify.carried import carried_prior
 from hilcal.identify.fit import fit
 from hilcal.identify.posterior import Posterior
+from hilcal.report.charts.fleet import arms_chart
+from hilcal.report.html.fleet import page
 from hilcal.robot.catalogue import configs_dir
 from hilcal.types import Floats
 from tests.support.campaigns import (
@@ -101,6 +104,21 @@ def test_in_an_ordinary_fleet_nobody_is_named(one: Posterior) -> None:
         assert pooled(members(one, seed), ()).odd == ()
 
 
+def test_the_page_shows_who_is_unlike(one: Posterior) -> None:
+    fleet = members(one, 3, odd=1.5)
+    of = pooled(fleet, effects_seen(fleet))
+    drawn = arms_chart(of)
+    assert [(len(trace.y), trace.name) for trace in drawn.data] == [
+        (ARMS * len(of.parameters) - 1, "like its type"),
+        (1, "unlike its type"),
+    ]
+    lost = (Failure("x<b>.hilcal", "no campaign"),)
+    html = page(Fleet((of,), tuple(fleet), lost), "fleet", "2026-04-01T00:00:00", "1")
+    assert f"Unlike their type: arm{ODD}" in html
+    assert "joint_compliance.j3" in html
+    assert "x&lt;b&gt;.hilcal: no campaign" in html
+
+
 def test_two_arms_have_no_spread(one: Posterior) -> None:
     with pytest.raises(CannotAnswerError, match="at least 3 arms"):
         pooled(members(one, 3)[:4], ())
@@ -147,15 +165,15 @@ def test_a_directory_of_campaigns_gives_a_prior_that_identify_takes(
     folder.mkdir()
     write(folder, ("a/1.hilcal", "b/1.hilcal", "c/1.hilcal", "c/2.hilcal"))
     (folder / "broken.hilcal").write_bytes(b"no campaign")
-    prior = tmp_path / "prior.json"
-    told = ok(capsys, "fleet", folder, "-o", prior, "--json", "--workers", "2")
+    prior, shown = tmp_path / "prior.json", tmp_path / "fleet.html"
+    options = ("--json", "--workers", "2", "--report", shown)
+    told = ok(capsys, "fleet", folder, "-o", prior, *options)
+    assert "A fleet of arms" in shown.read_text(encoding="utf-8")
     (of,) = told.document["types"]
     assert of["arms"] == ["a", "b", "c"]
     assert {c["arm_known_by"] for c in told.document["campaigns"]} == {"folder"}
     assert [f["name"] for f in told.document["failed"]] == ["broken.hilcal"]
     assert "broken.hilcal: " in told.err
-    assert "no serial number" not in told.err
-    write(tmp_path, ("new.hilcal",))
     readings = readings_of(np.ones(6), 77, poses=4)
     new = tmp_path / "fresh.hilcal"
     content, base = configuration().to_json(), str(configs_dir() / "cells")
