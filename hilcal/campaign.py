@@ -10,6 +10,7 @@ from hilcal.calibration.calibration import Calibration
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
 from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.command_line import typed_now
 from hilcal.data.covariance import COVERS, INSTRUMENT, WHOLE
 from hilcal.data.purpose import refuse_fitting
 from hilcal.data.readings import Readings
@@ -321,7 +322,8 @@ class Campaign:
             raise InputError(f"{self.path}: the fit is of other readings than this campaign's")
         document = None if diagnosis is None else to_json(diagnosis)
         record = to_record(found, document, added, hashed, removed, parent)
-        return replace(record, options={**record.options, STORED: self.file.data_hash()})
+        own = {STORED: self.file.data_hash(), **typed_now()}
+        return replace(record, options={**record.options, **own})
 
     def fit_in_use(
         self, say: Say = lambda text: None, revision: int | None = None

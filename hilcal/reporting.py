@@ -69,7 +69,8 @@ def report(
         later: a later campaign of the same arm: the page compares the two.
         validation: a campaign that was never fitted: the page says how well it is predicted; where
             None, the one that `calibrate` has put beside the campaign, if there is one.
-        limit_m: the largest 3-D position error that is allowed, m.
+        limit_m: the largest 3-D position error that is allowed, m; that of the campaign's
+            configuration, [limits] accuracy_m, where None.
         operator: who answers for the measurement.
         revision: what the page is about; the one in use where None.
         say: takes progress, one line each.
@@ -144,6 +145,7 @@ def content_of(
     say: Say = lambda text: None,
 ) -> ReportContent:
     """Collect what a report says; arguments and errors as of `report`."""
+    limit = run.config.limits.accuracy_m if limit_m is None else limit_m
     record = run.in_use(revision)
     chapters = run.chapters(say, revision)
     last = chapters[-1].fit
@@ -177,7 +179,7 @@ def content_of(
         plan=_plan(run),
         tested=tested,
         corrected=_corrected(run, record),
-        limit_m=limit_m,
+        limit_m=limit,
         operator=operator,
         commands=tuple(commands),
     )

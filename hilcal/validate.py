@@ -60,7 +60,8 @@ def validate(
         run: has the revision; without any, the baseline is fitted and not kept.
         other: has the readings.
         revision: its number, or a record; the one in use where None.
-        limit_m: the largest 3-D position error that is allowed, m.
+        limit_m: the largest 3-D position error that is allowed, m; that of the configuration of
+            `run`, [limits] accuracy_m, where None.
         register: the tracker was set up anew: estimate its place first.
         say: takes progress, one line each.
 
@@ -90,6 +91,8 @@ def validate(
         spoilt=int(np.sum(~known & ~fresh)) if mixed else 0,
         unseen=mixed or not known.any(),
     )
+    if limit_m is None and judged.unseen:
+        limit_m = run.config.limits.accuracy_m
     if limit_m is not None and not judged.unseen:
         count = "all" if known.all() else f"{judged.fitted} of"
         raise CannotAnswerError(

@@ -16,6 +16,7 @@ from hilcal import __version__
 from hilcal.cli.commands import COMMANDS, Command, load
 from hilcal.cli.failing import Failures, Watched
 from hilcal.cli.help import EXIT_CODES, EXIT_CODES_OF_RUN, Group, InOrderOfWork
+from hilcal.data.command_line import typed
 from hilcal.errors import HilcalError, StoppedError
 
 DEBUG = "HILCAL_DEBUG"
@@ -185,7 +186,7 @@ def _run(
     out = failures.out
     try:
         app = make()
-        with _one_thread():
+        with _one_thread(), typed((name, *arguments)):
             result = app(arguments, prog_name=name, standalone_mode=False)
         out.flush()
     except HilcalError as error:

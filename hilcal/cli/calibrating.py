@@ -115,6 +115,8 @@ def calibrate(
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     config, numbers = read_cell(cell)
     asked = _asked(goal, limit, max_time, poses, validation)
+    if config.limits.accuracy_m is not None and not resume:
+        asked.setdefault("limit_m", config.limits.accuracy_m)
     if prior is not None:
         asked["prior"] = str(prior.absolute())
     on = ["hilcal", "calibrate", str(cell), "-o", str(output)]

@@ -76,7 +76,7 @@ class Load(Section):
 
 
 class Limits(Section):
-    """[limits]: what a plan keeps clear of."""
+    """[limits]: what a plan keeps clear of, and the error that is allowed."""
 
     joint_margin_rad: NonNegative = Field(
         0.05, description="the distance kept from every joint limit in rad, 0 or more"
@@ -96,6 +96,12 @@ class Limits(Section):
     )
     joint_speed_rad_s: Positive = Field(
         2.0, description="a measured joint speed in rad/s that stops the arm, over 0"
+    )
+    accuracy_m: Positive | None = Field(
+        None,
+        description="the largest 3-D position error that is allowed in m, over 0: calibrate, "
+        "validate and report judge by it where --limit is not given",
+        examples=[0.0001],
     )
 
     @model_validator(mode="after")

@@ -13,6 +13,7 @@ import numpy as np
 
 from hilcal import __version__
 from hilcal.data import rows, schema
+from hilcal.data.command_line import typed_now
 from hilcal.data.readings import Readings
 from hilcal.data.records import Layout, content_hash, layout_of, read_layout
 from hilcal.data.revision import RevisionRecord, fitted_to, from_text, to_text, utc_now
@@ -68,7 +69,7 @@ class CampaignFile:
             zip(_META, (config_json, base_dir, source, utc_now(), __version__), strict=True)
         )
         try:
-            meta |= more or {}
+            meta |= {**typed_now(), **(more or {})}
             may_write(path, overwrite)
             for leftover in (new, *_sidecars(new)):
                 leftover.unlink(missing_ok=True)

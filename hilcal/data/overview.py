@@ -10,6 +10,7 @@ import numpy as np
 
 from hilcal.config import CellConfig
 from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.command_line import COMMAND
 from hilcal.data.readings import Readings
 from hilcal.data.revision import RevisionRecord
 from hilcal.data.run_log import PLAN, RunLog
@@ -77,6 +78,7 @@ class Overview:
         created: when the file was made, ISO 8601, UTC.
         program_version: of the program that made it.
         source: where the readings come from.
+        command: that made the file, as it was typed; empty where it is not kept.
         config: the cell's configuration.
         readings: all of them, with the covariances as stored; None before the first.
         loads: number of readings by load.
@@ -98,6 +100,7 @@ class Overview:
     created: str
     program_version: str
     source: str
+    command: str
     config: CellConfig
     readings: Readings | None
     loads: Mapping[str, int]
@@ -136,6 +139,7 @@ def overview(file: CampaignFile) -> Overview:
         created=file.created,
         program_version=file.about("program_version") or "",
         source=file.source,
+        command=file.about(COMMAND) or "",
         config=CellConfig.from_json(file.config_json),
         readings=readings,
         loads={} if readings is None else _count(readings.load.tolist(), readings.load_names),

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 
+from hilcal.data.command_line import COMMAND
 from hilcal.diagnose.effect_ranking import Suspect
 from hilcal.identify.full_prediction import full_prediction
 from hilcal.report import numbers, text
@@ -33,6 +34,7 @@ from hilcal.report.text_seen import could_have_been_seen, doubtful, redundant_li
 MOST_SUSPECTS = 4
 """Suspects with an added-variable plot; a choice."""
 MOST_CURVES = 6
+NOT_KEPT = "not kept: made by a program of one's own, at the workbench, or before hilcal kept it"
 MOST_LISTED = 8
 """Suspects that are not folded away; a choice."""
 
@@ -284,6 +286,16 @@ def _plan_parts(m: ReportContent, about: dict[str, object]) -> Iterator[Part]:
             )
 
 
+def _commands(m: ReportContent) -> Iterator[Part]:
+    """The commands as they were typed."""
+    made = [("the campaign", m.overview.command or NOT_KEPT)]
+    made += [
+        (f"revision {r.number}", str(r.options.get(COMMAND, NOT_KEPT)))
+        for r in m.overview.revisions
+    ]
+    yield table("Commands as they were typed", ("made", "by"), made)
+
+
 def _provenance(m: ReportContent) -> Section:
     o = m.overview
     rows = [("campaign", m.name, m.sha256)]
@@ -307,6 +319,7 @@ def _provenance(m: ReportContent) -> Section:
                 ),
             )
         )
+    parts += _commands(m)
     parts.append(Words("Commands that show the same", "heading"))
     parts += [Words(c, "code") for c in m.commands]
     details = from_terminal(
