@@ -33,19 +33,26 @@ class EndedError(AssertionError):
 class Run:
     """One `hilcal run`, in a session of its own."""
 
-    def __init__(self, site: Site, path: Path, *more: str, limit: int | None = None) -> None:
-        """Start it; `--resume` where the campaign is there already.
+    def __init__(
+        self,
+        site: Site,
+        path: Path,
+        *more: str,
+        limit: int | None = None,
+        how: tuple[str, ...] = (),
+    ) -> None:
+        """Start it; unless `how` says otherwise, `--resume` where the campaign is there already.
 
         With `limit`, no file of the program can grow beyond so many bytes.
         """
         self.site, self.path = site, path
         self.log = path.with_suffix(f".{time.monotonic_ns()}.log")
-        how = ("--resume",) if path.exists() else ("--plan", str(site.plan_file))
+        usual = ("--resume",) if path.exists() else ("--plan", str(site.plan_file))
         command = [sys.executable, "-m", "hilcal", "run", str(site.toml), "-o", str(path)]
         environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
         with self.log.open("wb") as log:
             self.process = subprocess.Popen(
-                [*command, *how, *more],
+                [*command, *(how or usual), *more],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
