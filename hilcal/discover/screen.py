@@ -27,6 +27,8 @@ MOST_READINGS = 400
 SEEN = 1e-4
 """Share that must be left of a column's square, of what the readings move each by itself. Less is
 explained by the model, or cancels in deflections, and single precision does not resolve it."""
+ALIKE = 1 - 1e-9
+"""Cosine of two sites' motions from which on they are the same; rounding."""
 LEAST_MOTION = 1e-4
 """Square of a column that counts as none, in units of the noise: all readings together move by less
 than 0.01 σ at an ordinary motion. As in `regression.evidence`."""
@@ -66,6 +68,23 @@ class Screen:
     def price(self) -> Floats:
         """(F,) what the search costs a candidate, see `amplitudes`."""
         return self.grammar.price(len(self.sites))
+
+    @cached_property
+    def alias(self) -> tuple[int, ...]:
+        """(S,) the simplest site that moves every reading as each does, up to a factor.
+
+        So the tilt of a bearing about the axis of the joint before it is that joint's displacement.
+        """
+        flat = self.motion.reshape(-1, len(self.sites))
+        size = np.linalg.norm(flat, axis=0)
+        unit = flat / np.where(size > 0, size, 1.0)
+        same = np.abs(unit.T @ unit) > ALIKE
+        takes = [(s.takes(False), s.takes(True)) for s in self.sites]
+        out = []
+        for k in range(len(self.sites)):
+            others = [o for o in np.flatnonzero(same[k]).tolist() if takes[o] == takes[k]]
+            out.append(min([k, *others], key=lambda o: (self.sites[o].rank, o)))
+        return tuple(out)
 
     @cached_property
     def one(self) -> int:

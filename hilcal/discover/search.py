@@ -79,7 +79,7 @@ def search(problem: Problem, most: int = MOST_TERMS, beam: int = BEAM) -> list[S
             # What was added last is the best beside the others already.
             s = _exchanged(problem, grown, last=len(grown.terms) - 1)
             _keep(problem, best, s)
-    return [best[k] for k in sorted(best)]
+    return [_plainly(problem.screen, best[k]) for k in sorted(best)]
 
 
 def alternatives(problem: Problem, s: Selection) -> list[tuple[Term, ...]]:
@@ -148,6 +148,18 @@ def _keep(problem: Problem, best: dict[int, Selection], s: Selection) -> None:
     count = len(s.terms)
     if count not in best or _better(problem, s, best[count]):
         best[count] = s
+
+
+def _plainly(screen: Screen, s: Selection) -> Selection:
+    """Name the simplest of the sites that move all readings alike."""
+    terms = []
+    for t in s.terms:
+        places = {place for place, _ in t.parts}
+        if len(places) == 1:
+            (place,) = places
+            t = replace(t, parts=tuple((screen.alias[place], f) for _, f in t.parts))
+        terms.append(t)
+    return replace(s, terms=tuple(terms))
 
 
 def _better(problem: Problem, s: Selection, other: Selection) -> bool:

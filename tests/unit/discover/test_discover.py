@@ -24,7 +24,7 @@ from hilcal.discover.problem import Problem, Term
 from hilcal.discover.proposal import LawSearch
 from hilcal.discover.refit import exact
 from hilcal.discover.screen import Screen, screen
-from hilcal.discover.search import _simplicity, search
+from hilcal.discover.search import Selection, _plainly, _simplicity, search
 from hilcal.discover.sites import sites
 from hilcal.discover.variables import variables
 from hilcal.discover.write_effect import effect_class, source_of_form
@@ -351,6 +351,15 @@ def test_of_equals_the_cause_in_the_joint_itself_is_simpler() -> None:
         _simplicity(s, Term(((2, by[name,]),), 0.0)) for name in ("joint 3 angle", "joint 4 angle")
     )
     assert own < other
+
+
+def test_a_tilt_that_is_a_joints_displacement_is_called_so() -> None:
+    s = screened()
+    named = {site.symbol: s.sites[s.alias[k]].symbol for k, site in enumerate(s.sites)}
+    assert (named["tilt5_y"], named["tilt5_x"], named["dq_4"]) == ("dq_4", "tilt5_x", "dq_4")
+    tilt = next(k for k, site in enumerate(s.sites) if site.symbol == "tilt5_y")
+    told = _plainly(s, Selection((Term(((tilt, s.one),), 0.0),), (1.0,)))
+    assert s.sites[told.terms[0].parts[0][0]].symbol == "dq_4"
 
 
 def test_every_quantity_reads_the_same_in_the_written_effect() -> None:
