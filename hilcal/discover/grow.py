@@ -59,7 +59,10 @@ def _products(beside: Beside, s: int, f: int) -> list[Amplitude]:
         if a.cost + more.cost > MOST or not all(different(more, x) for x in a.factors):
             continue
         product = Amplitude((*a.factors, more))
-        if screen.sites[s].takes(product.elastic) and screen.grammar.place(product) is None:
+        known = screen.grammar.place(product)
+        if known is not None and known < len(screen.grammar.amplitudes):
+            continue  # it is screened
+        if screen.sites[s].takes(product.elastic):
             out.append(product)
     return out
 

@@ -392,7 +392,7 @@ class Beside:
         amplitude, place = grammar.at(f), grammar.place
 
         def visible(parts: list[tuple[int, int]]) -> tuple[tuple[int, int], ...]:
-            return tuple(p for p in parts if screen.square[p] > 0)
+            return tuple(p for p in parts if screen.visible(*p))
 
         same = [k for k, o in enumerate(screen.sites) if o.group == site.group]
         parts = visible([(k, f) for k in same])
@@ -400,7 +400,7 @@ class Beside:
             yield self.term(parts, LOG2)
         for inner in grammar.inner(f):
             # The zero of one factor is free, as that of a temperature.
-            if screen.square[s, inner]:
+            if screen.visible(s, inner):
                 yield self.term(((s, f), (s, inner)), LOG2)
         if any(x.variable.vector for x in amplitude.factors):
             # A vector's components along all axes of the site.

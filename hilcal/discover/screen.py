@@ -91,6 +91,10 @@ class Screen:
         """Index of the constant amplitude."""
         return self.grammar.amplitudes.index(Amplitude(()))
 
+    def visible(self, site: int, amplitude: int) -> bool:
+        """Whether the model leaves something of a candidate; unknown where it is grown."""
+        return amplitude >= len(self.price) or bool(self.square[site, amplitude] > 0)
+
     def price_of(self, amplitude: int) -> float:
         """Return what the search costs a candidate, in no or in further products too."""
         if amplitude < len(self.price):

@@ -139,6 +139,29 @@ def test_a_law_with_a_name_of_its_own_is_an_effect_everywhere(
     assert "forearm_hose" in run(capsys, "compensate", calibration, points, *use).err
 
 
+def test_next_separates_a_law_from_what_readings_do_not_tell_from_it(
+    campaign: Path, tmp_path: Path, capsys: Capsys
+) -> None:
+    square = Factor(VARIABLES["q_5"], shapes.EVEN, (2.0, 0.01))
+    other = Form((Part(sites(6)[2], Amplitude((square, PRODUCT[1])), 0),))
+    given: list[str | Path] = []
+    for name, form in (("found", COMPLIANCE), ("found_or_1", other)):
+        path = tmp_path / f"{name}.py"
+        source = source_of_form(form, name, (Coefficient("a", 2e-6, 1e-7, "rad/(N·m)"),))
+        path.write_text(source, encoding="utf-8")
+        given += ["--effects-from", path]
+    plan, asked = tmp_path / "plan.json", ("--poses", "4", "--quick", "--json")
+    suspects = ("--suspects", "found,found_or_1")
+    planned = ok(capsys, "next", campaign, "-o", plan, *suspects, *given, *asked).document
+    assert planned["suspects"] == ["found", "found_or_1"]
+    now, then = (
+        {(a, b): power for a, b, power in planned[key]} for key in ("separates_now", "separates")
+    )
+    assert {*then} == {("found", "found_or_1"), ("found_or_1", "found")}
+    assert all(then[pair] >= now[pair] for pair in then)
+    assert plan.exists()
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [

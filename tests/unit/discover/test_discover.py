@@ -353,6 +353,32 @@ def test_of_equals_the_cause_in_the_joint_itself_is_simpler() -> None:
     assert own < other
 
 
+def test_products_that_were_added_later_are_tried_again_and_extended(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    s = screen(linearise(campaign(LAW)))
+    by = {a.names: k for k, a in enumerate(s.grammar.amplitudes) if a.names and a.cost == 1}
+    one, two = by["joint 3 torque",], by["joint 4 torque",]
+    singles = s.grammar.amplitudes
+    cubed = replace(singles[two].factors[0], shape=shapes.ODD, numbers=(2.7, 0.1))
+    inner = s.grammar.index(Amplitude((cubed,)))
+    place = s.grammar.index(Amplitude((*singles[one].factors, cubed)))
+    assert inner is not None
+    assert place is not None
+    assert min(inner, place) >= len(singles)
+    assert s.grammar.index(Amplitude((cubed,))) == inner
+    beside = Problem(s).beside(())
+    monkeypatch.setattr(grow, "MOST", 3)
+    further = grow._products(beside, 2, by["joint 3 torque",])
+    assert further
+    s.grammar.index(further[0])
+    assert grow._products(beside, 2, by["joint 3 torque",]) == further
+    terms = list(beside._extended(2, place))
+    assert ((2, place), (2, inner)) in [t.parts for t in terms]
+    (values,) = s.grammar.rows([place])
+    assert np.sqrt(np.mean(values**2)) == pytest.approx(1.0, rel=1e-6)
+
+
 def test_a_tilt_that_is_a_joints_displacement_is_called_so() -> None:
     s = screened()
     named = {site.symbol: s.sites[s.alias[k]].symbol for k, site in enumerate(s.sites)}
