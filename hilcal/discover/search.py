@@ -90,7 +90,7 @@ def alternatives(problem: Problem, s: Selection) -> list[tuple[Term, ...]]:
         beside = problem.beside(others)
         own = beside.score([s.terms[k]])[0].odds
         found += [
-            (c.odds - own, (*s.terms[:k], c.term, *s.terms[k + 1 :]))
+            (c.odds - own, (*s.terms[:k], _plain(problem.screen, c.term), *s.terms[k + 1 :]))
             for c in _ordered(beside)
             if c.odds > own - LEAST and c.term.parts != s.terms[k].parts
         ]
@@ -152,14 +152,14 @@ def _keep(problem: Problem, best: dict[int, Selection], s: Selection) -> None:
 
 def _plainly(screen: Screen, s: Selection) -> Selection:
     """Name the simplest of the sites that move all readings alike."""
-    terms = []
-    for t in s.terms:
-        places = {place for place, _ in t.parts}
-        if len(places) == 1:
-            (place,) = places
-            t = replace(t, parts=tuple((screen.alias[place], f) for _, f in t.parts))
-        terms.append(t)
-    return replace(s, terms=tuple(terms))
+    return replace(s, terms=tuple(_plain(screen, t) for t in s.terms))
+
+
+def _plain(screen: Screen, t: Term) -> Term:
+    places = {place for place, _ in t.parts}
+    if len(places) > 1:
+        return t
+    return replace(t, parts=tuple((screen.alias[place], f) for place, f in t.parts))
 
 
 def _better(problem: Problem, s: Selection, other: Selection) -> bool:
