@@ -89,8 +89,14 @@ def discover(
     title = "Laws discovered, and none where none is hidden"
     if law:
         title = f"Laws discovered: {', '.join(law)}"
-    keep(keep_file, title, figures)
+    keep(keep_file, title, figures, {"cases": [_brief(o) for o in done]} if counted else None)
     t.document({"cases": [asdict(o) for o in outcomes], "figures": [asdict(f) for f in figures]})
+
+
+def _brief(o: Outcome) -> dict[str, object]:
+    """Return a case as it is kept."""
+    hidden = o.asked.law or o.asked.effect or "nothing"
+    return {**asdict(o), "asked": f"{hidden}, {o.asked.robot}, seed {o.asked.seed}"}
 
 
 def _outcome(line: str) -> Outcome:
