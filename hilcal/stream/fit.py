@@ -49,8 +49,8 @@ from hilcal.identify.uncertainty import (
 )
 from hilcal.model import Model
 from hilcal.regression.normal_equations import NormalEquations
+from hilcal.regression.triangle import combined
 from hilcal.stream.passes import Errors, Reduced, Work, errors_of_group, reduce_group, sample_group
-from hilcal.stream.triangle import combined
 from hilcal.types import Bools, Floats, Ints
 
 Result = TypeVar("Result")

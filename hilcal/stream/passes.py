@@ -18,7 +18,7 @@ from hilcal.identify.full_covariance import joint_factors
 from hilcal.identify.gauss_newton import whitened_jacobian
 from hilcal.identify.residual import residual
 from hilcal.model import Model, Prediction
-from hilcal.stream.triangle import Triangle
+from hilcal.regression.triangle import Triangle
 from hilcal.types import Bools, Floats, Ints
 
 

@@ -47,7 +47,7 @@ def _first(fleet: "Fleet") -> FirstScreen:
     headline = f"Unlike their type: {numbers.names(arms)}" if arms else "No arm is unlike its type"
     cards = (
         Card("Arms", str(sum(len(t.arms) for t in fleet.types)), "that were pooled"),
-        Card("Campaigns", str(len(fleet.members)), f"used; {len(fleet.failures)} were not"),
+        Card("Campaigns", str(len(fleet.members)), f"used; not used: {len(fleet.failures)}"),
     )
     answers = (
         ("Which arms are unlike, and by how much?", "; ".join(map(unlike_words, odd)) or "None."),
