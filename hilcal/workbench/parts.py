@@ -6,7 +6,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
-from nicegui import ui
+from nicegui import background_tasks, run, ui
 from nicegui.events import GenericEventArguments, TableSelectionEventArguments
 
 from hilcal.data.plan import UNLOADED
@@ -226,17 +226,28 @@ def evidence(view: View, d: Snapshot) -> None:
     if effect is None:
         ui.label("Choose an effect above to see what the readings say of it.").classes("soft")
         return
-    drawn = view.session.evidence(d, effect)
-    if drawn is None:
-        ui.label("These readings say nothing of it.").classes("soft")
-    else:
-        chart(view, added_variable(drawn, effect)).props("data-part=evidence")
+    with ui.column().style("width: 100%; gap: 8px") as place:
+        ui.label("…").classes("soft")
+
+    async def draw() -> None:
+        found = await run.io_bound(view.session.evidence, d, effect)
+        if place.is_deleted:  # something else was chosen meanwhile
+            return
+        place.clear()
+        with place:
+            if found is None:
+                ui.label("These readings say nothing of it.").classes("soft")
+            else:
+                chart(view, added_variable(found, effect)).props("data-part=evidence")
+
+    background_tasks.create(draw(), name="evidence")
 
 
 def readings(view: View, d: Snapshot) -> None:
     """Draw the residuals over a variable, the readings that were picked and what they share."""
     variable = view.tab.variable
-    found = view.session.recorded(d).get(variable or "")
+    plain_kind = variable in (None, "load")
+    found = None if plain_kind else view.session.recorded(d).get(variable or "")
     title("The readings" if variable is None else f"The readings over {variable}")
     if found is None or variable == "load":
         kind = residuals.residual_by_load if variable == "load" else residuals.residual_by_pose

@@ -61,11 +61,12 @@ def residual_by_time(story: Story, revision: StoryRevision) -> go.Figure:
 
 def worst_of(names: Sequence[str], sigma: Floats) -> list[tuple[str, float, int]]:
     """Return (name, rms σ, readings) of each name, the worst first."""
-    out = []
-    for name in dict.fromkeys(names):
-        mine = np.array([n == name for n in names])
-        out.append((name, float(np.sqrt(np.mean(sigma[mine] ** 2))), int(mine.sum())))
-    return sorted(out, key=lambda row: -row[1])
+    found = {name: k for k, name in enumerate(dict.fromkeys(names))}
+    which = np.array([found[name] for name in names])
+    count = np.bincount(which)
+    rms = np.sqrt(np.bincount(which, sigma**2) / count)
+    rows = zip(found, rms.tolist(), count.tolist(), strict=True)
+    return sorted(rows, key=lambda row: -row[1])
 
 
 def _by(story: Story, revision: StoryRevision, what: str) -> str:
