@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated
 
@@ -9,8 +10,10 @@ import numpy as np
 import typer
 
 from hilcal.cli.demo import CELL
+from hilcal.cli.engine import Jobs, Scheduler
 from hilcal.cli.terminal import Json, Terminal, terminal
 from hilcal.config import load_config
+from hilcal.engine.engine import open_engine
 from hilcal.report import text
 from hilcal.report.numbers import length
 from hilcal.report.progress import counting, working
@@ -41,6 +44,8 @@ def change(
         Path | None,
         typer.Option("--real", metavar="F.csv", help="Of a real arm instead: an IPA UR10 series."),
     ] = None,
+    jobs: Jobs = None,
+    scheduler: Scheduler = None,
     keep_file: Keep = None,
     as_json: Json = False,
 ) -> None:
@@ -56,18 +61,13 @@ def change(
             real_figures(halves),
         )
         return
-    config = load_config(configs_dir() / "cells" / CELL)
-    cases: list[Case] = []
-    with counting(t.progress, "comparisons", seeds + nothing) as advance:
-        arms = [studied_arm(config, robot, k, more=more) for k, (robot, more) in enumerate(ARMS)]
-        for k in range(seeds):
-            cases.append(_repaired(arms, k, first_seed, readings))
-            advance(1)
-        for k in range(nothing):
-            arm, seed = arms[k % len(arms)], first_seed + 10_000 + k
-            anew, other = k // 4 % 2 == 1, k // 8 % 2 == 1
-            cases.append(case(arm, "nothing", 0, anew, seed, other=other, count=readings))
-            advance(1)
+    asked = [(True, k) for k in range(seeds)] + [(False, k) for k in range(nothing)]
+    run = partial(_case, first=first_seed, count=readings)
+    with (
+        open_engine(jobs, scheduler) as engine,
+        counting(t.progress, "comparisons", len(asked)) as advance,
+    ):
+        cases = engine.map(run, asked, advance=advance)
     figures = figures_of(cases)
     _tell(t, figures, [asdict(c) for c in cases])
     keep(keep_file, f"What has changed on an arm, by {readings} readings", figures)
@@ -95,6 +95,24 @@ def real_figures(cases: Sequence[RealCase]) -> list[Figure]:
         ),
         _rate("… and its size is in the stated 95 %", moved, inside),
     ]
+
+
+@cache
+def _arms() -> tuple[StudiedArm, ...]:
+    """Measure the arms, once in each process."""
+    config = load_config(configs_dir() / "cells" / CELL)
+    return tuple(studied_arm(config, robot, k, more=more) for k, (robot, more) in enumerate(ARMS))
+
+
+def _case(asked: tuple[bool, int], first: int, count: int) -> Case:
+    """Return the k-th repair, or the k-th comparison of an arm that nobody repaired."""
+    repaired, k = asked
+    arms = _arms()
+    if repaired:
+        return _repaired(arms, k, first, count)
+    arm, seed = arms[k % len(arms)], first + 10_000 + k
+    anew, other = k // 4 % 2 == 1, k // 8 % 2 == 1
+    return case(arm, "nothing", 0, anew, seed, other=other, count=count)
 
 
 def _repaired(arms: Sequence[StudiedArm], k: int, first: int, count: int) -> Case:

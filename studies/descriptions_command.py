@@ -7,16 +7,20 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from hilcal.cli.engine import Jobs, Scheduler
 from hilcal.cli.terminal import Json, terminal
+from hilcal.engine.engine import open_engine
 from hilcal.report import text
-from hilcal.report.progress import working
-from studies.random_descriptions import draw, judge
+from hilcal.report.progress import counting
+from studies.random_descriptions import Outcome, draw, judge
 from studies.records import Figure, Keep, keep
 
 
 def descriptions(
     cases: Annotated[int, typer.Option("--cases", help="Number of draws.")] = 300,
     first: Annotated[int, typer.Option("--first-seed", help="Seed of the first draw.")] = 0,
+    jobs: Jobs = None,
+    scheduler: Scheduler = None,
     as_json: Json = False,
     keep_file: Keep = None,
 ) -> None:
@@ -25,18 +29,17 @@ def descriptions(
     right, seen, named, exact = 0, Counter[str](), Counter[str](), Counter[str]()
     missed: list[int] = []
     begun = time.monotonic()
-    with working(t.progress) as say:
-        for seed in range(first, first + cases):
-            say(f"case {seed - first + 1} of {cases}")
-            case = draw(np.random.default_rng(seed))
-            outcome, _ = judge(case)
-            right += outcome.right
-            if outcome.named is not None and case.error is not None:
-                seen[case.error] += 1
-                named[case.error] += outcome.named
-                exact[case.error] += outcome.exact
-            if not outcome.right or outcome.named is False:
-                missed.append(seed)
+    every = range(first, first + cases)
+    with open_engine(jobs, scheduler) as engine, counting(t.progress, "cases", cases) as advance:
+        judged = engine.map(_judged, every, advance=advance)
+    for seed, (error, outcome) in zip(every, judged, strict=True):
+        right += outcome.right
+        if outcome.named is not None and error is not None:
+            seen[error] += 1
+            named[error] += outcome.named
+            exact[error] += outcome.exact
+        if not outcome.right or outcome.named is False:
+            missed.append(seed)
     out = text.table("error of description", "visible", "named", "of these the very one")
     for kind in sorted(seen):
         out.add_row(kind, str(seen[kind]), str(named[kind]), str(exact[kind]))
@@ -72,3 +75,9 @@ def descriptions(
         }
     )
     keep(keep_file, "Errors of description", figures)
+
+
+def _judged(seed: int) -> tuple[str | None, Outcome]:
+    """Draw a case and judge it: the error that it has, and what became of it."""
+    case = draw(np.random.default_rng(seed))
+    return case.error, judge(case)[0]

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from hilcal.cli.demo import CELL
-from hilcal.cli.engine import Scheduler
+from hilcal.cli.engine import Jobs, Scheduler
 from hilcal.cli.terminal import Json, terminal
 from hilcal.config import CellConfig, load_config
 from hilcal.data.readings import Readings
@@ -68,9 +68,7 @@ def diagnosis(
         bool,
         typer.Option("--next", help="At 0.5 σ, also plan and measure what separates suspects."),
     ] = False,
-    jobs: Annotated[
-        int | None, typer.Option("--jobs", help="Processes; one per processor by default.")
-    ] = None,
+    jobs: Jobs = None,
     scheduler: Scheduler = None,
     keep_file: Keep = None,
     as_json: Json = False,

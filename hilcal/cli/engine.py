@@ -10,6 +10,9 @@ Workers = Annotated[
         "--workers", metavar="N", help="Processes of this machine; one per processor by default."
     ),
 ]
+Jobs = Annotated[
+    int | None, typer.Option("--jobs", help="Processes; one per processor by default.")
+]
 Scheduler = Annotated[
     str | None,
     typer.Option(
