@@ -5,9 +5,9 @@ The true position of the tool differs from the prediction by
     Σ = κ J C Jᵀ + s² 1 + J_q Σ_q J_qᵀ
 
 C the covariance of the parameters, what a family does at places that nobody measured included (see
-`identify.predictive`); κ ≥ 1 what poses left out were farther off than by C; s² what the
-positions' residuals have beyond the noise, where χ² is larger than chance allows; Σ_q the arm's
-scatter from one arrival to the next.
+`identify.predictive`); κ ≥ 1 what positions of poses left out were farther off than by C, in
+metres; s² what the positions' residuals have beyond the noise, where χ² is larger than chance
+allows; Σ_q the arm's scatter from one arrival to the next.
 
 Of a fit to deflections only what the load does is known: errors are then counted from the unloaded
 arm.
@@ -34,7 +34,7 @@ from hilcal.data.whitening import Mode
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit
-from hilcal.identify.predictive import open_prior, parameter_factor, predictive
+from hilcal.identify.predictive import open_prior, position_factor, predictive
 from hilcal.model import Model, Prediction
 from hilcal.robot import se3
 from hilcal.robot.chain import evaluate
@@ -172,7 +172,7 @@ class Calibration:
         p = predictive(model, found.theta, prior, used, found.mode, left_out)
         values, vectors = np.linalg.eigh(p.covariance)
         noise = np.trace(p.of_noise(found.whitening)[:, :3, :3], axis1=1, axis2=2)
-        kappa = parameter_factor(p, left_out)
+        kappa = position_factor(p, found.holdout.rms_m)
         # A deflection is the difference of two readings.
         readings = 2 if found.mode == "deflection" else 1
         loads = () if model.cell.config is None else model.cell.config.loads

@@ -16,10 +16,14 @@ prior precision,
 
 W is the stated covariance V, with more for positions or attitudes where their residual asks for it
 (`identify.excess`): a misfit has not the shape of an instrument's noise.
-κ, at least 1, makes the mean variance on a pose left out, in units of V, equal to the mean square
-that was found there: what repeats itself in new poses.
+κ, at least 1, makes the mean variance on poses left out, in units of V, equal to the mean square
+that was found there: what repeats itself in new poses. The variance is that of the folds as they
+are left out, F of rows Y, with X the same whitened by W and multiplied by the root of C: the mean
+of Y (1 − XᵀX/σ²)⁻¹ Yᵀ. With few poses a fold may be all that tells of a direction; its variance is
+that of the prior then.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +32,7 @@ from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode, Whitening, whitening
 from hilcal.identify.coordinates import Coordinates, coordinates_of
 from hilcal.identify.excess import Excess, excess
+from hilcal.identify.folds import distinct_poses, random_folds
 from hilcal.identify.gauss_newton import whitened_jacobian
 from hilcal.identify.holdout import ordinary
 from hilcal.identify.residual import residual
@@ -40,6 +45,8 @@ ROUNDS = 3
 """Most times that the covariance of the parameters is computed anew as W changes; a choice."""
 MOST_LEVERAGE = 0.99
 """Bound on the leverage of a row, since that of a row which alone tells something is 1."""
+ROUNDING = 1e-9
+"""Least share of a direction's information that is not of one fold, for rounding."""
 CHUNK = 4096
 """Measurements that are taken at once, for memory."""
 
@@ -59,6 +66,8 @@ class Predictive:
             prediction over that of the noise.
         scatter: mean variance of the fitted readings by σ² W, in units of V.
         left_out: mean variance of the predictions of poses left out by C, in units of V.
+        scatter_m2: the first of both of a 3-D position, m².
+        left_out_m2: the second.
     """
 
     model: Model
@@ -70,6 +79,8 @@ class Predictive:
     leverage: Floats
     scatter: float
     left_out: float
+    scatter_m2: float
+    left_out_m2: float
 
     def of_prediction(self, prediction: Prediction, w: Whitening) -> Floats:
         """Return κ J C Jᵀ (D, m, m) of predicted measurements."""
@@ -124,16 +135,23 @@ def predictive(
         part = (a[k : k + CHUNK * w.m] @ root).reshape(-1, w.m, len(root))
         shares.append(np.linalg.eigvalsh(part @ np.swapaxes(part, 1, 2)) / noise)
     leverage = np.clip(np.concatenate(shares), 0.0, MOST_LEVERAGE).max(axis=1)
-    pose = w.rows_of(fitted.pose[w.reading])
+    fold = random_folds(distinct_poses(fitted)[w.reading])
     scatter, b = noise, a
+    wider = more.widened(stated.covariance)
     if not more.none:
-        wider = np.linalg.solve(stated.covariance, more.widened(stated.covariance))
-        scatter = noise * float(np.trace(wider, axis1=1, axis2=2).mean()) / w.m
+        share = np.trace(np.linalg.solve(stated.covariance, wider), axis1=1, axis2=2)
+        scatter = noise * float(share.mean()) / w.m
         b = _rows(model, prediction, theta, of, std, stated)
-    left_out = _left_out(a, b, root, pose, noise)
+    position = of.columns(w.raw(model.jacobian(prediction, theta, 3)).reshape(-1, model.size)) * std
+    rows, points = w.rows_of(fold), np.repeat(fold, 3)
+    left_out, left_out_m2 = _left_out(a, rows, ((b, rows), (position, points)), root, noise)
+    scatter_m2 = noise * float(np.trace(wider[:, :3, :3], axis1=1, axis2=2).mean())
     root = of.transform(root * std[:, None])
     factor = max(1.0, left_out_sigma**2 / (scatter + left_out))
-    return Predictive(model, theta, root @ root.T, more, noise, factor, leverage, scatter, left_out)
+    return Predictive(
+        model, theta, root @ root.T, more, noise, factor, leverage, scatter, left_out,
+        scatter_m2, 3 * left_out_m2,
+    )  # fmt: skip
 
 
 def _rows(
@@ -162,29 +180,32 @@ def _spectrum(a: Floats, raw: Floats, w: Whitening) -> tuple[Floats, Floats, flo
     return values, vectors, noise
 
 
-def _left_out(a: Floats, b: Floats, root: Floats, pose: Ints, noise: float) -> float:
-    """Mean variance of the rows of each pose, predicted without it.
+def _left_out(
+    a: Floats, fold: Ints, asked: Sequence[tuple[Floats, Ints]], root: Floats, noise: float
+) -> list[float]:
+    """Mean variance of rows of each fold, predicted without it.
 
     Args:
-        a: (R, P) rows in units of W.
-        b: (R, P) the same in units of V, in which the variance is asked for.
+        a: (R, P) fitted rows in units of W.
+        fold: (R,) of each.
+        asked: (R', P) rows in the units in which the variance is asked for, and their folds.
         root: (P, K) root of C.
-        pose: (R,) of each row.
         noise: σ².
     """
-    order = np.argsort(pose, kind="stable")
-    total = 0.0
-    for mine in np.split(order, np.flatnonzero(np.diff(pose[order])) + 1):
-        x, y = a[mine] @ root, b[mine] @ root
-        # C without the pose: root (1 − XᵀX/σ²)⁻¹ rootᵀ.
-        values, vectors = np.linalg.eigh(x @ x.T if len(x) < len(root) else x.T @ x)
-        h = np.clip(values / noise, 0.0, MOST_LEVERAGE)
-        if len(x) < len(root):
-            along = y @ (x.T @ vectors)
-            total += float(np.sum(y**2) + np.sum(along**2 / (noise * (1 - h))))
-        else:
-            total += float(np.sum((y @ vectors) ** 2 / (1 - h)))
-    return total / max(len(a), 1)
+    total = np.zeros(len(asked))
+    for f in range(int(fold.max(initial=-1)) + 1):
+        x = a[fold == f] @ root
+        few = len(x) < len(root)
+        values, vectors = np.linalg.eigh(x @ x.T if few else x.T @ x)
+        rest = np.maximum(1.0 - values / noise, ROUNDING)
+        for k, (b, mine) in enumerate(asked):
+            y = b[mine == f] @ root
+            if few:
+                along = y @ (x.T @ vectors)
+                total[k] += np.sum(y**2) + np.sum(along**2 / (noise * rest))
+            else:
+                total[k] += np.sum((y @ vectors) ** 2 / rest)
+    return [float(t) / max(len(b), 1) for t, (b, _) in zip(total, asked, strict=True)]
 
 
 def open_prior(model: Model, theta: Floats, prior: Floats) -> Floats:
@@ -206,10 +227,24 @@ def family_prior(model: Model, prior: Floats) -> Floats:
 def parameter_factor(p: Predictive, left_out_sigma: float) -> float:
     """Factor, at least 1, by which C is too small where the noise alone is right.
 
-    With it the mean variance on a pose left out is the mean square that was found there.
+    With it the mean variance on poses left out is the mean square that was found there.
 
     Args:
         p: what a fit knows.
         left_out_sigma: rms of the whitened residual on poses left out.
     """
     return max(1.0, (left_out_sigma**2 - max(p.scatter, 1.0)) / max(p.left_out, 1e-12))
+
+
+def position_factor(p: Predictive, left_out_m: float) -> float:
+    """Factor, at least 1, by which C is too small for positions.
+
+    With it the mean square error of the positions left out, m², is what was found there: in metres,
+    as a band about a position is stated. In units of V the directions that an instrument measures
+    best would decide, in which misfits count most.
+
+    Args:
+        p: what a fit knows.
+        left_out_m: rms of the 3-D position errors on poses left out.
+    """
+    return max(1.0, (left_out_m**2 - p.scatter_m2) / max(p.left_out_m2, 1e-300))
