@@ -118,7 +118,8 @@ def compensation(
         document.append({"series": path.parent.name, "splits": [asdict(x) for x in found]})
     for f in figures:
         t.show(f"{f.what}: {f.measured}")
-    keep(keep_file, "A real UR10: corrections at poses that were not fitted", figures)
+    part = "" if share == HALF else f", {100 * share:.0f} % fitted"
+    keep(keep_file, f"A real UR10: corrections at poses that were not fitted{part}", figures)
     t.document({"series": document})
 
 
