@@ -126,9 +126,11 @@ def check_covariances(table: CsvTable, covariance: Floats) -> None:
         )
     smallest = smallest_correlation(covariance)
     for i in np.flatnonzero(smallest < -1e-9)[:1]:
+        why = f"smallest eigenvalue of the correlation matrix {smallest[i]:.3g}"
+        if np.isinf(smallest[i]):
+            why = "a covariance is larger than its two variances allow"
         raise InputError(
-            f"{table.at(int(i))}: the covariance is not positive semi-definite "
-            f"(smallest eigenvalue of the correlation matrix {smallest[i]:.3g})"
+            f"{table.at(int(i))}: the covariance is not positive semi-definite ({why})"
         )
     std = np.sqrt(variance[:, :3].max(axis=1))
     for i in np.flatnonzero(std > MAX_STD)[:1]:
@@ -147,12 +149,15 @@ def check_covariances(table: CsvTable, covariance: Floats) -> None:
 def smallest_correlation(covariance: Floats) -> Floats:
     """Return the smallest eigenvalue (N,) of the correlation matrices of covariances (N, m, m).
 
-    −∞ where a variable without variance has a covariance with another, or a variance is negative.
+    −∞ where a variable without variance has a covariance with another, a variance is negative, or a
+    correlation is beyond ±1 (its eigenvalues need not be computable).
     """
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     scale = 1.0 / np.sqrt(np.where(variance > 0, variance, 1.0))
     correlation = scale[:, :, None] * covariance * scale[:, None, :]
-    undefined = (variance <= 0)[:, :, None] & (covariance != 0)
+    beyond = ~(np.abs(correlation) <= 1.0 + 1e-9)
+    undefined = ((variance <= 0)[:, :, None] & (covariance != 0)) | beyond
+    correlation = np.where(undefined, 0.0, correlation)
     smallest = np.linalg.eigvalsh(correlation)[:, 0]
     return np.where(np.any(undefined, axis=(1, 2)), -np.inf, smallest)
 

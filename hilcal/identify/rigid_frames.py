@@ -75,10 +75,20 @@ class Seen:
 
 
 def inverse_roots(covariance: Floats) -> Floats:
-    """(N, m, m) lower triangular W with W V Wᵀ = I, V the covariance with the roughness added."""
+    """(N, m, m) lower triangular W with W V Wᵀ = I, V the covariance with the roughness added.
+
+    A covariance may have an eigenvalue below zero by rounding (`data.checks`), which can be larger
+    than the roughness; it counts as zero.
+    """
     m = covariance.shape[-1]
-    rough = np.repeat([ROUGH_M**2, ROUGH_RAD**2], 3)[:m]
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance + np.diag(rough))))
+    rough = np.diag(np.repeat([ROUGH_M**2, ROUGH_RAD**2], 3)[:m])
+    try:
+        root = np.linalg.cholesky(covariance + rough)
+    except np.linalg.LinAlgError:
+        value, axes = np.linalg.eigh(covariance)
+        whole = (axes * np.maximum(value, 0.0)[:, None, :]) @ np.swapaxes(axes, 1, 2)
+        root = np.linalg.cholesky(whole + rough)
+    return np.asarray(np.linalg.inv(root))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

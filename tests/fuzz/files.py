@@ -208,6 +208,35 @@ def _chain(bench: _Bench) -> Parser:
     return Parser("chain", make, parse, limit_s=120.0)
 
 
+def _cell_chain(bench: _Bench) -> Parser:
+    """A sound table in a damaged cell, all the way."""
+    text = _CELL.read_text()
+
+    def make(by: Random) -> bytes:
+        return words_damaged(text, by).encode("utf-8", "replace")
+
+    def parse(data: bytes) -> bool:
+        cell = hc.Cell.load(bench.path("chain.toml", data))
+        readings = hc.read_table(bench.path("s.csv", bench.table), cell)
+        hc.diagnose(hc.fit(hc.baseline(cell, readings), readings))
+        return True
+
+    return Parser("cell_chain", make, parse, limit_s=120.0)
+
+
+def _campaign_chain(bench: _Bench, damaged: Parser) -> Parser:
+    """A damaged campaign, all the way."""
+
+    def parse(data: bytes) -> bool:
+        path = bench.path("chain.hilcal", data)
+        path.with_name("chain.hilcal-journal").unlink(missing_ok=True)
+        with Campaign.open(path) as run:
+            hc.diagnose(hc.fit(hc.baseline(run.cell, run.readings), run.readings))
+        return True
+
+    return Parser("campaign_chain", damaged.make, parse, limit_s=120.0)
+
+
 def _packed(bench: _Bench) -> list[Parser]:
     """XLSX, Parquet and MAT: as files, and with odd things in them."""
     import openpyxl
@@ -483,6 +512,7 @@ def parsers() -> list[Parser]:
 
         return text
 
+    campaigns = _campaign(bench)
     return [
         _table(bench),
         _points(bench),
@@ -501,6 +531,8 @@ def parsers() -> list[Parser]:
         _document(bench, "posterior", of_run("posterior"), posterior_document.read),
         _document(bench, "parameters", of_run("parameters"), parameters_document.read),
         _urdf(bench),
-        _campaign(bench),
+        campaigns,
         _chain(bench),
+        _cell_chain(bench),
+        _campaign_chain(bench, campaigns),
     ]
