@@ -1,5 +1,7 @@
 """The other side of each wire: what the simulated devices read."""
 
+import atexit
+import shutil
 import struct
 import tempfile
 from pathlib import Path
@@ -36,6 +38,7 @@ class _Writer:
 def parsers() -> list[Parser]:
     """One for each that speaks."""
     folder = Path(tempfile.mkdtemp(prefix="hilcal-fuzz-", dir=MEMORY_DISK))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
     board = Blackboard.create(folder / "world.bin", 1e9)
     rng = np.random.default_rng(0)
     state = switched_on(load_arm("ur10e"), board, (5, 11, 6, 0), rng)
