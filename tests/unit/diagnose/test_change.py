@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 import hilcal as hc
+from drivers.simulated.injected_effects import nothing_hidden
+from drivers.simulated.rehearsal import measurement_noise
 from drivers.simulated.truth import Truth
 from drivers.simulated.world import stand
 from hilcal.cell import Cell
@@ -15,10 +17,11 @@ from hilcal.diagnose.change import Changes, find_changes
 from hilcal.diagnose.change_candidates import candidates
 from hilcal.effects.spec import effect
 from hilcal.errors import CannotAnswerError, InputError
+from hilcal.identify.baseline import with_effects
 from hilcal.identify.earlier import earlier_fit
 from hilcal.identify.remeasured import setting
 from hilcal.robot.catalogue import configs_dir
-from studies.change import StudiedArm, remeasured, studied_arm
+from studies.change import StudiedArm, measured, remeasured, studied_arm
 
 CONFIG = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
 
@@ -145,13 +148,19 @@ def test_columns_that_the_later_readings_lack_are_named(arm: StudiedArm) -> None
 
 
 def test_a_misfit_that_is_of_poses_is_told_from_one_of_readings(arm: StudiedArm) -> None:
-    fit, rng = arm.earlier.fit, np.random.default_rng(3)
-    r = fit.readings
-    of_pose = 1e-4 * rng.standard_normal((int(r.pose.max()) + 1, 3))[r.pose]
-    of_reading = 1e-4 * rng.standard_normal((len(r), 3))
+    rng, off = np.random.default_rng(3), 1e-4
+    noise, joints = measurement_noise(CONFIG), CONFIG.repeatability.per_joint(arm.cell.arm.n)
+    world = nothing_hidden(arm.cell, rng, noise=noise, joint_std=joints)
+    r = measured(world, arm.loads, 30, rng)
+    model = with_effects(arm.cell, r, "absolute", ("joint_compliance",))  # much fewer than poses
+    of_pose = off * rng.standard_normal((int(r.pose.max()) + 1, 3))[r.pose]
+    of_reading = off * rng.standard_normal((len(r), 3))
     found = [
-        earlier_fit(hc.fit(fit.model, replace(r, value=r.value + off), readings="absolute"))
-        for off in (of_pose, of_reading)
+        earlier_fit(hc.fit(model, replace(r, value=r.value + shift), readings="absolute"))
+        for shift in (of_pose, of_reading)
     ]
+    w = found[0].fit.whitening
+    drawn = float(np.mean(w.whiten(of_pose[w.reading]) ** 2))
+    assert found[0].by_pose == pytest.approx(drawn, rel=0.3)  # some of the 90 values are fitted
     assert found[0].by_pose > 5 * found[0].noise
     assert found[1].by_pose < 0.5 * found[1].noise  # parameters are shared by a pose, too
