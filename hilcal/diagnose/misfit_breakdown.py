@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from hilcal.diagnose.pose_alone import pose_constants
+from hilcal.diagnose.pose_constants import pose_constants
 from hilcal.identify.linearisation import Linearisation
 from hilcal.observe import motion
 from hilcal.regression.distributions import chi2
@@ -151,9 +151,8 @@ def _poses(p: Linearisation) -> list[MisfitShare]:
     found = pose_constants(p)
     if found is None:
         return []
-    rank = found.basis.shape[1]
-    within = max((p.rss - found.gain) / (p.fit.dof - rank), 1e-300)
-    return [MisfitShare("pose", p.share(found.gain - rank * within), found.p_value)]
+    within = max((p.rss - found.gain) / (p.fit.dof - found.rank), 1e-300)
+    return [MisfitShare("pose", p.share(found.gain - found.rank * within), found.p_value)]
 
 
 def _axes(p: Linearisation) -> list[MisfitShare]:

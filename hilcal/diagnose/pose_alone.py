@@ -19,11 +19,10 @@ import numpy as np
 
 from hilcal.diagnose.more_poses import enough
 from hilcal.diagnose.noise_verdict import MISFIT_ALARM
+from hilcal.diagnose.pose_constants import pose_constants
 from hilcal.effects.protocol import Effect
 from hilcal.identify.linearisation import Linearisation, effect_columns
 from hilcal.regression.distributions import chi2
-from hilcal.regression.distributions import f as f_distribution
-from hilcal.types import Floats
 
 LEAST = 0.9
 """Share of the misfit that pose constants must take; a choice, they take 0.99 of a transmission
@@ -53,43 +52,6 @@ class PoseAlone:
     chance: float | None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PoseConstants:
-    """Constants of each pose beside a model.
-
-    Attributes:
-        basis: (R, K) orthonormal, beside the model's columns.
-        gain: reduction of ‖r‖² by them.
-        p_value: of that.
-    """
-
-    basis: Floats
-    gain: float
-    p_value: float
-
-
-def pose_constants(p: Linearisation) -> PoseConstants | None:
-    """Split the residual by displacements of each pose; None where poses have too few readings."""
-    fit, w = p.fit, p.fit.whitening
-    poses = int(fit.pose.max()) + 1
-    if poses * 3 > fit.dof / 2 or len(fit.pose) < 2 * poses:
-        return None
-    member = (fit.pose[:, None] == np.arange(poses)).astype(float)
-    axes = np.zeros((len(fit.pose), w.m, 3))
-    axes[:, :3] = 1e-3 * fit.solution.prediction.observation.axes[w.reading]
-    raw = (axes[:, :, :, None] * member[:, None, None, :]).reshape(len(axes), w.m, -1)
-    free = p.project_out(w.whiten(raw).reshape(-1, raw.shape[2]))
-    u, s, _ = np.linalg.svd(free, full_matrices=False)
-    u = u[:, s > 1e-6 * s.max(initial=0.0)]
-    rank = u.shape[1]
-    if rank == 0 or fit.dof - rank <= 0:
-        return None
-    gain = float(np.sum((u.T @ p.residual) ** 2))
-    within = (p.rss - gain) / (fit.dof - rank)
-    p_value = float(f_distribution.sf(gain / rank / within, rank, fit.dof - rank))
-    return PoseConstants(u, gain, p_value)
-
-
 def pose_alone(
     p: Linearisation, effects: Sequence[Effect], level: float, least: float
 ) -> PoseAlone | None:
@@ -104,7 +66,7 @@ def pose_alone(
     found = pose_constants(p)
     if found is None:
         return None
-    fit, rank = p.fit, found.basis.shape[1]
+    fit, rank = p.fit, found.rank
     rest = p.rss - found.gain
     share = p.share(found.gain - rank * rest / (fit.dof - rank))
     if share < LEAST or float(chi2.sf(rest, fit.dof - rank)) < MISFIT_ALARM:
@@ -114,7 +76,7 @@ def pose_alone(
         full = e.fine(states) or e
         x = p.project_out(effect_columns(fit, full).white)
         square = float(np.sum(x**2))
-        if square > 0 and float(np.sum((found.basis.T @ x) ** 2)) >= ALIKE * square:
+        if square > 0 and found.square(x) >= ALIKE * square:
             able.append((len(full.parameters), e))
     if not able:
         return None
