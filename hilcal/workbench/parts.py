@@ -112,8 +112,8 @@ def verdict(view: View, d: Snapshot) -> None:
             number("error on fitted poses", numbers.length(fit.error.rms_m))
             number("noise alone would leave", numbers.length(d.story.noise_floor_m))
             low, high = fit.variance_factor_interval
-            interval = f"{numbers.digits(low, 2)} to {numbers.digits(high, 2)}"
-            number(f"variance factor, 95 %: {interval}", numbers.digits(fit.variance_factor))
+            factor = f"{fit.variance_factor:.2f}"
+            number(f"variance factor, 95 %: {low:.2f} to {high:.2f}", factor)
         model(view, d)
 
 

@@ -11,7 +11,7 @@ from hilcal.report.charts.readings_drawn import Drawn, drawn, escaped
 from hilcal.report.story import Story, StoryRevision
 from hilcal.types import Floats
 
-MOST_POSES = 60
+MOST_POSES = 24
 """Poses up to which all their names stand at the axis; a choice."""
 
 
