@@ -48,10 +48,8 @@ def follow(messages: BinaryIO, reply: Reply, record: Path, port: int) -> None:
         port: the first to be tried, on the loopback interface only.
     """
     identifier = str(uuid.uuid4())
-    file = _Outlet(
-        identifier, reply, f"recording {record}", lambda: rr.FileSink(str(record)), to_open=True
-    )
-    outlets = [file]
+    name = f"recording {record}"
+    outlets = [_Outlet(identifier, reply, name, lambda: rr.FileSink(str(record)), record)]
     with contextlib.suppress(OSError):
         disable_analytics()
     found = next((p for p in range(port, port + PORTS) if free("127.0.0.1", p)), None)
@@ -61,7 +59,7 @@ def follow(messages: BinaryIO, reply: Reply, record: Path, port: int) -> None:
     else:
         sink = rr.GrpcServerSink(bind_ip="127.0.0.1", port=found, server_memory_limit=MEMORY)
         name = f"live viewer at port {found}"
-        outlets.append(_Outlet(identifier, reply, name, lambda: sink, to_open=False))
+        outlets.append(_Outlet(identifier, reply, name, lambda: sink))
         reply(url=f"rerun+http://127.0.0.1:{found}/proxy")
     with contextlib.suppress(EOFError, pickle.UnpicklingError):
         while True:
@@ -84,23 +82,28 @@ class _Outlet:
     """One place where the pictures go; what fails here is told once, and the others go on."""
 
     def __init__(
-        self, identifier: str, reply: Reply, name: str, sink: Callable[[], Sink], to_open: bool
+        self,
+        identifier: str,
+        reply: Reply,
+        name: str,
+        sink: Callable[[], Sink],
+        file: Path | None = None,
     ) -> None:
-        """Open it; `to_open`: it is a file that is read later."""
-        self._reply, self._name, self._to_open = reply, name, to_open
+        """Open it; `file`: where it is one that is read later."""
+        self._reply, self._name, self._file = reply, name, file
         self._scene: LiveScene | None = None
         self._told, self._written = 0, 0
         self._rec = rr.RecordingStream(
             APPLICATION,
             recording_id=identifier,
             send_properties=False,
-            batcher_config=rr.ChunkBatcherConfig(flush_tick=_NEVER) if to_open else None,
+            batcher_config=rr.ChunkBatcherConfig(flush_tick=_NEVER) if file else None,
         )
         self._rec.set_log_time_enabled(False)
         self._rec.set_log_tick_enabled(False)
         try:
             self._rec.set_sinks(sink())
-            self._scene = LiveScene(self._rec, batches=to_open)
+            self._scene = LiveScene(self._rec, batches=file is not None)
         except (OSError, RuntimeError, ValueError) as error:
             self._fail(error)
 
@@ -114,24 +117,31 @@ class _Outlet:
             told(self._scene)
             self._told += flush
             little = self._told - self._written < max(1.0, SHARE * self._told)
-            if not flush or (self._to_open and little and not now):
+            if not flush or (self._file and little and not now):
                 return
             self._written = self._told
             self._scene.settle()
         except (InputError, ValueError, IndexError, KeyError) as error:
             self._reply(problem=f"{self._name}: not drawn: {error}")
+        size = self._size()
         try:
             self._rec.flush(timeout_sec=_FLUSH_S)
         except (OSError, RuntimeError, ValueError, HilcalError) as error:
-            if "timeout" in str(error).lower() or "timed out" in str(error).lower():
-                return  # slow; what does not fit in is dropped by the command
-            self._fail(error)
+            if "timeout" not in str(error).lower() and "timed out" not in str(error).lower():
+                self._fail(error)
+            elif self._file and self._size() == size:  # rerun says no more of a write that failed
+                self._fail(f"nothing was written for {_FLUSH_S:.0f} s; is the disk full?")
+            # else slow; what does not fit in is dropped by the command
 
     def end(self) -> None:
         """End it, whole."""
-        self.tell(lambda scene: scene.end(self._to_open), now=True)
-        self._rec.disconnect()
+        self.tell(lambda scene: scene.end(self._file is not None), now=True)
+        if self._scene is not None:  # else it would wait for what cannot be written
+            self._rec.disconnect()
 
-    def _fail(self, error: Exception) -> None:
+    def _size(self) -> int:
+        return self._file.stat().st_size if self._file and self._file.exists() else 0
+
+    def _fail(self, error: Exception | str) -> None:
         self._scene = None
         self._reply(problem=f"{self._name}: cannot be written ({error}); everything else goes on")

@@ -118,7 +118,7 @@ def test_every_target_of_an_arrival_is_drawn_where_it_is(tmp_path):
 
 def test_a_long_campaign_is_a_small_file(tmp_path):
     path = tmp_path / "long.rrd"
-    outlet = live._Outlet("long", print, "file", lambda: rr.FileSink(str(path)), to_open=True)
+    outlet = live._Outlet("long", print, "file", lambda: rr.FileSink(str(path)), path)
     told = measuring(plan(250))
     for wall, what in events(told):
         tell = partial(LiveScene.tell, wall=wall, what=what)
