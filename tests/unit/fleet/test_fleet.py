@@ -92,9 +92,8 @@ def test_the_spread_of_arms_is_recovered_and_the_odd_one_named(one: Posterior) -
     assert [(o.arm, o.campaign, o.parameter) for o in found.odd] == [
         (f"arm{ODD}", "", "joint_compliance.j3")
     ]
-    assert found.odd[0].off == pytest.approx(
-        1.5 * one.mean[one.names.index("joint_compliance.j3")], rel=0.5
-    )
+    odd, mean = found.odd[0], one.mean[one.names.index("joint_compliance.j3")]
+    assert odd.off == pytest.approx(1.5 * mean, abs=3 * odd.off / odd.sigma)
     assert [(s.effect, s.kind, s.arms) for s in found.seen] == [("creep", "defect", (f"arm{ODD}",))]
     assert not found.wear
 

@@ -151,6 +151,7 @@ def test_a_frozen_viewer_costs_nothing(live, said, home, monkeypatch):
         frozen.kill()
         frozen.wait()
     live.close()
+    assert readings(live.record) == 1800 - BLIND
     assert said == []
 
 
