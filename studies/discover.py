@@ -16,6 +16,7 @@ from hilcal.data.whitening import Mode, whitening
 from hilcal.discover.agreement import agreement
 from hilcal.discover.discovery import discover
 from hilcal.discover.law import Law
+from hilcal.effects.spec import EffectSpec
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
@@ -26,6 +27,16 @@ from studies.random_campaigns import rehearsal_states
 from studies.study_cases import with_study_loads
 
 POSES = 30
+CAUSES = {
+    "joint_stiffening": ("torque",),
+    "backlash": ("torque",),
+    "hysteresis": ("side",),
+    "transmission_error": ("angle",),
+    "periodic_joint_compliance": ("torque", "angle"),
+}
+"""Quantities of its own joint that an effect of the catalogue depends on."""
+CLEAR = 3.0
+"""Standard uncertainties from which a parameter of an effect counts as found."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,6 +136,8 @@ def run_case(config: CellConfig, asked: Asked) -> Outcome:
     again = rehearsal_states(cell, asked.poses, loads, rng)
     fresh = _scaled(_measured(world, again, names, rng, law), size)
     off = _error(before, fresh)
+    if d.reason == "catalogue":
+        return _with_catalogue(replace(out, before=off), law, before, d.catalogue, first, fresh)
     if not d.laws or d.after is None:
         return replace(out, before=off, after=off)
     return replace(
@@ -134,6 +147,38 @@ def run_case(config: CellConfig, asked: Asked) -> Outcome:
         correlation=agreement(before, d.after, first.moved),
         before=off,
         after=_error(d.after, fresh),
+    )
+
+
+def _with_catalogue(
+    out: Outcome,
+    law: Foreign,
+    before: Fit,
+    names: Sequence[str],
+    first: _Campaign,
+    fresh: _Campaign,
+) -> Outcome:
+    """The error after adding what the answer names: effects of the catalogue."""
+    model = before.model
+    for name in names:
+        model = model + EffectSpec(name)
+    after = fit(model, before.readings, before.mode)
+    clear = [
+        e.name
+        for e in after.parameters
+        if e.name.partition(".")[0] in names
+        and e.value is not None
+        and e.std is not None
+        and abs(e.value) > CLEAR * e.std
+    ]
+    return replace(
+        out,
+        formula=f"{' + '.join(names)} of the catalogue",
+        site=bool(clear) and all(f"joint {n[-1]}" in law.sites for n in clear),
+        variables=law.variables
+        == {f"joint {n[-1]} {c}" for n in clear for c in CAUSES.get(n.partition(".")[0], ())},
+        correlation=agreement(before, after, first.moved),
+        after=_error(after, fresh),
     )
 
 

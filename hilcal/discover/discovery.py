@@ -128,7 +128,10 @@ def discover(
     say("comparing with the catalogue")
     chain, total, columns = _catalogue(fit)
     near = _resembling(problem, best, columns)
-    if total > best.total - LEAST or (near and near[0].cosine >= SAME):
+    same = (
+        near and near[0].cosine >= SAME and not _tells_more(problem, best, columns, near[0].effect)
+    )
+    if total > best.total - LEAST or same:
         names = tuple(chain) or (near[0].effect,)
         return Discovery(fit, "catalogue", catalogue=names, candidates=found.candidates)
     say("repeating the search without each fold of poses")
@@ -205,6 +208,27 @@ def _resembling(problem: Problem, s: Selection, catalogue: _Columns) -> tuple[Re
         share = 1.0 - float(np.sum(left**2)) / max(whole, 1e-300)
         out.append(Resemblance(effect, float(np.sqrt(max(share, 0.0)))))
     return tuple(sorted(out, key=lambda r: -r.cosine))
+
+
+def _tells_more(problem: Problem, s: Selection, catalogue: _Columns, effect: str) -> bool:
+    """Whether odds of 20 : 1, the search paid for, ask for a law beside an effect that is near it.
+
+    An effect of the catalogue is preferred to a law that describes the same; a law that readings
+    tell from it, as a power of 2.3 from a cube, is not the same.
+    """
+    x, columns = catalogue
+    law = np.hstack([problem.columns(t) for t in s.terms])
+    both = np.hstack([x[:, columns[effect]], law])
+    count = both.shape[1] - law.shape[1]
+    places = {"effect": slice(0, count), "law": slice(count, both.shape[1])}
+    families = families_beside(
+        problem.model.information(both), problem.residual, problem.dof, both, places, {}
+    )
+    score = families.scores()["effect"]
+    if not score.rank:
+        return True
+    beside = families.with_family("effect", score).scores()["law"]
+    return bool(beside.log_evidence - sum(t.price for t in s.terms) > LEAST)
 
 
 def _laws(
