@@ -119,6 +119,11 @@ class Soak:
         try:
             way()
         except Exception as error:
+            runs = self._site.runs if self._site is not None else []
+            if isinstance(error, EndedError) and runs and runs[-1].process.poll() == 0:
+                self.counts["done before the fault"] += 1
+                self.site.slider(1.0)
+                return
             words = "".join(traceback.format_exception_only(error)).strip()
             at = traceback.extract_tb(error.__traceback__)[-1]
             if STARVED.search(words):
