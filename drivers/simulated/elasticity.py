@@ -6,7 +6,7 @@ import numpy as np
 
 from drivers.simulated.elastic_tree import ElasticTree
 from hilcal.errors import InputError
-from hilcal.types import Floats
+from hilcal.types import Floats, Ints
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,37 +32,38 @@ class Elasticity:
     extra: Floats | None = None
     turns: Floats | None = None
 
-    def give(self, tau: Floats, state: int) -> tuple[Floats, Floats]:
-        """Return delta (v,) and its derivative by tau (v, v) in one of the states.
+    def give(self, tau: Floats, states: Ints) -> tuple[Floats, Floats]:
+        """Return delta (K, v) and its derivative by tau (K, v, v) in K of the states.
 
         Raises:
             InputError: the gear would soften to nothing.
         """
         if self.turns is None:
-            return self._give(tau, state)
-        delta, slack = self._give(tau @ self.turns, state)
-        return self.turns @ delta, self.turns @ slack @ self.turns.T
+            return self._give(tau, states)
+        delta, slack = self._give(tau @ self.turns, states)
+        return delta @ self.turns.T, self.turns @ slack @ self.turns.T
 
-    def _give(self, tau: Floats, state: int) -> tuple[Floats, Floats]:
-        slack, bend = self.linear, None
+    def _give(self, tau: Floats, states: Ints) -> tuple[Floats, Floats]:
+        delta, bend = tau @ self.linear.T, np.zeros_like(tau)
         if self.extra is not None:
-            slack = slack + np.diag(self.extra[state])
-        delta = slack @ tau
+            bend += self.extra[states]
+            delta += bend * tau
         stiffens = self.cubic != 0.0
         if stiffens.any():
-            delta = delta + self.cubic * tau**3
-            bend = 3.0 * self.cubic * tau**2
-            if np.any((np.diag(slack) + bend)[stiffens] <= 0.0):
+            delta += self.cubic * tau**3
+            bend += 3.0 * self.cubic * tau**2
+            soft = np.any((np.diag(self.linear) + bend)[:, stiffens] <= 0.0, axis=1)
+            if soft.any():
                 raise InputError(
-                    "joint_stiffening is too strong for joint_compliance: the joint would "
-                    "spring back under more torque; valid: c + 3 s tau^2 > 0"
+                    f"state {states[soft][0]}: joint_stiffening is too strong for "
+                    "joint_compliance: the joint would spring back under more torque; "
+                    "valid: c + 3 s tau^2 > 0"
                 )
         if self.play.any():
             part = np.tanh(tau / self.crossing)
-            delta = delta + self.play * part
-            more = self.play / self.crossing * (1.0 - part**2)
-            bend = more if bend is None else bend + more
-        return delta, slack if bend is None else slack + np.diag(bend)
+            delta += self.play * part
+            bend += self.play / self.crossing * (1.0 - part**2)
+        return delta, self.linear + bend[:, :, None] * np.eye(len(self.linear))
 
 
 def elasticity(

@@ -49,8 +49,8 @@ class Misreading:
         return Misreading(turn @ self.gain @ turn.T, turn @ self.bias)
 
     def acting(self, said: Floats) -> Floats:
-        """Return the (6,) wrench that acts where the sensor reads `said`, N and N·m."""
-        return np.asarray(self.gain @ (said - self.bias))
+        """Return the (N, 6) wrenches that act where the sensor reads `said`, N and N·m."""
+        return np.asarray((said - self.bias) @ self.gain.T)
 
 
 def _both(turn: Floats) -> Floats:

@@ -32,6 +32,13 @@ def inverse(transform: Floats) -> Floats:
     return out
 
 
+def skew(vector: Floats) -> Floats:
+    """Return (..., 3, 3) matrices that multiply as (..., 3) vectors do in a cross product."""
+    out = np.zeros((*vector.shape, 3))
+    out[..., 2, 1], out[..., 0, 2], out[..., 1, 0] = np.moveaxis(vector, -1, 0)
+    return out - np.swapaxes(out, -1, -2)
+
+
 def moved_by(jacobian: Floats, arm: Floats) -> Floats:
     """Return Jacobians (N, 6, k) taken at a point that lies `arm` (N, 3) further, same axes.
 
