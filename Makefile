@@ -6,6 +6,8 @@ STAMP := .venv/.installed
 
 # pytest runs in parallel; more threads in each process only slow it down
 export OMP_NUM_THREADS ?= 1
+# else every program that a test starts compiles all of hilcal again
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help setup demo test check format slow bench lock clean
 

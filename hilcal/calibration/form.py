@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from hilcal.effects.protocol import Effect, Situation
 from hilcal.robot.deviation import Deviation
@@ -61,13 +60,13 @@ class Form:
         angle = np.linspace(-TURN, TURN, NODES)
         steps = 2 * self.torque / (TORQUE_NODES - 1)
         slopes, soft_slopes = (
-            CubicSpline(angle, x, axis=1)(angle, 1) if len(x) else np.zeros_like(x)
+            _spline(angle, x, axis=1)(angle, 1) if len(x) else np.zeros_like(x)
             for x in (self.by_angle, self.soft)
         )
         torque_slopes = np.zeros_like(self.by_torque)
         for j, values in enumerate(self.by_torque):
             grid = np.linspace(-self.torque[j], self.torque[j], TORQUE_NODES)
-            torque_slopes[j] = CubicSpline(grid, values)(grid, 1)
+            torque_slopes[j] = _spline(grid, values)(grid, 1)
         return (
             self.by_angle, packed(slopes), -TURN, float(angle[1] - angle[0]),
             self.by_torque, torque_slopes, -self.torque, steps, self.soft, packed(soft_slopes),
@@ -132,7 +131,7 @@ class Form:
         unit[:, :n, 5] = 1.0
         parts = np.array_split(angle, 16)
         own = np.concatenate([_at(e, theta, replace(s, wrench=unit), part) for part in parts])
-        waves = CubicSpline(angle, own)
+        waves = _spline(angle, own)
         here = np.stack([waves(s.angle[:, j])[:, j] for j in range(n)], axis=1)
         if not _same(Deviation(dq=dq), here * s.wrench[:, :n, 5], None):
             return False
@@ -150,7 +149,7 @@ class Form:
         values = e.deviation(theta, replace(grid, wrench=wrench)).dq
         if values is None or found.dq is None:
             return False
-        splines = [CubicSpline(share * torque[j], values[:, j]) for j in range(n)]
+        splines = [_spline(share * torque[j], values[:, j]) for j in range(n)]
         dq = np.stack([splines[j](s.wrench[:, j, 5]) for j in range(n)], axis=1)
         if not _same(found, dq, None):
             return False
@@ -182,7 +181,7 @@ class Form:
             return True
         angle = np.linspace(-TURN, TURN, NODES)
         own = np.concatenate([_at(e, theta, s, part) for part in np.array_split(angle, 16)])
-        waves = CubicSpline(angle, own)
+        waves = _spline(angle, own)
         each = np.stack([waves(s.angle[:, j])[:, j] for j in range(n)], axis=1)
         # What is left may follow other joints in proportion.
         left = found.dq - each
@@ -216,6 +215,12 @@ def given_the_columns(e: Effect, theta: Floats, s: Situation) -> bool:
         return False
     dq = np.zeros((TRIALS, n)) if found.dq is None else found.dq
     return _same(e.deviation(theta, other), dq, found.twist)
+
+
+def _spline(x: Floats, y: Floats, axis: int = 0) -> Any:
+    from scipy.interpolate import CubicSpline  # slow to import
+
+    return CubicSpline(x, y, axis=axis)
 
 
 def _at(e: Effect, theta: Floats, s: Situation, angle: Floats) -> Floats:

@@ -14,7 +14,6 @@ from hilcal.identify.arm_scatter import with_prior_scatter
 from hilcal.identify.baseline import with_effects
 from hilcal.identify.carried import CarriedPrior, carried_prior
 from hilcal.identify.fit import Fit, fit
-from hilcal.library import load_posterior
 
 Prior = Annotated[
     Path | None,
@@ -61,6 +60,8 @@ class PriorOptions:
             if self.drift is not None:
                 raise InputError("--drift is of a prior; give --prior OTHER.hilcal as well")
             return None
+        from hilcal.library import load_posterior  # imports all that a script can do
+
         posterior = load_posterior(self.path, catalogue)
         try:
             return carried_prior(posterior, self.relation, _drifts(self.drift), catalogue)

@@ -11,8 +11,6 @@ from typing import Annotated
 
 import typer
 
-from drivers.simulated.on_the_wire import case_of_plan, simulated_cell
-from drivers.simulated.rehearsal import NOTHING
 from hilcal.acquire.clock import Clock
 from hilcal.acquire.connect import ConnectionResult, connect
 from hilcal.acquire.progress import Watcher
@@ -116,6 +114,9 @@ def run(
         if rehearse:
             with working(t.progress) as say:
                 say("starting the simulated devices")
+                from drivers.simulated.on_the_wire import case_of_plan, simulated_cell
+                from drivers.simulated.rehearsal import NOTHING
+
                 choice = config.simulation.hide or NOTHING
                 secret = case_of_plan(config, made, choice, config.simulation.seed, catalogue)
                 simulated = simulated_cell(secret, config.simulation.seed, base_dir)

@@ -11,7 +11,6 @@ import re
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import PchipInterpolator
 
 from hilcal.discover.amplitudes import HARMONICS
 from hilcal.discover.curve import LEAST, LINE, MOST_POINTS, Curve, binned, said_by_readings
@@ -130,6 +129,8 @@ def _curve(
 
 def _line(x: Floats, y: Floats) -> Floats:
     """(2, L) a law that is known at some places (K,), interpolated without overshooting."""
+    from scipy.interpolate import PchipInterpolator  # slow to import
+
     places, which = np.unique(x, return_inverse=True)
     if len(places) < 2:
         return np.vstack([x[:1], y[:1]])

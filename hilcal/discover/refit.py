@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.optimize import minimize
 
 from hilcal.discover.law import LETTERS, Coefficient, Form, ordinary, with_numbers
 from hilcal.discover.screen import Screen
@@ -31,6 +30,8 @@ RANGE = 30.0
 
 def refine(screen: Screen, form: Form) -> Form:
     """Return the law with its free numbers refined, where the readings ask for it."""
+    from scipy.optimize import minimize  # slow to import
+
     linear = screen.linear
     s = linear.fit.solution.prediction.situation
     free = _free(form)

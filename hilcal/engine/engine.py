@@ -11,7 +11,6 @@ on how many there are or which computes what:
 A worker that dies costs no result: what it held is computed again. Ctrl-C leaves no process.
 """
 
-import asyncio
 import logging
 import os
 import signal
@@ -246,6 +245,8 @@ def _own(count: int, threads: bool) -> Iterator["Client"]:
 
 async def _end(nannies: list[Any]) -> None:
     """End the processes of workers, whatever they are doing."""
+    import asyncio  # slow to import
+
     kills = [nanny.kill(timeout=END_S) for nanny in nannies]
     await asyncio.gather(*kills, return_exceptions=True)
 

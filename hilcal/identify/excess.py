@@ -16,7 +16,6 @@ Source: Mandel and Paule, Analytical Chemistry 42 (1970) 1194-1197.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import brentq
 
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode, Whitening
@@ -93,6 +92,8 @@ def excess(raw: Floats, stated: Whitening, used: Whitening, rows: Floats, root: 
         if part.start:
             attitude = total / free
         else:
+            from scipy.optimize import brentq  # slow to import
+
             most = float(square.sum()) / free
             position = float(
                 brentq(lambda s, q=square, e=values, f=free: np.sum(q / (e + s)) - f, 0.0, most)

@@ -102,6 +102,11 @@ class t:  # noqa: N801
     """Student's t distribution with df degrees of freedom."""
 
     @staticmethod
+    def sf(x: Numbers, df: Numbers) -> Floats:
+        """P(X > x)."""
+        return _value(special.stdtr(df, np.negative(x)))
+
+    @staticmethod
     def ppf(p: Numbers, df: Numbers) -> Floats:
         """Value that X does not exceed with probability p."""
         return _value(special.stdtrit(df, p))

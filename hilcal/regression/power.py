@@ -7,7 +7,6 @@ noise is known (ν infinite) the test is the χ² test.
 """
 
 import numpy as np
-from scipy.optimize import brentq
 
 from hilcal.regression.distributions import chi2
 from hilcal.regression.distributions import f as f_distribution
@@ -46,6 +45,8 @@ def power_of_test(noncentrality: float, rank: int, rest: float, level: float) ->
 
 def noncentrality_of_power(rank: int, rest: float, level: float, power: float) -> float:
     """Return the non-centrality at which the F-test at `level` has the given power."""
+    from scipy.optimize import brentq  # slow to import
+
     high = 10.0 * (rank + 1.0) + 4.0 * rank * float(f_distribution.isf(level, rank, rest))
 
     def lacks(value: float) -> float:

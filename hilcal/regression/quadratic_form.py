@@ -8,7 +8,6 @@ variables*, Biometrika 86 (1999) 929-935; Lugannani and Rice, Adv. Appl. Prob. 1
 """
 
 import numpy as np
-from scipy.optimize import brentq
 from scipy.special import log_ndtr
 
 from hilcal.regression.distributions import norm
@@ -38,6 +37,8 @@ def ratio_tail(eigenvalues: Floats, dimension: float, c: float) -> float:
         return 1.0
     scale = np.abs(d).max()
     d = d / scale
+
+    from scipy.optimize import brentq  # slow to import
 
     def slope(t: float) -> float:
         return float(np.sum(weight * d / (1 - 2 * t * d)))

@@ -17,7 +17,6 @@ from functools import partial
 from typing import ClassVar, TypeVar
 
 import numpy as np
-from scipy.stats import chi2
 
 from hilcal.cell import Cell
 from hilcal.data import columns
@@ -48,6 +47,7 @@ from hilcal.identify.uncertainty import (
     name_directions,
 )
 from hilcal.model import Model
+from hilcal.regression.distributions import chi2
 from hilcal.regression.normal_equations import NormalEquations
 from hilcal.regression.triangle import combined
 from hilcal.stream.passes import Errors, Reduced, Work, errors_of_group, reduce_group, sample_group

@@ -10,15 +10,25 @@ from hilcal.cli.commands import COMMANDS, Command, load
 from tests.support.paths import ROOT
 
 HEAVY = ("numpy", "scipy", "pydantic", "pinocchio", "rerun", "sklearn", "rich.console", "dask")
+SLOW = (
+    "asyncio",
+    "plotly",
+    "rerun",
+    "scipy.interpolate",
+    "scipy.optimize",
+    "scipy.stats",
+    "sklearn",
+)
+"""Libraries that few commands need, each a tenth of a second or more to load."""
 
 
-def loaded(code: str) -> set[str]:
+def loaded(code: str, of: tuple[str, ...] = HEAVY) -> set[str]:
     """Heavy modules that are loaded after a piece of code has run in a process of its own."""
     report = f"{code}\nimport sys\nprint(*sys.modules, sep='\\n', file=sys.stderr)"
     done = subprocess.run(
         [sys.executable, "-c", report], cwd=ROOT, capture_output=True, text=True, check=True
     )
-    return set(HEAVY) & set(done.stderr.split())
+    return set(of) & set(done.stderr.split())
 
 
 @pytest.mark.parametrize("option", ["--help", "--version"])
@@ -49,6 +59,13 @@ except SystemExit as ended:
 def test_the_package_loads_nothing_until_a_name_is_used() -> None:
     assert loaded("import hilcal") == set()
     assert "numpy" in loaded("import hilcal.model")  # the measurement itself can find something
+
+
+def test_commands_load_no_library_that_they_may_not_need() -> None:
+    places = {name: c.place or c.subcommands[0][1] for name, c in COMMANDS.items()}
+    places = [place for name, place in places.items() if name != "workbench"]
+    code = f"from hilcal.cli.commands import load\nfor place in {places}:\n    load(place)"
+    assert loaded(code, SLOW) == set()
 
 
 @pytest.mark.parametrize(("name", "command"), COMMANDS.items(), ids=list(COMMANDS))

@@ -48,8 +48,9 @@ def test_normal(x: float, p: float, scale: float) -> None:
     assert norm.pdf(x, scale) == pytest.approx(stats.norm.pdf(x, scale=scale), rel=1e-9, abs=1e-300)
 
 
-@given(CHANCE, st.floats(1.0, 1e4))
-def test_quantile_of_t(p: float, df: float) -> None:
+@given(CHANCE, st.floats(1.0, 1e4), st.floats(-50.0, 50.0))
+def test_t(p: float, df: float, x: float) -> None:
+    assert distributions.t.sf(x, df) == pytest.approx(stats.t.sf(x, df), rel=1e-9)
     assert distributions.t.ppf(p, df) == pytest.approx(stats.t.ppf(p, df), rel=1e-6, abs=1e-9)
 
 
