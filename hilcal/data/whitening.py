@@ -30,6 +30,10 @@ Mode = Literal["deflection", "absolute"]
 SCALINGS: tuple[Scaling, ...] = ("none", "gu", "gc")
 MODES: tuple[Mode, ...] = ("deflection", "absolute")
 RANK_TOLERANCE = 1e-10
+MANY = 1000
+"""Blocks from which on Cholesky's factor takes the place of eigenvectors where the rule for
+rank-deficient blocks does not come into play: a fifth of the time for 100,000 blocks; a choice by
+timing."""
 
 
 def inverse_root(covariance: Floats, scaling: Scaling = "gc") -> Floats:
@@ -38,7 +42,7 @@ def inverse_root(covariance: Floats, scaling: Scaling = "gc") -> Floats:
     For `gc`, V = D C D with D the standard deviations and C = U Λ Uᵀ the correlation matrix;
     S = D U Λ^½, so that S Sᵀ = V and S⁻¹ ε does not depend on the units of ε. (The
     eigenvectors of V itself would turn with the units; every S with S Sᵀ = V gives the same
-    estimate.)
+    estimate. Of `MANY` blocks, those of full rank take S = D L with C = L Lᵀ.)
 
     Rule for rank-deficient V: an element of zero variance, or a direction whose eigenvalue
     of C is below 1e-10 of the largest, has no stated noise to weigh it by. It is left out:
@@ -52,12 +56,53 @@ def inverse_root(covariance: Floats, scaling: Scaling = "gc") -> Floats:
     per_std = np.where(seen, 1.0, 0.0) / np.sqrt(np.where(seen, variance, 1.0))
     if scaling == "gu":
         return np.asarray(per_std[..., None] * np.eye(k))
+    if covariance.ndim == 3 and len(covariance) >= MANY:
+        return _triangular_roots(covariance, per_std)
+    return _eigenvalue_roots(covariance, per_std)
+
+
+def _eigenvalue_roots(covariance: Floats, per_std: Floats) -> Floats:
+    """S⁻¹ (..., k, k) by eigenvalues of the correlation matrix, the rule applied."""
     correlation = covariance * per_std[..., :, None] * per_std[..., None, :]
     values, vectors = np.linalg.eigh((correlation + np.swapaxes(correlation, -1, -2)) / 2)
     kept = values > RANK_TOLERANCE * values[..., -1:]
     per_root = np.where(kept, 1.0, 0.0) / np.sqrt(np.where(kept, values, 1.0))
     rows = per_root[..., :, None] * np.swapaxes(vectors, -1, -2)
     return np.asarray(rows * per_std[..., None, :])
+
+
+def _triangular_roots(covariance: Floats, per_std: Floats) -> Floats:
+    """S⁻¹ (N, k, k) by Cholesky's factor; by eigenvalues where the rule may leave something out.
+
+    The correlation matrix has trace k, so that λ_max ≤ k, and the product of the k − 1 largest
+    eigenvalues is at most (k/(k − 1))^(k − 1) < e: λ_min > det/e. Blocks with
+    det > e k `RANK_TOLERANCE` have no eigenvalue that the rule leaves out.
+    """
+    k = covariance.shape[-1]
+    out = np.zeros(covariance.shape)
+    for rows in chunks(len(covariance)):
+        v, d, root = covariance[rows], np.asfortranarray(per_std[rows]), out[rows]
+        low: dict[tuple[int, int], Floats] = {}
+        inverse: dict[tuple[int, int], Floats] = {}
+        det = np.ones(len(v))
+        for i in range(k):
+            for j in range(i + 1):
+                rest = 0.5 * (v[:, i, j] + v[:, j, i]) * (d[:, i] * d[:, j])
+                for n in range(j):
+                    rest -= low[i, n] * low[j, n]
+                if j < i:
+                    low[i, j] = rest * inverse[j, j]
+            det *= np.maximum(rest, 0.0)
+            inverse[i, i] = 1.0 / np.sqrt(np.maximum(rest, RANK_TOLERANCE))
+            for j in range(i):
+                total = sum(low[i, n] * inverse[n, j] for n in range(j, i))
+                inverse[i, j] = -total * inverse[i, i]
+        for (i, j), x in inverse.items():
+            np.multiply(x, d[:, j], out=root[:, i, j])
+        doubtful = ~(det > math.e * k * RANK_TOLERANCE)
+        if doubtful.any():
+            root[doubtful] = _eigenvalue_roots(v[doubtful], d[doubtful])
+    return out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,6 +137,13 @@ class Bucket:
         """(G, L or 1, m, m) covariance of those means, from covariances (N, m, m)."""
         square = (self.weights[:1] if self.shared else self.weights) ** 2
         return np.asarray(np.einsum("lu,guij->glij", square, v[self.reference]))
+
+    def own_covariance(self, v: Floats) -> Floats:
+        """(G, L, m, m) covariance of each measurement, from covariances (N, m, m)."""
+        loaded = v[self.loaded]
+        if self.reference.shape[1]:
+            loaded += self.reference_covariance(v)
+        return np.asarray(loaded)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -176,12 +228,10 @@ def whitening(readings: Readings, mode: Mode, scaling: Scaling = "gc") -> Whiten
     for loaded, reference, weights in _groups(readings, mode):
         covariance = _group_covariance(readings, loaded, reference, weights)
         factor = inverse_root(covariance, scaling)
-        rank += int(np.count_nonzero(np.any(factor != 0, axis=-1)))
+        rank += int(np.count_nonzero(factor.any(axis=-1)))
         buckets.append(Bucket(loaded, reference, np.ascontiguousarray(factor), weights))
     reading = np.concatenate([b.loaded.ravel() for b in buckets])
-    own = np.concatenate(
-        [(v[b.loaded] + b.reference_covariance(v)).reshape(-1, m, m) for b in buckets]
-    )
+    own = np.concatenate([b.own_covariance(v).reshape(-1, m, m) for b in buckets])
     return Whitening(mode, scaling, m, tuple(buckets), reading, own, readings.pose[reading], rank)
 
 

@@ -22,6 +22,8 @@ from hilcal.identify.regularisation import (
     regularise,
 )
 from hilcal.model import Model
+from hilcal.regression.normal_equations import TALL
+from hilcal.regression.triangle import triangle_of
 from hilcal.types import Floats
 
 MAX_ITERATIONS = 20
@@ -106,11 +108,18 @@ def linear_problem(
 
     Flat parameters step from where they are, so that unidentifiable directions stay put; those with
     a prior are solved for as a whole, since the prior is about zero.
+
+    Many rows are reduced to a triangle once, which rank analysis, priors and solution then take in
+    place of them; unless most columns have a prior, whose products alone cost less.
     """
     live = np.flatnonzero(prior > 0)
     origin = np.where(np.isinf(prior), point.y, 0.0)
+    rows = a
+    if len(a) > TALL and 2 * np.count_nonzero(np.isinf(prior)) > len(live):
+        triangle = triangle_of(a, white)
+        a, white = triangle[:, :-1], triangle[:, -1]
     target = white + a @ (point.y - origin)[live]
-    return LinearProblem(live, origin, a, a.T @ a, target, rank, noise, whitened)
+    return LinearProblem(live, origin, a, a.T @ a, target, rank, noise, whitened, rows)
 
 
 def minimise(
@@ -134,7 +143,7 @@ def minimise(
         linear = linear.restricted(sigma)
         weighed = bool((groups[linear.live] >= 0).any()) or bool(len(of.index))
         by, aim = _step(linear, by, weighed)
-        moved = linear.a @ (aim - point.y)[linear.live]
+        moved = linear.rows @ (aim - point.y)[linear.live]
         shortcut = path.accelerated(aim, moved) if settled and problem.same_rows else None
         point = _line_search(problem, point, aim, by, shortcut)
         before, square = square, point.mean_square(len(by.basis.singular))

@@ -26,12 +26,13 @@ class LinearProblem:
     Attributes:
         live: (L,) indices of the parameters that are not held at zero.
         origin: (P,) θ_0: the point for flat parameters, zero for those with a prior.
-        a: (R, L) A.
+        a: (R', L) A, or rows that have the same products with each other and with y.
         gram: (L, L) AᵀA.
-        target: (R,) y.
+        target: (R',) y.
         rank: number of rows that carry information.
         noise: variance of the rows: 1 where the scaling whitens, else that of the residual.
         whitened: whether rows are in units of the stated noise.
+        rows: (R, L) A itself, one row per element of the readings.
     """
 
     live: Ints
@@ -42,6 +43,7 @@ class LinearProblem:
     rank: int
     noise: float
     whitened: bool
+    rows: Floats
 
     def restricted(self, prior: Floats) -> "LinearProblem":
         """Return the problem without the parameters that a prior (P,) of zero holds at zero."""
@@ -49,7 +51,9 @@ class LinearProblem:
         if kept.all():
             return self
         gram = self.gram[np.ix_(kept, kept)]
-        return replace(self, live=self.live[kept], a=self.a[:, kept], gram=gram)
+        a = self.a[:, kept]
+        rows = a if self.rows is self.a else self.rows[:, kept]
+        return replace(self, live=self.live[kept], a=a, gram=gram, rows=rows)
 
     def basis(self, scale: Floats, prior: Floats, spread: float) -> Basis:
         """Return identifiable coordinates for magnitudes (P,), priors (P,), and the residual's σ.

@@ -36,16 +36,28 @@ class Triangle:
         """(K, K) R, upper triangular."""
         return np.triu(self._r)
 
-    def add(self, rows: Floats) -> None:
-        """Reduce rows (N, K)."""
+    def add(self, rows: Floats, right: Floats | None = None) -> None:
+        """Reduce rows (N, K); (N, K − 1) with the last column `right` (N,) given apart."""
         block = min(BLOCK, len(self._r))
         for start in range(0, len(rows), ROWS):
-            part = np.asfortranarray(rows[start : start + ROWS])
-            if part.base is not None or part is rows:  # it is overwritten
-                part = part.copy(order="F")
+            some = slice(start, start + ROWS)
+            part = np.empty((len(rows[some]), len(self._r)), order="F")  # it is overwritten
+            part[:, : rows.shape[1]] = rows[some]
+            if right is not None:
+                part[:, -1] = right[some]
             self._r, _, _, info = dtpqrt(0, block, self._r, part, overwrite_a=1, overwrite_b=1)
             if info:
                 raise ArithmeticError(f"LAPACK's dtpqrt refuses argument {-info}")
+
+
+def triangle_of(a: Floats, right: Floats) -> Floats:
+    """Return the triangle (P + 1, P + 1) of a matrix A (R, P) and a column b (R,) beside it.
+
+    Its rows have the products of those of [A, b]: they can be solved in place of them.
+    """
+    whole = Triangle(a.shape[1] + 1)
+    whole.add(a, right)
+    return whole.r
 
 
 def combined(parts: Iterable[Floats], size: int) -> Floats:

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from hilcal.data.readings import Readings, States
 from hilcal.data.whitening import (
+    MANY,
     MODES,
     SCALINGS,
     Mode,
@@ -157,6 +158,24 @@ def test_whitened_errors_are_the_same_pure_numbers_in_all_units(
     white = inverse_root(v, scaling) @ eps
     other = inverse_root(u[:, None] * v * u, scaling) @ (u * eps)
     np.testing.assert_allclose(np.abs(other), np.abs(white), rtol=1e-7, atol=1e-8)
+
+
+@given(seeds, sizes)
+def test_many_blocks_give_the_squares_that_each_gives_by_itself(seed: int, k: int) -> None:
+    """Cholesky's factor or eigenvectors: V⁻¹ = S⁻ᵀ S⁻¹ is the same, singular blocks included."""
+    rng = np.random.default_rng(seed)
+    v = spd(rng, 50, k)
+    thin = rng.standard_normal((3, k, k - 1))
+    v[:3] = thin @ np.swapaxes(thin, 1, 2)
+    v[3, 0], v[3, :, 0] = 0.0, 0.0
+    u = random_units(rng, k)
+    v *= u[:, None] * u
+    one_by_one = np.stack([inverse_root(block) for block in v])
+    many = inverse_root(np.tile(v, (MANY // 50, 1, 1)))[-50:]
+    np.testing.assert_array_equal(many.any(axis=2).sum(axis=1), one_by_one.any(axis=2).sum(axis=1))
+    std = np.sqrt(np.einsum("nii->ni", v))
+    for a, b in zip(many * std[:, None], one_by_one * std[:, None], strict=True):
+        np.testing.assert_allclose(a.T @ a, b.T @ b, rtol=0, atol=1e-9 * np.abs(b.T @ b).max())
 
 
 # --- rank-deficient covariances ------------------------------------------------------------
