@@ -122,36 +122,42 @@ def by_wrench_changes(moves: Motion, blocks: list[Block], change: Floats) -> Flo
 def by_wrenches(
     blocks: list[Block],
     by_joint: Callable[[int], Floats],
-    by_slot: Callable[[int, int], Floats],
+    by_slot: Callable[[int, slice], Floats],
 ) -> dict[int, Floats]:
     """Derivatives (N, m, 6) by the wrench of each slot, from those by the deviation.
 
     Args:
         blocks: the compliance.
         by_joint: (N, m) by the displacement of a joint.
-        by_slot: (N, m, 6 − e) by the twist of a slot, from its element e on.
+        by_slot: (N, m, E) by a range of the elements of the twist of a slot.
     """
-    first: dict[int, int] = {}
+    used: dict[int, slice] = {}
     for b in blocks:
         if not b.joint:
-            first[b.to] = min(first.get(b.to, 3), 3 if b.elements.start >= 3 else 0)
-    twists = {to: by_slot(to, e) for to, e in first.items()}
+            old = used.get(b.to, b.elements)
+            start, stop = min(old.start, b.elements.start), max(old.stop, b.elements.stop)
+            used[b.to] = slice(start, stop)
+    twists = {to: by_slot(to, elements) for to, elements in used.items()}
     out: dict[int, Floats] = {}
     for b in blocks:
         if b.joint:
             found = by_joint(b.to)[..., None]
         else:
-            e = first[b.to]
+            e = used[b.to].start
             found = twists[b.to][..., b.elements.start - e : b.elements.stop - e]
         if b.slot not in out:
             out[b.slot] = zeros(*found.shape[:2], 6)
-        out[b.slot][..., b.components] += np.einsum("nme,nie->nmi", found, b.values)
+        to = out[b.slot][..., b.components]
+        if b.values.size == 1:
+            to += float(b.values[0, 0, 0]) * found
+        else:
+            to += np.einsum("nme,nie->nmi", found, b.values)
     return out
 
 
-def _by_twist(gradient: MotionGradient, frames: SlotFrames, slot: int, first: int) -> Floats:
-    """Derivative (N, m, 6 − first) by the twist of a slot, from that by its motion."""
-    return frames.by_twist(slot, gradient.displacement(slot), gradient.turn(slot), first)
+def _by_twist(gradient: MotionGradient, frames: SlotFrames, slot: int, elements: slice) -> Floats:
+    """Derivative (N, m, E) by elements of the twist of a slot, from that by its motion."""
+    return frames.by_twist(slot, gradient.displacement(slot), gradient.turn(slot), elements)
 
 
 def _norm(form: Mapping[int, Floats]) -> float:

@@ -1,6 +1,5 @@
 """A model is a cell and a tuple of effects; `model + effect` is a new model."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING
@@ -18,7 +17,7 @@ from hilcal.errors import CannotAnswerError, InputError
 from hilcal.observe import Motion, Observation, motion, observe
 from hilcal.robot import chain as chains
 from hilcal.robot import se3
-from hilcal.robot.batch import along_states, chunks, join, take, zeros
+from hilcal.robot.batch import along_states, by_field, chunks, put, room, take, zeros
 from hilcal.robot.chain import Chain
 from hilcal.robot.deviation import Deviation
 from hilcal.robot.geometric_stiffness import geometric_stiffness
@@ -61,6 +60,14 @@ class Prediction:
             load=replace(s.load, wrench=s.load.wrench[rows]),
         )
         return Prediction(chosen, take(self.deviation, rows), take(self.observation, rows))
+
+    def put(self, rows: slice, part: "Prediction") -> None:
+        """Write the prediction of the chosen states; the chain's twists are the deviation's."""
+        s, of = self.situation, part.situation
+        put(self.deviation, rows, part.deviation)
+        put(self.observation, rows, part.observation)
+        put(s.chain, rows, replace(of.chain, twist=None), axis=1)
+        s.angle[rows], s.wrench[rows], s.load.wrench[rows] = of.angle, of.wrench, of.load.wrench
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,8 +148,16 @@ class Model:
         Raises:
             CannotAnswerError: the deviations grow instead of settling.
         """
-        parts = [self._equilibrium(states[rows], theta) for rows in chunks(len(states))]
-        return _joined(states, parts)
+        whole: Prediction | None = None
+        for rows in chunks(len(states)):
+            part = self._equilibrium(states[rows], theta)
+            if len(part.situation.angle) == len(states):
+                return part
+            # Written at once: chunks that are kept until the end take new memory each.
+            whole = _room(states, part) if whole is None else whole
+            whole.put(rows, part)
+        assert whole is not None  # noqa: S101 - there is always a chunk
+        return whole
 
     def _equilibrium(self, states: States, theta: Floats) -> Prediction:
         """Return the equilibrium of a chunk of states."""
@@ -338,23 +353,20 @@ def _flange_motion(a: Chain, b: Chain, reach: float) -> float:
     return float(max(shift, reach * turn))
 
 
-def _joined(states: States, parts: Sequence[Prediction]) -> Prediction:
-    """Put the predictions of successive chunks of the states together."""
-    if len(parts) == 1:
-        return parts[0]
-    situations = [part.situation for part in parts]
+def _room(states: States, part: Prediction) -> Prediction:
+    """Return the prediction of all states, yet to be written, from that of a chunk of them."""
+    count, s = len(states), part.situation
+    deviation = by_field([part.deviation], lambda given: room(given[0], count))
+    observation = by_field([part.observation], lambda given: room(given[0], count))
+    chain = by_field([replace(s.chain, twist=None)], lambda given: room(given[0], count, axis=1))
+    if deviation.twist is not None:
+        chain = replace(chain, twist=np.swapaxes(deviation.twist, 0, 1))
     situation = replace(
-        situations[0],
+        s,
         states=states,
-        angle=np.concatenate([s.angle for s in situations]),
-        chain=join([s.chain for s in situations], axis=1),
-        wrench=np.concatenate([s.wrench for s in situations]),
-        load=replace(
-            situations[0].load, wrench=np.concatenate([s.load.wrench for s in situations])
-        ),
+        angle=room(s.angle, count),
+        chain=chain,
+        wrench=room(s.wrench, count),
+        load=replace(s.load, wrench=room(s.load.wrench, count)),
     )
-    return Prediction(
-        situation,
-        join([part.deviation for part in parts]),
-        join([part.observation for part in parts]),
-    )
+    return Prediction(situation, deviation, observation)

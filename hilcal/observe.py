@@ -4,6 +4,7 @@ T_sensor_target = exp(station) T_sensor_base exp(base) T_base_flange T_flange_ta
 position read   = (1 + scale) · position
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,6 +17,9 @@ from hilcal.robot.chain import Chain, joint_jacobian, twist_jacobian
 from hilcal.robot.deviation import Deviation
 from hilcal.robot.geometric_stiffness import MotionGradient, rows_times
 from hilcal.types import Floats, Ints
+
+ALL = slice(0, 6)
+"""All elements of a twist."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,9 +111,13 @@ class Motion:
             return out
         if c.field == "twist":
             out = empty(len(self.dq), self.m, len(c.parameter))
-            for slot in np.unique(c.element):
-                mine = c.element == slot
-                out[:, :, mine] = _per_column(self.by_slot(int(slot)), c.values[:, mine])
+            twists: dict[int, Floats] = {}
+            used = _range([e for e in range(6) if c.values[..., e].any()])
+            for slot, mine in c.runs():
+                if slot not in twists:
+                    twists[slot] = self.by_slot(slot, used)
+                values = along_states(c.values[:, mine, used])
+                np.einsum("nie,npe->nip", twists[slot], values, out=out[:, :, mine])
             return out
         sides = {"base": self.by_base, "station": self.by_station, "target": self.by_target}
         return _per_column(sides[c.field](), c.values)
@@ -120,13 +128,13 @@ class Motion:
         drive = self.cell.arm.drive
         return self.dq if drive is None else np.asarray(self.dq @ drive)
 
-    def by_slot(self, slot: int, first: int = 0) -> Floats:
-        """Motion (N, m, 6 − first) by the twist of a slot, from its element `first` (0 or 3) on."""
+    def by_slot(self, slot: int, elements: slice = ALL) -> Floats:
+        """Motion (N, m, E) by some elements of the twist of a slot."""
         v, w = self._rigid(slot)
         if self.yielding is not None:
             more = self.yielding.displacement(slot)
             v, w = v if more is None else v + more, w + self.yielding.turn(slot)
-        return self.frames.by_twist(slot, v, w, first)
+        return self.frames.by_twist(slot, v, w, elements)
 
     def _rigid(self, slot: int) -> tuple[Floats, Floats]:
         """Rows (N, m, 3) by displacement and turn of all beyond a slot, as of a rigid body."""
@@ -134,7 +142,7 @@ class Motion:
             o, scale = self.observation, self.deviation.scale
             axes = o.axes if scale is None else o.axes * (1 + scale[:, None, None])
             lever = o.base_position - self.chain.position[slot]
-            v, w = axes, rows_times(axes, se3.skew(lever), transposed=True)
+            v, w = axes, se3.cross(lever[:, None], axes)
             if self.m == 6:
                 v, w = (np.concatenate(x, axis=1) for x in ((axes, 0 * axes), (w, o.axes)))
             self._known[slot] = v, w
@@ -189,17 +197,28 @@ class SlotFrames:
     chain: Chain
     known: dict[int, tuple[Floats, Floats | None]] = field(default_factory=dict)
 
-    def by_twist(self, slot: int, v: Floats | None, w: Floats, first: int) -> Floats:
-        """Rows (N, m, 6 − first) by the twist, from rows by v (None for zero) and ω, base axes."""
+    def by_twist(self, slot: int, v: Floats | None, w: Floats, elements: slice = ALL) -> Floats:
+        """Rows (N, m, E) by the twist, from rows by v (None for zero) and ω (N, m, 3), base axes.
+
+        Args:
+            slot: whose twist.
+            v: rows by the displacement.
+            w: rows by the turn.
+            elements: range of the elements of the twist.
+        """
         turned, shift = self._blocks(slot)
-        out = empty(*w.shape[:2], 6 - first)
-        np.einsum("nmi,nij->nmj", w, turned, out=out[..., -3:])
-        if v is not None and shift is not None:
-            out[..., -3:] += rows_times(v, shift)
-        if not first and v is not None:
-            np.einsum("nmi,nij->nmj", v, turned, out=out[..., :3])
-        elif not first:
-            out[..., :3] = 0.0
+        start, stop = elements.start, elements.stop
+        out = empty(*w.shape[:2], stop - start)
+        split = max(min(3, stop) - start, 0)
+        if split and v is not None:
+            np.einsum("nmi,nij->nmj", v, turned[..., start : start + split], out=out[..., :split])
+        elif split:
+            out[..., :split] = 0.0
+        if stop > 3:
+            turns = slice(max(start - 3, 0), stop - 3)
+            np.einsum("nmi,nij->nmj", w, turned[..., turns], out=out[..., split:])
+            if v is not None and shift is not None:
+                out[..., split:] += rows_times(v, shift[..., turns])
         return out
 
     def _blocks(self, slot: int) -> tuple[Floats, Floats | None]:
@@ -221,6 +240,11 @@ def motion(
     moved = joint_jacobian(chain, observation.base_position)
     dq = _to_sensor(observation, deviation, moved, m)
     return Motion(cell, observation, chain, deviation, m, SlotFrames(chain), dq)
+
+
+def _range(elements: Sequence[int]) -> slice:
+    """Range of the elements of a twist that covers some of them; one where there is none."""
+    return slice(min(elements), max(elements) + 1) if elements else slice(5, 6)
 
 
 def _still(o: Observation) -> Floats:

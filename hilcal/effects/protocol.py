@@ -383,7 +383,10 @@ def total(columns: tuple[Columns, ...], theta: Floats, s: Situation) -> Deviatio
         t = theta[c.parameter]
         if c.field in ("dq", "twist"):
             for e, mine in c.runs():
-                field[:, e] += np.tensordot(c.values[:, mine], t[mine], axes=(1, 0))
+                if mine.stop - mine.start == 1:
+                    field[:, e] += c.values[:, mine.start] * t[mine.start]
+                else:
+                    field[:, e] += np.tensordot(c.values[:, mine], t[mine], axes=(1, 0))
         else:
             field += np.einsum("np...,p->n...", c.values, t)
     return Deviation(**fields)

@@ -21,6 +21,11 @@ BUDGET = 1 << 20
 """Numbers of a chunk's largest array, 8 MB; a choice by timing."""
 LEAST_CHUNK = 256
 """States of a chunk, at least: Python's share of the time grows with the number of chunks."""
+_LARGEST = (32 << 20) - (64 << 10)
+"""Bytes. The C library (glibc) hands freed memory back to the system beyond twice the largest block
+freed so far, if that was below 32 MiB. Without a block of this size freed first, the temporaries of
+each chunk are handed back and taken anew, page by page: a third of the time of a Jacobian. Source:
+mallopt(3), M_MMAP_THRESHOLD."""
 
 
 class Record(Protocol):
@@ -55,6 +60,8 @@ def chunks(count: int, numbers: int = 0) -> Iterator[slice]:
         numbers: that are computed for each state, where they are many: chunks are smaller then.
     """
     size = CHUNK if numbers == 0 else max(LEAST_CHUNK, min(CHUNK, BUDGET // numbers))
+    if count > size:
+        np.empty(_LARGEST, dtype=np.uint8)  # freed at once
     for start in range(0, max(count, 1), size):
         yield slice(start, min(start + size, count))
 
@@ -65,9 +72,18 @@ def take(record: R, rows: slice, axis: int = 0) -> R:
     return by_field([record], lambda given: given[0][index])
 
 
-def join(records: Sequence[R], axis: int = 0) -> R:
-    """Put the records of successive chunks of states together."""
-    return by_field(records, lambda given: np.concatenate(given, axis=axis))
+def room(part: Floats, count: int, axis: int = 0) -> Floats:
+    """Return an empty array for `count` states, otherwise like that of a chunk of them."""
+    shape = (*part.shape[:axis], count, *part.shape[axis + 1 :])
+    return np.empty_like(part, shape=shape)
+
+
+def put(whole: R, rows: slice, part: R, axis: int = 0) -> None:
+    """Write a record of the chosen states into one of all states."""
+    for f in fields(whole):
+        values = getattr(part, f.name)
+        if values is not None:
+            getattr(whole, f.name)[(*(slice(None),) * axis, rows)] = values
 
 
 def by_field(records: Sequence[R], combine: Callable[[Sequence[Floats]], Floats]) -> R:
