@@ -27,7 +27,7 @@ from hilcal.effects.protocol import Effect
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit
 from hilcal.identify.linearisation import EffectColumns, Linearisation, effect_columns, linearise
-from hilcal.regression.evidence import FamilyScore
+from hilcal.regression.evidence import FamilyScore, Spectrum, spectrum
 from hilcal.types import Floats
 
 SAME_EVIDENCE = 3.0
@@ -230,8 +230,8 @@ def ranked(suspects: Iterable[Suspect], rejected: Collection[str] = ()) -> tuple
 
 def _suspect(p: Linearisation, of: EffectColumns, bare: Unloaded | None, level: float) -> Suspect:
     s = p.information(of.white)
-    largest = most(of, bare)
-    result = p.score(of.white, s, largest)
+    of_s, largest = spectrum(s), most(of, bare)
+    result = p.score(of.white, of_s, largest)
     held = p.held_out(of.white, result)
 
     def least() -> Strength:
@@ -243,9 +243,10 @@ def _suspect(p: Linearisation, of: EffectColumns, bare: Unloaded | None, level: 
             p.fit.dof,
             max(p.fit.variance_factor, 1.0),
             level,
+            of_s.rank,
         )
-        if large(of, s, p.fit.dof):
-            return least_of_family(p, of, s, found, level, LEAST_SHARE, largest)
+        if large(of_s, p.fit.dof):
+            return least_of_family(p, of, of_s, found, level, LEAST_SHARE, largest)
         return found
 
     detection = Detection(least)
@@ -259,7 +260,7 @@ def _suspect(p: Linearisation, of: EffectColumns, bare: Unloaded | None, level: 
         holdout_share=held.share,
         explains=False,
         sure=held.sure,
-        needs=_implausible(p, of, s, result, largest),
+        needs=_implausible(p, of, of_s, result, largest),
         detection=detection,
     )
 
@@ -270,7 +271,7 @@ def _computed(found: Strength) -> Detection:
 
 
 def _implausible(
-    p: Linearisation, of: EffectColumns, s: Floats, at_most: FamilyScore, largest: float
+    p: Linearisation, of: EffectColumns, s: Spectrum, at_most: FamilyScore, largest: float
 ) -> tuple[tuple[str, float, float], ...]:
     """Size that an effect needs where plausible ones explain less, and plausible sizes, by unit."""
     free = p.score(of.white, s)

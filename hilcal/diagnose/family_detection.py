@@ -10,13 +10,14 @@ beside it.
 """
 
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
 from hilcal.diagnose.minimum_detectable_effect import POWER, Strength
 from hilcal.identify.linearisation import EffectColumns, Linearisation, by_pose, effect_columns
-from hilcal.regression.evidence import LARGE_FAMILY, score_family, visible
-from hilcal.regression.leave_out import left_out_residuals
+from hilcal.regression.evidence import LARGE_FAMILY, Spectrum, score_family
+from hilcal.regression.leave_out import FamilyFolds
 from hilcal.regression.paired_test import improves
 from hilcal.types import Floats
 
@@ -27,16 +28,15 @@ GRID = np.logspace(0.0, 1.5, 7)
 _SEED = 20240612
 
 
-def large(of: EffectColumns, s: Floats, dof: float) -> bool:
+def large(s: Spectrum, dof: float) -> bool:
     """Whether a family is large against the degrees of freedom, which hides what it predicts."""
-    values = np.asarray(np.linalg.eigvalsh((s + s.T) / 2), dtype=float)
-    return int(visible(values).sum()) > LARGE_FAMILY * dof
+    return s.rank > LARGE_FAMILY * dof
 
 
 def least_of_family(
     p: Linearisation,
     of: EffectColumns,
-    s: Floats,
+    s: Spectrum,
     start: Strength,
     level: float,
     least_share: float,
@@ -47,7 +47,7 @@ def least_of_family(
     Args:
         p: linearisation of the fit.
         of: the family, as it is scored.
-        s: (P, P) its information.
+        s: spectrum of its information.
         start: what the F-test alone would reveal.
         level: of the test, between 0 and 1.
         least_share: share of the misfit on poses left out that must be explained.
@@ -56,24 +56,17 @@ def least_of_family(
     if not start.visible:
         return start
     fine = of.effect.fine(p.fit.readings[~p.fit.outlier].states)
-    least = _least(p, of, of, s, start, level, least_share, largest)
+    tests = SuspectTests(p, of, s, level, least_share, largest)
+    least = _least(tests, of, start)
     if fine is None:
         return least
-    finest = _least(p, of, effect_columns(p.fit, fine), s, start, level, least_share, largest)
+    finest = _least(tests, effect_columns(p.fit, fine), start)
     return replace(least, finest_m=finest.displacement_m)
 
 
-def _least(
-    p: Linearisation,
-    of: EffectColumns,
-    full: EffectColumns,
-    s: Floats,
-    start: Strength,
-    level: float,
-    least_share: float,
-    largest: float,
-) -> Strength:
-    """`least_of_family` where the parameters of `full` are there and those of `of` are scored."""
+def _least(tests: "SuspectTests", full: EffectColumns, start: Strength) -> Strength:
+    """`least_of_family` where the parameters of `full` are there and those of a family scored."""
+    p = tests.p
     rng = np.random.default_rng(_SEED)
     beta = rng.standard_normal((full.white.shape[1], DRAWS))
     signal = full.white @ beta
@@ -82,7 +75,7 @@ def _least(
     moved = np.sqrt(np.mean(np.sum(np.einsum("dip,pk->dik", full.motion, beta) ** 2, axis=1)))
     for displacement in GRID * start.displacement_m:
         t = float(displacement / moved)
-        if np.mean(found(p, of, s, t * signal + error, level, least_share, largest)) >= POWER:
+        if np.mean(tests.found(t * signal + error)) >= POWER:
             own = tuple(
                 (unit, t * float(np.sqrt(np.mean(full.scale[_of_unit(full, unit)] ** 2))))
                 for unit, _ in start.parameters
@@ -97,31 +90,46 @@ def _of_unit(of: EffectColumns, unit: str) -> list[int]:
     return [k for k, q in enumerate(of.effect.parameters) if q.unit == unit]
 
 
-def found(
-    p: Linearisation,
-    of: EffectColumns,
-    s: Floats,
-    y: Floats,
-    level: float,
-    least_share: float,
-    largest: float,
-) -> list[bool]:
-    """Whether each of K simulated residuals y (R, K) would reveal the family."""
-    r = p.project_out(y)
-    g, rss = of.white.T @ r, np.sum(r * y, axis=0)
-    scores = [
-        score_family(s, g[:, k], float(rss[k]), p.fit.dof, most=largest) for k in range(y.shape[1])
-    ]
-    able = [c.p_value < level and c.log_evidence > 0 for c in scores]
-    if np.mean(able) < POWER:
-        return able
-    ridge = float(np.median([c.ridge for c in scores]))
-    before = left_out_residuals(p.folds, p.projection, y)
-    after = left_out_residuals(p.folds, p.projection, y, of.white, ridge)
-    rank = p.fit.whitening.rank
-    out = []
-    for k, fit_able in enumerate(able):
-        a, b = by_pose(p.fit, before[:, k]), by_pose(p.fit, after[:, k])
-        share = float(a.sum() - b.sum()) / max(float(a.sum()) - rank, 1.0)
-        out.append(fit_able and share >= least_share and improves(a, b))
-    return out
+class SuspectTests:
+    """The tests that a suspect must pass, of simulated residuals."""
+
+    def __init__(
+        self,
+        p: Linearisation,
+        of: EffectColumns,
+        s: Spectrum,
+        level: float,
+        least_share: float,
+        largest: float,
+    ) -> None:
+        """Take what `least_of_family` takes."""
+        self.p, self._x, self._s = p, of.white, s
+        self._level, self._least_share, self._largest = level, least_share, largest
+
+    @cached_property
+    def _folds(self) -> tuple[FamilyFolds, FamilyFolds]:
+        """The model without each fold, without the family and with it."""
+        p = self.p
+        return FamilyFolds(p.folds, p.projection), FamilyFolds(p.folds, p.projection, self._x)
+
+    def found(self, y: Floats) -> list[bool]:
+        """Whether each of K simulated residuals y (R, K) would reveal the family."""
+        p = self.p
+        r = p.project_out(y)
+        g, rss = self._x.T @ r, np.sum(r * y, axis=0)
+        scores = [
+            score_family(self._s, g[:, k], float(rss[k]), p.fit.dof, most=self._largest)
+            for k in range(y.shape[1])
+        ]
+        able = [c.p_value < self._level and c.log_evidence > 0 for c in scores]
+        if np.mean(able) < POWER:
+            return able
+        ridge = float(np.median([c.ridge for c in scores]))
+        before, after = (of.left_out(y, ridge) for of in self._folds)
+        rank = p.fit.whitening.rank
+        out = []
+        for k, fit_able in enumerate(able):
+            a, b = by_pose(p.fit, before[:, k]), by_pose(p.fit, after[:, k])
+            share = float(a.sum() - b.sum()) / max(float(a.sum()) - rank, 1.0)
+            out.append(fit_able and share >= self._least_share and improves(a, b))
+        return out

@@ -50,6 +50,7 @@ def least_strength(
     dof: float,
     variance: float,
     level: float,
+    rank: int | None = None,
 ) -> Strength:
     """Return the smallest strength of a family that would be revealed.
 
@@ -62,22 +63,24 @@ def least_strength(
         dof: degrees of freedom of the fit.
         variance: its variance factor: how much larger than stated the scatter is, at least 1.
         level: of the test, between 0 and 1.
+        rank: number of directions that can be tested, where it is known.
     """
-    values = np.asarray(np.linalg.eigvalsh((s + s.T) / 2), dtype=float)
-    rank = int(visible(values).sum())
+    if rank is None:
+        values = np.asarray(np.linalg.eigvalsh((s + s.T) / 2), dtype=float)
+        rank = int(visible(values).sum())
     unseen = Strength(np.inf, tuple((u, np.inf) for u in dict.fromkeys(units)))
     if rank == 0 or dof - rank < 1:
         return unseen
     wanted = noncentrality_of_power(rank, dof - rank, level, POWER)
     beta = np.random.default_rng(_SEED).standard_normal((DIRECTIONS, len(s)))
-    gain = np.einsum("kp,pq,kq->k", beta, s, beta)
+    gain = np.sum(beta @ s * beta, axis=1)
     if float(np.median(gain)) <= 0.0:
         return unseen
     t = np.sqrt(wanted * variance / np.maximum(gain, 1e-300))
     typical = float(np.median(t))
     flat = motion.reshape(-1, motion.shape[2])
     gram = flat.T @ flat / len(motion)
-    moved = t * np.sqrt(np.einsum("kp,pq,kq->k", beta, gram, beta))
+    moved = t * np.sqrt(np.sum(beta @ gram * beta, axis=1))
     names = np.array(units)
     own = tuple(
         (unit, typical * float(np.sqrt(np.mean(scale[names == unit] ** 2))))

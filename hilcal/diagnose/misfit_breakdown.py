@@ -7,6 +7,7 @@ family is scored like a suspect, so its p-value is exact; its share is the part 
 it predicts on poses left out. It names no cause.
 """
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -23,6 +24,8 @@ ROW_ORDER = "row order"
 """The variable in place of the time where the readings do not state it: a drift shows by it."""
 MANY = 4000
 """Degrees of freedom from which the families of joint angles are finer."""
+MOST_AT_ONCE = 8_000_000
+"""Numbers of the columns that are scored together, 64 MB; a choice."""
 
 
 Group = Literal["joints", "load and target", "time and air", "pose", "direction"]
@@ -75,24 +78,49 @@ def misfit_breakdown(p: Linearisation) -> tuple[MisfitShare, ...]:
     # Motions of ordinary size: 1 mrad of a joint, 1 mm of the target.
     generic = 1e-3 * np.concatenate([moves.drives, axes], axis=2)
     at_measurement = generic[w.reading]
-    raws = []
-    for name, basis, follows_load in _variables(p):
-        if follows_load:
-            raws.append((name, w.raw(_times(generic, basis))))
-        else:
-            raws.append((name, _times(at_measurement, basis[w.reading])))
-    target = fit.readings.target[~fit.outlier][w.reading]
-    if np.ptp(target) > 0:
-        member = (target[:, None] == np.unique(target)).astype(float)
-        raws.append(("target", 1e-3 * _times(moves.by_target()[w.reading, :, :3], member)))
-    out = []
-    for name, raw in raws:
-        x = w.whiten(raw).reshape(-1, raw.shape[2])
-        result = p.score(x)
-        share = max(p.held_out(x, result).share, 0.0)
-        out.append(MisfitShare(name, share, result.p_value))
+
+    def raws() -> Iterator[tuple[str, Floats]]:
+        for name, basis, follows_load in _variables(p):
+            if follows_load:
+                yield name, w.raw(_times(generic, basis))
+            else:
+                yield name, _times(at_measurement, basis[w.reading])
+        target = fit.readings.target[~fit.outlier][w.reading]
+        if np.ptp(target) > 0:
+            member = (target[:, None] == np.unique(target)).astype(float)
+            yield "target", 1e-3 * _times(moves.by_target()[w.reading, :, :3], member)
+
+    columns = ((n, w.whiten(raw).reshape(-1, raw.shape[2])) for n, raw in raws())
+    out = [share for batch in _batches(columns) for share in _shares(p, batch)]
     out += [*_poses(p), *_axes(p)]
     return tuple(sorted(out, key=lambda v: (-v.share, v.p_value)))
+
+
+_Named = tuple[str, Floats]
+
+
+def _batches(columns: Iterable[_Named]) -> Iterator[list[_Named]]:
+    """Collect named columns up to `MOST_AT_ONCE` numbers."""
+    batch: list[_Named] = []
+    size = 0
+    for name, x in columns:
+        if batch and size + x.size > MOST_AT_ONCE:
+            yield batch
+            batch, size = [], 0
+        batch.append((name, x))
+        size += x.size
+    if batch:
+        yield batch
+
+
+def _shares(p: Linearisation, batch: list[_Named]) -> list[MisfitShare]:
+    """Score named columns (R, F)."""
+    scores = [p.score(x) for _, x in batch]
+    held = p.held_out_each([(x, s) for (_, x), s in zip(batch, scores, strict=True)])
+    return [
+        MisfitShare(name, max(of.share, 0.0), score.p_value)
+        for (name, _), score, of in zip(batch, scores, held, strict=True)
+    ]
 
 
 def _times(motions: Floats, basis: Floats) -> Floats:

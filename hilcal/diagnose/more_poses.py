@@ -15,13 +15,14 @@ import numpy as np
 
 from hilcal.data.readings import Readings
 from hilcal.diagnose.effect_ranking import FALSE_ALARM, LEAST_SHARE
-from hilcal.diagnose.family_detection import found
+from hilcal.diagnose.family_detection import SuspectTests
 from hilcal.diagnose.plausible_size import most, unloaded_readings
 from hilcal.diagnose.stepwise import add
 from hilcal.effects.protocol import Effect
 from hilcal.errors import HilcalError
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.linearisation import Linearisation, effect_columns, linearise
+from hilcal.regression.evidence import spectrum
 from hilcal.robot import se3
 
 DRAWS = 24
@@ -114,9 +115,9 @@ def chance(
     there = effect_columns(then, full.with_options(states)).white
     signal = t * there @ rng.standard_normal((there.shape[1], DRAWS))
     y = signal + rng.standard_normal(signal.shape)
-    s = q.information(scored.white)
+    s = spectrum(q.information(scored.white))
     largest = most(scored, unloaded_readings(then))
-    return float(np.mean(found(q, scored, s, y, level, least, largest)))
+    return float(np.mean(SuspectTests(q, scored, s, level, least, largest).found(y)))
 
 
 def pose_powers(before: Fit, effects: Sequence[str], more: int) -> Iterator[PosePower]:

@@ -4,6 +4,7 @@ The ranking of effects that could be missing and the planning of measurements th
 both use it, so that the planner's power and the diagnosis's test are of the same information.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -16,8 +17,8 @@ from hilcal.identify.gauss_newton import columns_of
 from hilcal.identify.holdout import folds_of
 from hilcal.identify.priors import scales_of
 from hilcal.regression.backward_elimination import ReducedModel, eliminate_columns
-from hilcal.regression.evidence import FamilyScore, score_family
-from hilcal.regression.leave_out import Fold, left_out_residual
+from hilcal.regression.evidence import FamilyScore, Spectrum, score_family
+from hilcal.regression.leave_out import Fold, left_out_of_families, left_out_residual
 from hilcal.regression.paired_test import improves
 from hilcal.regression.projection import Projection
 from hilcal.types import Floats, Ints
@@ -106,12 +107,14 @@ class Linearisation:
         """Return S = Xᵀ M X (P, P) of whitened columns X (R, P)."""
         return self.projection.information(x)
 
-    def score(self, x: Floats, s: Floats | None = None, most: float = np.inf) -> FamilyScore:
+    def score(
+        self, x: Floats, s: Floats | Spectrum | None = None, most: float = np.inf
+    ) -> FamilyScore:
         """Score whitened columns X (R, P) beside the model.
 
         Args:
             x: X.
-            s: (P, P) S where it is known.
+            s: (P, P) S where it is known, or its spectrum.
             most: largest plausible strength.
         """
         s = self.information(x) if s is None else s
@@ -133,9 +136,19 @@ class Linearisation:
             x: (R, P) whitened columns of the family.
             found: their score, for the ridge.
         """
-        if found.rank == 0:
-            return HeldOut(0.0, False)
-        left = left_out_residual(self.folds, self.projection, self.fit.white, x, found.ridge)
+        return self.held_out_each([(x, found)])[0]
+
+    def held_out_each(self, families: Sequence[tuple[Floats, FamilyScore]]) -> list[HeldOut]:
+        """Return `held_out` of several families, each beside the model by itself."""
+        seen = [(x, found.ridge) for x, found in families if found.rank]
+        left = iter(left_out_of_families(self.folds, self.projection, self.fit.white, seen))
+        return [
+            self._held_out(next(left)) if found.rank else HeldOut(0.0, False)
+            for _, found in families
+        ]
+
+    def _held_out(self, left: Floats) -> HeldOut:
+        """Compare residuals (R,) predicted without their poses with those of the model alone."""
         noise = self.fit.whitening.rank
         before, after = self.left_out, by_pose(self.fit, left)
         misfit = max(float(before.sum()) - noise, LEAST_MISFIT * np.sqrt(2 * noise))

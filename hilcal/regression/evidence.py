@@ -120,13 +120,44 @@ def _posterior_strengths(lam: Floats, explained: Floats, rss: float, dof: float)
     return np.asarray(STRENGTHS * np.sqrt(left / rss))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Spectrum:
+    """Eigenvalues and eigenvectors of S, which every score of a family needs.
+
+    Attributes:
+        values: (P,) eigenvalues, ascending.
+        vectors: (P, P) eigenvectors, in columns.
+        seen: (P,) which belong to directions that can be tested.
+    """
+
+    values: Floats
+    vectors: Floats
+    seen: Bools
+
+    @property
+    def rank(self) -> int:
+        """Number of directions that can be tested."""
+        return int(self.seen.sum())
+
+
+def spectrum(s: Floats) -> Spectrum:
+    """Return the spectrum of S (P, P)."""
+    values, vectors = np.linalg.eigh((s + s.T) / 2)
+    return Spectrum(values, vectors, visible(values))
+
+
 def score_family(
-    s: Floats, g: Floats, rss: float, dof: float, spent: float = 0.0, most: float = np.inf
+    s: Floats | Spectrum,
+    g: Floats,
+    rss: float,
+    dof: float,
+    spent: float = 0.0,
+    most: float = np.inf,
 ) -> FamilyScore:
     """Score a family.
 
     Args:
-        s: (P, P) S.
+        s: (P, P) S, or its spectrum.
         g: (P,) g.
         rss: ‖r‖².
         dof: degrees of freedom ν of r.
@@ -136,9 +167,8 @@ def score_family(
         most: largest plausible standard deviation of the parameters; the test does not depend on
             it.
     """
-    values, vectors = np.linalg.eigh((s + s.T) / 2)
-    seen = visible(values)
-    rank = int(seen.sum())
+    of = s if isinstance(s, Spectrum) else spectrum(s)
+    values, vectors, seen, rank = of.values, of.vectors, of.seen, of.rank
     if rank == 0 or rss <= 0 or dof - spent <= 1:
         return NOTHING
     lam, u = values[seen], vectors[:, seen]

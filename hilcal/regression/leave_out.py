@@ -12,6 +12,7 @@ standard deviation is their magnitude in the full fit. A direction that the othe
 the model without it where it is not.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
 
@@ -112,20 +113,49 @@ def left_out_residual(
         for fold in folds:
             left[fold.out] = white[fold.out] - p.rows[fold.out] @ fold.step()
         return left
-    parts = [_Products.of(p.rows[f.out], x[f.out], white[f.out]) for f in folds]
-    whole = reduce(_Products.plus, parts)
+    return left_out_of_families(folds, p, white, [(x, ridge)])[0]
+
+
+def left_out_of_families(
+    folds: tuple[Fold, ...], p: Projection, white: Floats, families: Sequence[tuple[Floats, float]]
+) -> list[Floats]:
+    """Return `left_out_residual` (R,) of each family, each beside the model by itself.
+
+    A fold's rows of the model's columns are copied once for all of them.
+
+    Args:
+        folds: of the model.
+        p: the model's columns.
+        white: (R,) residual of the model fitted to all rows.
+        families: (R, F) whitened columns and ridge of each.
+    """
+    parts: list[list[_Products]] = [[] for _ in families]
+    for fold in folds:
+        own, y = p.rows[fold.out], white[fold.out]
+        for of, (x, _) in zip(parts, families, strict=True):
+            of.append(_Products.of(own, x[fold.out], y))
+    whole = [reduce(_Products.plus, of) for of in parts]
+    found = [np.zeros(len(white)) for _ in families]
+    for f, fold in enumerate(folds):
+        own = p.rows[fold.out]
+        for (x, ridge), of, total, left in zip(families, parts, whole, found, strict=True):
+            back, step = _without(fold, total, of[f], ridge)
+            left[fold.out] = white[fold.out] - own @ back - x[fold.out] @ step
+    return found
+
+
+def _without(
+    fold: Fold, whole: "_Products", own: "_Products", ridge: float
+) -> tuple[Floats, Floats]:
+    """Return the steps (K,) of the model and (F,) of a family without a fold."""
     least = max(ridge, FAMILY_ROUNDING * float(whole.gram.max(initial=0.0)))
-    left = np.zeros(len(white))
-    for fold, own in zip(folds, parts, strict=True):
-        # Eliminate the model's own coordinates, then solve for the family.
-        lifted = fold.inverse_root @ np.column_stack([whole.cross - own.cross, fold.rhs])
-        along, size = lifted[:, :-1], lifted[:, -1]
-        h = whole.gram - own.gram - along.T @ along
-        h[np.diag_indices_from(h)] += least
-        step = positive_solve(h, whole.rhs - own.rhs - along.T @ size)
-        back = fold.inverse_root.T @ (size - along @ step)
-        left[fold.out] = white[fold.out] - p.rows[fold.out] @ back - x[fold.out] @ step
-    return left
+    # Eliminate the model's own coordinates, then solve for the family.
+    lifted = fold.inverse_root @ np.column_stack([whole.cross - own.cross, fold.rhs])
+    along, size = lifted[:, :-1], lifted[:, -1]
+    h = whole.gram - own.gram - along.T @ along
+    h[np.diag_indices_from(h)] += least
+    step = positive_solve(h, whole.rhs - own.rhs - along.T @ size)
+    return fold.inverse_root.T @ (size - along @ step), step
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -146,6 +176,51 @@ class _Products:
         return _Products(self.cross + other.cross, self.gram + other.gram, self.rhs + other.rhs)
 
 
+class FamilyFolds:
+    """Model and family without each fold, for any residuals and ridges: products formed once."""
+
+    def __init__(self, folds: tuple[Fold, ...], p: Projection, x: Floats | None = None) -> None:
+        """Form the products.
+
+        Args:
+            folds: of the model; their right-hand sides are not used.
+            p: the model's columns.
+            x: (R, F) whitened columns of the family; None for the model alone.
+        """
+        self._x = x = np.zeros((len(p.rows), 0)) if x is None else x
+        self._folds, self._p = folds, p
+        gram, cross = x.T @ x, p.rows.T @ x
+        self._rounding = FAMILY_ROUNDING * float(gram.max(initial=0.0))
+        self._of = []
+        for fold in folds:
+            out = x[fold.out]
+            c = cross - p.rows[fold.out].T @ out
+            at = fold.solve(c)
+            self._of.append((c, at, gram - out.T @ out - c.T @ at))
+
+    def left_out(self, y: Floats, ridge: float = 0.0) -> Floats:
+        """Return `left_out_residual` (R, K) of K residuals of models at zero, as simulated ones.
+
+        Args:
+            y: (R, K) what remains where all parameters are zero.
+            ridge: of the family's parameters.
+        """
+        x, p = self._x, self._p
+        total, rhs = p.rows.T @ y, x.T @ y
+        least = max(ridge, self._rounding)
+        left = np.zeros(y.shape)
+        for fold, (c, at, gram) in zip(self._folds, self._of, strict=True):
+            out, own, r = x[fold.out], p.rows[fold.out], y[fold.out]
+            steps = fold.solve(total - own.T @ r)
+            left[fold.out] = r - own @ steps
+            if x.shape[1]:
+                h, b = gram.copy(), rhs - out.T @ r - c.T @ steps
+                h[np.diag_indices_from(h)] += least
+                family = positive_solve(h, b)
+                left[fold.out] += own @ (at @ family) - out @ family
+        return left
+
+
 def left_out_residuals(
     folds: tuple[Fold, ...],
     p: Projection,
@@ -153,29 +228,5 @@ def left_out_residuals(
     x: Floats | None = None,
     ridge: float = 0.0,
 ) -> Floats:
-    """Return `left_out_residual` (R, K) of K residuals of models at zero, as simulated ones are.
-
-    Args:
-        folds: of the model; their right-hand sides are not used.
-        p: the model's columns.
-        y: (R, K) what remains where all parameters are zero.
-        x: (R, F) whitened columns of the family; None for the model alone.
-        ridge: of the family's parameters.
-    """
-    x = np.zeros((len(y), 0)) if x is None else x
-    width, total = x.shape[1], p.rows.T @ y
-    cross, gram, rhs = p.rows.T @ x, x.T @ x, x.T @ y
-    gram[np.diag_indices_from(gram)] += max(ridge, FAMILY_ROUNDING * float(gram.max(initial=0.0)))
-    left = np.zeros(y.shape)
-    for fold in folds:
-        out, own, r = x[fold.out], p.rows[fold.out], y[fold.out]
-        c = cross - own.T @ out
-        both = np.column_stack([c, total - own.T @ r])
-        solved = fold.solve(both)
-        at, steps = solved[:, :width], solved[:, width:]
-        left[fold.out] = r - own @ steps
-        if width:
-            h, b = gram - out.T @ out - c.T @ at, rhs - out.T @ r - c.T @ steps
-            family = positive_solve(h, b)
-            left[fold.out] += (own @ at - out) @ family
-    return left
+    """Return `FamilyFolds.left_out` (R, K) of residuals y (R, K)."""
+    return FamilyFolds(folds, p, x).left_out(y, ridge)

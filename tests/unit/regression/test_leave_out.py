@@ -4,9 +4,15 @@ import numpy as np
 import pytest
 
 from hilcal.regression.backward_elimination import eliminate_columns
-from hilcal.regression.leave_out import folds, left_out_residual
+from hilcal.regression.leave_out import (
+    FamilyFolds,
+    Fold,
+    folds,
+    left_out_of_families,
+    left_out_residual,
+)
 from hilcal.regression.normal_equations import find_basis, normal_equations
-from hilcal.regression.projection import projection
+from hilcal.regression.projection import Projection, projection
 from hilcal.types import Floats
 
 PRIOR = np.array([np.inf, np.inf, 0.5, 2.0, np.inf, 1.0])
@@ -50,6 +56,48 @@ def test_rows_left_out_are_predicted_as_by_a_refit_without_them(beta: float) -> 
         np.testing.assert_allclose(alone[out], y[out] - a[out] @ model, atol=1e-4)
         step = basis.transform @ each[f].step()
         np.testing.assert_allclose(theta + step, model, atol=1e-4)
+
+
+def model(beta: float) -> tuple[tuple[Fold, ...], Projection, Floats, Floats]:
+    """Folds and columns of the fit of `case`, its residual, and a family."""
+    a, x, y, theta = case(beta)
+    basis = find_basis(a, np.ones(6), PRIOR)
+    equations = normal_equations(a, y, basis, a.T @ a)
+    p = projection(a @ basis.transform, beta * basis.prior_precision)
+    fold = np.arange(60) % 5
+    each = folds(p, y - a @ theta, equations, theta, PRIOR, MAGNITUDE, beta, fold)
+    return each, p, y - a @ theta, x
+
+
+def test_families_together_are_predicted_as_each_by_itself() -> None:
+    each, p, white, x = model(1.0)
+    other = np.random.default_rng(5).standard_normal((60, 4))
+    families = [(x, 0.8), (other, 3.0), (other[:, :1], 0.1)]
+    together = left_out_of_families(each, p, white, families)
+    for (columns, ridge), left in zip(families, together, strict=True):
+        alone = left_out_residual(each, p, white, columns, ridge)
+        np.testing.assert_allclose(left, alone, rtol=1e-11, atol=1e-13)
+
+
+@pytest.mark.parametrize("ridge", [0.0, 0.8, 40.0])
+def test_simulated_residuals_are_predicted_as_by_refits_without_their_fold(ridge: float) -> None:
+    each, p, _, x = model(1.0)
+    y = np.random.default_rng(6).standard_normal((60, 3))
+    found = FamilyFolds(each, p, x)
+    for again in (ridge, 2.0, ridge):  # another ridge in between changes nothing
+        left = found.left_out(y, again)
+    alone = FamilyFolds(each, p).left_out(y)
+    for fold in each:
+        rows, stay = p.rows[fold.out], ~fold.out
+        h = np.linalg.inv(fold.inverse_root.T @ fold.inverse_root)
+        cross = p.rows[stay].T @ x[stay]
+        own = x[stay].T @ x[stay] + ridge * np.eye(2)
+        rhs = np.vstack([p.rows[stay].T @ y[stay], x[stay].T @ y[stay]])
+        step = np.linalg.solve(np.block([[h, cross], [cross.T, own]]), rhs)
+        expected = y[fold.out] - np.hstack([rows, x[fold.out]]) @ step
+        np.testing.assert_allclose(left[fold.out], expected, atol=1e-8)
+        plain = y[fold.out] - rows @ np.linalg.solve(h, p.rows[stay].T @ y[stay])
+        np.testing.assert_allclose(alone[fold.out], plain, atol=1e-8)
 
 
 @pytest.mark.parametrize("out", [[0], [2, 3], [4, 5], [0, 1, 4]])

@@ -8,6 +8,7 @@ from hilcal.regression.schur import (
     eliminate,
     inverse_root,
     nuisance_inverse,
+    positive_solve,
     schur_complement,
 )
 from hilcal.types import Floats
@@ -115,3 +116,24 @@ def test_elimination_gives_the_normal_equations_of_the_residual(ridge: float) ->
                                rtol=1e-11, atol=1e-11)  # fmt: skip
     np.testing.assert_allclose(b[rest], (wide.T @ p @ data)[rest], rtol=1e-11, atol=1e-11)
     assert square == pytest.approx(float(data @ p @ data), rel=1e-12)
+
+
+@pytest.mark.parametrize("least", [1.0, 1e-6, 1e-11, 1e-14])
+def test_solutions_follow_the_rule_for_singular_blocks(least: float) -> None:
+    """By Cholesky's factor or by eigenvalues, whatever the condition and the units."""
+    rng = np.random.default_rng(7)
+    q = np.linalg.qr(rng.standard_normal((8, 8)))[0]
+    units = 10.0 ** rng.uniform(-4, 4, 8)
+    m = (q * np.geomspace(1.0, least, 8)) @ q.T
+    m = (m + m.T) / 2 * np.outer(units, units)
+    rhs = m @ (rng.standard_normal((8, 3)) / units[:, None])
+    root = inverse_root(m)
+    by_rule = root.T @ (root @ rhs)
+    size = np.abs(by_rule * units[:, None]).max()
+    off = (positive_solve(m, rhs) - by_rule) * units[:, None] / size
+    assert np.abs(off).max() < 1e-15 / max(least, 1e-12)
+    np.testing.assert_array_equal(positive_solve(m, rhs[:, 0]).shape, (8,))
+    zero = m.copy()
+    zero[3] = zero[:, 3] = 0.0
+    root = inverse_root(zero)
+    np.testing.assert_allclose(positive_solve(zero, rhs), root.T @ (root @ rhs), rtol=1e-12)
