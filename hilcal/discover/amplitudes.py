@@ -80,6 +80,11 @@ class Amplitude:
         return any(f.variable.slot is not None for f in self.factors)
 
     @property
+    def sensed(self) -> bool:
+        """Whether it depends on what the force sensor reads in its own axes."""
+        return any(f.variable.kind == "sensor" for f in self.factors)
+
+    @property
     def needs(self) -> tuple[str, ...]:
         """Columns of the readings that it needs."""
         return tuple(dict.fromkeys(f.variable.need for f in self.factors if f.variable.need))
@@ -367,7 +372,12 @@ _Made = Callable[[Variable, Floats], list[Factor]]
 
 def _bent(v: Variable, x: Floats) -> list[Factor]:
     """Return functions that are zero up to some value, by either side, and symmetric ones."""
-    alone = v.kind in ("force", "load", "place")  # many, and rarely with a bend: in no product
+    alone = v.kind in (
+        "force",
+        "load",
+        "sensor",
+        "place",
+    )  # many, and rarely with a bend: in no product
     made = [
         Factor(v, replace(f, cost=MOST) if alone else f, (_round(at),))
         for at in np.quantile(x, BENDS).tolist()
@@ -397,6 +407,14 @@ def _wrench(v: Variable, x: Floats) -> list[Factor]:
     if v.kind == "torque":
         out += [Factor(v, shapes.ODD, (p, near)) for p in (0.5, 2.0, 3.0)]
     return out
+
+
+def _read_by_sensor(v: Variable, x: Floats) -> list[Factor]:
+    """Curvature, and a sensor that is another one for pull and push."""
+    near = _round(0.01 * _middle(x))
+    if not x.min() < 0 < x.max():
+        return [Factor(v, shapes.EVEN, (2.0, near))]
+    return [Factor(v, shapes.PLUS), *(Factor(v, shapes.EVEN, (p, near)) for p in (1.0, 2.0))]
 
 
 def _gravity(v: Variable, x: Floats) -> list[Factor]:
@@ -434,6 +452,7 @@ _CURVED: dict[str, _Made] = {
     "torque": _wrench,
     "force": _wrench,
     "load": _wrench,
+    "sensor": _read_by_sensor,
     "gravity": _gravity,
     "temperature": _temperature,
     "time": _lasting,

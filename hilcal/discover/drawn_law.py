@@ -14,8 +14,9 @@ import numpy as np
 
 from hilcal.discover.amplitudes import HARMONICS
 from hilcal.discover.curve import LEAST, LINE, MOST_POINTS, Curve, binned, said_by_readings
-from hilcal.discover.sites import ORDINARY, Site, site_motions
+from hilcal.discover.sites import ORDINARY, Place, Site, site_motions
 from hilcal.discover.variables import Variable, variables
+from hilcal.effects.force_sensor import sensor_error
 from hilcal.effects.protocol import Effect
 from hilcal.identify.fit import Fit
 from hilcal.types import Bools, Floats
@@ -78,7 +79,9 @@ def _drawn(fit: Fit, index: int, sites: tuple[Site, ...], unit: Floats) -> Drawn
 def _motions(effect: Effect, theta: Floats, fit: Fit, sites: tuple[Site, ...]) -> dict[int, Floats]:
     """Motion (N,) of each site, by its index, by the effect."""
     s = fit.solution.prediction.situation
-    place = {(x.field, x.element, x.axis): k for k, x in enumerate(sites)}
+    place: dict[tuple[Place, int, int], int] = {
+        (x.field, x.element, x.axis): k for k, x in enumerate(sites)
+    }
     out: dict[int, Floats] = {}
     for c in effect.columns(s):
         for k, (p, element) in enumerate(zip(c.parameter, c.element, strict=True)):
@@ -89,6 +92,10 @@ def _motions(effect: Effect, theta: Floats, fit: Fit, sites: tuple[Site, ...]) -
                 if at is not None and np.any(values[:, axis]):
                     now = np.broadcast_to(theta[p] * values[:, axis], len(s.angle))
                     out[at] = out.get(at, np.zeros(len(s.angle))) + now
+    change = effect.wrench_change(theta, s)
+    if change is not None:
+        error = sensor_error(s, change)
+        out |= {place["sensor", 0, c]: error[:, c] for c in range(6) if np.any(error[:, c])}
     return out
 
 

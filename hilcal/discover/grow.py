@@ -62,7 +62,7 @@ def _products(beside: Beside, s: int, f: int) -> list[Amplitude]:
         known = screen.grammar.place(product)
         if known is not None and known < len(screen.grammar.amplitudes):
             continue  # it is screened
-        if screen.sites[s].takes(product.elastic):
+        if screen.sites[s].takes(product.elastic, product.sensed):
             out.append(product)
     return out
 

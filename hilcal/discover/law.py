@@ -45,6 +45,11 @@ class Form:
         return any(p.amplitude.elastic for p in self.parts)
 
     @property
+    def of_setup(self) -> bool:
+        """Whether all of it is of how a campaign was set up, not of the arm."""
+        return all(p.site.of_setup for p in self.parts)
+
+    @property
     def needs(self) -> tuple[str, ...]:
         """Columns of the readings that it needs."""
         return tuple(dict.fromkeys(n for p in self.parts for n in p.amplitude.needs))
@@ -70,6 +75,8 @@ class Form:
         inner = part.amplitude.unit()
         if inner == "1":
             return part.site.unit
+        if part.site.field == "sensor" and inner == part.site.unit:
+            return "1"
         wrapped = f"({inner})" if "·" in inner or "^" in inner else inner
         return f"{part.site.unit}/{wrapped}"
 

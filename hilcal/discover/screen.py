@@ -79,7 +79,7 @@ class Screen:
         size = np.linalg.norm(flat, axis=0)
         unit = flat / np.where(size > 0, size, 1.0)
         same = np.abs(unit.T @ unit) > ALIKE
-        takes = [(s.takes(False), s.takes(True)) for s in self.sites]
+        takes = [(s.takes(False), s.takes(True), s.takes(False, True)) for s in self.sites]
         out = []
         for k in range(len(self.sites)):
             others = [o for o in np.flatnonzero(same[k]).tolist() if takes[o] == takes[k]]
@@ -144,7 +144,8 @@ def screen(linear: Linearisation) -> Screen:
     a = words.values[:, readings]
     squares = a**2
     has = np.flatnonzero(words.partner >= 0)
-    elastic = np.array([x.elastic for x in words.amplitudes])
+    kinds = np.array([(x.elastic, x.sensed) for x in words.amplitudes])
+    every_kind = {(bool(e), bool(d)) for e, d in np.unique(kinds, axis=0)}
     for k in range(len(places)):
         spread = np.zeros((len(motion), w.m, len(readings)))
         spread[readings, :, np.arange(len(readings))] = motion[readings, :, k]
@@ -157,9 +158,9 @@ def screen(linear: Linearisation) -> Screen:
         across[k, has] = np.einsum("fn,fn->f", lifted[has], a[words.partner[has]])
         seen = SEEN * (squares @ np.sum(t**2, axis=0).astype(np.float32)) + LEAST_MOTION
         square[k, square[k] < seen] = 0.0
-        for kind in (False, True):
-            if not places[k].takes(kind):
-                square[k, elastic == kind] = 0.0
+        for kind in every_kind:
+            if not places[k].takes(*kind):
+                square[k, (kinds == kind).all(axis=1)] = 0.0
     return Screen(
         linear, words, places, motion, rows, readings, form, every, square, across, across_one,
     )  # fmt: skip

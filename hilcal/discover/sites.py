@@ -1,18 +1,27 @@
-"""Where a law may act: the unit motions of joints, bearings, links, base, target and tracker."""
+"""Where a law may act: joints, bearings, links, base, target, tracker, and the force sensor.
+
+A site is a unit motion, or a unit error of the force sensor: recorded = true + error.
+"""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.data.readings import States
+from hilcal.effects.force_sensor import acting_columns
 from hilcal.effects.protocol import Columns, Effect, Field, Parameter, Situation
 from hilcal.identify.fit import Fit
 from hilcal.types import Floats
 
-ORDINARY = {"rad": 1e-4, "m": 1e-4, "1": 1e-5}
-"""An ordinary motion, by unit: 0.1 mrad, 0.1 mm, 10 ppm of the distance; a choice. It only sets
-the range of strengths that the evidence tries, which is a million wide."""
+ORDINARY = {"rad": 1e-4, "m": 1e-4, "1": 1e-5, "N": 1.0, "N·m": 0.1}
+"""An ordinary motion, by unit: 0.1 mrad, 0.1 mm, 10 ppm of the distance, and an ordinary error of
+a force sensor; a choice. It only sets the range of strengths that the evidence tries, which is a
+million wide."""
+Place = Field | Literal["sensor"]
+SETUP = ("target", "tracker", "force sensor")
+"""What is set up anew for another campaign of the same arm."""
 _AXES = "xyz"
 
 
@@ -21,18 +30,18 @@ class Site:
     """A unit motion.
 
     Attributes:
-        field: of `Deviation`.
+        field: of `Deviation`; "sensor" for the recorded wrench, flange axes.
         element: joint or slot; 0 where the field has none.
         axis: component of the twist; 0 for joints and the scale.
         group: what moves, e.g. "joint 2 bearing tilts".
         words: the same with the axis.
         symbol: in formulas.
         latex: likewise.
-        unit: rad, m or 1.
+        unit: rad, m, 1, N or N·m.
         joint: index of the joint that it belongs to; −1 for none.
     """
 
-    field: Field
+    field: Place
     element: int
     axis: int
     group: str
@@ -50,12 +59,20 @@ class Site:
             return 0
         return {"base": 1, "target": 2, "tracker": 3}.get(first, 4) + (self.axis > 2)
 
-    def takes(self, elastic: bool) -> bool:
-        """Whether a law that depends on transmitted wrenches, or not, may act here.
+    @property
+    def of_setup(self) -> bool:
+        """Whether it is of the setup of a campaign, not of the arm."""
+        return self.group.split(",")[0] in SETUP
 
-        Wrenches move parts of the arm only. They move the base as the frame of joint 1, other
-        causes as the frame of the base itself.
+    def takes(self, elastic: bool, sensed: bool = False) -> bool:
+        """Whether a law that depends on transmitted or on recorded wrenches, or not, may act here.
+
+        Transmitted wrenches move parts of the arm only. They move the base as the frame of joint 1,
+        other causes as the frame of the base itself. What the force sensor reads, in its own axes,
+        is the cause of its own errors only.
         """
+        if self.field == "sensor" or sensed:
+            return self.field == "sensor" and not elastic
         if self.field == "twist" and self.element == 0:
             return elastic
         return not elastic or self.field in ("dq", "twist")
@@ -82,6 +99,15 @@ def sites(n: int) -> tuple[Site, ...]:
     out += _twists(0, "tracker, turn", "turn", r"\sigma", (3, 4, 5), field="station")
     scale = "tracker, scale of its distances"
     out.append(Site("scale", 0, 0, scale, scale, "scale", r"\mu", "1"))
+    for c in range(6):
+        kind, way, letter = ("force", "along", "f") if c < 3 else ("moment", "about", "m")
+        group, axis = f"force sensor, {kind}", _AXES[c % 3]
+        out.append(
+            Site(
+                "sensor", 0, c, group, f"{group} {way} {axis}", f"sensor_{letter}{axis}",
+                rf"h_{{{letter}{axis}}}", "N" if c < 3 else "N·m",
+            )
+        )  # fmt: skip
     return tuple(out)
 
 
@@ -124,7 +150,9 @@ class UnitMotions(Effect):
     def columns(self, s: Situation) -> tuple[Columns, ...]:
         """Return a one in the place of each site."""
         out = []
-        for field in dict.fromkeys(site.field for site in self.sites):
+        for field in dict.fromkeys(x.field for x in self.sites):
+            if field == "sensor":
+                continue
             mine = [k for k, site in enumerate(self.sites) if site.field == field]
             mine.sort(key=lambda k: self.sites[k].element)
             wide = field not in ("dq", "scale")
@@ -135,6 +163,14 @@ class UnitMotions(Effect):
             element = np.array([self.sites[k].element for k in mine])
             out.append(Columns(field, np.array(mine), element, values))
         return tuple(out)
+
+    def wrench_columns(self, theta: Floats, s: Situation) -> Floats:
+        """Return what unit errors of the force sensor do to the slot wrenches."""
+        errors = np.zeros((1, len(self.sites), 6))
+        for k, site in enumerate(self.sites):
+            if site.field == "sensor":
+                errors[0, k, site.axis] = 1.0
+        return acting_columns(s, errors)
 
 
 def site_motions(fit: Fit) -> tuple[tuple[Site, ...], Floats]:

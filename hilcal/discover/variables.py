@@ -7,12 +7,13 @@ from typing import Literal
 
 import numpy as np
 
+from hilcal.effects.force_sensor import recorded
 from hilcal.effects.protocol import Situation
 from hilcal.types import Floats
 
 Kind = Literal[
     "angle", "sum", "torque", "force", "load", "gravity", "temperature", "time", "hanging", "side",
-    "place", "sight",
+    "place", "sight", "sensor",
 ]  # fmt: skip
 VARIES = 1e-6
 """Least spread, as a share of the largest value, of a quantity that counts as varying."""
@@ -67,6 +68,7 @@ def _all(s: Situation) -> list[Variable]:
         *_angles(n),
         *_wrenches(n),
         *_loads(),
+        *_sensed(),
         *_attitude(n),
         *_temperatures(s, n),
         *_times(s),
@@ -155,6 +157,23 @@ def _loads() -> list[Variable]:
                     vector=letter, axis=c,
                 )
             )  # fmt: skip
+    return out
+
+
+def _sensed() -> list[Variable]:
+    """What the force sensor reads, along its own axes: causes of its own errors."""
+    out = []
+    for c in range(6):
+        kind, letter, unit = ("force", "f", "N") if c < 3 else ("moment", "m", "N·m")
+        axis = _AXES[c % 3]
+        out.append(
+            Variable(
+                "sensor", (f"force sensor {kind} {axis}",), f"{letter}S_{axis}",
+                rf"{letter}_{{S,{axis}}}", unit, f"recorded(s)[:, {c}]",
+                lambda s, c=c: recorded(s)[:, c],  # type: ignore[misc]
+                vector=f"{letter}S", axis=c % 3,
+            )
+        )  # fmt: skip
     return out
 
 

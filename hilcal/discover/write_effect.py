@@ -48,10 +48,7 @@ class {class_name}(Effect):
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:
         """Derivative of the deviation by the coefficients."""
-{values}
-        return (
 {columns}
-        )
 '''
 _RESPONSE = '''
     def response(self, theta: Floats, s: Situation, change: Floats) -> Response:
@@ -62,6 +59,23 @@ _RESPONSE = '''
 {body}
         return Response(dq=dq, twist=twist)
 '''
+_SENSOR = '''
+    def sensor_columns(self, s: Situation) -> Floats:
+        """Derivative of the force sensor's error by the coefficients, flange axes."""
+        out = np.zeros((len(s.angle), {count}, 6))
+{body}
+        return out
+
+    def wrench_change(self, theta: Floats, s: Situation) -> Floats:
+        """Change of the load's wrench: what acts is what was recorded less the error."""
+        return acting_change(s, np.einsum("npc,p->nc", self.sensor_columns(s), theta))
+
+    def wrench_columns(self, theta: Floats, s: Situation) -> Floats:
+        """Derivative of the wrenches through the arm by the coefficients."""
+        return acting_columns(s, self.sensor_columns(s))
+'''
+_IMPORTED = "from hilcal.effects.force_sensor import acting_change, acting_columns, recorded\n"
+_PROTOCOL = "from hilcal.effects.protocol"
 _FLOATS = "from hilcal.types import Floats\n"
 
 
@@ -82,6 +96,8 @@ def source_of_form(
         file: the file's own name.
     """
     attributes = ["    elastic = True\n"] if form.elastic else []
+    if form.of_setup:
+        attributes.append("    of_setup = True\n")
     if form.needs:
         needs = "".join(f'"{n}", ' for n in form.needs).rstrip()
         attributes.append(f"    needs = ({needs})\n")
@@ -94,14 +110,17 @@ def source_of_form(
         class_name=class_name(name),
         attributes="".join(attributes),
         parameters="\n".join(_parameters(form, found)),
-        values="\n".join(
-            f"        by_{k} = {_product(p.amplitude.factors)}" for k, p in enumerate(form.parts)
-        ),
-        columns="\n".join(f"            {_columns(k, p)}," for k, p in enumerate(form.parts)),
+        columns="\n".join(_moving(form)),
     )
-    if not form.elastic:
-        return source.replace(_FLOATS, "")
-    return source + _RESPONSE.format(body="\n".join(_responses(form)))
+    if form.elastic:
+        source += _RESPONSE.format(body="\n".join(_responses(form)))
+    if any(p.site.field == "sensor" for p in form.parts):
+        source += _SENSOR.format(count=form.count, body="\n".join(_misread(form)))
+        names = _IMPORTED if "recorded(s)" in source else _IMPORTED.replace(", recorded", "")
+        source = source.replace(_PROTOCOL, names + _PROTOCOL, 1)
+    elif not form.elastic:
+        source = source.replace(_FLOATS, "")
+    return source
 
 
 def class_name(name: str) -> str:
@@ -140,6 +159,26 @@ def _product(factors: Sequence[Factor]) -> str:
 
 def _numbers(f: Factor) -> list[str]:
     return [repr(x) for x in f.numbers]
+
+
+def _moving(form: Form) -> Iterator[str]:
+    """Yield the lines of what moves parts of the arm, or the frames."""
+    parts = [(k, p) for k, p in enumerate(form.parts) if p.site.field != "sensor"]
+    if not parts:
+        yield "        return ()"
+        return
+    yield from (f"        by_{k} = {_product(p.amplitude.factors)}" for k, p in parts)
+    yield "        return ("
+    yield from (f"            {_columns(k, p)}," for k, p in parts)
+    yield "        )"
+
+
+def _misread(form: Form) -> Iterator[str]:
+    """Yield the lines of what the force sensor reads beside the true wrench."""
+    for p in form.parts:
+        if p.site.field == "sensor":
+            yield f"        by = {_product(p.amplitude.factors)}"
+            yield f"        out[:, {p.coefficient}, {p.site.axis}] += by"
 
 
 def _columns(k: int, p: Part) -> str:

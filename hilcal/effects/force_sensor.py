@@ -13,6 +13,8 @@ from hilcal.robot.statics import load_wrench_change
 from hilcal.types import Floats
 
 FORCE_AXES = ("x", "y", "z")
+ALONG_FLANGE: Floats = np.eye(3)
+"""Axes of a force sensor that are those of the flange."""
 
 
 class ForceSensorEffect(Effect):
@@ -53,22 +55,42 @@ class ForceSensorEffect(Effect):
 
     def wrench_change(self, theta: Floats, s: Situation) -> Floats:
         """Return −R h."""
-        r = self._sensor(s)
-        return -_turned(r, self.error(theta, self._recorded(s, r))) * _loaded(s)
+        return acting_change(s, self.error(theta, recorded(s, self.axes)), self.axes)
 
     def wrench_columns(self, theta: Floats, s: Situation) -> Floats:
         """Slot wrenches by the derivative of −R h."""
-        r = self._sensor(s)
-        change = -_turned(r[:, None], self.error_columns(theta, self._recorded(s, r)))
-        return load_wrench_change(s.chain, s.load, change * _loaded(s)[:, None])
+        return acting_columns(s, self.error_columns(theta, recorded(s, self.axes)), self.axes)
 
-    def _sensor(self, s: Situation) -> Floats:
-        """(N, 3, 3) sensor axes in base axes."""
-        return np.asarray(se3.product(s.chain.rotation[-1], self.axes))
 
-    def _recorded(self, s: Situation, r: Floats) -> Floats:
-        """(N, 6) recorded wrench, sensor axes."""
-        return _turned(np.swapaxes(r, 1, 2), s.states.wrench)
+def recorded(s: Situation, axes: Floats = ALONG_FLANGE) -> Floats:
+    """Return the recorded wrench (N, 6) in sensor axes, N and N·m.
+
+    Args:
+        s: the situation.
+        axes: (3, 3) the sensor's axes in flange axes.
+    """
+    return _turned(np.swapaxes(_sensor(s, axes), 1, 2), s.states.wrench)
+
+
+def acting_change(s: Situation, error: Floats, axes: Floats = ALONG_FLANGE) -> Floats:
+    """Return −R h (N, 6), base axes, of the sensor's error h (N, 6); see `recorded`."""
+    return -_turned(_sensor(s, axes), error) * _loaded(s)
+
+
+def acting_columns(s: Situation, columns: Floats, axes: Floats = ALONG_FLANGE) -> Floats:
+    """Slot wrenches (N, P, n + 1, 6) by −R h, of the derivative (N or 1, P, 6) of h."""
+    change = -_turned(_sensor(s, axes)[:, None], columns)
+    return load_wrench_change(s.chain, s.load, change * _loaded(s)[:, None])
+
+
+def sensor_error(s: Situation, change: Floats) -> Floats:
+    """Return h (N, 6), flange axes, of a change −R h (N, 6) of the load's wrench."""
+    return -_turned(np.swapaxes(_sensor(s, ALONG_FLANGE), 1, 2), change)
+
+
+def _sensor(s: Situation, axes: Floats) -> Floats:
+    """(N, 3, 3) sensor axes in base axes."""
+    return np.asarray(se3.product(s.chain.rotation[-1], axes))
 
 
 def _turned(r: Floats, wrench: Floats) -> Floats:

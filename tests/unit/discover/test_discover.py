@@ -25,12 +25,13 @@ from hilcal.discover.proposal import LawSearch
 from hilcal.discover.refit import exact
 from hilcal.discover.screen import Screen, screen
 from hilcal.discover.search import Selection, _plainly, _simplicity, search
-from hilcal.discover.sites import sites
+from hilcal.discover.sites import ORDINARY, sites
 from hilcal.discover.variables import variables
 from hilcal.discover.write_effect import effect_class, source_of_form
 from hilcal.effects.catalogue import installed
 from hilcal.effects.check import check_effect
 from hilcal.effects.example import example_cell, example_situation, example_states
+from hilcal.effects.force_sensor import recorded
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
@@ -253,7 +254,7 @@ def test_columns_of_the_written_effect_are_those_of_the_search() -> None:
 
 
 def unit_motion(form: Form) -> float:
-    return {"rad": 1e-4, "m": 1e-4, "1": 1e-5}[form.parts[0].site.unit]
+    return ORDINARY[form.parts[0].site.unit]
 
 
 def test_what_is_told_of_a_law_names_all_that_speaks_for_it() -> None:
@@ -392,7 +393,7 @@ def test_every_quantity_reads_the_same_in_the_written_effect() -> None:
     cell = example_cell()
     s = example_situation(cell, example_states(cell))
     for v in variables(s):
-        read = eval(v.code, {"s": s, "np": np})
+        read = eval(v.code, {"s": s, "np": np, "recorded": recorded})
         assert np.allclose(read, v.read(s), rtol=1e-12, atol=0), v.names
 
 

@@ -1,0 +1,67 @@
+"""Laws of the force sensor's own errors."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+
+from hilcal.discover.curve import curves
+from hilcal.discover.discovery import Discovery, discover
+from hilcal.discover.write_effect import effect_class
+from hilcal.effects.check import check_effect
+from hilcal.identify.baseline import baseline
+from hilcal.identify.fit import Fit, fit
+from hilcal.robot import se3
+from tests.unit.discover.test_discover import campaign
+
+SHARE = 0.3
+"""Share of what the sensor reads along +z that is not there; it reads the other way rightly."""
+
+
+@cache
+def misread() -> Fit:
+    """The same arm with nothing hidden, read by a force sensor that is wrong on one side."""
+    of = campaign()
+    assert not of.outlier.any()
+    states = of.readings.states
+    turn = of.solution.prediction.situation.chain.rotation[-1]
+    along = se3.apply(np.swapaxes(turn, 1, 2), states.wrench[:, :3])
+    more = np.zeros_like(along)
+    more[:, 2] = SHARE / (1 - SHARE) * np.maximum(along[:, 2], 0.0)
+    wrench = states.wrench.copy()
+    wrench[:, :3] += se3.apply(turn, more)
+    readings = replace(of.readings, states=replace(states, wrench=wrench))
+    return fit(baseline(of.model.cell, readings, of.mode), readings, of.mode)
+
+
+@cache
+def found() -> Discovery:
+    return discover(misread())
+
+
+def test_a_one_sided_force_sensor_is_found_with_its_size() -> None:
+    d = found()
+    law = d.laws[0]
+    assert law.acts_on == ("force sensor, force along z",)
+    assert law.variables == ("force sensor force z",)
+    (a,) = law.parameters
+    assert a.unit == "1"
+    assert abs(a.value - SHARE) < 4 * a.std < 0.5 * SHARE
+    assert d.after is not None
+    assert d.after.chi2 < 0.5 * misread().chi2
+
+
+def test_what_is_written_is_an_effect_of_the_setup_with_its_derivative() -> None:
+    d = found()
+    kind = effect_class(d.source, d.laws[0].name)
+    assert kind.of_setup
+    check_effect(kind)
+
+
+def test_the_curve_of_the_law_is_drawn_beside_the_readings() -> None:
+    d = found()
+    assert d.after is not None
+    curve = curves(d.after, d.laws[0].form)[0]
+    assert (curve.of, curve.unit, curve.quantity) == ("sensor_fz", "N", "fS_z")
+    away = (curve.y - SHARE * np.maximum(curve.x, 0.0)) / curve.std
+    assert abs(float(np.mean(away[curve.x > 0]))) < 0.5
