@@ -17,11 +17,12 @@ def prior_lines(found: Fit) -> list[str]:
     if prior is None:
         return []
     source = prior.posterior.source
-    of = {"arm": "this arm", "type": "another arm of the type"}[prior.relation]
+    of = {"arm": " of this arm", "type": " of another arm of the type"}[prior.relation]
+    fleet = source.campaign and not source.revision  # it says itself of which arms
     lines = [
         f"Prior: {source.campaign or 'a posterior'}"
         + (f", revision {source.revision}" if source.revision else "")
-        + f" ({source.n_readings} readings of {of})."
+        + f" ({source.n_readings} readings{'' if fleet else of})."
     ]
     told = disagreements(found)
     for c in told[:MOST]:

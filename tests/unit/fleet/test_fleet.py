@@ -13,6 +13,7 @@ from hilcal.errors import CannotAnswerError, InputError
 from hilcal.fleet.fleet import Fleet
 from hilcal.fleet.members import Failure, Member, entries, member_of
 from hilcal.fleet.pooled import effects_seen, pooled
+from hilcal.identify import posterior_document
 from hilcal.identify.baseline import baseline
 from hilcal.identify.carried import carried_prior
 from hilcal.identify.fit import fit
@@ -21,6 +22,7 @@ from hilcal.report.charts.fleet import arms_chart
 from hilcal.report.html.fleet import page
 from hilcal.robot.catalogue import configs_dir
 from hilcal.types import Floats
+from tests.support.calibrate_process import CELL
 from tests.support.campaigns import (
     cell_of,
     configuration,
@@ -143,6 +145,45 @@ def test_with_the_prior_a_new_arm_needs_fewer_poses(one: Posterior) -> None:
         with_it.append(error_of(few, factors, prior))
         without.append(error_of(few, factors, None))
     assert np.mean(with_it) < 0.8 * np.mean(without)
+
+
+def prior_file(one: Posterior, path: Path) -> Path:
+    """What a fleet of 30 arms lets expect, as `fleet -o` writes it; and a small cell beside it."""
+    posterior_document.write(pooled(members(one, 3), ()).prior, path)
+    path.with_name("cell.toml").write_text(CELL, encoding="utf-8")
+    return path
+
+
+def test_a_plan_counts_on_what_the_fleet_knows(
+    one: Posterior, capsys: Capsys, tmp_path: Path
+) -> None:
+    prior = prior_file(one, tmp_path / "prior.json")
+    command = ("plan", tmp_path / "cell.toml", "-o", tmp_path / "p.json", "--poses", "4", "--quick")
+    alone = ok(capsys, *command, "--json").document["predicted_std"]
+    told = ok(capsys, *command, "--prior", prior, "--json")
+    known = told.document["predicted_std"]
+    assert "60 campaigns of 30 arms of the type ur10e" in " ".join(told.err.split())
+    stiffness = [name for name in alone if name.startswith("joint_compliance.")]
+    assert len(stiffness) == 6
+    assert all(known[name] < alone[name] for name in stiffness)
+
+
+@pytest.mark.slow
+def test_a_calibration_takes_the_prior_of_a_fleet(
+    one: Posterior, capsys: Capsys, tmp_path: Path
+) -> None:
+    """On simulated devices, from the plan to the corrected targets; asked for once, kept after."""
+    prior, out = prior_file(one, tmp_path / "prior.json"), tmp_path / "run.hilcal"
+    size = ("--poses", "4", "--validation", "3")
+    command = ("calibrate", tmp_path / "cell.toml", "--rehearse", "--yes", "-o", out)
+    told = ok(capsys, *command, *size, "--prior", prior, "--json")
+    words = " ".join(told.err.split())
+    assert "Prior: 60 campaigns of 30 arms of the type ur10e" in words
+    assert "of this arm" not in words
+    error = told.document["improvement"]["error"]
+    assert error["after"]["rms_m"] < 0.2 * error["before"]["rms_m"]
+    revision = ok(capsys, "info", out, "--json").document["revisions"][-1]
+    assert revision["verdict"] == "adequate"
 
 
 def write(folder: Path, names: Sequence[str]) -> None:
