@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.discover.amplitudes import HARMONICS
+from hilcal.discover.functions import HARMONICS
 from hilcal.discover.law import Form, Part
 from hilcal.discover.sites import ORDINARY, Site, site_motions
 from hilcal.effects.protocol import Situation

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.discover.amplitudes import HARMONICS
 from hilcal.discover.curve import LEAST, LINE, MOST_POINTS, Curve, binned, said_by_readings
+from hilcal.discover.functions import HARMONICS
 from hilcal.discover.sites import ORDINARY, Place, Site, site_motions
 from hilcal.discover.variables import Variable, variables
 from hilcal.effects.force_sensor import sensor_error

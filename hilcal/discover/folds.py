@@ -9,9 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilcal.discover.law import Again
-from hilcal.discover.problem import Problem, Term
+from hilcal.discover.problem import Problem
 from hilcal.discover.screen import Screen
 from hilcal.discover.search import SAME, Selection, search
+from hilcal.discover.terms import Term
 from hilcal.identify.folds import random_folds
 from hilcal.identify.linearisation import by_pose
 from hilcal.regression.paired_test import improves

@@ -20,7 +20,8 @@ from hilcal.discover.amplitudes import Amplitude, Factor, different
 from hilcal.types import Floats
 
 if TYPE_CHECKING:
-    from hilcal.discover.problem import Beside, Found, Term
+    from hilcal.discover.problem import Beside
+    from hilcal.discover.terms import Found, Term
 
 MOST = 4
 """Complexity of a product; a choice."""

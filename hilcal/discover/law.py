@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilcal.discover.amplitudes import Amplitude
-from hilcal.discover.problem import Term
 from hilcal.discover.screen import Screen
 from hilcal.discover.sites import ORDINARY, Site
+from hilcal.discover.terms import Term
 from hilcal.effects.protocol import Situation
 from hilcal.types import Floats
 

@@ -7,13 +7,13 @@ with the terms that extend it. The odds of a term are its evidence less what the
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from hilcal.discover.grow import grown
 from hilcal.discover.screen import LEAST_MOTION, SEEN, Screen
+from hilcal.discover.terms import Found, Scored, Screened, Term
 from hilcal.regression.evidence import FamilyScore, score_family
 from hilcal.regression.projection import Projection, projection
 from hilcal.types import Bools, Floats, Ints
@@ -33,55 +33,6 @@ LEAST_RIDGE = 1e-6
 """Least ridge of the model's directions, not all of which some rows determine; a choice."""
 SPANNED = 1e-9
 """Directions of chosen columns below this share of the largest are rounding."""
-
-
-@dataclass(frozen=True, slots=True)
-class Term:
-    """Columns of a law that are chosen together.
-
-    Attributes:
-        parts: (site, amplitude) of each column, by index.
-        price: what the search costs it.
-        common: whether all columns have one coefficient.
-        alone: what it would cost as the first term.
-    """
-
-    parts: tuple[tuple[int, int], ...]
-    price: float
-    common: bool = False
-    alone: float = 0.0
-
-    @property
-    def count(self) -> int:
-        """Number of coefficients."""
-        return 1 if self.common else len(self.parts)
-
-
-@dataclass(frozen=True, eq=False)
-class Scored:
-    """A term beside others.
-
-    Attributes:
-        term: the term.
-        score: its score as a family.
-    """
-
-    term: Term
-    score: FamilyScore
-
-    @property
-    def odds(self) -> float:
-        """Evidence less what the search costs."""
-        return self.score.log_evidence - self.term.price
-
-
-@dataclass(frozen=True, slots=True)
-class Found:
-    """A candidate of the screening: site, amplitude, and its odds."""
-
-    s: int
-    f: int
-    odds: float
 
 
 class Problem:
@@ -166,23 +117,6 @@ class Problem:
     def beside(self, chosen: Sequence[Term]) -> "Beside":
         """Return the candidates beside chosen terms."""
         return Beside(self, tuple(chosen))
-
-
-@dataclass(frozen=True, eq=False)
-class Screened:
-    """All candidates beside some columns, as in `Screen`.
-
-    Attributes:
-        slope: (S, F) xᵀ r.
-        square: (S, F) xᵀ M x; zero where little of a column is left.
-        across: (S, F) xᵀ M x' with the partner.
-        across_one: (S, F) xᵀ M x' with a constant at the site.
-    """
-
-    slope: Floats
-    square: Floats
-    across: Floats
-    across_one: Floats
 
 
 class Beside:

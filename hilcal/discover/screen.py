@@ -14,7 +14,8 @@ from functools import cached_property
 
 import numpy as np
 
-from hilcal.discover.amplitudes import Amplitude, Grammar, grammar
+from hilcal.discover.amplitudes import Amplitude
+from hilcal.discover.grammar import Grammar, grammar
 from hilcal.discover.sites import Site, site_motions
 from hilcal.discover.variables import variables
 from hilcal.identify.fit import Fit
@@ -66,7 +67,7 @@ class Screen:
 
     @cached_property
     def price(self) -> Floats:
-        """(F,) what the search costs a candidate, see `amplitudes`."""
+        """(F,) what the search costs a candidate, see `grammar`."""
         return self.grammar.price(len(self.sites))
 
     @cached_property

@@ -10,8 +10,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from hilcal.discover.problem import SHORT_LIST, Beside, Problem, Scored, Term
+from hilcal.discover.problem import SHORT_LIST, Beside, Problem
 from hilcal.discover.screen import Screen
+from hilcal.discover.terms import Scored, Term
 from hilcal.regression.forward_selection import families_beside
 from hilcal.types import Floats
 

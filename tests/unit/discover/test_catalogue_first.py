@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from hilcal.discover.discovery import _catalogue, _tells_more
-from hilcal.discover.problem import Problem, Term
+from hilcal.discover.problem import Problem
 from hilcal.discover.screen import screen
 from hilcal.discover.search import Selection
+from hilcal.discover.terms import Term
 from hilcal.identify.linearisation import linearise
 from tests.unit.discover.test_discover import campaign
 

@@ -15,17 +15,20 @@ from drivers.simulated.rehearsal import measurement_noise, simulate
 from hilcal.cell import cell_from_config
 from hilcal.config import load_config
 from hilcal.data.readings import Readings
-from hilcal.discover import amplitudes, grow, shapes
-from hilcal.discover.amplitudes import Amplitude, Factor, grammar
+from hilcal.discover import grammar as products
+from hilcal.discover import grow, shapes
+from hilcal.discover.amplitudes import Amplitude, Factor
 from hilcal.discover.curve import curves
 from hilcal.discover.discovery import Discovery, discover
+from hilcal.discover.grammar import grammar
 from hilcal.discover.law import Form, Part
-from hilcal.discover.problem import Problem, Term
+from hilcal.discover.problem import Problem
 from hilcal.discover.proposal import LawSearch
 from hilcal.discover.refit import exact
 from hilcal.discover.screen import Screen, screen
 from hilcal.discover.search import Selection, _plainly, _simplicity, search
 from hilcal.discover.sites import ORDINARY, sites
+from hilcal.discover.terms import Term
 from hilcal.discover.variables import variables
 from hilcal.discover.write_effect import effect_class, source_of_form
 from hilcal.effects.catalogue import installed
@@ -54,10 +57,10 @@ LAW = "compliance by another joint"
 @pytest.fixture(autouse=True, scope="module")
 def short_products() -> Iterator[None]:
     """Products of two simple functions at most, for speed; studies search all."""
-    most, grown = amplitudes.MOST, grow.MOST
-    amplitudes.MOST = grow.MOST = 2
+    most, grown = products.MOST, grow.MOST
+    products.MOST = grow.MOST = 2
     yield
-    amplitudes.MOST, grow.MOST = most, grown
+    products.MOST, grow.MOST = most, grown
 
 
 @cache
@@ -332,7 +335,7 @@ def test_every_function_is_an_effect_with_its_derivative() -> None:
 def test_fine_waves_are_tried_up_to_the_number_of_poses_and_in_no_product(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(amplitudes, "MOST", 3)
+    monkeypatch.setattr(products, "MOST", 3)
     cell = example_cell()
     s = example_situation(cell, example_states(cell))
     words = grammar([v for v in variables(s) if v.kind == "angle"][:2], s, 14)

@@ -1,0 +1,221 @@
+"""All amplitudes that are tried: products of functions, to a stated complexity.
+
+All products of at most `MOST_FACTORS` factors of different quantities up to the complexity `MOST`
+are tried.
+
+What a law costs for the search that found it is the logarithm of the number of candidates of its
+complexity, and log 2 for each unit of complexity: simple laws are few, and pay little.
+"""
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from math import comb, log
+
+import numpy as np
+
+from hilcal.discover import shapes
+from hilcal.discover.amplitudes import Amplitude, Factor, different
+from hilcal.discover.functions import FINEST, fine_waves, functions
+from hilcal.discover.shapes import Numbers
+from hilcal.discover.variables import Variable
+from hilcal.effects.protocol import Situation
+from hilcal.types import Floats, Ints
+
+MOST = 3
+"""Complexity of a product; a choice, by the number of candidates (about 10⁶ with all sites)."""
+MOST_FACTORS = 2
+"""Factors of a product; a choice, likewise."""
+FLAT = 0.1
+"""Factors whose spread is a smaller share of their size are in no product: it would be the other
+factor's law to within that share. A choice."""
+
+
+@dataclass(frozen=True, eq=False)
+class Grammar:
+    """All amplitudes that are tried, and their values.
+
+    Attributes:
+        known: the quantities.
+        amplitudes: the products.
+        values: (F, N) their values, single precision, each with root mean square 1.
+        size: (F,) what they were divided by.
+        cost: (F,) complexities.
+        partner: (F,) the amplitude with sine for cosine in its first periodic factor; −1 for none.
+        situation: of the readings.
+        singles: the functions of one quantity from which products are made.
+    """
+
+    known: list[Variable]
+    amplitudes: tuple[Amplitude, ...]
+    values: Floats
+    size: Floats
+    cost: Ints
+    partner: Ints
+    situation: Situation
+    singles: tuple[Factor, ...]
+    _more: list[tuple[Amplitude, Floats, float]] = field(default_factory=list)
+    _read: dict[str, Floats] = field(default_factory=dict)
+
+    def at(self, k: int) -> Amplitude:
+        """Return an amplitude by its index."""
+        own = len(self.amplitudes)
+        return self.amplitudes[k] if k < own else self._more[k - own][0]
+
+    def rows(self, which: list[int]) -> Floats:
+        """(P, N) values of amplitudes, each with root mean square 1."""
+        own = len(self.amplitudes)
+        return np.array([self.values[k] if k < own else self._more[k - own][1] for k in which])
+
+    def index(self, amplitude: Amplitude) -> int | None:
+        """Return the index of an amplitude, added where it is new; None where it is zero."""
+        known = self.place(amplitude)
+        if known is not None:
+            return known
+        values = self.values_of(amplitude)
+        size = float(np.sqrt(np.mean(values**2)))
+        if not np.isfinite(size) or size == 0:
+            return None
+        k = len(self.amplitudes) + len(self._more)
+        self._more.append((amplitude, (values / size).astype(np.float32), size))
+        self._places[_key(amplitude)] = k
+        return k
+
+    def values_of(self, a: Amplitude) -> Floats:
+        """(N,) of an amplitude at the readings."""
+        out = np.ones(self.values.shape[1])
+        for f in a.factors:
+            out = out * f.shape.value(self.read(f.variable), f.numbers)
+        return out
+
+    def read(self, v: Variable) -> Floats:
+        """(N,) of a quantity at the readings."""
+        if v.symbol not in self._read:
+            self._read[v.symbol] = v.read(self.situation)
+        return self._read[v.symbol]
+
+    def turned(self, k: int) -> int | None:
+        """Return the amplitude with sine for cosine in its first periodic factor."""
+        if k < len(self.amplitudes):
+            return int(self.partner[k]) if self.partner[k] >= 0 else None
+        factors = list(self.at(k).factors)
+        for i, f in enumerate(factors):
+            if f.shape.name == "cos":
+                factors[i] = replace(f, shape=replace(shapes.SIN, cost=f.shape.cost))
+                return self.index(Amplitude(tuple(factors)))
+        return None
+
+    def place(self, amplitude: Amplitude) -> int | None:
+        """Return the index of an amplitude; None where it is not tried."""
+        return self._places.get(_key(amplitude))
+
+    @cached_property
+    def _places(self) -> dict[frozenset[tuple[str, str, Numbers]], int]:
+        return {_key(a): k for k, a in enumerate(self.amplitudes)}
+
+    def inner(self, k: int) -> list[int]:
+        """Return the amplitudes with one factor less."""
+        factors = self.at(k).factors
+        less = (Amplitude((*factors[:i], *factors[i + 1 :])) for i in range(len(factors)))
+        return [at for a in less if (at := self.place(a)) is not None]
+
+    def price(self, sites: int) -> Floats:
+        """(F,) log of the number of candidates of the same complexity, and of 2 per unit of it."""
+        count = np.bincount(self.cost) * sites
+        return np.asarray(np.log(count[self.cost]) + log(2.0) * self.cost)
+
+    def price_of(self, a: Amplitude, sites: int) -> float:
+        """Return the same of any product: as if all of its complexity had been tried."""
+        kind = a.cost, len(a.factors)
+        count = self._counts.get(kind, self._counts.get((a.cost, 0), 1))
+        return log(max(count, 1) * sites) + log(2.0) * a.cost
+
+    @cached_property
+    def _counts(self) -> dict[tuple[int, int], int]:
+        """Number of products by complexity and factors; by complexity, those of `amplitudes`."""
+        n = np.bincount([f.cost for f in self.singles], minlength=4).tolist()
+        own = np.bincount(self.cost).tolist()
+        return {
+            (4, 2): comb(n[2], 2) + n[1] * n[3],
+            (3, 3): comb(n[1], 3),
+            (4, 3): comb(n[1], 2) * n[2],
+            **{(cost, 0): count for cost, count in enumerate(own)},
+        }
+
+    @cached_property
+    def depends(self) -> tuple[frozenset[str], ...]:
+        """Names of the quantities that each amplitude depends on."""
+        return tuple(frozenset(a.names) for a in self.amplitudes)
+
+
+def _key(a: Amplitude) -> frozenset[tuple[str, str, Numbers]]:
+    return frozenset((f.variable.symbol, f.shape.name, f.numbers) for f in a.factors)
+
+
+def grammar(known: list[Variable], s: Situation, poses: int = 0) -> Grammar:
+    """Return all products of the functions of the quantities.
+
+    Args:
+        known: the quantities.
+        s: the situation of the readings.
+        poses: number of poses, which limits the multiples of an angle; see `FINEST`.
+    """
+    singles = [f for v in known for f in functions(v, v.read(s), MOST)]
+    singles += [f for v in known if v.kind == "angle" for f in fine_waves(v, min(poses, FINEST))]
+    value = np.array([f.values(s) for f in singles]).reshape(len(singles), -1)
+    cost = np.array([f.cost for f in singles])
+    flat = np.std(value, axis=1) < FLAT * np.sqrt(np.mean(value**2, axis=1))
+    pairs: list[tuple[int, int]] = [(-1, -1)] + [
+        (i, -1) for i in range(len(singles)) if cost[i] <= MOST
+    ]
+    curved = np.flatnonzero((cost < MOST) & ~flat).tolist()
+    for at, i in enumerate(curved):
+        for k in curved[at + 1 :]:
+            if cost[i] + cost[k] <= MOST and different(singles[i], singles[k]):
+                pairs.append((i, k))
+    value = np.vstack([value, np.ones(value.shape[1])])
+    index = np.array(pairs)
+    products = value[index[:, 0]] * value[index[:, 1]]
+    size = np.sqrt(np.mean(products**2, axis=1))
+    kept = np.flatnonzero(size > 0)
+    amplitudes = tuple(
+        Amplitude(tuple(singles[i] for i in pairs[k] if i >= 0)) for k in kept.tolist()
+    )
+    place = {pairs[k]: at for at, k in enumerate(kept.tolist())}
+    turned = _turned(singles)
+    partner = np.array([_partner(pairs[k], turned, place) for k in kept.tolist()])
+    return Grammar(
+        known,
+        amplitudes,
+        (products[kept] / size[kept, None]).astype(np.float32),
+        size[kept],
+        np.array([a.cost for a in amplitudes]),
+        partner,
+        s,
+        tuple(
+            f
+            for f, same in zip(singles, flat.tolist(), strict=True)
+            if not same and f.shape not in (shapes.FINE_COS, shapes.FINE_SIN)
+        ),
+    )
+
+
+def _turned(singles: list[Factor]) -> dict[int, int]:
+    """Sine by cosine of the same quantity."""
+    place = {(id(f.variable), f.shape.name, f.numbers): k for k, f in enumerate(singles)}
+    return {
+        k: place[id(f.variable), "sin", f.numbers]
+        for k, f in enumerate(singles)
+        if f.shape.name == "cos"
+    }
+
+
+def _partner(
+    pair: tuple[int, int], turned: dict[int, int], place: dict[tuple[int, int], int]
+) -> int:
+    for at, k in enumerate(pair):
+        if k in turned:
+            other = [*pair]
+            other[at] = turned[k]
+            low, high = sorted(other, key=lambda i: (i < 0, i))
+            return place.get((low, high), -1)
+    return -1
