@@ -6,13 +6,17 @@ import ctypes.util
 import json
 import os
 import socket
+import struct
 import subprocess
 import tempfile
 import time
+import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from hilcal.errors import HilcalError, InputError
 from hilcal.report.viewer.stream import executable
@@ -103,16 +107,23 @@ def pictures(
     if not vulkan_available():
         raise HilcalError(_MISSING)
     problems: dict[str, set[str]] = {}
-    with _headless(size) as viewer:
-        viewer.open([str(Path(rrd).resolve())])
-        _wait_until_loaded(viewer)
-        viewer.take_screenshot(max_size=64)  # the first frame compiles shaders and loads meshes
+    with opened(rrd, size) as (viewer, _):
         for shot in shots:
             _take(viewer, shot, longest)
             for v in viewer.get_state().views:
                 found = problems.setdefault(v.name or v.view_id, set())
                 found.update(f"{r.severity}: {r.summary} {r.details or ''}" for r in v.reports)
     return tuple(ViewReport(name, tuple(sorted(found))) for name, found in problems.items())
+
+
+@contextlib.contextmanager
+def opened(rrd: Path, size: tuple[int, int]) -> Iterator[tuple["ViewerClient", int]]:
+    """A headless viewer that has shown a recording, and the number of its process."""
+    with _headless(size) as (viewer, process):
+        viewer.open([str(Path(rrd).resolve())])
+        _wait_until_loaded(viewer)
+        viewer.take_screenshot(max_size=64)  # the first frame compiles shaders and loads meshes
+        yield viewer, process
 
 
 def _take(viewer: "ViewerClient", shot: Shot, longest: int | None) -> None:
@@ -164,7 +175,7 @@ def _wait_until_loaded(viewer: "ViewerClient") -> "ViewerState":
 
 
 @contextlib.contextmanager
-def _headless(size: tuple[int, int]) -> Iterator["ViewerClient"]:
+def _headless(size: tuple[int, int]) -> Iterator[tuple["ViewerClient", int]]:
     """Run a viewer of our own in a home of its own, with analytics off; end it afterwards."""
     with tempfile.TemporaryDirectory(prefix="hilcal-picture-") as home, socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -179,7 +190,7 @@ def _headless(size: tuple[int, int]) -> Iterator["ViewerClient"]:
                 command, env=_environment(Path(home)), stdout=sink, stderr=subprocess.STDOUT
             )
         try:
-            yield _connect(process, port)
+            yield _connect(process, port), process.pid
         except (ConnectionError, RuntimeError) as error:
             tail = log.read_text(errors="replace").strip().splitlines()[-1:] or ["no message"]
             raise HilcalError(f"the viewer failed: {error}; it said: {tail[0]}") from error
@@ -229,3 +240,45 @@ def _environment(home: Path) -> dict[str, str]:
         "RUST_LOG": "error",  # warnings pop up over the picture
         "NO_COLOR": "1",
     }
+
+
+def pixels(png: Path) -> np.ndarray:
+    """Decode an 8-bit PNG without interlace into (height, width, channels)."""
+    data, at, body = png.read_bytes(), 8, b""
+    while at < len(data):
+        size, kind = struct.unpack(">I4s", data[at : at + 8])
+        chunk = data[at + 8 : at + 8 + size]
+        if kind == b"IHDR":
+            width, height, depth, color = struct.unpack(">IIBB", chunk[:10])
+        elif kind == b"IDAT":
+            body += chunk
+        at += size + 12
+    assert depth == 8
+    channels = {2: 3, 6: 4}[color]
+    raw = np.frombuffer(zlib.decompress(body), np.uint8).reshape(height, width * channels + 1)
+    out = np.zeros((height, width * channels), dtype=np.uint8)
+    above = np.zeros(width * channels, dtype=np.uint8)
+    for i, line in enumerate(raw):
+        above = out[i] = unfilter(int(line[0]), line[1:], above, channels)
+    return out.reshape(height, width, channels)
+
+
+def unfilter(kind: int, line: np.ndarray, above: np.ndarray, step: int) -> np.ndarray:
+    """Undo one PNG line filter."""
+    if kind == 0:
+        return line
+    if kind == 1:
+        return np.cumsum(line.reshape(-1, step), axis=0, dtype=np.uint8).reshape(-1)
+    if kind == 2:
+        return line + above
+    done = [0] * step
+    corner = [0] * step + above.tolist()
+    for k, (value, up) in enumerate(zip(line.tolist(), above.tolist(), strict=True)):
+        left, diagonal = done[k], corner[k]
+        if kind == 3:
+            guess = (left + up) // 2
+        else:
+            p = left + up - diagonal
+            guess = min((left, up, diagonal), key=lambda c: abs(p - c))
+        done.append((value + guess) & 255)
+    return np.array(done[step:], dtype=np.uint8)

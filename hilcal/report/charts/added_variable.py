@@ -50,4 +50,4 @@ def added_variable(r: Regressor, effect: str) -> go.Figure:
         f"Residual against what {effect} would explain: slope {slope:.2f}, where 1 means that it "
         f"is right and 0 that it explains nothing.{note}"
     )
-    return style.figure(says, x=r.x_label, y=r.y_label, traces=traces, height=340)
+    return style.figure(says, x="it would explain [µm]", y=r.y_label, traces=traces, height=340)

@@ -58,7 +58,7 @@ def error_per_revision(story: Story) -> go.Figure:
         waterfallgroupgap=0.15,
     )
     line = {"color": style.NOISE, "dash": "dash", "width": 2}
-    out.add_hline(floor, line=line)
+    out.add_hline(floor, line=line, layer="below")
     # for the legend alone: a shape has no entry there
     named = {"name": f"noise alone, {floor:.3g} µm", "mode": "lines", "line": line}
     out.add_trace(go.Scatter(x=[names[0]], y=[None], hoverinfo="skip", **named))

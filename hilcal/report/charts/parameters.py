@@ -46,8 +46,8 @@ def parameters(revision: StoryRevision) -> go.Figure:
     )
     out = style.figure(
         says,
-        x="value / standard uncertainty (asinh)" if np.abs(t).max() > 50 else
-        "value / standard uncertainty",
+        x="value / its σ" if np.abs(t).max() <= 50 else
+        "value / its σ (asinh)",
         traces=[trace],
         height=110 + 22 * len(order),
     )  # fmt: skip

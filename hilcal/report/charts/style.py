@@ -42,7 +42,7 @@ def template(dark: bool) -> go.layout.Template:
         "linecolor": grid,
         "zerolinecolor": grid,
         "automargin": True,
-        "title": {"standoff": 8},
+        "title": {"standoff": 8, "font": {"size": 12}},
         "ticks": "",
     }
     in_space = {"gridcolor": grid, "zerolinecolor": grid, "showbackground": False, "color": ink}

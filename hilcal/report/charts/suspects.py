@@ -33,7 +33,7 @@ def suspects(d: Diagnosis) -> go.Figure:
             f"{100 * max(d.lead.holdout_share, 0.0):.0f} % on poses left out; ✓ marks those that "
             "pass all tests."
         )
-    return bars(names, shares, hover, says, "explained on poses left out [%]", colors)
+    return bars(names, shares, hover, says, "on poses left out [%]", colors)
 
 
 def evidence(d: Diagnosis) -> go.Figure:

@@ -287,7 +287,9 @@ def _limit(m: ReportContent) -> Iterator[Part]:
         yield from from_terminal(
             text_validate.validation_report(t.judged, t.prediction, t.beyond), "Validation"
         )
-        yield from from_terminal(text_validate.shares_report(t.shares))
+        yield from from_terminal(
+            text_validate.shares_report(t.shares), "Errors of the validation campaign"
+        )
     else:
         yield _by_load(m)
 

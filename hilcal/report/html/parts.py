@@ -1,7 +1,7 @@
 """What a page consists of: sections of words, tables, lists and charts; no markup in any of it."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import plotly.graph_objects as go
 from rich.console import RenderableType
@@ -92,11 +92,24 @@ def in_script(json: str) -> str:
 
 
 def from_terminal(parts: Iterable[RenderableType], caption: str = "") -> tuple[Part, ...]:
-    """Return what a command says at the terminal as parts: the words exist once."""
+    """Return what a command says at the terminal as parts: the words exist once.
+
+    The caption of a table is the heading right above it, else `caption`; where two tables would
+    have the same, the second says what its rows are.
+    """
     out: list[Part] = []
+    used: set[str] = set()
     for part in parts:
         if isinstance(part, RichTable):
-            out.append(_table(part, caption))
+            found = _table(part, caption)
+            above = out[-1] if out else None
+            if isinstance(above, Words) and above.kind == "heading":
+                out.pop()
+                found = replace(found, caption=above.text)
+            elif found.caption in used:
+                found = replace(found, caption=f"{found.caption}: {found.heads[0]}")
+            used.add(found.caption)
+            out.append(found)
             continue
         words = part.plain if isinstance(part, Text) else str(part)
         styled = str(part.style) if isinstance(part, Text) else ""

@@ -99,7 +99,7 @@ def _evidence(m: ReportContent) -> Section:
         words = Words("Not diagnosed: only a model fitted with scaling gc can be.")
         return Section("evidence", "What is missing, with its evidence", (words,))
     parts: list[Part] = [Words(m.story.revisions[-1].message)]
-    parts += [chart("Suspects", suspects(d)), chart("Evidence", evidence(d))]
+    parts += [chart("Suspects: share of the misfit", suspects(d)), chart("Evidence", evidence(d))]
     parts.append(_suspects(d.suspects[:MOST_LISTED], "Suspects, best first"))
     parts += from_terminal([*doubtful(d), *redundant_line(d)])
     tested = [s for s in d.suspects if s.score.rank > 0 and s.plausible]

@@ -1,6 +1,7 @@
 """What is known of a campaign while it is measured: places of its readings, and a tally."""
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -23,6 +24,11 @@ LIMIT = style.BALL_SIGMAS / 3**0.5
 ALARM = 0.001
 """Chance that noise alone leaves as many readings outside their balls as is called wrong."""
 WORST = 3
+FLUENT = 1000
+"""Residuals that a viewer draws one by one. Of 10,000 each of its pictures took 3.5 times the
+processor time of 100 (tests/benchmarks/test_viewer_speed.py); of this many some 1.2 times."""
+GROUPS = 150
+"""Groups that more of them are divided into: as many as a finished recording has bars."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,12 +40,14 @@ class Judged:
         target: name of the target; empty where there is one.
         length: of the residual r, m.
         norm2: rᵀ V⁻¹ r, V the covariance of reading and prediction; 3 degrees of freedom.
+        stands_out: whether it is the worst of its group so far, see `LiveDigest.group`.
     """
 
     step: Step
     target: str
     length: float
     norm2: float
+    stands_out: bool = True
 
     @property
     def sigma(self) -> float:
@@ -69,6 +77,7 @@ class LiveDigest:
         worst: those that are farthest from the model.
         remarks: that people should look at, newest last.
         places: index of each pose by its name; filled when it is first asked for.
+        group_worst: largest `Judged.norm2` of the group that is being measured.
     """
 
     told: Measuring
@@ -84,6 +93,7 @@ class LiveDigest:
     worst: list[Judged] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
     places: dict[str, int] = field(default_factory=dict)
+    group_worst: float = 0.0
 
     @classmethod
     def of(cls, told: Measuring) -> "LiveDigest":
@@ -98,6 +108,12 @@ class LiveDigest:
     def total(self) -> int:
         """Readings that are planned."""
         return len(self.told.plan.steps)
+
+    @property
+    def group(self) -> int:
+        """Residuals, one after the other, of which a viewer keeps those that stand out; 1: all."""
+        planned = self.total * len(self.told.targets)
+        return 1 if planned <= FLUENT else math.ceil(planned / GROUPS)
 
     def place(self, step: Step, target: int = 0) -> Floats:
         """(3,) where the nominal arm holds a target, m."""
@@ -126,6 +142,9 @@ class LiveDigest:
             self.outside += 1
             of_load[1] += 1
         self.worst = sorted([*self.worst, found], key=lambda j: -j.norm2)[:WORST]
+        begins = (self.judged - 1) % self.group == 0
+        found = replace(found, stands_out=begins or found.norm2 > self.group_worst)
+        self.group_worst = max(found.norm2, 0.0 if begins else self.group_worst)
         return found
 
     @property

@@ -11,8 +11,8 @@ from hilcal.report.viewer.live_digest import LiveDigest
 from hilcal.types import Floats
 
 TIMELINE = "time"
-RESIDUALS = "Residual of each reading in σ: an arrow that leaves its noise ball = model wrong"
-IN_TIME = "Residual of each reading, in σ: grey noise, amber doubtful, red model wrong"
+RESIDUALS = "in σ: an arrow that leaves its noise ball = model wrong"
+IN_TIME = "in σ: grey noise, amber doubtful, red model wrong"
 
 
 def blueprint(d: LiveDigest, world: str, series: str) -> rrb.Blueprint:
@@ -28,11 +28,12 @@ def blueprint(d: LiveDigest, world: str, series: str) -> rrb.Blueprint:
         start=rrb.TimeRangeBoundary.infinite(),
         end=rrb.TimeRangeBoundary.cursor_relative(),
     )
+    of = "Residual of each reading," if d.group == 1 else f"Worst of every {d.group} residuals,"
     middle, size = _center(d)
     scene = rrb.Spatial3DView(
         origin="world",
         contents=[f"+ {world}/**"],
-        name=RESIDUALS,
+        name=f"{of} {RESIDUALS}",
         background=BACKGROUND,
         line_grid=GRID,
         overrides={f"{world}/{name}": every for name in ("arrows", "balls", "dots")},
@@ -45,7 +46,7 @@ def blueprint(d: LiveDigest, world: str, series: str) -> rrb.Blueprint:
     )
     in_time = rrb.TimeSeriesView(
         origin=series,
-        name=IN_TIME,
+        name=f"{of} {IN_TIME}",
         plot_legend=rrb.PlotLegend(visible=False),
         axis_x=archetypes.TimeAxis(
             view_range=rr.TimeRange(

@@ -1,5 +1,6 @@
 """Draws a command while it works: readings as they come, revisions as they are found."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -23,6 +24,7 @@ from hilcal.report.viewer.arm_shapes import MovingArm
 from hilcal.report.viewer.digest import Digest, Limits, digest
 from hilcal.report.viewer.live_digest import BALL, LIMIT, LiveDigest, arrow
 from hilcal.robot.body import body_poses
+from hilcal.types import Floats
 
 _ABOVE = np.array([0.0, 0.0, 1.3 * BALL])
 BALLS = 60
@@ -169,15 +171,19 @@ class LiveScene:
     def _reading(self, d: LiveDigest, event: ReadingStored) -> None:
         """Draw a reading: each target's arrow in its ball and place in time, and a label."""
         rec, before = self._rec, d.judged
-        dots, arrows, balls = [], [], []
+        dots, arrows, balls, now = [], [], [], []
         read = d.add(event)
         for target, live, found in read:
             at = d.place(event.step, target)
             if found is None:
                 dots.append(at)
                 continue
+            drawn = (at, arrow(live, found), found.level)
+            now.append(drawn)
+            if not found.stands_out:
+                continue
             if found.level or d.judged <= MANY:
-                arrows.append((at, arrow(live, found), found.level))
+                arrows.append(drawn)
             if d.judged <= (MANY if found.level else BALLS):
                 balls.append(at)
             name = style.LEVEL_NAMES[found.level]
@@ -186,26 +192,12 @@ class LiveScene:
             dot = rr.Points3D(dots, colors=[style.MEASURED], radii=[0.01])
             rec.log(f"{self._world}/dots", dot)
         if arrows:
-            starts, vectors, levels = zip(*arrows, strict=True)
-            rec.log(
-                f"{self._world}/arrows",
-                rr.Arrows3D(
-                    origins=starts,
-                    vectors=vectors,
-                    colors=[style.LEVEL_COLORS[level] for level in levels],
-                    radii=[0.0055 if level else 0.0035 for level in levels],
-                ),
-            )
+            rec.log(f"{self._world}/arrows", _arrows(arrows))
         if balls:
-            rec.log(
-                f"{self._world}/balls",
-                rr.Ellipsoids3D(
-                    centers=balls,
-                    half_sizes=[(BALL, BALL, BALL)] * len(balls),
-                    colors=[(*style.NOISE, 46)],
-                    fill_mode="solid",
-                ),
-            )
+            rec.log(f"{self._world}/balls", _balls(balls))
+        if now and d.group > 1:  # the last reading, drawn until the next one comes
+            rec.log(f"{self._world}/now/arrow", _arrows(now))
+            rec.log(f"{self._world}/now/ball", _balls([at for at, *_ in now]))
         if d.judged > before and not (self._batches and before):
             rec.log(f"{self._series}/limit", rr.Scalars(LIMIT))
         target, _, worst = max(read, key=lambda r: -1.0 if r[2] is None else r[2].norm2)
@@ -244,6 +236,29 @@ class LiveScene:
         if titles != self._titles or not earlier:
             rec.send_blueprint(layout.blueprint(d), make_active=True, make_default=True)
             self._titles = titles
+
+
+Drawn = tuple[Floats, Floats, int]
+"""Where an arrow begins, m; the arrow, m; its level."""
+
+
+def _arrows(of: Sequence[Drawn]) -> rr.Arrows3D:
+    starts, vectors, levels = zip(*of, strict=True)
+    return rr.Arrows3D(
+        origins=starts,
+        vectors=vectors,
+        colors=[style.LEVEL_COLORS[level] for level in levels],
+        radii=[0.0055 if level else 0.0035 for level in levels],
+    )
+
+
+def _balls(at: Sequence[Floats]) -> rr.Ellipsoids3D:
+    return rr.Ellipsoids3D(
+        centers=at,
+        half_sizes=[(BALL, BALL, BALL)] * len(at),
+        colors=[(*style.NOISE, 46)],
+        fill_mode="solid",
+    )
 
 
 def _titles(d: Digest) -> tuple[str, ...]:

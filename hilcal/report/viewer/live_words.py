@@ -19,6 +19,10 @@ model is wrong there. All arrows are in units of that noise. Grey: noise. Amber:
 Red: beyond 99.99 %. Blue dots were measured before there was a model, or in an earlier session.
 After 300 readings only arrows that leave their balls are drawn; below stand all.
 
+A campaign of more than 1000 readings is divided into 150 groups, one after the other. The last
+reading is always drawn; of the earlier ones only those stay that were the worst of their group so
+far, here and below. The words count all readings, and the log lists them.
+
 **Residual of each reading** (below): the same along the time of day, in σ as on the
 terminal (rms of the three axes): 1 is noise, the green line 99 %.
 

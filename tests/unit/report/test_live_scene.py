@@ -12,7 +12,7 @@ from rerun.chunk import RrdReader
 from hilcal.acquire.progress import ArmAt, LiveResidual, ReadingStored, Remark
 from hilcal.report.live_messages import Measuring, Revised
 from hilcal.report.viewer import live, live_words, style
-from hilcal.report.viewer.live_digest import BALL, LiveDigest, judged
+from hilcal.report.viewer.live_digest import BALL, FLUENT, GROUPS, LIMIT, LiveDigest, judged
 from hilcal.report.viewer.live_scene import MANY, LiveScene
 from tests.support.live_story import BLIND, events, measuring, plan, residual
 from tests.support.picture import Shot, pictures, vulkan_available
@@ -86,6 +86,27 @@ def test_of_many_readings_only_those_outside_are_drawn_in_space(tmp_path):
     assert len(arrows) == MANY + sum(outside[MANY:]) < len(stored)
     shown = [rows(path, f"/live/1/{name}", "Scalars:scalars") for name in style.LEVEL_NAMES]
     assert sum(map(len, shown)) == len(stored)
+
+
+def test_of_a_thousand_readings_and_more_the_worst_of_each_group_stay(tmp_path):
+    told = measuring(plan(FLUENT // 2 + 100))
+    path = recorded(tmp_path / "thousands.rrd", events(told, wrong=2.0))
+    stored = [e for _, e in events(told, wrong=2.0) if isinstance(e, ReadingStored)][BLIND:]
+    sigma = np.array([judged(e.step, e.live).sigma for e in stored])
+    group = -(-len(told.plan.steps) // GROUPS)
+    shown = np.sort(np.concatenate(
+        [np.ravel(rows(path, f"/live/1/{n}", "Scalars:scalars")) for n in style.LEVEL_NAMES]
+    ))  # fmt: skip
+    assert LiveDigest.of(told).group == group == 8
+    assert len(shown) < 0.45 * len(sigma)
+    worst = [sigma[k : k + group].max() for k in range(0, len(sigma), group)]
+    assert all(np.abs(shown - w).min() < 1e-9 for w in worst)
+    last = rows(path, "/world/live/1/now/arrow", "Arrows3D:vectors")
+    assert len(last) == len(stored)  # each reading is drawn while it is the last
+    kept = rows(path, "/world/live/1/arrows", "Arrows3D:vectors")
+    assert len(kept) <= len(shown)
+    outside = [w for w in worst if w > LIMIT]
+    assert sum(np.linalg.norm(v[0]) > BALL for v in kept) >= len(outside) > 20
 
 
 def test_every_target_of_an_arrival_is_drawn_where_it_is(tmp_path):

@@ -3,6 +3,8 @@
 import itertools
 import json
 import re
+import shutil
+import subprocess
 from collections.abc import Iterator
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -17,9 +19,22 @@ from hilcal.report.html.certificate import left_out_errors, limit_words, mm
 from hilcal.report.html.content import ReportContent
 from hilcal.report.html.page import page as page_of
 from tests.support.browser import DESKTOP, PHONE, needs_chromium, open_browser
+from tests.support.picture import pixels
 from tests.support.report_pages import EVIL, opened, small_content
 
 DRAW_ALL = "drawAll()"
+PAPER = 681
+"""Width of A4 without its margins, 180 mm, in CSS pixels."""
+CUT = (
+    "() => charts.flatMap((c) => { const box = c.getBoundingClientRect();"
+    " return [...c.querySelectorAll('svg text')].filter((t) => t.textContent && (({left, right,"
+    " width}) => width && (left < box.left - 2 || right > box.right + 2))("
+    "t.getBoundingClientRect())).map((t) => [c.ariaLabel.split(':')[0], t.textContent]); })"
+)
+"""Words of charts that are cut at their left or right edge."""
+needs_poppler = pytest.mark.skipif(
+    shutil.which("pdftoppm") is None, reason="no poppler: on Debian install poppler-utils"
+)
 
 
 @pytest.fixture(scope="module")
@@ -134,6 +149,7 @@ def test_it_is_whole_in_a_browser(made, browser: Browser, size, scheme: str) -> 
         assert found == readings
         ink = page.evaluate("charts[0]._fullLayout.font.color")
         assert ink == {"light": "#24272e", "dark": "#e4e5e9"}[scheme]
+        assert page.evaluate(f"({CUT})()") == []
         assert page.evaluate("window.harmed") is None
         assert bad == []
 
@@ -146,16 +162,47 @@ def test_it_prints_on_a4_in_light_colours_with_all_charts(made, browser: Browser
         page.evaluate(
             "window.addEventListener('beforeprint', () => { window.printed = charts.map("
             "(c) => [!!c._fullLayout, c.getBoundingClientRect().width,"
-            " c._fullLayout.font.color]); })"
+            " c._fullLayout.font.color]);"
+            f" window.cut = ({CUT})(); }})"
         )
         pdf = page.pdf(prefer_css_page_size=True)
         printed = page.evaluate("window.printed")
+        assert page.evaluate("window.cut") == []
         assert all(drawn for drawn, _, _ in printed)
-        assert max(width for _, width, _ in printed) <= 681  # 180 mm in CSS pixels
+        assert max(width for _, width, _ in printed) <= PAPER
         assert {ink for _, _, ink in printed} == {"#24272e"}
         assert re.search(rb"/MediaBox \[0 0 59[45][.0-9]* 84[12][.0-9]*\]", pdf)
         assert page.evaluate("charts[0]._fullLayout.font.color") == "#e4e5e9"  # as it was
+        page.set_viewport_size({"width": PAPER, "height": 1000})
+        page.emulate_media(media="print")
+        page.add_style_tag(content=".chart { display: none; }")  # they are as wide as the screen
+        assert page.evaluate("document.documentElement.scrollWidth") <= PAPER
         assert bad == []
+
+
+@needs_chromium
+@needs_poppler
+@pytest.mark.slow
+def test_printed_pages_are_numbered_light_and_end_with_no_heading(
+    made, browser: Browser, tmp_path: Path
+) -> None:
+    with opened(browser, made[1], viewport=DESKTOP, color_scheme="dark") as (page, _):
+        titles = set(page.locator("h2, h3, caption").all_text_contents())
+        page.pdf(path=tmp_path / "page.pdf", prefer_css_page_size=True, print_background=True)
+    pdf = str(tmp_path / "page.pdf")
+    told = subprocess.run(["pdftotext", "-layout", pdf, "-"], capture_output=True, text=True)
+    pages = [[x.strip() for x in p.splitlines() if x.strip()] for p in told.stdout.split("\f")]
+    pages = [p for p in pages if p]
+    assert len(pages) > 5
+    for k, lines in enumerate(pages):
+        assert lines[-1] == f"page {k + 1} of {len(pages)}"
+        assert lines[-2] not in titles, lines[-3:]
+        assert len(lines) > 3  # no page for the end of a table alone
+    subprocess.run(["pdftoppm", "-r", "20", "-png", pdf, str(tmp_path / "p")], check=True)
+    for png in sorted(tmp_path.glob("p-*.png")):
+        ink = pixels(png)[..., :3]
+        assert np.median(ink) == 255  # white paper
+        assert (ink < 200).any()  # and something on it
 
 
 def test_what_is_in_scripts_is_json(made) -> None:
