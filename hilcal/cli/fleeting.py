@@ -7,7 +7,9 @@ from typing import Annotated
 import typer
 
 from hilcal.cli.engine import Scheduler, Workers
-from hilcal.cli.terminal import Json, terminal
+from hilcal.cli.files import check_record
+from hilcal.cli.terminal import Json, Record, terminal
+from hilcal.cli.viewing import opening
 from hilcal.engine.engine import open_engine
 from hilcal.fleet.document import to_json
 from hilcal.fleet.fleet import fleet as pool_fleet
@@ -28,12 +30,14 @@ def fleet(
     report: Annotated[
         Path | None, typer.Option("--report", metavar="F.html", help="Write it as one HTML page.")
     ] = None,
+    record: Record = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
     as_json: Json = False,
 ) -> None:
     """Pool many campaigns: a prior for other arms, arms unlike their type, drift."""
     t = terminal(as_json)
+    check_record(record)
     entries(directory)  # refused before workers are started
     with open_engine(workers, scheduler) as engine:
         found = pool_fleet(directory, engine, partial(counting, t.progress))
@@ -49,4 +53,10 @@ def fleet(
         write_fleet_report(found, directory, report)
         t.show(f"{report}: the report")
         document["report"] = str(report)
+    if record is not None:
+        from hilcal.report.viewer.fleet_stream import record_fleet  # loads the viewer's library
+
+        record_fleet(found, record)
+        t.notice(f"recorded {record}; open it with: {opening(record)}")
+        document["recording"] = str(record)
     t.document(document)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
 from typing import Any
 
+from hilcal.errors import InputError
 from hilcal.toml import parse_json
 
 STORED = "stored_sha256"
@@ -18,6 +19,19 @@ its last bits depend on the machine."""
 def utc_now() -> str:
     """Present time, ISO 8601, UTC, to the second."""
     return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def seconds_of(date: str, where: str = "date") -> float:
+    """Return seconds since 1970 of a date in ISO 8601, UTC unless it says otherwise.
+
+    Raises:
+        InputError: no date.
+    """
+    try:
+        found = datetime.fromisoformat(date)
+    except ValueError:
+        raise InputError(f"{where}: {date!r}; valid: a date as 2026-03-31") from None
+    return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp()
 
 
 @dataclass(frozen=True, slots=True)

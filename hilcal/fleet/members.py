@@ -3,12 +3,12 @@
 import csv
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from pathlib import Path
 
 from hilcal.campaign import Campaign
 from hilcal.data.overview import overview
 from hilcal.data.purpose import refuse_fitting
+from hilcal.data.revision import seconds_of
 from hilcal.diagnose.verdict import diagnose
 from hilcal.effects.failure import failure_of
 from hilcal.errors import HilcalError, InputError
@@ -116,19 +116,6 @@ def _listed(path: Path) -> Mapping[str, tuple[str, str]]:
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: cannot be read ({error})") from None
     return found
-
-
-def seconds_of(date: str, where: str = "date") -> float:
-    """Return seconds since 1970 of a date in ISO 8601, UTC unless it says otherwise.
-
-    Raises:
-        InputError: no date.
-    """
-    try:
-        found = datetime.fromisoformat(date)
-    except ValueError:
-        raise InputError(f"{where}: {date!r}; valid: a date as 2026-03-31") from None
-    return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp()
 
 
 def member_of(entry: Entry) -> Member | Failure:

@@ -13,9 +13,9 @@ from itertools import pairwise
 import numpy as np
 
 from hilcal.data.ranges import Range
-from hilcal.data.revision import utc_now
+from hilcal.data.revision import seconds_of, utc_now
 from hilcal.errors import CannotAnswerError
-from hilcal.fleet.members import Member, seconds_of
+from hilcal.fleet.members import Member
 from hilcal.identify.posterior import LearntEffect, Posterior, Source
 from hilcal.regression.distributions import norm
 from hilcal.regression.hierarchy import (

@@ -55,7 +55,13 @@ def type_report(t: "Pooled") -> Iterator[RenderableType]:
         "±: standard uncertainty; between arms, and campaigns of an arm: standard deviations.\n",
         style="dim",
     )
-    if not repeated:
+    yield from type_lines(t)
+    yield ""
+
+
+def type_lines(t: "Pooled") -> Iterator[str]:
+    """Yield what is said below the table of a type."""
+    if all(p.within is None for p in t.parameters):
         yield "No arm was measured twice: what changes with time is part of the arms' spread.\n"
     if t.odd:
         yield "Unlike the others:"
@@ -72,7 +78,6 @@ def type_report(t: "Pooled") -> Iterator[RenderableType]:
     if t.seen:
         yield "Effects that the diagnoses added:"
         yield from (f"  {_seen(s)}" for s in t.seen)
-    yield ""
 
 
 def _row(p: "Spread", repeated: bool) -> list[str]:

@@ -206,8 +206,11 @@ def test_a_directory_of_campaigns_gives_a_prior_that_identify_takes(
     write(folder, ("a/1.hilcal", "b/1.hilcal", "c/1.hilcal", "c/2.hilcal"))
     (folder / "broken.hilcal").write_bytes(b"no campaign")
     prior, shown = tmp_path / "prior.json", tmp_path / "fleet.html"
-    options = ("--json", "--workers", "2", "--report", shown)
+    recording = tmp_path / "fleet.rrd"
+    options = ("--json", "--workers", "2", "--report", shown, "--record", recording)
     told = ok(capsys, "fleet", folder, "-o", prior, *options)
+    assert told.document["recording"] == str(recording)
+    assert recording.stat().st_size > 10_000
     assert "A fleet of arms" in shown.read_text(encoding="utf-8")
     (of,) = told.document["types"]
     assert of["arms"] == ["a", "b", "c"]

@@ -1,0 +1,90 @@
+"""A fleet in rerun: the odd arm is red, in its joint, and stands by its dates."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rerun as rr
+from rerun.chunk import RrdReader
+
+from hilcal.fleet.fleet import Fleet
+from hilcal.fleet.pooled import Pooled, pooled
+from hilcal.identify.posterior import Posterior
+from hilcal.report.viewer import style
+from hilcal.report.viewer.fleet_digest import type_digest
+from hilcal.report.viewer.fleet_scene import places
+from hilcal.report.viewer.fleet_stream import record_fleet
+from hilcal.robot.body import capsules
+from tests.support.picture import Shot, pictures, vulkan_available
+from tests.support.viewer_plan import entities, rgb, rows
+from tests.unit.fleet.test_fleet import ARMS, ODD, members, posterior_of, readings_of
+
+
+@pytest.fixture(scope="module")
+def one() -> Posterior:
+    return posterior_of(readings_of(np.ones(6), 1))
+
+
+def fleet(one: Posterior, odd: float) -> tuple[Fleet, Pooled]:
+    """30 arms in January and March, of which one may have a soft joint 3."""
+    mine = members(one, 3, odd=odd)
+    of = pooled(mine, ())
+    return Fleet((of,), tuple(mine), ()), of
+
+
+def recorded(one: Posterior, path: Path, odd: float) -> Path:
+    rr.set_strict_mode(True)
+    try:
+        record_fleet(fleet(one, odd)[0], path)
+    finally:
+        rr.set_strict_mode(False)
+    return path
+
+
+def test_campaigns_are_as_far_from_the_type_as_their_arm(one: Posterior) -> None:
+    whole, of = fleet(one, 1.5)
+    d = type_digest(of, whole.members)
+    assert np.argwhere(d.odd).tolist() == [[ODD, d.names.index("joint_compliance.j3")]]
+    assert d.joints == tuple(int(name[-1]) for name in d.names)
+    assert (d.units.shape, d.campaigns.shape) == ((ARMS, len(d.names)), (2 * ARMS, len(d.names)))
+    assert [d.owner[k] for k in (0, 1, 2)] == [0, 0, 1]
+    assert d.seconds[1] - d.seconds[0] == 59 * 86400
+    odd = d.campaigns[np.array(d.owner) == ODD][:, d.names.index("joint_compliance.j3")]
+    assert (odd > 5).all()
+    apart = np.linalg.norm(places(d)[:, None] - places(d), axis=2) + 10 * np.eye(ARMS)
+    assert apart.min() > 0.5
+
+
+def test_the_odd_joint_alone_is_red_and_its_arm_framed(one: Posterior, tmp_path: Path) -> None:
+    path = recorded(one, tmp_path / "fleet.rrd", 1.5)
+    d = type_digest(fleet(one, 1.5)[1], fleet(one, 1.5)[0].members)
+    shapes = capsules(d.arm)
+    colors = [rgb(c) for c in rows(path, "/arms0/arms", "Capsules3D:colors")[0]]
+    red = [k for k, c in enumerate(colors) if c == style.RED]
+    assert red == [ODD * len(shapes) + k for k, s in enumerate(shapes) if s.body == 3]
+    (centre,) = rows(path, "/arms0/unlike", "Boxes3D:centers")[0]
+    np.testing.assert_allclose(centre[:2], places(d)[ODD, :2], atol=1e-6)
+    words = rows(path, "/words/type0", "TextDocument:text")[0][0]
+    assert f"arm{ODD} is unlike the others" in words
+    drifts = {e for e in entities(path) if e.startswith("/date0/")}
+    assert [e for e in drifts if "unlike" in e] == [f"/date0/2/zunlike/{ODD}"]
+    chunks = RrdReader(path).stream().filter(content=f"/date0/2/zunlike/{ODD}").to_chunks()
+    told = [c.to_record_batch() for c in chunks]
+    assert sum(b.num_rows for b in told if "date" in b.schema.names) == 2
+
+
+def test_an_ordinary_fleet_has_nothing_red(one: Posterior, tmp_path: Path) -> None:
+    path = recorded(one, tmp_path / "fleet.rrd", 0.0)
+    colors = [rgb(c) for c in rows(path, "/arms0/arms", "Capsules3D:colors")[0]]
+    assert style.RED not in colors
+    assert "/arms0/unlike" not in entities(path)
+    assert "No arm is unlike" in rows(path, "/words/type0", "TextDocument:text")[0][0]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not vulkan_available(), reason="no Vulkan driver installed")
+def test_the_viewer_draws_it_without_a_complaint(one: Posterior, tmp_path: Path) -> None:
+    path = recorded(one, tmp_path / "fleet.rrd", 1.5)
+    told = pictures(path, [Shot(tmp_path / "fleet.png")], (960, 540), 480)
+    assert {v.name: v.problems for v in told if v.problems} == {}
+    assert len(told) >= 4
