@@ -76,13 +76,18 @@ class Amplitude:
             out = out * f.values(s)
         return out
 
-    def unit(self) -> str:
-        """Unit of the product; "1" where it has none."""
+    @property
+    def powers(self) -> dict[str, float]:
+        """Powers of the units that the product has."""
         powers: dict[str, float] = {}
         for f in self.factors:
             if f.power and f.variable.unit != "1":
                 powers[f.variable.unit] = powers.get(f.variable.unit, 0.0) + f.power
-        return "·".join(_raised(u, p) for u, p in powers.items()) or "1"
+        return powers
+
+    def unit(self) -> str:
+        """Unit of the product; "1" where it has none."""
+        return unit_of(self.powers)
 
     def of_joint(self, old: int, new: int, known: list[Variable]) -> "Amplitude | None":
         """Return the same law of another joint's own quantities; None where it has none."""
@@ -113,6 +118,11 @@ class Amplitude:
 
 def _alike(a: Variable, b: Variable) -> bool:
     return a.slot is None or b.slot is None or a.slot[1] == b.slot[1]
+
+
+def unit_of(powers: dict[str, float]) -> str:
+    """Return a product of units by their powers; "1" where there is none."""
+    return "·".join(_raised(u, p) for u, p in powers.items()) or "1"
 
 
 def _raised(unit: str, power: float) -> str:

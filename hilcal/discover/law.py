@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilcal.discover.amplitudes import Amplitude
+from hilcal.discover.amplitudes import Amplitude, unit_of
 from hilcal.discover.screen import Screen
 from hilcal.discover.sites import ORDINARY, Site
 from hilcal.discover.terms import Term
@@ -72,13 +72,17 @@ class Form:
     def unit(self, coefficient: int) -> str:
         """Unit of a coefficient."""
         part = next(p for p in self.parts if p.coefficient == coefficient)
-        inner = part.amplitude.unit()
+        site, powers = part.site.unit, dict(part.amplitude.powers)
+        if part.site.field == "sensor" and site in powers:
+            # A force by a force; an angle by an angle is left as people write it.
+            left = powers.pop(site) - 1.0
+            powers |= {site: left} if left > 0 else {}
+            site = "1" if left >= 0 else unit_of({site: -left})
+        inner = unit_of(powers)
         if inner == "1":
-            return part.site.unit
-        if part.site.field == "sensor" and inner == part.site.unit:
-            return "1"
+            return site
         wrapped = f"({inner})" if "·" in inner or "^" in inner else inner
-        return f"{part.site.unit}/{wrapped}"
+        return f"{site}/{wrapped}"
 
     def text(self) -> str:
         """Return the formula as plain text, one equation per site."""

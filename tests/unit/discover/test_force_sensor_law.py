@@ -4,9 +4,15 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pytest
 
+from hilcal.discover import shapes
+from hilcal.discover.amplitudes import Amplitude, Factor
 from hilcal.discover.curve import curves
 from hilcal.discover.discovery import Discovery, discover
+from hilcal.discover.law import Form, Part
+from hilcal.discover.sites import sites
+from hilcal.discover.variables import variables
 from hilcal.discover.write_effect import effect_class
 from hilcal.effects.check import check_effect
 from hilcal.identify.baseline import baseline
@@ -65,3 +71,15 @@ def test_the_curve_of_the_law_is_drawn_beside_the_readings() -> None:
     assert (curve.of, curve.unit, curve.quantity) == ("sensor_fz", "N", "fS_z")
     away = (curve.y - SHARE * np.maximum(curve.x, 0.0)) / curve.std
     assert abs(float(np.mean(away[curve.x > 0]))) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("quantities", "unit"),
+    [(("S_z",), "1"), (("S_z", "S_z"), "1/N"), (("S_x", "t"), "1/s"), (("t",), "N/s")],
+)
+def test_units_of_the_sensors_own_quantities_cancel(quantities: tuple[str, ...], unit: str) -> None:
+    known = variables(misread().solution.prediction.situation)
+    named = {v.symbol.removeprefix("f").partition(" ")[0].strip("("): v for v in known}
+    factors = tuple(Factor(named[q], shapes.LINEAR) for q in quantities)
+    site = next(s for s in sites(6) if s.symbol == "sensor_fz")
+    assert Form((Part(site, Amplitude(factors), 0),)).unit(0) == unit
