@@ -9,6 +9,7 @@ from hilcal.diagnose.diagnosis import Diagnosis, History, Verdict
 from hilcal.diagnose.effect_ranking import LEAST_SHARE
 from hilcal.diagnose.evidence import Evidence
 from hilcal.diagnose.promise import LEAST_KEPT, kept_by_refit
+from hilcal.diagnose.residual_regression import Regressions
 from hilcal.diagnose.stepwise import Refits, add, exchange, predicts_better, remove
 from hilcal.diagnose.stepwise_alternatives import Alternative
 from hilcal.diagnose.verdict import NOTHING, judge
@@ -146,7 +147,7 @@ class Path:
         self._given, self._before, self._say = first.model.names, before, say
         self._laws, self._seen = laws, seen
         self._rejected, self._removed = [*before.rejected], [*before.removed]
-        self._refits = Refits()
+        self._refits, self._regressions = Refits(), Regressions()
         taken = first.readings.arm_scatter is not None
         self._scattered = [first.model.names] if taken else []
         say("diagnosing")
@@ -166,7 +167,7 @@ class Path:
 
     def append(self, found: Fit, added: str | None, removed: str | None = None) -> None:
         """Judge a fit and append it."""
-        self._evidence = Evidence(found, self._refits.add, self._say)
+        self._evidence = Evidence(found, self._refits.add, self._say, self._regressions)
         diagnosis = judge(self._evidence, self._history(found))
         self.steps.append(Step(found, diagnosis, added, removed))
         self._seen(self.steps[-1])
@@ -256,7 +257,8 @@ class Path:
         if fitted.readings.arm_scatter is not None:
             stated = fitted.readings.as_stated()
             fitted = fit(fitted.model, stated, fitted.mode, start=fitted.theta)
-            judged = judge(Evidence(fitted, self._refits.add), self._history(fitted))
+            evidence = Evidence(fitted, self._refits.add, regressions=self._regressions)
+            judged = judge(evidence, self._history(fitted))
         if judged.reason != "arm_scatter" or judged.scatter is None:
             return False
         self._scattered.append(names)

@@ -5,7 +5,9 @@ the end. It is scored like a suspect of the model without it, at the same linear
 redundant where its F-test is not significant.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 from hilcal.diagnose.effect_ranking import SAME_EVIDENCE
 from hilcal.identify.carried_evidence import carried_effects, evidence_of_carried
@@ -30,10 +32,16 @@ class Redundant:
     score: FamilyScore
 
 
-def backward_elimination(fit: Fit) -> tuple[Redundant, ...]:
+def backward_elimination(
+    fit: Fit, known: Mapping[str, FamilyScore] = MappingProxyType({})
+) -> tuple[Redundant, ...]:
     """Return the redundant effects of a fit, the least significant first.
 
     Those with a carried prior are judged by `spoken_against`: other readings speak for them.
+
+    Args:
+        fit: the fit.
+        known: scores of its effects against the model without them, as far as they were made.
     """
     carried = fit.solution.space.carried(fit.model.size)
     judged = [
@@ -43,12 +51,11 @@ def backward_elimination(fit: Fit) -> tuple[Redundant, ...]:
     ]
     if not judged:
         return ()
-    x = model_columns(fit)
-    found = []
-    for name in judged:
-        result = eliminate_effect(fit, x, name).score()
-        if result.p_value > CHANCE:
-            found.append(Redundant(name, result))
+    scores = {name: known[name] for name in judged if name in known}
+    if len(scores) < len(judged):
+        x = model_columns(fit)
+        scores = {n: scores.get(n) or eliminate_effect(fit, x, n).score() for n in judged}
+    found = [Redundant(n, scores[n]) for n in judged if scores[n].p_value > CHANCE]
     return tuple(sorted(found, key=lambda n: -n.score.p_value))
 
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from hilcal.diagnose.effect_ranking import FALSE_ALARM, catalogue_columns
 from hilcal.diagnose.noise import pure_error
 from hilcal.diagnose.noise_verdict import MISFIT_ALARM, PREDICTABLE, NoiseVerdict, judge_noise
-from hilcal.diagnose.residual_regression import Dependence, residual_regression
+from hilcal.diagnose.residual_regression import Dependence, Regressions
 from hilcal.identify.fit import Fit
 from hilcal.identify.linearisation import linearise
 from hilcal.regression import forward_selection as selection
@@ -93,6 +93,7 @@ def insufficiency(
     fit: Fit,
     refit: Callable[[Fit, str], Fit],
     say: Callable[[str], None] = lambda text: None,
+    regressions: Regressions | None = None,
 ) -> Insufficiency | None:
     """Return what the whole catalogue leaves of a misfit; None where that is noise.
 
@@ -100,7 +101,9 @@ def insufficiency(
         fit: a fit of which a suspect passes all tests.
         refit: returns a fit with one more effect.
         say: takes progress, one line each.
+        regressions: those that were made.
     """
+    regressions = Regressions() if regressions is None else regressions
     current = fit
     names: list[str] = []
     misfit = fit.chi2 - fit.dof
@@ -114,7 +117,7 @@ def insufficiency(
         say(f"testing the whole catalogue: adding {found.effects[0]}")
         current = refit(current, found.effects[0])
         names.append(found.effects[0])
-    regression = residual_regression(linearise(current))
+    regression = regressions.of(linearise(current))
     noise = judge_noise(current, pure_error(current), regression.share > PREDICTABLE)
     if noise.misjudged or not noise.off:
         return None

@@ -26,7 +26,13 @@ from hilcal.diagnose.stepwise import add
 from hilcal.effects.protocol import Effect
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit
-from hilcal.identify.linearisation import EffectColumns, Linearisation, effect_columns, linearise
+from hilcal.identify.linearisation import (
+    EffectColumns,
+    Linearisation,
+    columns_of_each,
+    effect_columns,
+    linearise,
+)
 from hilcal.regression.evidence import FamilyScore, Spectrum, spectrum
 from hilcal.types import Floats
 
@@ -140,7 +146,7 @@ def candidates(fit: Fit) -> tuple[Effect, ...]:
 
 def catalogue_columns(fit: Fit) -> tuple[Floats, dict[str, slice], dict[str, float]]:
     """Return the columns (R, P) of all `candidates`, which are whose, and how large each may be."""
-    families = [effect_columns(fit, e) for e in candidates(fit)]
+    families = list(columns_of_each(fit, candidates(fit)))
     ends = np.cumsum([0] + [f.white.shape[1] for f in families])
     columns = np.hstack([np.zeros((len(fit.white), 0)), *(f.white for f in families)])
     of = {
@@ -166,7 +172,8 @@ def rank_suspects(
         refit: returns a fit with one more effect.
     """
     bare = unloaded_readings(p.fit)
-    found = [_suspect(p, effect_columns(p.fit, e), bare, level / len(effects)) for e in effects]
+    columns = columns_of_each(p.fit, effects)
+    found = [_suspect(p, of, bare, level / len(effects)) for of in columns]
     tested = max(sum(s.score.rank > 0 for s in found), 1)
     out: list[Suspect] = []
     geometry: Floats | None = None

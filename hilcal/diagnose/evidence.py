@@ -18,7 +18,7 @@ from hilcal.diagnose.misfit_breakdown import MisfitShare, misfit_breakdown
 from hilcal.diagnose.noise import PureError, pure_error
 from hilcal.diagnose.noise_verdict import MISFIT_ALARM
 from hilcal.diagnose.pose_alone import PoseAlone, pose_alone
-from hilcal.diagnose.residual_regression import ResidualRegression, residual_regression, tree_share
+from hilcal.diagnose.residual_regression import Regressions, ResidualRegression
 from hilcal.diagnose.stepwise import add
 from hilcal.diagnose.stepwise_alternatives import Alternative, StepwiseAlternatives
 from hilcal.effects.protocol import Effect
@@ -27,6 +27,7 @@ from hilcal.identify.arm_scatter import estimate_arm_scatter, with_arm_scatter
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.linearisation import Linearisation, linearise
 from hilcal.regression.distributions import chi2
+from hilcal.regression.evidence import FamilyScore
 
 
 class Evidence:
@@ -37,6 +38,7 @@ class Evidence:
         fit: Fit,
         refit: Callable[[Fit, str], Fit] = add,
         say: Callable[[str], None] = lambda text: None,
+        regressions: Regressions | None = None,
     ) -> None:
         """Take a fit.
 
@@ -44,6 +46,7 @@ class Evidence:
             fit: the fit.
             refit: returns a fit with one more effect.
             say: takes progress, one line each.
+            regressions: of residuals, those that were made.
 
         Raises:
             InputError: for a fit whose residual is not whitened.
@@ -51,7 +54,9 @@ class Evidence:
         if fit.scaling != "gc":
             raise InputError(f"diagnosis needs scaling gc, this fit has {fit.scaling}")
         self.fit, self._refit, self._say = fit, refit, say
+        self._regressions = Regressions() if regressions is None else regressions
         self._known: dict[tuple[str, frozenset[str]], Alternative] = {}
+        self._eliminated: dict[str, FamilyScore] = {}
 
     @cached_property
     def linearisation(self) -> Linearisation:
@@ -86,7 +91,7 @@ class Evidence:
     @cached_property
     def regression(self) -> ResidualRegression:
         """What smooth laws, or trees, predict of the misfit on poses left out."""
-        return residual_regression(self.linearisation)
+        return self._regressions.of(self.linearisation)
 
     @cached_property
     def arm_scatter(self) -> ArmScatter | None:
@@ -115,23 +120,25 @@ class Evidence:
             return None
         model, mode, start = self.fit.model, self.fit.mode, self.fit.theta
         scattered = with_arm_scatter(model.cell, readings, self.arm_scatter)
-        return Evidence(fit(model, scattered, mode, start=start), self._refit, self._say)
+        found = fit(model, scattered, mode, start=start)
+        return Evidence(found, self._refit, self._say, self._regressions)
 
     @cached_property
     def tree_share(self) -> float:
         """Share of the misfit that trees predict on poses left out."""
-        return tree_share(self.linearisation)
+        return self._regressions.tree_share(self.linearisation)
 
     @cached_property
     def redundant(self) -> tuple[str, ...]:
         """Effects of the model without which the readings are explained as well."""
-        needless = tuple(n.effect for n in backward_elimination(self.fit))
+        found = backward_elimination(self.fit, self._eliminated)
+        needless = tuple(n.effect for n in found)
         return (*spoken_against(self.fit), *needless)
 
     @cached_property
     def insufficiency(self) -> Insufficiency | None:
         """What all effects of the catalogue together leave, where it is not noise."""
-        return insufficiency(self.fit, self._refit, self._say)
+        return insufficiency(self.fit, self._refit, self._say, self._regressions)
 
     def alternatives(
         self, effects: Collection[str], excluded: Collection[str]
@@ -147,4 +154,5 @@ class Evidence:
             # Not kept: the columns of the whole catalogue are the largest arrays of a judgement.
             algebra = StepwiseAlternatives(self.fit)
             self._known |= {key: algebra.of(key[0], excluded) for key in keys}
+            self._eliminated |= algebra.eliminated
         return tuple(self._known[key] for key in keys)

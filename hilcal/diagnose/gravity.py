@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hilcal.effects.protocol import Effect, Situation
-from hilcal.identify.linearisation import EffectColumns, Linearisation, by_pose, effect_columns
+from hilcal.identify.linearisation import EffectColumns, Linearisation, by_pose, columns_of_each
 from hilcal.regression.evidence import score_family
 from hilcal.regression.leave_out import left_out_residual
 from hilcal.regression.paired_test import improves
@@ -38,7 +38,8 @@ def through_load(effect: Effect) -> bool:
 def geometry_columns(p: Linearisation, effects: Sequence[Effect]) -> Floats:
     """Whitened columns (R, Q) of the effects that are constant in the arm's axes."""
     s = p.fit.solution.prediction.situation
-    families = [effect_columns(p.fit, e).white for e in effects if _constant(e, s)]
+    constant = [e for e in effects if _constant(e, s)]
+    families = [of.white for of in columns_of_each(p.fit, constant)]
     return np.hstack([np.zeros((len(p.residual), 0)), *families])
 
 

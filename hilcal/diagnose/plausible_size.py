@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilcal.identify.fit import Fit
-from hilcal.identify.linearisation import EffectColumns, effect_columns
+from hilcal.identify.linearisation import EffectColumns, columns_of_each
 from hilcal.types import Bools, Floats
 
 ALLOWED = 2.0
@@ -57,9 +57,8 @@ def unloaded_readings(fit: Fit) -> Unloaded | None:
     readings, model = fit.readings[~fit.outlier], fit.model
     rows = readings.unloaded
     kinds = model.catalogue.with_role("registration", "target")
-    frames = [
-        effect_columns(fit, kind(model.cell, readings.states)).at_reading[rows] for kind in kinds
-    ]
+    of = columns_of_each(fit, [kind(model.cell, readings.states) for kind in kinds])
+    frames = [each.at_reading[rows] for each in of]
     columns = np.concatenate(frames, axis=2).reshape(3 * int(rows.sum()), -1)
     u, s, _ = np.linalg.svd(columns, full_matrices=False)
     u = u[:, s > ROUNDING * s.max(initial=0.0)]

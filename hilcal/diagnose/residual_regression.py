@@ -18,6 +18,7 @@ noise, from everything that is recorded of the state. Source: Geurts, Ernst and 
 """
 
 from dataclasses import dataclass, replace
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -30,6 +31,7 @@ from hilcal.diagnose.recorded import (
     motions,
     recorded,
 )
+from hilcal.identify.fit import Fit
 from hilcal.identify.folds import random_folds
 from hilcal.identify.linearisation import Linearisation
 from hilcal.regression.block_selection import BlockSelection, block_evidence
@@ -105,12 +107,37 @@ class ResidualRegression:
     dependences: tuple[Dependence, ...]
 
 
+class Regressions:
+    """Regressions of the residuals of fits, each made once.
+
+    A judgement regresses the residual of a fit that it tried; where that becomes the next
+    revision, it is judged itself.
+    """
+
+    def __init__(self) -> None:
+        """Begin with none."""
+        self._of: WeakKeyDictionary[Fit, ResidualRegression] = WeakKeyDictionary()
+        self._trees: WeakKeyDictionary[Fit, float] = WeakKeyDictionary()
+
+    def of(self, p: Linearisation) -> ResidualRegression:
+        """Return what is predicted on poses left out of the misfit, and what carries it."""
+        if p.fit not in self._of:
+            found = smooth_laws(p)
+            if found.share < LITTLE:
+                found = replace(found, share=max(found.share, self.tree_share(p)))
+            self._of[p.fit] = found
+        return self._of[p.fit]
+
+    def tree_share(self, p: Linearisation) -> float:
+        """Return the share of the misfit that trees predict on poses left out, within [0, 1]."""
+        if p.fit not in self._trees:
+            self._trees[p.fit] = tree_share(p)
+        return self._trees[p.fit]
+
+
 def residual_regression(p: Linearisation) -> ResidualRegression:
     """Return the share of the misfit that is predicted on poses left out, and what carries it."""
-    found = smooth_laws(p)
-    if found.share >= LITTLE:
-        return found
-    return replace(found, share=max(found.share, tree_share(p)))
+    return Regressions().of(p)
 
 
 def tree_share(p: Linearisation) -> float:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from hilcal.diagnose.effect_ranking import SAME_EVIDENCE, catalogue_columns
 from hilcal.identify.fit import Fit
 from hilcal.identify.linearisation import eliminate_effect, model_columns
+from hilcal.regression.evidence import FamilyScore
 from hilcal.regression.forward_selection import families_beside, forward_selection
 
 MOST_TOGETHER = 3
@@ -61,6 +62,8 @@ class StepwiseAlternatives:
         self._fit, self._model = fit, model_columns(fit)
         self._x, self._columns, self._most = catalogue_columns(fit)
         self._gram, self._products = self._x.T @ self._x, self._model.white.T @ self._x
+        self.eliminated: dict[str, FamilyScore] = {}
+        """Score of each effect that `of` was asked for, against the model without it."""
 
     def of(self, effect: str, excluded: Collection[str] = ()) -> Alternative:
         """Return the other effects that explain together what one of the model does.
@@ -70,7 +73,8 @@ class StepwiseAlternatives:
             excluded: effects that are not to be added.
         """
         reduced = eliminate_effect(self._fit, self._model, effect)
-        own = reduced.score().log_evidence
+        self.eliminated[effect] = reduced.score()
+        own = self.eliminated[effect].log_evidence
         families = families_beside(
             reduced.information(self._x, self._gram, self._products),
             reduced.residual,

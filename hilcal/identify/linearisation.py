@@ -4,7 +4,7 @@ The ranking of effects that could be missing and the planning of measurements th
 both use it, so that the planner's power and the diagnosis's test are of the same information.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -23,6 +23,8 @@ from hilcal.regression.paired_test import improves
 from hilcal.regression.projection import Projection
 from hilcal.types import Floats, Ints
 
+TOGETHER = 8_000_000
+"""Numbers of the columns of effects that are computed together, 64 MB; a choice by memory."""
 LEAST_MISFIT = 3.0
 """A misfit counts as at least so many standard deviations of χ²; a choice."""
 
@@ -168,13 +170,40 @@ def computable(fit: Fit, effect: Effect) -> bool:
 
 def effect_columns(fit: Fit, effect: Effect) -> EffectColumns:
     """Return the columns of an effect that is not in the model, at the parameters of the fit."""
+    return next(columns_of_each(fit, (effect,)))
+
+
+def columns_of_each(fit: Fit, effects: Sequence[Effect]) -> Iterator[EffectColumns]:
+    """Yield `effect_columns` of several effects.
+
+    The equilibrium is differentiated once for as many of them as have `TOGETHER` numbers.
+    """
     s, w = fit.solution, fit.whitening
-    jacobian = fit.model.jacobian_of((effect,), s.prediction, s.theta, w.m)
-    scale = np.array([q.scale for q in effect.parameters])
-    jacobian *= scale
-    at_reading = jacobian[:, :3].copy()
-    motion = w.raw(at_reading)
-    return EffectColumns(effect, scale, w.whiten_readings(jacobian), motion, at_reading)
+    rows = w.m * len(s.prediction.situation.angle)
+    for group in _groups(effects, rows):
+        jacobian = fit.model.jacobian_of(group, s.prediction, s.theta, w.m)
+        start = 0
+        for effect in group:
+            scale = np.array([q.scale for q in effect.parameters])
+            own = jacobian[:, :, start : start + len(scale)] * scale
+            at_reading = own[:, :3].copy()
+            motion, start = w.raw(at_reading), start + len(scale)
+            yield EffectColumns(effect, scale, w.whiten_readings(own), motion, at_reading)
+
+
+def _groups(effects: Sequence[Effect], rows: int) -> Iterator[tuple[Effect, ...]]:
+    """Split effects into successive groups of at most `TOGETHER` numbers, or of one effect."""
+    group: list[Effect] = []
+    size = 0
+    for effect in effects:
+        numbers = rows * len(effect.parameters)
+        if group and size + numbers > TOGETHER:
+            yield tuple(group)
+            group, size = [], 0
+        group.append(effect)
+        size += numbers
+    if group:
+        yield tuple(group)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

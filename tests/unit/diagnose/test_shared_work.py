@@ -1,0 +1,68 @@
+"""What parts of a judgement share is what each of them would compute by itself."""
+
+import numpy as np
+import pytest
+
+from hilcal.diagnose import residual_regression as regression
+from hilcal.diagnose.backward_elimination import backward_elimination
+from hilcal.diagnose.effect_ranking import candidates
+from hilcal.diagnose.residual_regression import Regressions, residual_regression
+from hilcal.diagnose.stepwise import add
+from hilcal.diagnose.stepwise_alternatives import StepwiseAlternatives
+from hilcal.identify import linearisation
+from hilcal.identify.baseline import baseline
+from hilcal.identify.fit import Fit, fit
+from hilcal.identify.linearisation import Linearisation, columns_of_each, linearise
+from tests.support.campaigns import campaign
+
+
+@pytest.fixture(scope="module")
+def found() -> Fit:
+    c = campaign("hysteresis", "deflection", poses=12)
+    return add(fit(baseline(c.cell, c.readings, c.mode), c.readings, c.mode), "encoder_offset")
+
+
+@pytest.mark.parametrize("together", [0, 20_000, 8_000_000])
+def test_columns_of_several_effects_are_those_of_each(
+    found: Fit, together: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(linearisation, "TOGETHER", together)
+    effects = candidates(found)
+    s, w = found.solution, found.whitening
+    for effect, of in zip(effects, columns_of_each(found, effects), strict=True):
+        assert of.effect is effect
+        jacobian = found.model.jacobian_of((effect,), s.prediction, s.theta, w.m) * of.scale
+        np.testing.assert_allclose(of.at_reading, jacobian[:, :3], rtol=1e-11, atol=1e-15)
+        white = w.whiten_readings(jacobian)
+        atol = 1e-12 * np.abs(white).max(initial=0.0)
+        np.testing.assert_allclose(of.white, white, rtol=1e-9, atol=atol)
+
+
+def test_the_residual_of_a_fit_is_regressed_once(
+    found: Fit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    alone = residual_regression(linearise(found))
+    grown: list[Linearisation] = []
+    trees = regression.tree_share
+
+    def counted(p: Linearisation) -> float:
+        grown.append(p)
+        return trees(p)
+
+    monkeypatch.setattr(regression, "tree_share", counted)
+    made = Regressions()
+    first = made.of(linearise(found))
+    assert (first.share, len(first.dependences)) == (alone.share, len(alone.dependences))
+    assert made.of(linearise(found)) is first
+    assert made.tree_share(linearise(found)) == made.tree_share(linearise(found))
+    assert len(grown) == 1
+
+
+def test_redundant_effects_by_scores_that_the_alternatives_made(found: Fit) -> None:
+    algebra = StepwiseAlternatives(found)
+    algebra.of("encoder_offset")
+    by_itself, shared = (backward_elimination(found, k) for k in ({}, algebra.eliminated))
+    assert "encoder_offset" in algebra.eliminated
+    assert [n.effect for n in by_itself] == [n.effect for n in shared]
+    for one, other in zip(by_itself, shared, strict=True):
+        assert one.score.p_value == pytest.approx(other.score.p_value, rel=1e-9)
