@@ -15,7 +15,8 @@ import numpy as np
 
 from hilcal.diagnose.noise_where import NoiseWhere, noise_where
 from hilcal.diagnose.repeats import contrasts
-from hilcal.identify.fit import Fit, variance_interval
+from hilcal.identify.fit import Fit
+from hilcal.identify.variance_factor import variance_interval
 from hilcal.regression.distributions import f as f_distribution
 
 FEWEST = 10

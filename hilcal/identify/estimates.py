@@ -4,11 +4,16 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, overload
 
+import numpy as np
+
 from hilcal.errors import InputError
 from hilcal.toml import suggest
+from hilcal.types import Bools, Floats
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from hilcal.model import Model
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +44,30 @@ class Estimates(Sequence[Estimate]):
     """
 
     rows: tuple[Estimate, ...]
+
+    @classmethod
+    def of(
+        cls, model: "Model", theta: Floats, std: Floats, identifiable: Bools, kept: Bools
+    ) -> "Estimates":
+        """Return the parameters (P,) of a model that are `kept`.
+
+        A standard uncertainty (P,) that is infinite stands for none.
+        """
+        names = [(f"{e.name}.{p.name}", p.unit) for e in model.effects for p in e.parameters]
+        seen = identifiable & np.isfinite(std)
+        return cls(
+            tuple(
+                Estimate(
+                    name,
+                    float(theta[k]) if identifiable[k] else None,
+                    float(std[k]) if seen[k] else None,
+                    unit,
+                    bool(identifiable[k]),
+                )
+                for k, (name, unit) in enumerate(names)
+                if kept[k]
+            )
+        )
 
     def __len__(self) -> int:
         """Return the number of parameters."""

@@ -12,7 +12,7 @@ from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.data_snooping import find_gross_errors
 from hilcal.identify.drift import Conflict, chosen_drift, conflicts
 from hilcal.identify.errors import ErrorBlock, error_block
-from hilcal.identify.estimates import Estimate, Estimates
+from hilcal.identify.estimates import Estimates
 from hilcal.identify.folds import distinct_poses, random_folds
 from hilcal.identify.gauss_newton import Solution, solve
 from hilcal.identify.holdout import leave_out
@@ -20,13 +20,12 @@ from hilcal.identify.outliers import limit
 from hilcal.identify.residual import residual
 from hilcal.identify.summary import summary
 from hilcal.identify.uncertainty import Uncertainty, uncertainty
+from hilcal.identify.variance_factor import WithVarianceFactor
 from hilcal.model import Model
 from hilcal.observe import Observation
-from hilcal.regression.distributions import chi2
 from hilcal.types import Bools, Floats, Ints
 
 Frame = Literal["sensor", "base"]
-CONFIDENCE = 0.95
 OUTLIER_ROUNDS = 6
 """Most searches for gross errors, each followed by a new fit; a choice, no study set it."""
 MAX_OUTLIER_SHARE = 0.05
@@ -42,7 +41,7 @@ _Solved = tuple[Whitening, Solution]
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class Fit(WithVarianceFactor):
     """A model fitted to readings.
 
     D is the number of measurements (readings or deflections), m their elements, P the
@@ -112,16 +111,6 @@ class Fit:
         return self.solution.theta
 
     @property
-    def variance_factor(self) -> float:
-        """χ²/dof of the gc-whitened residual; 1 where model and noise are right."""
-        return self.chi2 / self.dof
-
-    @property
-    def variance_factor_interval(self) -> tuple[float, float]:
-        """95 % confidence interval of the variance factor."""
-        return variance_interval(self.chi2, self.dof)
-
-    @property
     def rank(self) -> int:
         """Number of directions of the parameters that the data determine."""
         return int(self.solution.equations.basis.transform.shape[1])
@@ -134,21 +123,8 @@ class Fit:
     @property
     def parameters(self) -> Estimates:
         """The parameters with their standard uncertainties, those of dropped groups left out."""
-        u, kept = self.uncertainty, self.solution.estimated
-        of = [(f"{e.name}.{p.name}", p.unit) for e in self.model.effects for p in e.parameters]
-        return Estimates(
-            tuple(
-                Estimate(
-                    name,
-                    float(self.theta[k]) if u.identifiable[k] else None,
-                    float(u.std[k]) if u.identifiable[k] and np.isfinite(u.std[k]) else None,
-                    unit,
-                    bool(u.identifiable[k]),
-                )
-                for k, (name, unit) in enumerate(of)
-                if kept[k]
-            )
-        )
+        u = self.uncertainty
+        return Estimates.of(self.model, self.theta, u.std, u.identifiable, self.solution.estimated)
 
     def summary(self) -> str:
         """Return the model, its errors and its parameters as plain text."""
@@ -194,12 +170,6 @@ def mahalanobis2(raw: Floats, covariance: Floats) -> Floats:
     """Squared Mahalanobis distances (D,) of residuals (D, m) with covariances (D, m, m)."""
     white = np.einsum("dij,dj->di", inverse_root(covariance), raw)
     return np.asarray(np.sum(white**2, axis=1))
-
-
-def variance_interval(total: float, dof: float) -> tuple[float, float]:
-    """95 % confidence interval of χ²/dof."""
-    tail = (1 - CONFIDENCE) / 2
-    return float(total / chi2.isf(tail, dof)), float(total / chi2.ppf(tail, dof))
 
 
 def fit(

@@ -31,8 +31,8 @@ from hilcal.identify.baseline import baseline, with_effects
 from hilcal.identify.carried import CarriedPrior
 from hilcal.identify.coordinates import coordinates_of
 from hilcal.identify.errors import ErrorBlock
-from hilcal.identify.estimates import Estimate, Estimates
-from hilcal.identify.fit import MAX_OUTLIER_SHARE, Fit, fit, variance_interval
+from hilcal.identify.estimates import Estimates
+from hilcal.identify.fit import MAX_OUTLIER_SHARE, Fit, fit
 from hilcal.identify.folds import FOLDS
 from hilcal.identify.full_covariance import with_joint_scatter
 from hilcal.identify.gauss_newton import over_all_parameters, prior_coordinates
@@ -46,6 +46,7 @@ from hilcal.identify.uncertainty import (
     in_ordinary_magnitudes,
     name_directions,
 )
+from hilcal.identify.variance_factor import WithVarianceFactor
 from hilcal.model import Model
 from hilcal.regression.distributions import chi2
 from hilcal.regression.normal_equations import NormalEquations
@@ -130,7 +131,7 @@ def _point(y: Floats, theta: Floats, parts: tuple[Reduced, ...]) -> _Point:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StreamFit:
+class StreamFit(WithVarianceFactor):
     """A model fitted to a stream.
 
     Attributes:
@@ -180,33 +181,9 @@ class StreamFit:
     converged: bool
 
     @property
-    def variance_factor(self) -> float:
-        """χ²/dof; 1 where model and noise are right."""
-        return self.chi2 / self.dof
-
-    @property
-    def variance_factor_interval(self) -> tuple[float, float]:
-        """95 % confidence interval of the variance factor."""
-        return variance_interval(self.chi2, self.dof)
-
-    @property
     def parameters(self) -> Estimates:
         """The parameters with their standard uncertainties, those of dropped groups left out."""
-        of = [(f"{e.name}.{p.name}", p.unit) for e in self.model.effects for p in e.parameters]
-        seen = self.identifiable
-        return Estimates(
-            tuple(
-                Estimate(
-                    name,
-                    float(self.theta[k]) if seen[k] else None,
-                    float(self.std[k]) if seen[k] and np.isfinite(self.std[k]) else None,
-                    unit,
-                    bool(seen[k]),
-                )
-                for k, (name, unit) in enumerate(of)
-                if self.estimated[k]
-            )
-        )
+        return Estimates.of(self.model, self.theta, self.std, self.identifiable, self.estimated)
 
 
 def fit_stream(
