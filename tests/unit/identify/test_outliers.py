@@ -189,9 +189,14 @@ def check_verdict(effect: str, mode: str, seed: int) -> None:
 
 SPOILT = [(e, m) for m in MODES for e in ("none", "joint_tilt_compliance", "base_compliance")]
 SPOILT += [(e, "absolute") for e in ("hysteresis", "encoder_offset", "link_geometry")]
+FAST = (
+    *(("base_compliance", "absolute"), ("hysteresis", "absolute"), ("link_geometry", "absolute")),
+    *(("none", "deflection"), ("joint_tilt_compliance", "deflection")),
+)
+"""One of each kind every time; all of them over many seeds in the slow suite."""
 
 
-@pytest.mark.parametrize(("effect", "mode"), SPOILT)
+@pytest.mark.parametrize(("effect", "mode"), FAST)
 def test_a_twentieth_of_gross_errors_changes_no_verdict(effect, mode):
     check_verdict(effect, mode, 0)
 
@@ -199,7 +204,7 @@ def test_a_twentieth_of_gross_errors_changes_no_verdict(effect, mode):
 @pytest.mark.slow
 @pytest.mark.parametrize(("effect", "mode"), SPOILT)
 def test_gross_errors_change_no_verdict_over_many_seeds(effect, mode):
-    for seed in range(1, 15):
+    for seed in range(15):
         check_verdict(effect, mode, seed)
 
 

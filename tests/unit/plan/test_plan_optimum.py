@@ -1,6 +1,7 @@
 """Continuous and whole optima of plans: known ones, brute force, and the bound of all others."""
 
 from collections.abc import Callable
+from functools import cache
 from itertools import product
 
 import numpy as np
@@ -202,6 +203,13 @@ def test_no_plan_exceeds_the_bound(
     assert most is None or relaxed.weight.max() <= most * (1 + 1e-9)
 
 
+@cache
+def all_plans(most: int, units: int, total: int) -> Floats:
+    """(N, units) plans of at most `most` of each unit and `total` of all (a unit costs 1)."""
+    plans = np.indices((most + 1,) * units).reshape(units, -1).T
+    return plans[plans.sum(axis=1) <= total].astype(float)
+
+
 @every
 def test_tiny_plans_against_all_plans(name: str) -> None:
     """The exchange finds the best of all plans of whole numbers, or nearly."""
@@ -212,7 +220,7 @@ def test_tiny_plans_against_all_plans(name: str) -> None:
         prior = prior_of(seed) if seed % 4 > 1 else None
         most = 1 if seed % 3 == 0 else None
         budget = 5.0
-        plans = np.array(list(product(range(2 if most else 6), repeat=7)), dtype=float)
+        plans = all_plans(1 if most else 5, 7, 5)
         plans = plans[plans @ units.cost <= budget]
         top = largest(criterion, units, plans, np.zeros((3, 3)) if prior is None else prior)
         design = best(

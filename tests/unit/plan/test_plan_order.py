@@ -53,7 +53,7 @@ def everything(world: World) -> list[Chosen]:
     return [Chosen(name, (UNLOADED, *LOADS)) for name in world.names]
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(
     st.integers(1, 12),
     st.floats(0.0, 0.7),
