@@ -247,7 +247,9 @@ def test_a_reader_that_leaves_early_is_no_error(campaign: Path) -> None:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
+)
 def test_view_serves_until_it_is_told_to_stop(campaign: Path, number: int, capsys: Capsys) -> None:
     ok(capsys, "identify", campaign)
     with start("view", campaign, "--port", str(free_port())) as process:

@@ -82,7 +82,10 @@ def with_pose_errors(readings: Readings, seed: int) -> Readings:
     return replace(readings, value=readings.value + off)
 
 
-@pytest.mark.parametrize(("poses", "seed"), [(15, 1), (15, 2), (30, 1)])
+@pytest.mark.parametrize(
+    ("poses", "seed"),
+    [(15, 1), *(pytest.param(*other, marks=pytest.mark.slow) for other in ((15, 2), (30, 1)))],
+)
 def test_what_no_effect_predicts_is_never_called_adequate(poses, seed):
     """A large family can reproduce any error of few poses; poses left out tell."""
     c = campaign(seed=3, plan_seed=0, poses=poses)

@@ -110,7 +110,7 @@ REST = (
     Fault("emergency stop", arm("emergency_stop"), release, ("emergency stop",)),
     Fault("local mode", arm("local_mode"), arm("remote_mode"), ("local",)),
     Fault("program stopped", arm("kill_script"), nothing, ("program",)),
-    Fault("link dropped", arm("rtde_drop"), nothing, ("link",), fast=True),
+    Fault("link dropped", arm("rtde_drop"), nothing, ("link",)),
     Fault("link stalled", arm("rtde_stall"), off("rtde_stall"), ("link",)),
     Fault("half a frame", arm("rtde_half_frame"), nothing, ("link",)),
     Fault("controller mute", arm("rtde_mute"), off("rtde_mute"), ("arm",)),

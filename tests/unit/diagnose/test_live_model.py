@@ -28,7 +28,7 @@ def told(seed: int) -> list[tuple[LiveResidual, Readings, float]]:
 
     Load by load, half of the unloaded readings after all of them, as in a plan against drift.
     """
-    c = campaign(seed=seed, poses=20)
+    c = campaign(seed=seed, poses=16)
     late = c.readings.unloaded & (c.readings.pose % 2 == 1)
     order = np.lexsort((c.readings.pose, c.readings.load, late))
     readings = c.readings[order]
@@ -68,7 +68,7 @@ def test_a_deflection_is_told_for_every_load_once_there_is_a_model():
                 assert judged.deflection is None
             elif begun:
                 off.append((judged.deflection - true) / judged.deflection_std)
-    assert len(off) == len(SEEDS) * 20 * 4
+    assert len(off) == len(SEEDS) * 16 * 4
     # Lengths err by less than the vectors do, of which `give` is the standard deviation.
     assert 0.2 < np.sqrt(np.mean(np.square(off))) < 1.2
 

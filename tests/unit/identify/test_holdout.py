@@ -22,14 +22,24 @@ from tests.support.campaigns import campaign
 MODES = ("absolute", "deflection")
 
 
+FURTHER = (("absolute", 3), ("deflection", 6))
+"""Positions and poses of both modes; each is in a fast case."""
+
+
 def fitted(mode: Mode, m: int = 3, effect: str = "none", **options) -> Fit:
     c = campaign(effect, mode, plan_seed=0, m=m, target_known=mode == "deflection", **options)
     model = with_effects(c.cell, c.readings, mode, ("joint_compliance", "hysteresis"))
     return fit(model, c.readings, mode)
 
 
-@pytest.mark.parametrize("m", [3, 6])
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(
+    ("mode", "m"),
+    [
+        ("absolute", 6),
+        ("deflection", 3),
+        *(pytest.param(*other, marks=pytest.mark.slow) for other in FURTHER),
+    ],
+)
 def test_leaving_out_is_refitting_without(mode, m):
     found = fitted(mode, m)
     readings, w = found.readings, found.whitening

@@ -67,7 +67,7 @@ def test_what_the_tracker_would_not_see_is_seen_by_the_dry_run() -> None:
     assert any("incidence_max_rad is 0.3" in line for line in problems(config, away, away))
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(boxes, st.integers(0, 99))
 def test_motions_that_are_clear_pass_the_dry_run(box: dict[str, Any], seed: int) -> None:
     config = cell(obstacles=[TABLE, box], limits={"workspace_min_m": [-1.5, -1.5, 0.0]})

@@ -194,7 +194,7 @@ class Noisy:
         return self.arm.position(states)
 
 
-@pytest.mark.parametrize("factor", [1.0, 2.0])
+@pytest.mark.parametrize("factor", [pytest.param(1.0, marks=pytest.mark.slow), 2.0])
 def test_errors_are_those_of_the_noise_that_is_there(factor: float) -> None:
     of = scene_of(configured(known=True))
     plan = at_random(of, 60, np.random.default_rng(0))
