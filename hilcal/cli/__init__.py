@@ -169,13 +169,19 @@ def execute(make: Callable[[], typer.Typer], name: str, arguments: Sequence[str]
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
-    """Limit BLAS to one thread: more gain nothing on small matrices, and cost on a busy machine."""
+def _computing() -> Iterator[None]:
+    """Limit BLAS to one thread: more gain nothing on small matrices, and cost on a busy machine.
+
+    Freed memory is kept for the next arrays (see `memory`).
+    """
     if "numpy" not in sys.modules:  # --help, --version: nothing is computed
         yield
         return
     from threadpoolctl import threadpool_limits
 
+    from hilcal.cli.memory import keep_freed_memory
+
+    keep_freed_memory()
     with threadpool_limits(limits=1, user_api="blas"):
         yield
 
@@ -186,7 +192,7 @@ def _run(
     out = failures.out
     try:
         app = make()
-        with _one_thread(), typed((name, *arguments)):
+        with _computing(), typed((name, *arguments)):
             result = app(arguments, prog_name=name, standalone_mode=False)
         out.flush()
     except HilcalError as error:
