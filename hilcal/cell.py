@@ -104,7 +104,9 @@ class Cell:
 STANDARD_GRAVITY = np.array([0.0, 0.0, -STANDARD_GRAVITY_M_S2])
 
 
-def cell_from_config(config: CellConfig, base_dir: Path | None = None) -> Cell:
+def cell_from_config(
+    config: CellConfig, base_dir: Path | None = None, robot_file: str | None = None
+) -> Cell:
     """Return the cell that a configuration describes.
 
     Unknown is what the configuration leaves out: the target where `target_m` is absent, the
@@ -114,13 +116,20 @@ def cell_from_config(config: CellConfig, base_dir: Path | None = None) -> Cell:
     Args:
         config: the checked configuration.
         base_dir: directory that a robot's file path is relative to.
+        robot_file: what that file holds, as a campaign keeps it; then none is read.
 
     Raises:
         InputError: unknown robot, unusable robot file, or a number of joint values that does
             not fit the arm.
     """
     robot, tool, tracker = config.robot, config.tool, config.tracker
-    arm = load_arm(robot.model, base_dir, base_link=robot.base_link, tip_link=robot.tip_link)
+    arm = load_arm(
+        robot.model,
+        base_dir,
+        base_link=robot.base_link,
+        tip_link=robot.tip_link,
+        text=robot_file,
+    )
     try:
         arm = as_counted(arm, robot)
     except InputError as error:

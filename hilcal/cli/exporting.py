@@ -19,6 +19,7 @@ from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.terminal import Json, Revision, Run, Terminal, terminal
 from hilcal.data.covariance import INSTRUMENT
 from hilcal.data.revision_table import revision_table
+from hilcal.data.robot_file import ROBOT_FILE
 from hilcal.data.table import with_what_rounding_does, write_table
 from hilcal.data.tabular import check_suffix, write_columns
 from hilcal.errors import InputError
@@ -97,7 +98,7 @@ def export(
         record = opened.in_use(revision)
         if record is None and (any(of_model) or revisions is not None):
             raise InputError(f"{run}: no revision yet, so nothing of it; run hilcal identify first")
-        _write_data(t, opened, readings, table, cell)
+        _write_data(t, opened, readings, table, cell, force)
         if revisions is not None and record is not None:
             records = opened.file.revisions()
             about = {"table": "revisions", "campaign": run.name}
@@ -165,7 +166,12 @@ def _check(
 
 
 def _write_data(
-    t: Terminal, run: Campaign, readings: Path | None, table: Path | None, cell: Path | None
+    t: Terminal,
+    run: Campaign,
+    readings: Path | None,
+    table: Path | None,
+    cell: Path | None,
+    force: bool,
 ) -> None:
     """Write readings and configuration."""
     about = {"campaign": run.path.name, "source": run.file.source, "robot": run.cell.arm.name}
@@ -181,19 +187,33 @@ def _write_data(
         write_table(full, table, with_what_rounding_does(run.covers, full), about)
         t.show(f"{table}: {len(run.readings)} readings, covariance: {run.covariance_parts}")
     if cell is not None:
+        kept = run.file.about(ROBOT_FILE)
+        if kept is not None:
+            robot = cell.parent / Path(run.config.robot.model).name
+            _beside(robot, kept, force)
+            t.show(f"{robot}: the robot, as the campaign keeps it")
         _text(cell, cell_toml(run))
         t.show(f"{cell}: the cell's configuration")
+
+
+def _beside(path: Path, text: str, force: bool) -> None:
+    """Write a robot's file; one of another content is replaced with --force only."""
+    if path.exists() and not force and path.read_bytes() != text.encode():
+        raise InputError(f"{path}: another file is there; choose another folder or give --force")
+    _text(path, text)
 
 
 def cell_toml(run: Campaign) -> str:
     """Return the configuration that a campaign was measured with, as CELL.toml.
 
-    The file of a robot that is not of the catalogue is named by its whole path.
+    The file of a robot that is not of the catalogue stands beside it; that of a campaign which does
+    not keep it is named by its whole path.
     """
     content = run.config.model_dump(mode="json", exclude_none=True)
     robot = Path(run.file.base_dir) / run.config.robot.model
     if robot.suffix:
-        content["robot"]["model"] = str(robot)
+        kept = run.file.about(ROBOT_FILE) is not None
+        content["robot"]["model"] = robot.name if kept else str(robot)
     return f"# The cell of {run.path.name}, every key written out.\n{tomli_w.dumps(content)}"
 
 

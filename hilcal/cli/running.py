@@ -98,10 +98,10 @@ def run(
             if plan is not None:
                 raise InputError("--plan with --resume: the plan is in the campaign; leave it out")
             campaign = stack.enter_context(CampaignFile.open(output))
-            check_same_cell(campaign, config)
+            check_same_cell(campaign, config, base_dir)
             made = RunLog(campaign).plans[0]
         elif append:
-            campaign, further = _append(t, stack, output, plan, config, numbers)
+            campaign, further = _append(t, stack, output, plan, config, numbers, base_dir)
             made = RunLog(campaign).plans[0]
         else:
             if output.exists():
@@ -203,7 +203,13 @@ def _says_how_to_resume(campaign: CampaignFile, planned: int, on: str) -> Iterat
 
 
 def _append(
-    t: Terminal, stack: ExitStack, output: Path, plan: Path | None, config: CellConfig, cell: Cell
+    t: Terminal,
+    stack: ExitStack,
+    output: Path,
+    plan: Path | None,
+    config: CellConfig,
+    cell: Cell,
+    base_dir: Path,
 ) -> tuple[CampaignFile, Plan]:
     """Open a campaign, and return it with a further plan that has been checked.
 
@@ -213,7 +219,7 @@ def _append(
     if plan is None:
         raise InputError("--append needs the further plan: give it with --plan PLAN")
     campaign = stack.enter_context(CampaignFile.open(output))
-    check_same_cell(campaign, config)
+    check_same_cell(campaign, config, base_dir)
     further = RunLog(campaign).with_new_names(load_plan(plan))
     refuse(dry_checked(t, cell, config, further), str(plan))
     return campaign, further

@@ -17,6 +17,7 @@ from hilcal.data.command_line import typed_now
 from hilcal.data.readings import Readings
 from hilcal.data.records import Layout, content_hash, layout_of, read_layout
 from hilcal.data.revision import RevisionRecord, fitted_to, from_text, to_text, utc_now
+from hilcal.data.robot_file import robot_file_of
 from hilcal.data.stored_priors import join, split
 from hilcal.errors import InputError
 
@@ -69,7 +70,8 @@ class CampaignFile:
             zip(_META, (config_json, base_dir, source, utc_now(), __version__), strict=True)
         )
         try:
-            meta |= {**typed_now(), **(more or {})}
+            kept = robot_file_of(config_json, base_dir)
+            meta |= {**typed_now(), **kept, **(more or {})}
             may_write(path, overwrite)
             for leftover in (new, *_sidecars(new)):
                 leftover.unlink(missing_ok=True)

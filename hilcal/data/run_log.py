@@ -16,6 +16,7 @@ from hilcal.data.covariance import COVERS, INSTRUMENT
 from hilcal.data.plan import Plan, Step, read_plan
 from hilcal.data.readings import Readings
 from hilcal.data.revision import utc_now
+from hilcal.data.robot_file import ROBOT_FILE, robot_file_of
 from hilcal.errors import InputError
 
 PLAN = "plan"
@@ -59,12 +60,24 @@ def create_run(
     )
 
 
-def check_same_cell(campaign: CampaignFile, config: CellConfig) -> None:
+def check_same_cell(campaign: CampaignFile, config: CellConfig, base_dir: Path) -> None:
     """Refuse to continue a campaign in another cell.
 
+    Args:
+        campaign: what was begun.
+        config: the cell as it is told now.
+        base_dir: directory to which relative paths in it refer.
+
     Raises:
-        InputError: names the section that differs.
+        InputError: names the section, or the robot's file, that differs.
     """
+    kept = campaign.about(ROBOT_FILE)
+    now = robot_file_of(config.to_json(), str(base_dir)).get(ROBOT_FILE)
+    if kept is not None and now is not None and kept != now:
+        raise InputError(
+            f"{base_dir / config.robot.model} is not what it was when {campaign.path} was begun; a "
+            "campaign is of one robot: start another one for this"
+        )
     for section in SAME:
         stored, given = (
             c.model_dump(mode="json", include={section: True}, exclude={section: ADDRESSES})

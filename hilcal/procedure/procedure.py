@@ -150,7 +150,7 @@ class Procedure(ValidationSteps):
         Raises:
             InputError: the campaign is of another cell.
         """
-        check_same_cell(campaign, self.config)
+        check_same_cell(campaign, self.config, self.base_dir)
         log = ProcedureLog(campaign)
         told = self.settings.to_json()
         before = log.last(BEGUN)
@@ -273,6 +273,6 @@ def continued(run: Path, cell: Cell, config: CellConfig, catalogue: Catalogue) -
         InputError: the campaign is of another cell, or not of a calibration.
     """
     with CampaignFile.open(run, read_only=True) as campaign:
-        check_same_cell(campaign, config)
         settings, base_dir = settings_of(campaign), Path(campaign.base_dir)
+        check_same_cell(campaign, config, base_dir)
     return Procedure(run, cell, config, base_dir, catalogue, settings)

@@ -1,6 +1,7 @@
 """The arms that come with the program, and the way to load any other."""
 
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from hilcal.errors import InputError
 from hilcal.robot.arm import Arm
@@ -32,6 +33,7 @@ def load_arm(
     *,
     base_link: str | None = None,
     tip_link: str | None = None,
+    text: str | None = None,
 ) -> Arm:
     """Load an arm by catalogue name, or from a file: `.urdf`, or `.toml` with a DH table.
 
@@ -40,6 +42,7 @@ def load_arm(
         base_dir: directory of the cell configuration; the working directory if None.
         base_link: first link of a URDF's chain.
         tip_link: last link of a URDF's chain.
+        text: what the file holds, as a campaign keeps it; then no file of that path is read.
 
     Raises:
         InputError: unknown name (lists the valid ones), or a file that does not describe a
@@ -47,6 +50,10 @@ def load_arm(
     """
     path = (base_dir or Path()) / model
     suffix = path.suffix.lower()
+    if text is not None and suffix in (".urdf", ".toml"):
+        with TemporaryDirectory(prefix="hilcal-") as folder:
+            (Path(folder) / path.name).write_text(text, encoding="utf-8")
+            return load_arm(path.name, Path(folder), base_link=base_link, tip_link=tip_link)
     if suffix == ".urdf":
         return arm_from_urdf(path, base_link, tip_link)
     for key, value in (("base_link", base_link), ("tip_link", tip_link)):
