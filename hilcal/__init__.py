@@ -51,7 +51,7 @@ _PLACES = {
     "preview_table": "hilcal.identify.table_preview",
     "read_table": "hilcal.library",
     "refine": "hilcal.library",
-    "report": "hilcal.reporting",
+    "report": "hilcal.write_report",
     "validate": "hilcal.validate",
     "view": "hilcal.library",
 }
@@ -89,8 +89,8 @@ if TYPE_CHECKING:
     from hilcal.model import Model
     from hilcal.procedure.procedure import Procedure
     from hilcal.refine import Refinement
-    from hilcal.reporting import report
     from hilcal.validate import validate
+    from hilcal.write_report import report
 
 
 def __getattr__(name: str) -> object:

@@ -17,7 +17,7 @@ from hilcal.fleet.members import entries
 from hilcal.identify.posterior_document import write
 from hilcal.report.progress import counting
 from hilcal.report.text_fleet import fleet_report
-from hilcal.reporting import write_fleet_report
+from hilcal.write_report import write_fleet_report
 
 
 def fleet(

@@ -50,7 +50,7 @@ def report(
     as_json: Json = False,
 ) -> None:
     """Write the whole story as one HTML page, a certificate first; it prints to PDF."""
-    from hilcal.reporting import write_report
+    from hilcal.write_report import Asked, write_report
 
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     limit_m = None if limit is None else parse_length(limit, "--limit")
@@ -63,16 +63,8 @@ def report(
             return stack.enter_context(Campaign.open(path, catalogue, read_only=True))
 
         first = stack.enter_context(Campaign.open(run, catalogue, read_only=True))
-        done = write_report(
-            first,
-            output,
-            later=opened(later),
-            validation=opened(validation),
-            limit_m=limit_m,
-            operator=operator,
-            revision=revision,
-            say=say,
-        )
+        asked = Asked(opened(later), opened(validation), limit_m, operator, revision)
+        done = write_report(first, output, asked, say)
     t.show(f"{done.headline}.")
     if done.limit:
         t.show(done.limit)

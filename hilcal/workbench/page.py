@@ -10,7 +10,7 @@ from fastapi.responses import PlainTextResponse, Response
 from nicegui import app as bench
 from nicegui import ui
 
-from hilcal.workbench import parts
+from hilcal.workbench import cards, next_card
 from hilcal.workbench.elements import Status
 from hilcal.workbench.session import Say, Session
 from hilcal.workbench.snapshot import Snapshot
@@ -170,9 +170,9 @@ class View:
         self.body.clear()
         with self.body:
             if snapshot is None:
-                parts.waiting(self)
+                cards.waiting(self)
             else:
-                parts.snapshot(self, snapshot)
+                cards.snapshot(self, snapshot)
         self.draw_below()
 
     def draw_below(self) -> None:
@@ -180,7 +180,7 @@ class View:
         self.below.clear()
         with self.below:
             if self.tab.snapshot is not None:
-                parts.viewer(self)
+                cards.viewer(self)
 
     # what can be clicked
 
@@ -254,7 +254,7 @@ class View:
     def pick_variable(self, name: str) -> None:
         """Show the residuals over a variable, and its readings that are furthest off."""
         self.tab.variable = name
-        worst = parts.furthest(self.tab.snapshot) if self.tab.snapshot else []
+        worst = cards.furthest(self.tab.snapshot) if self.tab.snapshot else []
         self.pick(worst, "The readings that are furthest off")
 
     def pick(self, measurements: list[int], told: str) -> None:
@@ -278,7 +278,7 @@ class View:
         self.readings.clear()
         with self.readings:
             if self.tab.snapshot is not None:
-                parts.readings(self, self.tab.snapshot)
+                cards.readings(self, self.tab.snapshot)
 
     def draw_plan(self) -> None:
         """Draw the next measurements, where they are planned."""
@@ -287,7 +287,7 @@ class View:
             return
         self.planned.clear()
         with self.planned:
-            parts.planned(self.session)
+            next_card.planned(self.session)
 
     def draw_evidence(self) -> None:
         """Draw the evidence of the chosen suspect."""
@@ -296,4 +296,4 @@ class View:
         self.evidence.clear()
         with self.evidence:
             if self.tab.snapshot is not None:
-                parts.evidence(self, self.tab.snapshot)
+                cards.evidence(self, self.tab.snapshot)

@@ -11,8 +11,8 @@ from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.command_line import COMMAND, typed, typed_now
 from hilcal.data.overview import overview
 from hilcal.report.html.page import page
-from hilcal.reporting import content_of
 from hilcal.robot.catalogue import configs_dir
+from hilcal.write_report import content_of
 from tests.support.campaigns import campaign, configuration
 from tests.support.cli_cases import ok
 

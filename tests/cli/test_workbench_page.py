@@ -272,6 +272,8 @@ def test_the_page_fits_desktop_and_phone(
     browser: Browser, served: Served, scheme: str, tmp_path: Path
 ) -> None:
     told: list[str] = []
+    with Campaign.open(served.run, read_only=True) as o:
+        readings = int((o.file.readings().load > 0).sum())
     page = opened(browser, served, told, viewport=DESKTOP, color_scheme=scheme)
     for size in (DESKTOP, PHONE):
         page.set_viewport_size(size)  # type: ignore[arg-type]
@@ -281,6 +283,14 @@ def test_the_page_fits_desktop_and_phone(
         first = page.locator("[data-part=verdict]").bounding_box()
         assert first is not None
         assert first["y"] + first["height"] < size["height"]  # the verdict is on the first screen
+        for part in ("verdict", "fails", "missing", "fell", "readings"):
+            box = page.locator(f"[data-part={part}]").first.bounding_box()
+            assert box is not None, part
+            assert box["x"] >= 0, part
+            assert box["x"] + box["width"] <= size["width"], part
+        expect(page.locator("[data-part=missing] tbody tr").filter(has_text=TILT)).to_be_visible()
+        drawn = page.locator("[data-part=readings] .scatterlayer .point")
+        expect(drawn).to_have_count(readings)
     dark = page.evaluate("getComputedStyle(document.body).backgroundColor")
     assert (sum(map(int, re.findall(r"\d+", dark)[:3])) < 200) == (scheme == "dark")
     assert told == []

@@ -122,8 +122,21 @@ def opened(rrd: Path, size: tuple[int, int]) -> Iterator[tuple["ViewerClient", i
     with _headless(size) as (viewer, process):
         viewer.open([str(Path(rrd).resolve())])
         _wait_until_loaded(viewer)
-        viewer.take_screenshot(max_size=64)  # the first frame compiles shaders and loads meshes
+        _draw_first(viewer)
         yield viewer, process
+
+
+def _draw_first(viewer: "ViewerClient") -> None:
+    """Draw the first picture, which compiles shaders and loads meshes: it may take its time."""
+    end = time.monotonic() + _LOAD_TIMEOUT
+    while True:
+        try:
+            viewer.take_screenshot(max_size=64)
+        except TimeoutError:
+            if time.monotonic() > end:
+                raise
+        else:
+            return
 
 
 def _take(viewer: "ViewerClient", shot: Shot, longest: int | None) -> None:

@@ -11,8 +11,8 @@ from playwright.sync_api import Browser, Page, Route
 from hilcal.campaign import Campaign
 from hilcal.data.campaign_file import CampaignFile
 from hilcal.report.html.content import ReportContent
-from hilcal.reporting import content_of
 from hilcal.robot.catalogue import configs_dir
+from hilcal.write_report import Asked, content_of
 from tests.support.campaigns import campaign, configuration
 
 EVIL = "<script>window.harmed = 1</script>"
@@ -35,7 +35,7 @@ def small_content(folder: Path) -> ReportContent:
     path = folder / "a&<b>.hilcal"
     write_campaign(path)
     with Campaign.open(path) as run:
-        return content_of(run, limit_m=1e-3, operator=EVIL)
+        return content_of(run, Asked(limit_m=1e-3, operator=EVIL))
 
 
 @contextmanager

@@ -4,7 +4,7 @@ from hilcal.diagnose.change import LEVEL
 from hilcal.diagnose.comparison import Comparison
 from hilcal.report import numbers
 from hilcal.report.charts.change import changes_chart, error_by_pose
-from hilcal.report.html.certificate import Card, FirstScreen, mm
+from hilcal.report.html.first_screen import Card, FirstScreen, mm
 from hilcal.report.html.page import render
 from hilcal.report.html.parts import Part, Section, Words, chart, from_terminal, table
 from hilcal.report.text_change import comparison_report, next_step, sentence

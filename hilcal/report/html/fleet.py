@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 from hilcal.report import numbers
 from hilcal.report.charts.fleet import arms_chart
-from hilcal.report.html.certificate import Card, FirstScreen
+from hilcal.report.html.first_screen import Card, FirstScreen
 from hilcal.report.html.page import render
 from hilcal.report.html.parts import Part, Section, chart, from_terminal, table
 from hilcal.report.text_fleet import closing, type_report, unlike_words

@@ -9,8 +9,9 @@ from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
 from hilcal.report.charts import style
-from hilcal.report.html.certificate import FirstScreen, certificate, first_screen
+from hilcal.report.html.certificate import certificate
 from hilcal.report.html.content import ReportContent
+from hilcal.report.html.first_screen import FirstScreen, first_screen
 from hilcal.report.html.parts import Section, in_script
 from hilcal.report.html.sections import sections
 

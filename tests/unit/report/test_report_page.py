@@ -15,8 +15,8 @@ import pytest
 from playwright.sync_api import Browser
 
 from hilcal.calibration.budget import budget
-from hilcal.report.html.certificate import left_out_errors, limit_words, mm
 from hilcal.report.html.content import ReportContent
+from hilcal.report.html.first_screen import left_out_errors, limit_words, mm
 from hilcal.report.html.page import page as page_of
 from tests.support.browser import DESKTOP, PHONE, needs_chromium, open_browser
 from tests.support.picture import pixels

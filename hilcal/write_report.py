@@ -5,7 +5,7 @@ import os
 import tempfile
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +45,17 @@ class ReportSummary:
     verdict: str | None
 
 
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What a report is asked to say; each as in `report`."""
+
+    later: Campaign | None = None
+    validation: Campaign | None = None
+    limit_m: float | None = None
+    operator: str = ""
+    revision: int | None = None
+
+
 def report(
     run: Campaign,
     path: str | Path,
@@ -79,47 +90,32 @@ def report(
         InputError: no such revision, the page cannot be written, or see `validate` and `compare`.
         CannotAnswerError: the readings do not determine the baseline, or see `validate`.
     """
-    write_report(
-        run,
-        Path(path),
-        later=later,
-        validation=validation,
-        limit_m=limit_m,
-        operator=operator,
-        revision=revision,
-        say=say,
-    )
+    asked = Asked(later, validation, limit_m, operator, revision)
+    write_report(run, Path(path), asked, say)
     return Path(path)
 
 
 def write_report(
-    run: Campaign,
-    path: Path,
-    *,
-    later: Campaign | None = None,
-    validation: Campaign | None = None,
-    limit_m: float | None = None,
-    operator: str = "",
-    revision: int | None = None,
-    say: Say = lambda text: None,
+    run: Campaign, path: Path, asked: Asked, say: Say = lambda text: None
 ) -> ReportSummary:
     """Write a page as `report` does, and return what it says first."""
+    later, validation = asked.later, asked.validation
     if path.resolve() in {c.path.resolve() for c in (run, later, validation) if c is not None}:
         raise InputError(f"{path}: this is the campaign itself; name another file for the page")
     if not path.absolute().parent.is_dir():  # said before minutes of work
         raise InputError(f"{path}: cannot be written, there is no folder {path.absolute().parent}")
     if later is not None:
-        if validation is not None or limit_m is not None:
+        if validation is not None or asked.limit_m is not None:
             raise InputError("a comparison of two campaigns takes neither --validation nor --limit")
         from hilcal.compare import compare
         from hilcal.report.html import change
 
-        found = compare(run, later, revision, say=say)
+        found = compare(run, later, asked.revision, say=say)
         names = ((run.path.name, _sha256(run.path)), (later.path.name, _sha256(later.path)))
-        html = change.page(found, names, operator, utc_now(), hilcal.__version__)
+        html = change.page(found, names, asked.operator, utc_now(), hilcal.__version__)
         first, verdict = change.first_screen(found, run.path.name), None
     else:
-        from hilcal.report.html.certificate import first_screen
+        from hilcal.report.html.first_screen import first_screen
         from hilcal.report.html.page import page
 
         with ExitStack() as stack:
@@ -128,7 +124,7 @@ def write_report(
                 say(f"taking {beside.name}, which stands beside it, as validation campaign")
                 opened = Campaign.open(beside, run.catalogue, read_only=True)
                 validation = stack.enter_context(opened)
-            m = content_of(run, validation, limit_m, operator, revision, say)
+            m = content_of(run, replace(asked, validation=validation), say)
         say("writing the page")
         html, first = page(m), first_screen(m)
         verdict = None if m.diagnosis is None else m.diagnosis.verdict
@@ -137,14 +133,11 @@ def write_report(
 
 
 def content_of(
-    run: Campaign,
-    validation: Campaign | None = None,
-    limit_m: float | None = None,
-    operator: str = "",
-    revision: int | None = None,
-    say: Say = lambda text: None,
+    run: Campaign, asked: Asked | None = None, say: Say = lambda text: None
 ) -> ReportContent:
-    """Collect what a report says; arguments and errors as of `report`."""
+    """Collect what a report of one campaign says; errors as of `report`."""
+    asked = Asked() if asked is None else asked
+    validation, limit_m, revision = asked.validation, asked.limit_m, asked.revision
     limit = run.config.limits.accuracy_m if limit_m is None else limit_m
     record = run.in_use(revision)
     chapters = run.chapters(say, revision)
@@ -180,7 +173,7 @@ def content_of(
         tested=tested,
         corrected=_corrected(run, record),
         limit_m=limit,
-        operator=operator,
+        operator=asked.operator,
         commands=tuple(commands),
     )
 

@@ -1,4 +1,4 @@
-"""The parts of the page: the verdict, where it fails, what is missing, revisions, what is next."""
+"""The cards of the page: the verdict, where it fails, what is missing, revisions."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from hilcal.data.plan import UNLOADED
 from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.diagnose.distinguish import Difference
 from hilcal.diagnose.effect_ranking import Suspect
-from hilcal.report import numbers, text, text_next, text_refine
+from hilcal.report import numbers, text, text_refine
 from hilcal.report.charts import error_per_revision, measured_predicted, misfit, residuals
 from hilcal.report.charts.added_variable import added_variable
 from hilcal.report.charts.law import law
 from hilcal.report.charts.residual_over import residual_over
 from hilcal.report.verdict_words import message
 from hilcal.workbench.elements import button, chart, number, plain, point, title
-from hilcal.workbench.session import Session
+from hilcal.workbench.next_card import next_measurement
 from hilcal.workbench.snapshot import RevisionRow, Snapshot
 
 if TYPE_CHECKING:
@@ -372,44 +372,6 @@ def laws(view: View, d: Snapshot) -> None:
             "soft"
         )
         chart(view, law(one)).props("data-part=law")
-
-
-def next_measurement(view: View, d: Snapshot) -> None:
-    """Draw what asks for the next measurement."""
-    title("Measure next")
-    ui.label("Plan the poses and loads that tell apart what these readings leave open.").classes(
-        "soft"
-    )
-    stem = view.session.path.stem
-    with ui.row().classes("items-center").style("gap: 12px; width: 100%"):
-        poses = ui.number("poses (as needed)", min=1, precision=0).props("dense outlined")
-        poses.style("width: 190px")
-        file = ui.input("plan file", value=f"{stem}-next-{d.number or 0}.json")
-        file.props("dense outlined").style("flex: 1 1 180px")
-    compare = ui.checkbox("Compare criteria and numbers of poses first; takes longer")
-
-    def plan() -> None:
-        view.plan(poses.value, file.value, quick=not compare.value)
-
-    button(view, "Plan the next measurements", plan, "unelevated")
-
-
-def planned(session: Session) -> None:
-    """Draw the next measurements."""
-    if session.planned is None:
-        return
-    found, path = session.planned
-    summary = found.made.summary
-    ui.label(text_next.summary(found.found.powers, summary.poses, summary.readings)).props(
-        "data-part=planned"
-    )
-    for effect, rival, now, then in text_next.power_rows(found.found.powers):
-        ui.label(f"If {effect} is there, {rival} is ruled out: {now} now, {then} then.").classes(
-            "soft"
-        )
-    ui.label(f"The plan is in {path.name}. Measure it into the same campaign with:")
-    ui.label(session.run_line()).classes("code")
-    ui.label("Then read the file again here.").classes("soft")
 
 
 def viewer(view: View) -> None:

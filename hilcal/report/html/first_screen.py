@@ -1,0 +1,217 @@
+"""The first screen: is the model good, where is it wrong, what is missing; before, after, limit."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilcal.data.plan import UNLOADED
+from hilcal.diagnose.diagnosis import Diagnosis
+from hilcal.identify.before import error_before
+from hilcal.identify.fit import Fit, all_left_out
+from hilcal.identify.full_prediction import full_prediction
+from hilcal.report import numbers, text
+from hilcal.report.html.content import ReportContent
+from hilcal.report.verdict_words import message
+from hilcal.types import Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Card:
+    """One number of the first screen: `label`, `value` with unit, and a note."""
+
+    label: str
+    value: str
+    note: str
+
+
+@dataclass(frozen=True, slots=True)
+class FirstScreen:
+    """What the first screen says.
+
+    Attributes:
+        headline: the verdict in a few words.
+        tone: "good", "doubt" or "bad", for the colour; the headline says it in words.
+        answers: question and answer: is it good, where is it wrong, what is missing.
+        cards: before and after.
+        limit: "PASSED" or "FAILED" and why; empty without a limit.
+        passed: whether the limit is kept; None without one.
+    """
+
+    headline: str
+    tone: str
+    answers: tuple[tuple[str, str], ...]
+    cards: tuple[Card, ...]
+    limit: str
+    passed: bool | None
+
+
+def first_screen(m: ReportContent) -> FirstScreen:
+    """Return what the first screen says."""
+    d, fit = m.diagnosis, m.fit
+    headline, tone = headline_of(d)
+    limit, passed = limit_words(m)
+    return FirstScreen(
+        headline,
+        tone,
+        (
+            ("Is the model good?", how_good(m)),
+            ("Where is it wrong?", where_wrong(m)),
+            ("What is missing?", missing(d)),
+        ),
+        tuple(_cards(m, fit)),
+        limit,
+        passed,
+    )
+
+
+def headline_of(d: Diagnosis | None) -> tuple[str, str]:
+    """Return the verdict in a few words, and its tone."""
+    if d is None:
+        return "Not judged: only a model fitted with scaling gc can be", "doubt"
+    lead = d.lead.effect if d.lead is not None else ""
+    if d.verdict == "adequate":
+        return "The model is good: what is left is noise", "good"
+    if d.verdict == "missing_effect":
+        return f"The model is incomplete: {lead} is missing", "bad"
+    if d.verdict == "ambiguous":
+        if d.reason == "inseparable_addition":
+            return "The model is good, but another one would be as good", "doubt"
+        return "The model is incomplete, and these readings cannot tell what is missing", "doubt"
+    if d.verdict == "unknown_effect":
+        return "The model is incomplete: no known effect explains what is left", "bad"
+    return "The stated noise is wrong: the model cannot be judged by it", "doubt"
+
+
+def how_good(m: ReportContent) -> str:
+    """Say in a sentence how well the model predicts."""
+    d, prior = m.diagnosis, m.fit.model.prior
+    told = text.misses(m.fit)
+    if prior is not None:
+        told += f" It also rests on a prior: {prior.posterior.source.campaign or 'a posterior'}."
+    if d is None:
+        return told
+    if d.verdict == "noise_misjudged":
+        return f"It cannot be told, for the stated noise is wrong. {told}"
+    good = d.verdict == "adequate" or d.reason == "inseparable_addition"
+    return f"{'Yes' if good else 'Not yet'}. {told}"
+
+
+def where_wrong(m: ReportContent) -> str:
+    """Say in a sentence where it is worst, and what the misfit follows."""
+    d = m.diagnosis
+    if d is not None and d.residual_is_noise:
+        return "Nowhere beyond the noise: all poses and loads are predicted within it."
+    worst = text.worst_poses(full_prediction(m.fit), most=1)
+    places = "" if d is None else text.follows(d.misfit_breakdown)
+    at = ""
+    if worst:
+        w = worst[0]
+        load = "unloaded" if w.load == UNLOADED else f"under {w.load}"
+        at = f"Worst at pose {w.pose} {load}: off by {numbers.length(w.error_m)}. "
+    return f"{at}{places}".strip()
+
+
+def missing(d: Diagnosis | None) -> str:
+    """Say in few words what is missing; the whole sentence stands with the evidence."""
+    if d is None:
+        return "Not judged; hilcal identify --scaling gc, then hilcal diagnose, say it."
+    if d.verdict == "adequate":
+        return "Nothing that these readings could show."
+    if d.reason == "inseparable_addition":
+        return _as_good(d)
+    if d.reason == "no_suspect":
+        best = f": the best, {d.suspects[0].effect}, does not" if d.suspects else ""
+        return (
+            f"No effect of the catalogue surely explains what is left{best}. hilcal discover "
+            "searches a law for it."
+        )
+    lead = d.lead
+    if lead is None or d.reason == "insufficient_catalogue":
+        return numbers.sentence(message(d), d.significant)
+    explained = (
+        f"explains {numbers.percent(lead.share)} of the misfit, "
+        f"{numbers.percent(max(lead.holdout_share, 0.0))} on poses left out"
+    )
+    name = lead.coarse or lead.effect
+    law = f"{name} is: {d.fit.model.catalogue[name].summary}."
+    if d.reason == "inseparable_suspects":
+        others = numbers.few([r.effect for r in d.separability])
+        return (
+            f"{lead.effect}, which {explained}; or {others}: these readings do not separate them. "
+            f"hilcal next plans those that do. {law}"
+        )
+    what = f"joints that differ in {name}: it" if lead.coarse else f"{name}: it"
+    return numbers.sentence(f"{what} {explained}. {law}", d.significant)
+
+
+def _as_good(d: Diagnosis) -> str:
+    """Say which effects of an adequate model others could replace."""
+    doubts = [
+        f"{a.effect} could as well be "
+        + (numbers.few(a.same_as, 1) if a.same_as else f"{len(a.others)} other effects together")
+        for a in d.alternatives
+        if a.inseparable
+    ]
+    told = "; ".join(doubts)
+    return f"Nothing that lowers the error. But {told}. hilcal next plans what separates them."
+
+
+def _cards(m: ReportContent, fit: Fit) -> Iterator[Card]:
+    before = error_before(fit)
+    what = (
+        "deflection under load; a rigid arm has none"
+        if fit.mode == "deflection"
+        else "nominal arm, only its frames fitted"
+    )
+    yield Card("Before", mm(before.rms_m), f"rms; largest {mm(before.max_m)}; {what}")
+    if m.tested is not None:
+        e = m.tested.prediction.error
+        seen = "never fitted" if m.tested.judged.unseen else "fitted, so no test"
+        yield Card("After, validation", mm(e.rms_m), f"rms; largest {mm(e.max_m)}; {seen}")
+    if m.corrected is not None:
+        e = m.corrected["error"]
+        before_m, after_m = (mm(float(e[k]["rms_m"])) for k in ("before", "after"))
+        yield Card(
+            "Measured at corrected targets",
+            after_m,
+            f"rms; {before_m} without correction; {e['count']} points",
+        )
+    held = fit.holdout
+    yield Card("After, poses left out", mm(held.rms_m), f"rms; largest {mm(held.max_m)}")
+    yield Card("Noise alone", mm(m.story.noise_floor_m), "rms that no model can go below")
+
+
+def mm(metres: float) -> str:
+    """Return a length in mm, three digits or µm at the least."""
+    return f"{1e3 * metres:.3f} mm"
+
+
+def limit_words(m: ReportContent) -> tuple[str, bool | None]:
+    """Say whether the limit is kept, and by what that was judged."""
+    if m.limit_m is None:
+        return "", None
+    limit = mm(m.limit_m)
+    if m.tested is not None:
+        a = m.tested.shares
+        passed = bool(a.passed)
+        head = "PASSED" if passed else "FAILED"
+        so = f"{a.everything.count - a.over} of {a.everything.count} errors are within {limit}"
+        end = f" (campaign {m.tested.name}, never fitted; largest {mm(a.everything.max_m)})."
+        if a.undecided:
+            end += " Noise alone exceeds the limit, so that these readings cannot tell."
+        return f"{head}: {so}{end}", passed
+    error = left_out_errors(m.fit)
+    over = int(np.sum(error > m.limit_m))
+    head = "PASSED" if over == 0 else "FAILED"
+    return (
+        f"{head}: {len(error) - over} of {len(error)} errors are within {limit}, each pose "
+        f"predicted without itself (largest {mm(float(error.max()))}). No validation campaign was "
+        "given: an independent test is missing."
+    ), over == 0
+
+
+def left_out_errors(fit: Fit) -> Floats:
+    """Return the 3-D errors (D,) of measurements predicted without their pose, m."""
+    raw, _ = all_left_out(fit)
+    return np.asarray(np.linalg.norm(raw[:, :3], axis=1))
