@@ -75,13 +75,21 @@ def keep(
     """
     if path is None:
         return
-    words = [Path(w).name if Path(w).exists() else w for w in sys.argv[1:]]
-    words = [word for word in words if word not in ("--keep", path.name, str(path))]
-    command = f"python -m studies {shlex.join(words)}"
+    command = f"python -m studies {shlex.join(_kept_words(sys.argv[1:]))}"
     date = datetime.now(UTC).date().isoformat()
     record = Record(title, command, date, __version__, tuple(figures))
     content = {**asdict(record), **(more or {})}
     _write(path, json.dumps(content, indent=1, ensure_ascii=False) + "\n")
+
+
+def _kept_words(given: Sequence[str]) -> list[str]:
+    """Return the words of a command without `--keep F.json`, files by their names."""
+    words = list(given)
+    if "--keep" in words:
+        at = words.index("--keep")
+        del words[at : at + 2]
+    words = [word for word in words if not word.startswith("--keep=")]
+    return [Path(w).name if Path(w).exists() else w for w in words]
 
 
 def results(

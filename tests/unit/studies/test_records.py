@@ -45,3 +45,17 @@ def test_a_folder_without_records_and_a_wrong_file_are_named(tmp_path: Path) -> 
     (tmp_path / "x.json").write_text("{}")
     with pytest.raises(InputError, match=r"x\.json: not a record"):
         page(tmp_path)
+
+
+def test_the_command_that_is_kept_is_the_one_without_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where another option names a file that is called alike."""
+    earlier, path = tmp_path / "earlier" / "carry.json", tmp_path / "carry.json"
+    earlier.parent.mkdir()
+    earlier.write_text("{}", encoding="utf-8")
+    words = ["carry", "b.csv", "--without-of", str(earlier), "--keep", str(path)]
+    monkeypatch.setattr("sys.argv", ["studies", *words])
+    keep(path, "a title", [])
+    kept = json.loads(path.read_text(encoding="utf-8"))["command"]
+    assert kept == "python -m studies carry b.csv --without-of carry.json"
