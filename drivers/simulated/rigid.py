@@ -2,7 +2,6 @@
 
 import numpy as np
 import pinocchio as pin
-from scipy.spatial.transform import Rotation
 
 from hilcal.types import Floats
 
@@ -14,11 +13,15 @@ def displacement(twist: Floats) -> Floats:
 
 def turned(rotation: Floats) -> Floats:
     """Return (N, 3, 3) rotation matrices of (N, 3) rotation vectors, rad."""
+    from scipy.spatial.transform import Rotation  # slow to import
+
     return np.asarray(Rotation.from_rotvec(rotation).as_matrix())
 
 
 def rotation_vector(matrix: Floats) -> Floats:
     """Return (N, 3) rotation vectors of (N, 3, 3) rotation matrices, rad, length at most pi."""
+    from scipy.spatial.transform import Rotation  # slow to import
+
     return np.asarray(Rotation.from_matrix(matrix).as_rotvec())
 
 

@@ -25,7 +25,6 @@ from typing import Literal
 
 import numpy as np
 import tomli_w
-from scipy.spatial.transform import Rotation
 
 from hilcal.errors import InputError
 from hilcal.robot import se3
@@ -266,6 +265,8 @@ def _twist_last(link: Floats) -> Floats:
 
 def _about_z(link: Floats) -> float:
     """Part of a rotation about z, the other being about a horizontal axis."""
+    from scipy.spatial.transform import Rotation  # slow to import
+
     z, w = Rotation.from_matrix(link[:3, :3]).as_quat()[2:]
     return float(2.0 * np.arctan2(z, w)) if np.hypot(z, w) > 1e-9 else 0.0
 

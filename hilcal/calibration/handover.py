@@ -16,7 +16,6 @@ from collections.abc import Iterator
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.corrected import Corrected
@@ -153,6 +152,8 @@ def _along(z: float) -> Floats:
 
 def _origin(place: Floats) -> tuple[Floats, Floats]:
     """Position and fixed-axis roll, pitch, yaw of a pose (4, 4), exact also at pitch ±90°."""
+    from scipy.spatial.transform import Rotation  # slow to import
+
     r = place[:3, :3]
     pitch = np.arctan2(-r[2, 0], np.hypot(r[0, 0], r[1, 0]))
     roll = np.arctan2(r[2, 1], r[2, 2])

@@ -14,7 +14,6 @@ export formats of the SpatialAnalyzer manual.
 from itertools import permutations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from hilcal.robot import se3
 from hilcal.types import Floats
@@ -60,6 +59,8 @@ def rotations(convention: str, numbers: Floats, unit: float) -> Floats:
             exactly normalised, the nearest rotation is taken.
         unit: radians in the unit of angles.
     """
+    from scipy.spatial.transform import Rotation  # slow to import
+
     kind = CONVENTIONS[convention]
     if kind == ROTATION_VECTOR:
         return se3.rotation(unit * numbers)

@@ -12,8 +12,6 @@ copies on both sides of a rounding boundary have different digests, however fine
 """
 
 import numpy as np
-from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from hilcal.data.readings import Readings
 from hilcal.types import Bools, Floats
@@ -39,6 +37,8 @@ def already(readings: Readings, others: Readings) -> Bools:
         return np.zeros(len(readings), dtype=np.bool_)
     if readings.states.q.shape[1] != others.states.q.shape[1]:
         return np.zeros(len(readings), dtype=np.bool_)
+    from scipy.spatial import cKDTree  # slow to import
+
     attitude = readings.m == others.m == 6
     tree = cKDTree(_coordinates(others, attitude))
     distance, _ = tree.query(
@@ -60,6 +60,8 @@ def among(readings: Readings, kept: Floats) -> Bools:
     own = prints(readings)
     if not len(own) or not len(kept) or own.shape[1] != kept.shape[1]:
         return np.zeros(len(readings), dtype=np.bool_)
+    from scipy.spatial import cKDTree  # slow to import
+
     distance, _ = cKDTree(kept).query(own, p=np.inf, distance_upper_bound=1.0 + 1e-9)
     return np.asarray(np.isfinite(distance))
 
@@ -96,5 +98,7 @@ def _coordinates(r: Readings, attitude: bool) -> Floats:
         np.where(r.unloaded, 0.0, _APART)[:, None],
     ]
     if attitude:  # as a matrix, since the rotation vector jumps at half a turn
+        from scipy.spatial.transform import Rotation  # slow to import
+
         parts.append(Rotation.from_rotvec(r.value[:, 3:]).as_matrix().reshape(-1, 9) / ATTITUDE_RAD)
     return np.concatenate(parts, axis=1)

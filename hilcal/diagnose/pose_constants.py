@@ -16,14 +16,17 @@ factorisation each and one of the model's size.
 """
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from hilcal.identify.linearisation import Linearisation
 from hilcal.regression.distributions import f as f_distribution
 from hilcal.regression.projection import Projection
 from hilcal.types import Floats, Ints
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 DETERMINED = 1e-6
 """Singular value of a determined direction over the largest; below it, rounding."""
@@ -46,7 +49,7 @@ class PoseConstants:
     """
 
     projection: Projection
-    columns: csr_array
+    columns: "csr_array"
     shared: Floats
     t: Floats
     rank: int
@@ -84,8 +87,10 @@ def pose_constants(p: Linearisation) -> PoseConstants | None:
     return PoseConstants(p.projection, columns, shared, t, rank, gain, p_value)
 
 
-def _orthonormal(columns: Floats, pose: Ints) -> tuple[csr_array, int]:
+def _orthonormal(columns: Floats, pose: Ints) -> "tuple[csr_array, int]":
     """Columns (R, 3 poses) of columns (R, 3) that each pose has alone, orthonormal; their rank."""
+    from scipy.sparse import csr_array  # slow to import
+
     values = np.zeros_like(columns)
     order = np.argsort(pose, kind="stable")
     parts = np.split(order, np.flatnonzero(np.diff(pose[order])) + 1)

@@ -14,14 +14,12 @@ to first order; those columns are taken out as well.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Bucket, Whitening, whitening
 from hilcal.identify.fit import Fit
 from hilcal.observe import motion
+from hilcal.regression.connected import connected, near
 from hilcal.types import Floats, Ints
 
 SAME_ANGLE = 1e-6
@@ -104,10 +102,7 @@ def classes(readings: Readings) -> Ints:
     wrench = s.wrench / np.where(size > 0, SAME_LOAD * size, 1.0)
     named = 10.0 * np.stack([readings.load, readings.target], axis=1)
     points = np.concatenate([s.q / SAME_ANGLE, wrench, named], axis=1)
-    pairs = cKDTree(points).query_pairs(1.0, p=np.inf, output_type="ndarray")
-    shape = (len(points),) * 2
-    links = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=shape)
-    return np.asarray(connected_components(links, directed=False)[1])
+    return near(points, 1.0)
 
 
 def contrasts(fit: Fit) -> Contrasts | None:
@@ -183,8 +178,7 @@ def _blocks(w: Whitening, kind: Ints) -> tuple[Block, ...]:
     # Groups are joined where they share a class of measurements or, through an unloaded
     # reading of several groups, an error; the latter does not occur (see `whitening`).
     total = len(groups) + int(number.max()) + 1
-    links = coo_matrix((np.ones(len(owner)), (owner, len(groups) + number)), shape=(total, total))
-    joined = connected_components(links, directed=False)[1][: len(groups)]
+    joined = connected(owner, len(groups) + number, total)[: len(groups)]
     out = []
     for rows in np.split(
         np.argsort(joined, kind="stable"), np.flatnonzero(np.diff(np.sort(joined))) + 1

@@ -5,11 +5,9 @@ their names: a repeated pose that is left out must not be predicted from its rep
 """
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from hilcal.data.readings import Readings
+from hilcal.regression.connected import near
 from hilcal.types import Floats, Ints
 
 SAME_POSE = 2e-3
@@ -20,10 +18,8 @@ FOLDS = 10
 
 def distinct_poses(readings: Readings) -> Ints:
     """(N,) number of the distinct pose of each reading, in order of first appearance."""
-    first, row, name = np.unique(readings.pose, return_index=True, return_inverse=True)
-    pairs = cKDTree(readings.states.q[row]).query_pairs(SAME_POSE, p=np.inf, output_type="ndarray")
-    links = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(first),) * 2)
-    label = connected_components(links, directed=False)[1][name.reshape(-1)]
+    _, row, name = np.unique(readings.pose, return_index=True, return_inverse=True)
+    label = near(readings.states.q[row], SAME_POSE)[name.reshape(-1)]
     _, index, inverse = np.unique(label, return_index=True, return_inverse=True)
     return np.asarray(np.argsort(np.argsort(index))[inverse.reshape(-1)])
 

@@ -6,7 +6,6 @@ from tempfile import TemporaryDirectory
 from hilcal.errors import InputError
 from hilcal.robot.arm import Arm
 from hilcal.robot.dh import arm_from_dh
-from hilcal.robot.urdf import arm_from_urdf
 from hilcal.toml import suggest
 
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -55,6 +54,8 @@ def load_arm(
             (Path(folder) / path.name).write_text(text, encoding="utf-8")
             return load_arm(path.name, Path(folder), base_link=base_link, tip_link=tip_link)
     if suffix == ".urdf":
+        from hilcal.robot.urdf import arm_from_urdf  # Pinocchio is slow to import
+
         return arm_from_urdf(path, base_link, tip_link)
     for key, value in (("base_link", base_link), ("tip_link", tip_link)):
         if value is not None:
