@@ -9,8 +9,9 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, rule, run_state_machine_as_test
 
-from tests.soak import Soak, soak
+from tests.soak import soak
 from tests.support.campaign_cases import Fault
+from tests.support.soak_actions import Soak
 
 MINUTES = float(os.environ.get("HILCAL_SOAK_MINUTES", "10"))
 

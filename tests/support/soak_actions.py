@@ -1,0 +1,369 @@
+"""What the soak does by chance on a simulated cell, and what must hold after each."""
+
+import re
+import signal
+import subprocess
+import sys
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from random import Random
+
+import numpy as np
+
+from hilcal.acquire.dry_run import dry_run
+from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.run_log import RunLog
+from tests.support.calibrate_process import Calibration
+from tests.support.campaign_cases import STARVED, Fault, right, stopped_on_its_way
+from tests.support.campaign_run import BEGUN, EndedError, Run
+from tests.support.campaign_site import Site, site
+from tests.support.spread_plan import spread_plan
+from tests.wire.test_fault_matrix_arm import MOTION, REST
+from tests.wire.test_fault_matrix_serial import FORCE, OVERCOME, TRACKER
+
+PATIENCE = 25.0
+"""So long a program may go on with a fault before it counts as overcome, s."""
+CODES = (0, 3, 130, -signal.SIGKILL)
+"""Exit codes: done, a device failed, interrupted, killed."""
+
+
+@dataclass
+class Soak:
+    """What is done, and what was found.
+
+    Attributes:
+        rng: draws everything.
+        folder: for the files.
+        counts: how often each thing was done, by name.
+        findings: what was wrong: what was being done, and the failed check.
+        starved: runs that ended because this computer gave a process no turn.
+    """
+
+    rng: Random
+    folder: Path
+    counts: Counter[str] = field(default_factory=Counter)
+    findings: list[str] = field(default_factory=list)
+    starved: int = 0
+    _stack: ExitStack = field(default_factory=ExitStack)
+    _site: Site | None = None
+    _path: Path | None = None
+    _calibration: Calibration | None = None
+    _number: int = 0
+
+    # --- cells ---
+
+    @property
+    def site(self) -> Site:
+        """The cell; built where there is none."""
+        if self._site is None:
+            self._number += 1
+            here = self.folder / str(self._number)
+            here.mkdir()
+            seed = self.rng.randrange(1000)
+            self._site = self._stack.enter_context(site(here, poses=8, seed=seed))
+            self._path = None
+        return self._site
+
+    @property
+    def path(self) -> Path:
+        """The campaign that is measured now."""
+        if self._path is None:
+            self._path = self.site.directory / f"run{self.counts['campaigns']}.hilcal"
+            self.counts["campaigns"] += 1
+        return self._path
+
+    def close(self) -> None:
+        """End the cell."""
+        if self._site is not None:
+            self._site.end_runs()
+        self._stack.close()
+        self._stack, self._site, self._path = ExitStack(), None, None
+
+    # --- actions ---
+
+    def act(self) -> None:
+        """Do one thing by chance, and check what must hold after it."""
+        ways: list[tuple[float, Callable[[], str]]] = [
+            (0.40, self.one_fault),
+            (0.20, self.two_faults),
+            (0.12, self.fault_during_recovery),
+            (0.12, self.signal),
+            (0.08, self.check),
+            (0.08, self.calibrate),
+        ]
+        (way,) = self.rng.choices([w for _, w in ways], [p for p, _ in ways])
+        self.do(way)
+
+    def do(self, way: Callable[[], str]) -> None:
+        """Do it; a failed check is kept, and the next thing is done on another cell."""
+        self.counts[way.__name__] += 1
+        try:
+            way()
+        except Exception as error:
+            runs = self._site.runs if self._site is not None else []
+            if isinstance(error, EndedError) and runs and runs[-1].process.poll() == 0:
+                self.counts["done before the fault"] += 1
+                self.site.slider(1.0)
+                return
+            words = "".join(traceback.format_exception_only(error)).strip()
+            at = traceback.extract_tb(error.__traceback__)[-1]
+            if STARVED.search(words):
+                self.starved += 1
+            else:
+                self.findings.append(f"{way.__name__}: {at.name}:{at.lineno}: {words[:600]}")
+            self.close()
+
+    def one_fault(self) -> str:
+        """A run meets a fault in motion, while measuring, or at any other moment."""
+        run, moment = self._begun()
+        fault = self._drawn(moment)
+        goal = run.moving() if moment == "moving" else None
+        if moment == "measuring":
+            run.measuring()
+        return self._meets(run, (fault,), goal, exact=moment != "any")
+
+    def two_faults(self) -> str:
+        """A second fault comes within a second of the first."""
+        run, moment = self._begun()
+        one, two = self._drawn(moment), self._drawn("any")
+        goal = run.moving() if moment == "moving" else None
+        return self._meets(run, (one, two), goal, exact=False)
+
+    def fault_during_recovery(self) -> str:
+        """The operator goes on while the fault is there still, or the next one comes at once."""
+        run, moment = self._begun()
+        first, second = self._drawn(moment), self._drawn("any")
+        goal = run.moving() if moment == "moving" else None
+        self._meets(run, (first,), goal, exact=False, undo=False)
+        again = self._run()
+        try:
+            time.sleep(self.rng.uniform(0.0, 3.0))
+            second.do(self.site)
+            first.undo(self.site)
+            self._ends(again, (first, second), exact=False)
+        finally:
+            first.undo(self.site)
+            second.undo(self.site)
+        self._sound()
+        return f"{first.name}, {second.name}"
+
+    def signal(self) -> str:
+        """Ctrl-C or a kill at any moment."""
+        run, moment = self._begun()
+        goal = run.moving() if moment == "moving" else None
+        hard = self.rng.random() < 0.5
+        since = self.site.now()
+        (run.kill if hard else run.interrupt)()
+        code, words = run.end()
+        assert code in ((-signal.SIGKILL, 0) if hard else (130, 0)), words
+        if goal is not None and code:
+            stopped_on_its_way(self.site, since, goal)
+        self._gone(run)
+        self._sound()
+        self.counts["kills" if hard else "interrupts"] += 1
+        return "kill" if hard else "interrupt"
+
+    def check(self) -> str:
+        """`hilcal check` names a fault that is there, and is content without."""
+        fault = self._drawn("any") if self.rng.random() < 0.7 else None
+        command = [sys.executable, "-m", "hilcal", "check", str(self.site.toml)]
+        arrivals = self.site.ask("arm", "state")["arrivals"]
+        if fault is not None:
+            self._count(fault)
+            fault.do(self.site)
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+        finally:
+            if fault is not None:
+                fault.undo(self.site)
+        words = done.stdout + done.stderr
+        assert "Traceback" not in words, words
+        assert done.returncode in (0, 3), words
+        if fault is None:
+            assert done.returncode == 0, words
+        assert self.site.ask("arm", "state")["arrivals"] == arrivals, "check has moved the arm"
+        return "check"
+
+    def calibrate(self) -> str:
+        """`calibrate --rehearse --resume` is killed at a random moment."""
+        if self._calibration is None:
+            here = self.folder / f"calibrate{self.counts['calibrations']}"
+            here.mkdir()
+            self._calibration = Calibration(here)
+            self.counts["calibrations"] += 1
+        c = self._calibration
+        try:
+            killed = c.killed_after(self.rng.uniform(0.0, 14.0))
+            self.counts["kills of calibrate"] += killed
+            c.sound()
+            if not killed:
+                c.every_reading_once()
+                self._calibration = None
+        except BaseException:
+            self._calibration = None
+            raise
+        return "calibrate"
+
+    # --- parts ---
+
+    def _run(self) -> Run:
+        """Begin, resume, or append to a campaign that is done."""
+        how: tuple[str, ...] = ()
+        if self.path.exists() and self._done():
+            self.counts["campaigns done"] += 1
+            self._sound()
+            if self.rng.random() < 0.5:
+                how = ("--append", "--plan", str(self._further()))
+                self.counts["appends"] += 1
+            else:
+                self._path = None
+        return Run(self.site, self.path, how=how)
+
+    def _further(self) -> Path:
+        """A plan of two more poses."""
+        s = self.site
+        rngs = (np.random.default_rng([self.rng.randrange(1000), k]) for k in range(20))
+        plans = (spread_plan(s.cell, s.config, 2, rng, repeats=0) for rng in rngs)
+        with CampaignFile.open(self.path, read_only=True) as campaign:
+            log = RunLog(campaign)  # whose reference pose is another one than a plan's own
+            plan = next(
+                p for p in plans if not dry_run(s.cell, s.config, log.with_new_names(p)).problems
+            )
+        path = s.directory / f"further{self.counts['appends']}.json"
+        path.write_text(plan.to_json(), encoding="utf-8")
+        return path
+
+    def _begun(self) -> tuple[Run, str]:
+        """Start or resume a run; returns the moment at which something is to happen, too."""
+        run, moment = self._run(), self.rng.choice(("moving", "measuring", "any"))
+        if moment == "any":
+            time.sleep(self.rng.uniform(0.0, 6.0))
+            return run, moment
+        try:
+            run.some_readings()
+        except EndedError:
+            self._ended(run)
+            if run.process.poll() == 0:
+                return self._begun()
+            raise
+        return run, moment
+
+    def _drawn(self, moment: str) -> Fault:
+        serial = (*TRACKER, *FORCE, *_overcome())
+        arm = MOTION if moment == "moving" else REST
+        return self.rng.choice(arm if self.rng.random() < 0.5 else serial)
+
+    def _count(self, fault: Fault) -> None:
+        self.counts["faults"] += 1
+        self.counts[f"fault: {fault.name}"] += 1
+
+    def _meets(
+        self,
+        run: Run,
+        faults: tuple[Fault, ...],
+        goal: object,
+        *,
+        exact: bool,
+        undo: bool = True,
+    ) -> str:
+        since = self.site.now()
+        try:
+            for k, fault in enumerate(faults):
+                if k:
+                    time.sleep(self.rng.uniform(0.0, 1.0))
+                self._count(fault)
+                fault.do(self.site)
+            ended = self._ends(run, faults, exact=exact)
+            arm_alone = len(faults) == 1 and faults[0] in MOTION and faults[0].stops
+            if ended and goal is not None and arm_alone:
+                stopped_on_its_way(self.site, since, goal)  # type: ignore[arg-type]
+        finally:
+            if undo:
+                for fault in faults:
+                    fault.undo(self.site)
+        if undo:
+            if run.process.poll() is None:
+                run.interrupt()
+                run.end()
+            self._gone(run)
+        self._sound()
+        self.site.slider(1.0)
+        return ", ".join(fault.name for fault in faults)
+
+    def _ends(self, run: Run, faults: tuple[Fault, ...], *, exact: bool) -> bool:
+        """Wait until a run has ended with one line, or is seen to go on in spite of the fault."""
+        end = time.monotonic() + PATIENCE
+        while run.process.poll() is None and time.monotonic() < end:
+            run.family()
+            time.sleep(0.05)
+        if run.process.poll() is None:
+            self.counts["went on"] += 1
+            run.interrupt()
+        self._ended(run, faults if exact else ())
+        return run.process.returncode == 3
+
+    def _ended(self, run: Run, faults: tuple[Fault, ...] = ()) -> None:
+        code, words = run.end()
+        assert "Traceback" not in words, words[-2000:]
+        assert code in CODES, f"exit code {code}: {words[-600:]}"
+        lines = [line for line in words.splitlines() if line.startswith("error:")]
+        assert len(lines) == (code != 0), words[-2000:]
+        self.counts[f"exit {code}"] += 1
+        if code == 3:
+            if STARVED.search(lines[0]) and not all(
+                re.search(says, lines[0]) for fault in faults for says in fault.says
+            ):
+                self.starved += 1
+            else:
+                for fault in faults:
+                    for says in fault.says:
+                        assert re.search(says, lines[0]), f"{fault.name}: {lines[0]}"
+            if BEGUN in words:  # before that nothing is there to go on with
+                assert "--resume" in lines[0], lines[0]
+            assert len(lines[0]) > 40, f"too short to name cause and mend: {lines[0]}"
+        assert not self.site.ask("arm", "state")["moving"], "the arm moves after the program's end"
+        self._gone(run)
+
+    def _gone(self, run: Run) -> None:
+        assert run.left_behind() == [], "a process is left"
+        end = time.monotonic() + 3.0
+        while self.site.ask("arm", "state")["rtde_clients"]:
+            assert time.monotonic() < end, "a client of the controller is left"
+            time.sleep(0.05)
+
+    def _sound(self) -> None:
+        """No reading is lost, doubled or wrong."""
+        if not self.path.exists():
+            return
+        with CampaignFile.open(self.path, read_only=True) as campaign:
+            steps = [tuple(d["step"].values()) for d in RunLog(campaign).details()]
+            count = campaign.n_readings
+        assert len(steps) == len(set(steps)) == count, "a reading is lost or doubled"
+        if count:
+            right(self.site, self.path)
+
+    def _done(self) -> bool:
+        with CampaignFile.open(self.path, read_only=True) as campaign:
+            log = RunLog(campaign)
+            return log.done() == frozenset(log.plan.steps)
+
+
+def _overcome() -> tuple[Fault, ...]:
+    """Faults that a run goes on from."""
+    out = []
+    for device, rows in OVERCOME.items():
+        for op, arguments, off in rows:
+
+            def do(s: Site, d: str = device, o: str = op, a: object = arguments) -> object:
+                return s.ask(d, o, **a)  # type: ignore[arg-type]
+
+            def undo(s: Site, d: str = device, off: object = off) -> object:
+                return None if off is None else s.ask(d, off[0], **off[1])  # type: ignore[index]
+
+            out.append(Fault(f"{device} {op}", do, undo, ()))
+    return tuple(out)
