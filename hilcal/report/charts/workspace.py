@@ -52,7 +52,7 @@ def workspace(story: Story, revision: StoryRevision) -> go.Figure:
         f"{numbers.length(float(d.size_m.max(initial=0.0)))}.{d.note}"
     )
     axes = {f"{a}axis": {"title": {"text": f"base {a} [m]"}} for a in "xyz"}
-    camera = {"eye": {"x": 1.55, "y": 1.55, "z": 0.95}, "center": {"x": 0, "y": 0, "z": -0.2}}
+    camera = {"eye": {"x": 1.3, "y": 1.3, "z": 0.8}, "center": {"x": 0, "y": 0, "z": -0.22}}
     scene = {**axes, "aspectmode": "data", "camera": camera}
     legend = {"itemsizing": "constant"}
     return style.figure(says, traces=traces, height=480, scene=scene, legend=legend)

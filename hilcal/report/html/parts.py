@@ -94,8 +94,8 @@ def in_script(json: str) -> str:
 def from_terminal(parts: Iterable[RenderableType], caption: str = "") -> tuple[Part, ...]:
     """Return what a command says at the terminal as parts: the words exist once.
 
-    The caption of a table is the heading right above it, else `caption`; where two tables would
-    have the same, the second says what its rows are.
+    The caption of a table is the heading right above it, unless that is a sentence, else `caption`;
+    where two tables would have the same, the second says what its rows are.
     """
     out: list[Part] = []
     used: set[str] = set()
@@ -103,9 +103,10 @@ def from_terminal(parts: Iterable[RenderableType], caption: str = "") -> tuple[P
         if isinstance(part, RichTable):
             found = _table(part, caption)
             above = out[-1] if out else None
-            if isinstance(above, Words) and above.kind == "heading":
+            heading = above.text if isinstance(above, Words) and above.kind == "heading" else ""
+            if heading and not heading.endswith("."):
                 out.pop()
-                found = replace(found, caption=above.text)
+                found = replace(found, caption=heading)
             elif found.caption in used:
                 found = replace(found, caption=f"{found.caption}: {found.heads[0]}")
             used.add(found.caption)

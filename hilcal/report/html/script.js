@@ -32,6 +32,10 @@ function draw(at) {
   const figure = JSON.parse(at.parentElement.querySelector("script").textContent);
   figure.layout.template = look();
   figure.layout.autosize = true;
+  const eye = figure.layout.scene?.camera?.eye;
+  if (eye && at.clientWidth < at.clientHeight) { // else the axes are cut at both sides
+    for (const k of "xyz") eye[k] *= (1.45 * at.clientHeight) / at.clientWidth;
+  }
   Plotly.newPlot(at, figure.data, figure.layout, CONFIG);
 }
 
