@@ -72,8 +72,10 @@ def maximise_evidence(
         start: (P,) starting standard deviations.
         beta: starting noise variance factor.
     """
-    g, b, yy = eliminate(gram, rhs, target_norm2, slice(0, flat))
-    g, b = g[flat:, flat:], b[flat:]
+    g, b, yy = gram, rhs, target_norm2
+    if flat:
+        g, b, yy = eliminate(gram, rhs, target_norm2, slice(0, flat))
+        g, b = g[flat:, flat:], b[flat:]
     count = int(groups.max()) + 1 if len(groups) else 0
     members = np.maximum(np.bincount(groups, minlength=count), 1)
     # A group is negligible where its effect on the data is.
@@ -165,8 +167,10 @@ def _inverse_root(h: Floats) -> Floats:
 
     Where H is so large that 1 is below its rounding, by its eigenvalues, which are at least zero.
     """
-    low, failed = sl.lapack.dpotrf(h + np.eye(len(h)), lower=1)
+    one = h.T.copy(order="F")  # in LAPACK's order, not turned over in memory
+    one[np.diag_indices_from(one)] += 1.0
+    low, failed = sl.lapack.dpotrf(one, lower=1, overwrite_a=1)
     if not failed:
-        return np.asarray(sl.lapack.dtrtri(low, lower=1)[0])
+        return np.asarray(sl.lapack.dtrtri(low, lower=1, overwrite_c=1)[0])
     values, vectors = np.linalg.eigh(h)
     return np.asarray((vectors / np.sqrt(1.0 + np.maximum(values, 0.0))).T)

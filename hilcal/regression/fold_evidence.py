@@ -19,6 +19,7 @@ import numpy as np
 import scipy.linalg as sl
 
 from hilcal.regression.empirical_bayes import maximise_evidence
+from hilcal.regression.schur import eliminate
 from hilcal.types import Bools, Floats, Ints
 
 
@@ -61,10 +62,13 @@ def solutions(p: FamilyProblem, fold: Ints) -> Floats:
     out = []
     for f, (own, side) in enumerate(parts):
         g, b, yy = gram - own, rhs - side, float(square.sum() - square[f])
-        count = len(fold) - int(count_of[f])
-        first = maximise_evidence(g, b, yy, count, flat, p.groups, p.std, p.beta)
-        start = _with_dropped(g, b, p.groups, first.std, first.beta)
-        last = maximise_evidence(g, b, yy, count, flat, p.groups, start, first.beta)
+        count = len(fold) - int(count_of[f]) - flat
+        # Beside the unshrunk columns, which are eliminated once.
+        h, c, left = eliminate(g, b, yy, slice(0, flat))
+        h, c = h[flat:, flat:], c[flat:]
+        first = maximise_evidence(h, c, left, count, 0, p.groups, p.std, p.beta)
+        start = _with_dropped(h, c, p.groups, first.std, first.beta)
+        last = maximise_evidence(h, c, left, count, 0, p.groups, start, first.beta)
         out.append(_solve(g, b, flat, last.std, last.beta)[0])
     return np.array(out)
 

@@ -57,8 +57,9 @@ def inverse_root(block: Floats) -> Floats:
 def _triangular(scaled: Floats) -> tuple[Floats, Bools]:
     """Inverse Cholesky factors of blocks (N, F, F), and which of them serve."""
     if len(scaled) == 1:
-        low, failed = sl.lapack.dpotrf(scaled[0], lower=1)
-        out = np.zeros_like(low) if failed else sl.lapack.dtrtri(low, lower=1)[0]
+        # The transpose, in LAPACK's order, is not turned over in memory.
+        low, failed = sl.lapack.dpotrf(scaled[0].T, lower=1)
+        out = np.zeros_like(low) if failed else sl.lapack.dtrtri(low, lower=1, overwrite_c=1)[0]
         out = np.asarray(out)[None]
     else:
         try:
@@ -81,7 +82,7 @@ def positive_solve(m: Floats, rhs: Floats) -> Floats:
     if len(m) and scale.all():
         scaled = m / np.outer(scale, scale)
         norm = float(np.abs(scaled).sum(axis=0).max())
-        low, failed = sl.lapack.dpotrf(scaled, lower=1, clean=0)
+        low, failed = sl.lapack.dpotrf(scaled.T, lower=1, clean=0)
         if not failed:
             condition, _ = sl.lapack.dpocon(low, norm, uplo="L")
             if condition * norm > len(m) * DETERMINED / _SOUND:

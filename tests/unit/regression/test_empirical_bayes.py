@@ -8,6 +8,7 @@ from hilcal.identify.fit import Fit, fit
 from hilcal.identify.regularisation import effective_parameters
 from hilcal.identify.validation import validate
 from hilcal.regression.empirical_bayes import EmpiricalPrior, maximise_evidence, spent_by_groups
+from hilcal.regression.schur import eliminate
 from tests.support.campaigns import campaign, measured, noiseless, plan
 from tests.support.effect_cases import make
 
@@ -175,3 +176,18 @@ def test_the_variance_is_right_where_the_data_choose_which_groups_to_keep():
         naive.append(rss / (rows - determined.sum()))
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.025)
     assert np.mean(naive) < 0.95
+
+
+def test_flat_columns_may_be_eliminated_before() -> None:
+    rng = np.random.default_rng(8)
+    a, flat = rng.normal(size=(80, 25)), 5
+    y = a[:, :9] @ rng.normal(size=9) + rng.normal(size=80)
+    gram, rhs, square = a.T @ a, a.T @ y, float(y @ y)
+    groups, start = np.repeat(np.arange(10), 2), np.full(20, 0.3)
+    whole = maximise_evidence(gram, rhs, square, 80, flat, groups, start)
+    g, b, left = eliminate(gram, rhs, square, slice(0, flat))
+    g, b = g[flat:, flat:], b[flat:]
+    beside = maximise_evidence(g, b, left, 80 - flat, 0, groups, start)
+    assert (whole.std > 0).any()
+    np.testing.assert_allclose(beside.std, whole.std, rtol=1e-9)
+    assert abs(beside.beta - whole.beta) < 1e-9 * whole.beta
