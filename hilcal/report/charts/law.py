@@ -30,7 +30,7 @@ def law(of: StoryLaw) -> go.Figure:
     ]
     says = (
         f"{of.formula}: {of.y_label} over {of.x_label}; where the law is right, the readings "
-        "(points) lie on it (line)."
+        "(points) lie on it (line, interpolated where there are none)."
     )
     x, y = escaped(of.x_label), escaped(of.y_label)
     return style.figure(says, x=x, y=y, traces=traces, height=340)

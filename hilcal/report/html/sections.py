@@ -138,7 +138,7 @@ def _laws(m: ReportContent) -> Section | None:
     parts.append(
         Words(
             "Each point is the mean over readings of the law's value plus what it leaves of them. "
-            "Nothing is known outside of the range that is drawn.",
+            "Nothing is known outside of the range that is drawn, nor within its gaps.",
             "note",
         )
     )
