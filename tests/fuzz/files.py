@@ -2,18 +2,12 @@
 
 import csv
 import io
-import json
-import os
 import shutil
 import sqlite3
 import tempfile
-import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from random import Random
-from typing import Any
 
 import numpy as np
 
@@ -23,74 +17,19 @@ from hilcal.calibration.handover import urdf
 from hilcal.calibration.points import read_points
 from hilcal.campaign import Campaign
 from hilcal.config import CellConfig, load_config
-from hilcal.data import matfile
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.covariance import INSTRUMENT
 from hilcal.data.importing import import_readings
-from hilcal.data.mapping import FileFormat, load_mapping
-from hilcal.data.plan import Plan, Step, load_plan
+from hilcal.data.mapping import load_mapping
+from hilcal.data.plan import load_plan
 from hilcal.data.rows import _reading_crc, text_crc
-from hilcal.data.sheets import open_grid
-from hilcal.data.table import write_table
-from hilcal.errors import InputError
 from hilcal.identify import parameters_document, posterior_document
 from hilcal.robot.catalogue import configs_dir, load_arm
 from hilcal.robot.dh import arm_from_dh
 from hilcal.robot.urdf import arm_from_urdf
-from tests.fuzz.damage import NUMBERS, ODD, bytes_damaged, document_damaged, words_damaged
+from tests.fuzz.bench import CELL, Bench
+from tests.fuzz.damage import NUMBERS, bytes_damaged, document_damaged, words_damaged
 from tests.fuzz.harness import MEMORY_DISK, Accepted, Parser
-from tests.fuzz.wire import instead
-from tests.support.campaigns import campaign, configuration
-
-_CELL = configs_dir() / "cells" / "demo_ur10e.toml"
-
-
-@dataclass
-class _Bench:
-    """Sound files to begin with."""
-
-    folder: Path
-
-    @cached_property
-    def readings(self) -> hc.Readings:
-        return campaign("joint_tilt_compliance", "deflection", 3, poses=6).readings
-
-    @cached_property
-    def table(self) -> bytes:
-        path = self.folder / "sound.csv"
-        write_table(self.readings, path, INSTRUMENT)
-        return path.read_bytes()
-
-    @cached_property
-    def rows(self) -> list[list[str]]:
-        return list(csv.reader(io.StringIO(self.table.decode())))
-
-    @cached_property
-    def run(self) -> bytes:
-        path = self.folder / "sound.hilcal"
-        with CampaignFile.create(
-            path, configuration().to_json(), str(self.folder), "fuzz", overwrite=True
-        ) as file:
-            file.append_readings(self.readings)
-        with Campaign.open(path) as run:
-            found = hc.fit(hc.baseline(run.cell, run.readings), run.readings)
-            run.append(found)
-            self.calibration = self.folder / "sound.json"
-            run.calibration().save(self.calibration)
-            self.posterior = json.dumps(run.posterior().to_json())
-            self.parameters = json.dumps(parameters_document.to_json(found, {"x": 1}))
-        return path.read_bytes()
-
-    @cached_property
-    def plan(self) -> str:
-        q = self.readings.states.q[:2]
-        steps = tuple(Step(p, load, 1) for p in ("a", "b") for load in ("none", "5kg"))
-        return Plan(("a", "b"), q, steps).to_json()
-
-    def path(self, name: str, data: bytes) -> Path:
-        path = self.folder / name
-        path.write_bytes(data)
-        return path
+from tests.fuzz.packed import packed
+from tests.support.campaigns import configuration
 
 
 def _plain(readings: hc.Readings) -> None:
@@ -155,8 +94,8 @@ def _csv(rows: list[list[str]]) -> bytes:
     return text.getvalue().encode()
 
 
-def _table(bench: _Bench) -> Parser:
-    config = load_config(_CELL)
+def _table(bench: Bench) -> Parser:
+    config = load_config(CELL)
     arm = load_arm(config.robot.model)
 
     def make(by: Random) -> bytes:
@@ -174,7 +113,7 @@ def _table(bench: _Bench) -> Parser:
     return Parser("table", make, parse)
 
 
-def _points(bench: _Bench) -> Parser:
+def _points(bench: Bench) -> Parser:
     arm = load_arm("ur10e")
     rows = [["pose", *(f"q{k}_rad" for k in range(1, 7)), "load"]]
     rows += [[f"p{k}", "0.1", "-1.5", "1", "0", "0.3", "0", "none"] for k in range(5)]
@@ -192,9 +131,9 @@ def _points(bench: _Bench) -> Parser:
     return Parser("points", make, parse)
 
 
-def _chain(bench: _Bench) -> Parser:
+def _chain(bench: Bench) -> Parser:
     """A damaged table all the way: import, registration, fit, diagnosis."""
-    cell = hc.Cell.load(_CELL)
+    cell = hc.Cell.load(CELL)
 
     def make(by: Random) -> bytes:
         return _csv(_cell_damaged(bench.rows, by))
@@ -208,9 +147,9 @@ def _chain(bench: _Bench) -> Parser:
     return Parser("chain", make, parse, limit_s=120.0)
 
 
-def _cell_chain(bench: _Bench) -> Parser:
+def _cell_chain(bench: Bench) -> Parser:
     """A sound table in a damaged cell, all the way."""
-    text = _CELL.read_text()
+    text = CELL.read_text()
 
     def make(by: Random) -> bytes:
         return words_damaged(text, by).encode("utf-8", "replace")
@@ -224,7 +163,7 @@ def _cell_chain(bench: _Bench) -> Parser:
     return Parser("cell_chain", make, parse, limit_s=120.0)
 
 
-def _campaign_chain(bench: _Bench, damaged: Parser) -> Parser:
+def _campaign_chain(bench: Bench, damaged: Parser) -> Parser:
     """A damaged campaign, all the way."""
 
     def parse(data: bytes) -> bool:
@@ -237,135 +176,12 @@ def _campaign_chain(bench: _Bench, damaged: Parser) -> Parser:
     return Parser("campaign_chain", damaged.make, parse, limit_s=120.0)
 
 
-def _packed(bench: _Bench) -> list[Parser]:
-    """XLSX, Parquet and MAT: as files, and with odd things in them."""
-    import openpyxl
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-    from scipy.io import savemat
-
-    how = FileFormat()
-    numbers = np.array([[float(c) for c in row[2:8]] for row in bench.rows[1:9]])
-
-    def xlsx(cells: list[list[Any]]) -> bytes:
-        book = openpyxl.Workbook()
-        for row in cells:
-            book.active.append(row)
-        out = io.BytesIO()
-        book.save(out)
-        return out.getvalue()
-
-    def parquet(columns: dict[str, Any]) -> bytes:
-        out = io.BytesIO()
-        pq.write_table(pa.table(columns), out)
-        return out.getvalue()
-
-    def mat(content: dict[str, Any]) -> bytes:
-        out = io.BytesIO()
-        savemat(out, content)
-        return out.getvalue()
-
-    sound = {
-        "xlsx": xlsx([["a", "b"], *numbers[:, :2].tolist()]),
-        "parquet": parquet({f"c{k}": numbers[:, k] for k in range(6)}),
-        "mat": mat({"A": numbers, "s": {"x": numbers, "n": np.array(["a", "b"], dtype=object)}}),
-    }
-
-    def rezipped(data: bytes, by: Random) -> bytes:
-        """One member damaged, with its checksum mended."""
-        out = io.BytesIO()
-        with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(out, "w") as new:
-            chosen = by.choice(old.namelist())
-            for name in old.namelist():
-                content = old.read(name)
-                if name == chosen:
-                    text = content.decode("utf-8", "replace")
-                    content = (
-                        bytes_damaged(content, by)
-                        if by.random() < 0.5
-                        else words_damaged(text, by).encode("utf-8", "replace")
-                    )
-                new.writestr(name, content)
-        return out.getvalue()
-
-    def odd(kind: str, by: Random) -> bytes:
-        values = [by.choice((*NUMBERS[:8], 0.5, "x", None)) for _ in range(4)]
-        match kind:
-            case "xlsx":
-                texts = [v for v in ODD if isinstance(v, int | float | str) and v == v]
-                cells = [[by.choice(texts) for _ in range(3)] for _ in range(3)]
-                try:
-                    return xlsx(cells)
-                except Exception:  # openpyxl writes no control characters
-                    return rezipped(sound["xlsx"], by)
-            case "parquet":
-                column = by.choice(
-                    (
-                        [[1.0], [2.0]],
-                        [{"a": 1}, None],
-                        [b"x", b"y"],
-                        ["a", "b"],
-                        [True, None],
-                        [None, None],
-                        [1 << 62, -1],
-                        [float("nan"), float("inf")],
-                    )
-                )
-                return parquet({"a": column, "b": [0.0, 1.0]})
-            case _:
-                shape = by.choice(((1, 1), (0, 3), (3, 0), (2, 3, 4), (1, 1, 1, 2), (5, 1)))
-                return mat(
-                    {
-                        "A": np.zeros(shape),
-                        "o": np.array(values, dtype=object),
-                        "z": np.zeros((2, 2), dtype=complex),
-                        "e": {},
-                    }
-                    if None not in values
-                    else {"A": np.zeros(shape)}
-                )
-
-    def parser(kind: str) -> Parser:
-        def make(by: Random) -> bytes:
-            if by.random() < 0.3:
-                return odd(kind, by)
-            if kind == "xlsx" and by.random() < 0.6:
-                return rezipped(sound[kind], by)
-            return bytes_damaged(sound[kind], by)
-
-        def parse(data: bytes) -> bool:
-            path = bench.path(f"t.{kind}", data)
-            if kind != "mat":
-                return len(open_grid(path, how).rows) > 0
-            with instead(matfile, {"read": _forked}):  # as quick as that, and as safe
-                return len(open_grid(path, how).rows) > 0
-
-        return Parser(kind, make, parse)
-
-    return [parser(kind) for kind in sound]
-
-
-def _forked(path: str) -> Any:
-    """Read a MAT file in a fork, which begins at once; a new interpreter takes 0.3 s."""
-    out = Path(path + ".npz")
-    child = os.fork()
-    if not child:
-        try:
-            out.write_bytes(matfile.packed(path))
-            os._exit(0)
-        except BaseException:
-            os._exit(1)
-    if os.waitpid(child, 0)[1]:
-        raise InputError("damaged")
-    return matfile.unpacked(out.read_bytes())
-
-
-def _mapping(bench: _Bench) -> Parser:
+def _mapping(bench: Bench) -> Parser:
     texts = [p.read_text() for p in sorted((configs_dir() / "mappings").glob("*.toml"))]
     return _toml(bench, "mapping", texts, load_mapping)
 
 
-def _toml(bench: _Bench, name: str, texts: list[str], read: Callable[[Path], object]) -> Parser:
+def _toml(bench: Bench, name: str, texts: list[str], read: Callable[[Path], object]) -> Parser:
     def make(by: Random) -> bytes:
         if by.random() < 0.01:
             return (b"a = " + b"[" * 5000) if by.random() < 0.5 else b"a." * 5000 + b"b = 1"
@@ -381,13 +197,13 @@ def _toml(bench: _Bench, name: str, texts: list[str], read: Callable[[Path], obj
     return Parser(name, make, parse)
 
 
-def _cell_toml(bench: _Bench) -> Parser:
+def _cell_toml(bench: Bench) -> Parser:
     texts = [p.read_text() for p in sorted((configs_dir() / "cells").glob("*.toml"))]
     return _toml(bench, "cell", texts, hc.Cell.load)
 
 
 def _document(
-    bench: _Bench, name: str, sound: Callable[[], str], read: Callable[[Path], object]
+    bench: Bench, name: str, sound: Callable[[], str], read: Callable[[Path], object]
 ) -> Parser:
     kept: list[str] = []
 
@@ -411,7 +227,7 @@ def _used(path: Path) -> None:
         raise Accepted("calibration: a position that is not finite")
 
 
-def _urdf(bench: _Bench) -> Parser:
+def _urdf(bench: Bench) -> Parser:
     text = urdf(load_arm("ur10e"))
 
     def make(by: Random) -> bytes:
@@ -430,7 +246,7 @@ def _urdf(bench: _Bench) -> Parser:
     return Parser("urdf", make, parse)
 
 
-def _campaign(bench: _Bench) -> Parser:
+def _campaign(bench: Bench) -> Parser:
     """Bytes of the file, and rows changed with their checksums mended."""
     work = bench.folder / "mended.hilcal"
 
@@ -501,7 +317,7 @@ def parsers() -> list[Parser]:
     import atexit
 
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    bench = _Bench(folder)
+    bench = Bench(folder)
     arms = [p.read_text() for p in sorted((configs_dir() / "robots").glob("*.toml"))]
 
     def of_run(name: str) -> Callable[[], str]:
@@ -516,7 +332,7 @@ def parsers() -> list[Parser]:
     return [
         _table(bench),
         _points(bench),
-        *_packed(bench),
+        *packed(bench),
         _mapping(bench),
         _cell_toml(bench),
         _toml(bench, "arm", arms, arm_from_dh),

@@ -8,9 +8,8 @@ reached and only what is physically possible may be accepted.
 import math
 import struct
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from random import Random
-from types import SimpleNamespace
 from typing import Any
 
 import minimalmodbus
@@ -21,81 +20,13 @@ from drivers import bota, ft300, geocom_line, modbus_rtu, onrobot_hex
 from drivers.force_stream import RING, ForceStream, SensorFormat
 from drivers.geocom import GeoComTracker, Options
 from drivers.geocom_line import Link
-from drivers.ur_link import dashboard, lines, probe, reading
-from drivers.ur_link.lines import LinkError
 from hilcal.acquire.clock import Clock
 from hilcal.config.cell import Tracker
+from tests.fuzz import controller
 from tests.fuzz.damage import NUMBERS, bytes_damaged
 from tests.fuzz.harness import Accepted, Parser, passed
+from tests.fuzz.stand_ins import Port, Time, finite, instead
 from tests.support.geocom_cases import crc16_arc, line
-
-
-class _Time:
-    """A clock that advances when it is read: deadlines pass without waiting."""
-
-    def __init__(self) -> None:
-        self.now = 0.0
-
-    def monotonic(self) -> float:
-        self.now += 1e-3
-        return self.now
-
-    def monotonic_ns(self) -> int:
-        return int(1e9 * self.monotonic())
-
-    def sleep(self, seconds: float) -> None:
-        self.now += max(0.0, seconds)
-
-
-class _Port:
-    """A serial port that holds some bytes and then is silent."""
-
-    is_open, baudrate, timeout, port, in_waiting = True, 115200, 0.1, "fuzz", 0
-
-    def __init__(self) -> None:
-        self.held = b""
-
-    def read(self, count: int = 1) -> bytes:
-        out, self.held = self.held[:count], self.held[count:]
-        return out
-
-    def read_until(self, end: bytes) -> bytes:
-        out, sep, self.held = self.held.partition(end)
-        return out + sep
-
-    def write(self, data: bytes) -> int:
-        return len(data)
-
-    def open(self) -> None: ...
-    def close(self) -> None: ...
-    def flush(self) -> None: ...
-    def reset_input_buffer(self) -> None: ...
-    def reset_output_buffer(self) -> None: ...
-
-
-class _Socket:
-    """A connection that gives some bytes in pieces and then closes."""
-
-    def __init__(self, data: bytes) -> None:
-        self._data = data
-
-    def recv(self, count: int) -> bytes:
-        out, self._data = self._data[:count], self._data[count:]
-        return out
-
-    def settimeout(self, seconds: float) -> None: ...
-    def sendall(self, data: bytes) -> None: ...
-    def shutdown(self, how: int) -> None: ...
-    def __enter__(self) -> "_Socket":
-        return self
-
-    def __exit__(self, *_: object) -> None: ...
-
-
-def _finite(rng: Random) -> float:
-    value = rng.choice(NUMBERS)
-    return float(value) if rng.random() < 0.5 else rng.uniform(-1e3, 1e3)
-
 
 # --- frames of force sensors ---
 
@@ -138,7 +69,7 @@ def _force(name: str) -> Parser:
         return tuple((counts * unit).tolist())
 
     measured = {wrench_of(body) for body in sound}
-    port = _Port()
+    port = Port()
     stream = ForceStream(port, sensor)  # type: ignore[arg-type]
     stream.stop()
     fresh = type(stream._deframer)
@@ -149,9 +80,9 @@ def _force(name: str) -> Parser:
             k = by.randrange(4)
             frames[k] = frame(
                 1000 * (k + 1),
-                [_finite(by) for _ in range(6)],
+                [finite(by) for _ in range(6)],
                 status=by.getrandbits(16),
-                temperature=_finite(by),
+                temperature=finite(by),
                 ticks=by.getrandbits(16),
             )
             return b"\1" + b"".join(frames)
@@ -199,9 +130,9 @@ def _force(name: str) -> Parser:
 
 def _geocom() -> Parser:
     rng = np.random.default_rng(2)
-    virtual = _Time()
+    virtual = Time()
     quiet: dict[str, Any] = {"drain": lambda *_: True, "time": virtual}
-    port = _Port()
+    port = Port()
     link = Link.__new__(Link)
     link._path, link._baud, link._port = "fuzz", 115200, port  # type: ignore[assignment]
     link._connection = geocom_line._Connection(port)  # type: ignore[arg-type]
@@ -274,8 +205,8 @@ def _geocom() -> Parser:
 
 
 def _modbus() -> Parser:
-    virtual = _Time()
-    port = _Port()
+    virtual = Time()
+    port = Port()
     registers = [struct.pack(">4H", *range(k, k + 4)) for k in range(1, 3000, 97)]
     minimalmodbus_quiet = {"time": virtual}
 
@@ -319,144 +250,6 @@ def modbus_rtu_crc(data: bytes) -> bytes:
     return crc.to_bytes(2, "little")
 
 
-# --- Universal Robots ---
-
-
-def _rtde_frame(kind: str, body: bytes) -> bytes:
-    return struct.pack(">HB", (3 + len(body)) % 65536, ord(kind)) + body
-
-
-def _rtde() -> Parser:
-    names = reading.OUTPUTS
-    kinds = ",".join("VECTOR6D" for _ in names).encode()
-    version = _rtde_frame("V", b"\1")
-    asked: list[tuple[bytes, Callable[[], object]]] = [
-        (
-            version
-            + _rtde_frame("v", struct.pack(">4I", 5, 11, 6, 0))
-            + _rtde_frame("O", b"\1" + kinds),
-            lambda: probe.controller("fuzz", names, 1.0),
-        ),
-        (
-            version
-            + _rtde_frame("M", b"\5hello\3foo\1")
-            + _rtde_frame("O", b"\1DOUBLE")
-            + _rtde_frame("S", b"\1")
-            + _rtde_frame("U", b"\1" + struct.pack(">d", 1.0)),
-            lambda: probe.check_stream("fuzz", 1.0),
-        ),
-        (
-            version + _rtde_frame("I", b"\1IN_USE,DOUBLE"),
-            lambda: probe.in_use("fuzz", ("a", "b"), 1.0),
-        ),
-    ]
-    corpus = [data for data, _ in asked]
-
-    def make(by: Random) -> bytes:
-        k = by.randrange(len(asked))
-        if by.random() < 0.2:
-            frames = [
-                _rtde_frame(by.choice("VvOSUIPM?"), by.randbytes(by.choice((0, 1, 2, 16, 17, 300))))
-                for _ in range(by.randint(1, 5))
-            ]
-            return bytes([k]) + by.choice((version, b"")) + b"".join(frames)
-        return bytes([k]) + bytes_damaged(corpus[k], by, corpus)
-
-    def parse(data: bytes) -> bool:
-        with instead(lines, _network(data[1:])):
-            asked[data[0] % len(asked)][1]()
-        return True
-
-    return Parser("rtde", make, parse, refusals=(LinkError,))
-
-
-def _dashboard() -> Parser:
-    said = (
-        b"Connected: Universal Robots Dashboard Server\n", b"UR10\n", b"20235500001\n",
-        b"URSoftware 5.11.6.1010327 (Jan 01 2023)\n", b"Robotmode: RUNNING\n",
-        b"Safetystatus: NORMAL\n", b"true\n", b"STOPPED <unnamed>\n",
-    )  # fmt: skip
-    corpus = [b"".join(said), said[0] + b"Stopped\n", said[0] + b"true\n",
-              said[0] + b"could not understand: 'is in remote control'\n"]  # fmt: skip
-    asked: list[Callable[[], object]] = [
-        lambda: dashboard.describe("fuzz", 1.0),
-        lambda: dashboard.stop("fuzz", 1.0),
-        lambda: dashboard.in_remote_control("fuzz", 1.0),
-    ]
-
-    def make(by: Random) -> bytes:
-        data = bytes_damaged(by.choice(corpus), by, corpus)
-        if by.random() < 0.001:
-            data *= 1 + 200_000 // max(1, len(data))
-        return bytes([by.randrange(len(asked))]) + data
-
-    def parse(data: bytes) -> bool:
-        with instead(lines, _network(data[1:])):
-            asked[data[0] % len(asked)]()
-        return True
-
-    return Parser("dashboard", make, parse, refusals=(LinkError,))
-
-
-def _packet() -> Parser:
-    """What the receive worker passes on: a packet whose numbers the network may have changed."""
-    width = {"payload_cog": 3}
-    single = {"timestamp", "robot_mode", "runtime_state", "safety_status_bits", "speed_scaling",
-              "target_speed_fraction", "payload"}  # fmt: skip
-    size = {name: 1 if name in single else width.get(name, 6) for name in reading.OUTPUTS}
-    layout = struct.Struct(f">{sum(size.values())}d")
-    usual = [0.5] * sum(size.values())
-
-    def make(by: Random) -> bytes:
-        values = list(usual)
-        for _ in range(by.randint(1, 4)):
-            values[by.randrange(len(values))] = _finite(by)
-        data = layout.pack(*values)
-        return bytes_damaged(data, by) if by.random() < 0.5 else data
-
-    def parse(data: bytes) -> bool:
-        values = list(struct.unpack(f">{len(data) // 8}d", data[: len(data) // 8 * 8]))
-        fields: dict[str, Any] = {}
-        for name, count in size.items():
-            taken, values = values[:count], values[count:]
-            whole = name in ("robot_mode", "runtime_state", "safety_status_bits")
-            one: Any = taken[0] if taken else 0.0
-            if whole:
-                one = int(one) if math.isfinite(one) else 0
-            fields[name] = one if name in single else taken
-        got = reading.read({"host_ns": 1, "fields": fields}).sample
-        if np.abs(got.q).max() > 100.0 or np.abs(got.joint_temperature).max() > 200.0:
-            raise Accepted("packet: joints or temperatures that cannot be")
-        return True
-
-    return Parser("packet", make, parse, refusals=(reading.ReadingError,))
-
-
-def _network(data: bytes) -> dict[str, Any]:
-    import socket
-
-    fake = SimpleNamespace(
-        create_connection=lambda *_, **__: _Socket(data),
-        gaierror=socket.gaierror,
-        SHUT_WR=socket.SHUT_WR,
-    )
-    return {"socket": fake}
-
-
-class instead:
-    """Puts other names into a module for a while."""
-
-    def __init__(self, module: Any, names: dict[str, Any]) -> None:
-        self._module, self._names = module, names
-
-    def __enter__(self) -> None:
-        self._before = {name: getattr(self._module, name) for name in self._names}
-        self._module.__dict__.update(self._names)
-
-    def __exit__(self, *_: object) -> None:
-        self._module.__dict__.update(self._before)
-
-
 def parsers() -> list[Parser]:
     """All of them."""
     from tests.fuzz.devices import parsers as servers
@@ -465,8 +258,8 @@ def parsers() -> list[Parser]:
         *(_force(name) for name in ("ft300", "bota", "hex")),
         _geocom(),
         _modbus(),
-        _rtde(),
-        _dashboard(),
-        _packet(),
+        controller.rtde(),
+        controller.dashboard_server(),
+        controller.packet(),
         *servers(),
     ]

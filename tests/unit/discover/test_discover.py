@@ -20,21 +20,18 @@ from hilcal.discover import grow, shapes
 from hilcal.discover.amplitudes import Amplitude, Factor
 from hilcal.discover.curve import curves
 from hilcal.discover.discovery import Discovery, discover
-from hilcal.discover.grammar import grammar
 from hilcal.discover.law import Form, Part
 from hilcal.discover.problem import Problem
 from hilcal.discover.proposal import LawSearch
 from hilcal.discover.refit import exact
 from hilcal.discover.screen import Screen, screen
 from hilcal.discover.search import Selection, _plainly, _simplicity, search
-from hilcal.discover.sites import ORDINARY, sites
+from hilcal.discover.sites import ORDINARY
 from hilcal.discover.terms import Term
 from hilcal.discover.variables import variables
 from hilcal.discover.write_effect import effect_class, source_of_form
 from hilcal.effects.catalogue import installed
 from hilcal.effects.check import check_effect
-from hilcal.effects.example import example_cell, example_situation, example_states
-from hilcal.effects.force_sensor import recorded
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
@@ -301,53 +298,6 @@ def test_a_wave_of_high_order_is_drawn_over_one_period() -> None:
     assert c.quantity == "q_2 within a period of 2π/40"
 
 
-def test_every_function_is_an_effect_with_its_derivative() -> None:
-    cell = example_cell()
-    s = example_situation(cell, example_states(cell))
-    known = {v.kind: v for v in variables(s)}
-    torque, angle, side = known["torque"], known["angle"], known["side"]
-    made = [
-        Factor(torque, shapes.LINEAR),
-        Factor(torque, shapes.ODD, (2.0, 0.0)),
-        Factor(torque, shapes.ODD, (0.5, 0.3)),
-        Factor(torque, shapes.EVEN, (1.0, 0.0)),
-        Factor(torque, shapes.EVEN, (1.7, 0.3)),
-        Factor(torque, shapes.EVEN, (0.6, 0.3)),
-        Factor(torque, shapes.THRESHOLD, (5.0,)),
-        Factor(torque, shapes.PLUS),
-        Factor(torque, shapes.MINUS),
-        Factor(torque, shapes.SATURATION, (20.0,)),
-        Factor(torque, shapes.SIN, (0.05,)),
-        Factor(torque, shapes.COS, (0.05,)),
-    ]
-    places = sites(cell.arm.n)
-    for k, factor in enumerate(made):
-        other = Factor(angle, shapes.COS, (2.0,)) if k % 2 else Factor(side, shapes.LINEAR)
-        site = places[(5 * k) % 18]
-        if not site.takes(True):
-            site = places[0]
-        form = Form(
-            (Part(site, Amplitude((factor, other)), 0), Part(places[1], Amplitude((factor,)), 1))
-        )
-        check_effect(effect_class(source_of_form(form, "tried"), "tried"))
-
-
-def test_fine_waves_are_tried_up_to_the_number_of_poses_and_in_no_product(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(products, "MOST", 3)
-    cell = example_cell()
-    s = example_situation(cell, example_states(cell))
-    words = grammar([v for v in variables(s) if v.kind == "angle"][:2], s, 14)
-    fine = [a for a in words.amplitudes if any(f.shape.cost == 3 for f in a.factors)]
-    assert {a.factors[0].numbers[0] for a in fine} == set(range(5, 15))
-    assert all(len(a.factors) == 1 for a in fine)
-    place = words.place(fine[0])
-    assert place is not None
-    partner = words.amplitudes[words.partner[place]].factors[0]
-    assert (partner.shape.name, partner.numbers) == ("sin", fine[0].factors[0].numbers)
-
-
 def test_of_equals_the_cause_in_the_joint_itself_is_simpler() -> None:
     s = screened()
     by = {a.names: k for k, a in enumerate(s.grammar.amplitudes) if a.names and a.cost == 1}
@@ -390,14 +340,6 @@ def test_a_tilt_that_is_a_joints_displacement_is_called_so() -> None:
     tilt = next(k for k, site in enumerate(s.sites) if site.symbol == "tilt5_y")
     told = _plainly(s, Selection((Term(((tilt, s.one),), 0.0),), (1.0,)))
     assert s.sites[told.terms[0].parts[0][0]].symbol == "dq_4"
-
-
-def test_every_quantity_reads_the_same_in_the_written_effect() -> None:
-    cell = example_cell()
-    s = example_situation(cell, example_states(cell))
-    for v in variables(s):
-        read = eval(v.code, {"s": s, "np": np, "recorded": recorded})
-        assert np.allclose(read, v.read(s), rtol=1e-12, atol=0), v.names
 
 
 def test_every_coefficient_has_a_unit() -> None:
