@@ -41,10 +41,10 @@ def switch(name: str, device: str, op: str, says: tuple[str, ...], *, fast: bool
     return Fault(name, on, off, (device, *says), fast=fast)
 
 
-def unplugged(device: str, *, fast: bool = False) -> Fault:
+def unplugged(device: str) -> Fault:
     name = f"{device} unplugged"
     says = (device, "unplugged")
-    return Fault(name, act(device, "unplug"), act(device, "replug"), says, fast=fast)
+    return Fault(name, act(device, "unplug"), act(device, "replug"), says)
 
 
 def rate(device: str, wrong: int, good: int, says: str) -> Fault:
@@ -64,7 +64,7 @@ TRACKER = (
     switch("no distance (1292)", "tracker", "dist_error", ("distance", "1292")),
     switch("tracker mute", "tracker", "mute", ("no answer",)),
     switch("tracker busy", "tracker", "busy", ("1293",)),
-    unplugged("tracker", fast=True),
+    unplugged("tracker"),
     rate("tracker", 9600, 115200, "no answer|what comes is no GeoCOM"),
 )
 

@@ -27,9 +27,15 @@ from tests.support.campaigns import Campaign, campaign, noiseless, plan, with_no
 
 MODES = ("absolute", "deflection")
 NAMES = tuple(e.name for e in BUILT_IN if e.name != "joint_compliance")
-HIDDEN = [(n, "absolute") for n in NAMES] + [
-    (n, "deflection") for n in NAMES if n in DEFLECTION_EFFECTS
+HIDDEN = [
+    *((n, "deflection" if n in DEFLECTION_EFFECTS else "absolute") for n in NAMES),
+    *(
+        pytest.param(n, "absolute", marks=pytest.mark.slow)
+        for n in NAMES
+        if n in DEFLECTION_EFFECTS
+    ),
 ]
+"""Every effect every time, in both modes in the slow suite."""
 
 
 def fit_of(c: Campaign, readings: Readings | None = None) -> Fit:

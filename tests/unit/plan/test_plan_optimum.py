@@ -224,7 +224,7 @@ def test_tiny_plans_against_all_plans(name: str) -> None:
         plans = plans[plans @ units.cost <= budget]
         top = largest(criterion, units, plans, np.zeros((3, 3)) if prior is None else prior)
         design = best(
-            units, criterion, budget, prior, np.random.default_rng(0), most=most, effort=400
+            units, criterion, budget, prior, np.random.default_rng(0), most=most, effort=150
         )
         assert design.bound >= top * (1 - 1e-9)
         assert design.value <= top * (1 + 1e-9)

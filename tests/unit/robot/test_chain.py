@@ -127,7 +127,7 @@ OFFSET = np.array([0.05, -0.1, 0.2])
 
 
 @pytest.mark.parametrize("name", ARMS)
-@pytest.mark.parametrize("size", [0.0, 1e-3, 0.3])
+@pytest.mark.parametrize("size", [0.0, pytest.param(1e-3, marks=pytest.mark.slow), 0.3])
 def test_jacobians_are_slopes(name: str, size: float) -> None:
     arm = arm_of(name)
     count = 3
