@@ -28,6 +28,8 @@ from tests.wire.test_fault_matrix_serial import FORCE, OVERCOME, TRACKER
 
 PATIENCE = 25.0
 """So long a program may go on with a fault before it counts as overcome, s."""
+STANDS = 1.0
+"""So long after its program was killed an arm may move, s: half of it to be noticed, and a ramp."""
 CODES = (0, 3, 130, -signal.SIGKILL)
 """Exit codes: done, a device failed, interrupted, killed."""
 
@@ -163,6 +165,7 @@ class Soak:
         assert code in ((-signal.SIGKILL, 0) if hard else (130, 0)), words
         if goal is not None and code:
             stopped_on_its_way(self.site, since, goal)
+        self._still()
         self._gone(run)
         self._sound()
         self.counts["kills" if hard else "interrupts"] += 1
@@ -172,6 +175,7 @@ class Soak:
         """`hilcal check` names a fault that is there, and is content without."""
         fault = self._drawn("any") if self.rng.random() < 0.7 else None
         command = [sys.executable, "-m", "hilcal", "check", str(self.site.toml)]
+        self._still()
         arrivals = self.site.ask("arm", "state")["arrivals"]
         if fault is not None:
             self._count(fault)
@@ -328,6 +332,13 @@ class Soak:
             assert len(lines[0]) > 40, f"too short to name cause and mend: {lines[0]}"
         assert not self.site.ask("arm", "state")["moving"], "the arm moves after the program's end"
         self._gone(run)
+
+    def _still(self) -> None:
+        """A program that was killed has left nobody who would let the arm go on."""
+        end = time.monotonic() + STANDS
+        while self.site.ask("arm", "state")["moving"]:
+            assert time.monotonic() < end, "the arm moves though no program commands it"
+            time.sleep(0.02)
 
     def _gone(self, run: Run) -> None:
         assert run.left_behind() == [], "a process is left"
