@@ -13,7 +13,7 @@ effect is implausible, and the size that it would need is stated.
 from collections.abc import Callable, Collection, Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -42,7 +42,7 @@ FALSE_ALARM = 0.001
 """Chance of naming any effect where none is missing, over the whole catalogue."""
 MOST_KEPT = 1_000_000
 """Numbers of an effect's columns up to which they are kept until the smallest strength that would
-be revealed is asked for, 8 MB; a choice."""
+be revealed is asked for, 8 MB; larger ones are computed again then. A choice."""
 LEAST_SHARE = 0.01
 """An effect that explains less of the misfit on poses left out is not worth adding; a guess."""
 
@@ -240,25 +240,27 @@ def _suspect(p: Linearisation, of: EffectColumns, bare: Unloaded | None, level: 
     of_s, largest = spectrum(s), most(of, bare)
     result = p.score(of.white, of_s, largest)
     held = p.held_out(of.white, result)
+    effect = of.effect
+    columns: Callable[[], EffectColumns] = lambda: of  # noqa: E731 - of the small ones alone
+    if of.white.size > MOST_KEPT:
+        columns = partial(effect_columns, p.fit, effect)
 
     def least() -> Strength:
+        own = columns()
         found = least_strength(
             s,
-            of.motion,
-            of.scale,
-            tuple(q.unit for q in of.effect.parameters),
+            own.motion,
+            own.scale,
+            tuple(q.unit for q in effect.parameters),
             p.fit.dof,
             max(p.fit.variance_factor, 1.0),
             level,
             of_s.rank,
         )
         if large(of_s, p.fit.dof):
-            return least_of_family(p, of, of_s, found, level, LEAST_SHARE, largest)
+            return least_of_family(p, own, of_s, found, level, LEAST_SHARE, largest)
         return found
 
-    detection = Detection(least)
-    if of.white.size > MOST_KEPT:
-        detection = _computed(detection.least)
     return Suspect(
         effect=of.effect.name,
         coarse=of.effect.coarse,
@@ -268,13 +270,8 @@ def _suspect(p: Linearisation, of: EffectColumns, bare: Unloaded | None, level: 
         explains=False,
         sure=held.sure,
         needs=_implausible(p, of, of_s, result, largest),
-        detection=detection,
+        detection=Detection(least),
     )
-
-
-def _computed(found: Strength) -> Detection:
-    """Return what needs no columns any more."""
-    return Detection(lambda: found)
 
 
 def _implausible(

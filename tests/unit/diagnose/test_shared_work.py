@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from hilcal.diagnose import effect_ranking
 from hilcal.diagnose import residual_regression as regression
 from hilcal.diagnose.backward_elimination import backward_elimination
-from hilcal.diagnose.effect_ranking import candidates
+from hilcal.diagnose.effect_ranking import candidates, rank_suspects
 from hilcal.diagnose.residual_regression import Regressions, residual_regression
 from hilcal.diagnose.stepwise import add
 from hilcal.diagnose.stepwise_alternatives import StepwiseAlternatives
@@ -66,3 +67,15 @@ def test_redundant_effects_by_scores_that_the_alternatives_made(found: Fit) -> N
     assert [n.effect for n in by_itself] == [n.effect for n in shared]
     for one, other in zip(by_itself, shared, strict=True):
         assert one.score.p_value == pytest.approx(other.score.p_value, rel=1e-9)
+
+
+def test_columns_that_are_computed_again_show_the_same_smallest_strengths(
+    found: Fit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    p, effects = linearise(found), candidates(found)[:6]
+    kept = rank_suspects(p, effects)
+    monkeypatch.setattr(effect_ranking, "MOST_KEPT", 0)
+    again = rank_suspects(p, effects)
+    for one, other in zip(kept, again, strict=True):
+        assert one.effect == other.effect
+        assert other.least.displacement_m == pytest.approx(one.least.displacement_m, rel=1e-9)
