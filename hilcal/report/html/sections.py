@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 
 from hilcal.data.command_line import COMMAND
+from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.diagnose.effect_ranking import Suspect
 from hilcal.identify.full_prediction import full_prediction
 from hilcal.report import numbers, text
@@ -32,7 +33,7 @@ from hilcal.report.text_scalings import scalings_table
 from hilcal.report.text_seen import could_have_been_seen, doubtful, redundant_line
 
 MOST_SUSPECTS = 4
-"""Suspects with an added-variable plot; a choice."""
+"""Suspects whose added-variable plot is not folded away; a choice."""
 MOST_CURVES = 6
 NOT_KEPT = "not kept: made by a program of one's own, at the workbench, or before hilcal kept it"
 MOST_LISTED = 8
@@ -104,15 +105,22 @@ def _evidence(m: ReportContent) -> Section:
     parts += from_terminal([*doubtful(d), *redundant_line(d)])
     tested = [s for s in d.suspects if s.score.rank > 0 and s.plausible]
     strong = [s for s in tested if s.explains or s.score.p_value < text.CERTAIN]
-    for s in strong[:MOST_SUSPECTS] or tested[:1]:
-        found = regressor(d.fit, s)
-        if found is not None:
-            parts.append(chart(f"Added variable: {s.effect}", added_variable(found, s.effect)))
-    details: list[Part] = []
+    shown = strong[:MOST_SUSPECTS] or tested[:1]
+    parts += _added_variables(d, shown)
+    details: list[Part] = [
+        *_added_variables(d, [s for s in tested if all(s is not other for other in shown)])
+    ]
     if len(d.suspects) > MOST_LISTED:
         details.append(_suspects(d.suspects[MOST_LISTED:], "Other suspects"))
     details += from_terminal(could_have_been_seen(d), "What could have been seen")
     return Section("evidence", "What is missing, with its evidence", tuple(parts), tuple(details))
+
+
+def _added_variables(d: Diagnosis, of: Sequence[Suspect]) -> Iterator[Part]:
+    for s in of:
+        found = regressor(d.fit, s)
+        if found is not None:
+            yield chart(f"Added variable: {s.effect}", added_variable(found, s.effect))
 
 
 def _laws(m: ReportContent) -> Section | None:
