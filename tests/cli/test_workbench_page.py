@@ -99,6 +99,12 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
 
 
 @pytest.fixture(scope="module")
+def untouched(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    with workbench(tmp_path_factory.mktemp("bench")) as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
     with open_browser() as found:
         yield found
@@ -269,9 +275,9 @@ def test_an_operator_sees_adds_removes_and_goes_back(browser: Browser, served: S
 @needs_chromium
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_the_page_fits_desktop_and_phone(
-    browser: Browser, served: Served, scheme: str, tmp_path: Path
+    browser: Browser, untouched: Served, scheme: str, tmp_path: Path
 ) -> None:
-    told: list[str] = []
+    told, served = list[str](), untouched
     with Campaign.open(served.run, read_only=True) as o:
         readings = int((o.file.readings().load > 0).sum())
     page = opened(browser, served, told, viewport=DESKTOP, color_scheme=scheme)
