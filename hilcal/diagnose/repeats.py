@@ -19,7 +19,7 @@ from hilcal.data.readings import Readings
 from hilcal.data.whitening import Bucket, Whitening, whitening
 from hilcal.identify.fit import Fit
 from hilcal.observe import motion
-from hilcal.regression.connected import connected, near
+from hilcal.regression.connected import connected, groups_within
 from hilcal.types import Floats, Ints
 
 SAME_ANGLE = 1e-6
@@ -102,7 +102,7 @@ def classes(readings: Readings) -> Ints:
     wrench = s.wrench / np.where(size > 0, SAME_LOAD * size, 1.0)
     named = 10.0 * np.stack([readings.load, readings.target], axis=1)
     points = np.concatenate([s.q / SAME_ANGLE, wrench, named], axis=1)
-    return near(points, 1.0)
+    return groups_within(points, 1.0)
 
 
 def contrasts(fit: Fit) -> Contrasts | None:

@@ -7,7 +7,7 @@ their names: a repeated pose that is left out must not be predicted from its rep
 import numpy as np
 
 from hilcal.data.readings import Readings
-from hilcal.regression.connected import near
+from hilcal.regression.connected import groups_within
 from hilcal.types import Floats, Ints
 
 SAME_POSE = 2e-3
@@ -19,7 +19,7 @@ FOLDS = 10
 def distinct_poses(readings: Readings) -> Ints:
     """(N,) number of the distinct pose of each reading, in order of first appearance."""
     _, row, name = np.unique(readings.pose, return_index=True, return_inverse=True)
-    label = near(readings.states.q[row], SAME_POSE)[name.reshape(-1)]
+    label = groups_within(readings.states.q[row], SAME_POSE)[name.reshape(-1)]
     _, index, inverse = np.unique(label, return_index=True, return_inverse=True)
     return np.asarray(np.argsort(np.argsort(index))[inverse.reshape(-1)])
 

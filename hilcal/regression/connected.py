@@ -14,7 +14,7 @@ def connected(a: Ints, b: Ints, count: int) -> Ints:
     return np.asarray(connected_components(links, directed=False)[1])
 
 
-def near(points: Floats, distance: float) -> Ints:
+def groups_within(points: Floats, distance: float) -> Ints:
     """Return the number (N,) of the group of each point (N, D).
 
     Points are joined that differ by at most `distance` in every coordinate.

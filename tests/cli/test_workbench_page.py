@@ -277,10 +277,10 @@ def test_an_operator_sees_adds_removes_and_goes_back(browser: Browser, served: S
 def test_the_page_fits_desktop_and_phone(
     browser: Browser, untouched: Served, scheme: str, tmp_path: Path
 ) -> None:
-    told, served = list[str](), untouched
-    with Campaign.open(served.run, read_only=True) as o:
+    told: list[str] = []
+    with Campaign.open(untouched.run, read_only=True) as o:
         readings = int((o.file.readings().load > 0).sum())
-    page = opened(browser, served, told, viewport=DESKTOP, color_scheme=scheme)
+    page = opened(browser, untouched, told, viewport=DESKTOP, color_scheme=scheme)
     for size in (DESKTOP, PHONE):
         page.set_viewport_size(size)  # type: ignore[arg-type]
         page.wait_for_timeout(300)
