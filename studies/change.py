@@ -20,8 +20,9 @@ from drivers.simulated.world import World, stand
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
 from hilcal.data.readings import Readings
-from hilcal.diagnose.change import LEVEL, POWER, STATED_DOF, Changes, find_changes
+from hilcal.diagnose.change import LEVEL, POWER, STATED_DOF, find_changes
 from hilcal.diagnose.change_candidates import changing
+from hilcal.diagnose.change_found import Changes
 from hilcal.diagnose.completed import completed
 from hilcal.errors import HilcalError
 from hilcal.identify.baseline import with_effects

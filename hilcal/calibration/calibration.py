@@ -21,7 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from hilcal.calibration.compensation import Inverse, Pose, invert, singular
+from hilcal.calibration.compensated import Compensation
+from hilcal.calibration.compensation import Inverse, Pose, invert
 from hilcal.calibration.compiled import Compiled, compiled
 from hilcal.calibration.learnt import Learnt
 from hilcal.calibration.measured import Measured
@@ -38,76 +39,7 @@ from hilcal.identify.predictive import open_prior, position_factor, predictive
 from hilcal.model import Model, Prediction
 from hilcal.robot import se3
 from hilcal.robot.chain import evaluate
-from hilcal.types import Bools, Floats, Ints
-
-
-@dataclass(frozen=True, eq=False)
-class Compensation:
-    """Joint values that put the tool where it was asked to be; the rest is computed when asked for.
-
-    Attributes:
-        inverse: joint values, and what is left.
-    """
-
-    inverse: Inverse
-    _calibration: "Calibration"
-    _tool: Tool
-    _states: States
-    _wanted: tuple[Floats, Floats] | None
-    _std: bool
-
-    @property
-    def q(self) -> Floats:
-        """(N, n) the joint values, rad."""
-        return self.inverse.q
-
-    @property
-    def given(self) -> Floats:
-        """(N, n) the joint values that were given, rad."""
-        return self._states.q
-
-    @property
-    def inside(self) -> Bools:
-        """(N,) whether the point lies within what was measured."""
-        out = np.ones(len(self.q), dtype=bool)
-        for o in self.after.outside:
-            out &= ~o.points
-        return out
-
-    @cached_property
-    def before(self) -> ToolPoses:
-        """The tool at the joint values that were given; without uncertainties."""
-        return self._calibration.poses(self._tool, self._states, self._goal, std=False)
-
-    @cached_property
-    def after(self) -> ToolPoses:
-        """The tool at the joint values that were found."""
-        found = replace(self._states, q=self.q)
-        return self._calibration.poses(self._tool, found, self._goal, std=self._std)
-
-    @property
-    def limits(self) -> Bools:
-        """(N, n) joint values that are beyond the arm's limits."""
-        arm = self._tool.model.cell.arm
-        return np.asarray((self.q < arm.q_min) | (self.q > arm.q_max))
-
-    @cached_property
-    def singular(self) -> Bools:
-        """(N,) whether the pose is singular."""
-        arm = self._tool.model.cell.arm
-        return singular(arm, evaluate(arm, self.q), self.after.position)
-
-    @property
-    def usable(self) -> Bools:
-        """(N,) points that are solved, not singular, within limits and what was measured."""
-        good = self.inverse.solved & ~self.singular & ~self.limits.any(axis=1)
-        return np.asarray(good & self.inside)
-
-    @cached_property
-    def _goal(self) -> tuple[Floats, Floats]:
-        if self._wanted is None:
-            return self._calibration.nominal(self._tool, self._states)
-        return self._wanted
+from hilcal.types import Floats, Ints
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,8 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from hilcal.calibration.calibration import Calibration, Compensation
+from hilcal.calibration.calibration import Calibration
+from hilcal.calibration.compensated import Compensation
 from hilcal.calibration.points import Points, on_branch, read_points
 from hilcal.calibration.urscript import JOINTS, movej_program, program_points, with_joints
 from hilcal.campaign import Campaign

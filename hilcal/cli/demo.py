@@ -34,7 +34,7 @@ from hilcal.cli.rehearsing import (
 )
 from hilcal.cli.terminal import Json, Record, Terminal, terminal
 from hilcal.config import load_config
-from hilcal.data.campaign_file import may_write
+from hilcal.data.new_campaign import may_write
 from hilcal.discover.agreement import agreement
 from hilcal.discover.proposal import LawSearch
 from hilcal.discover.search import SAME

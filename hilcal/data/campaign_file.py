@@ -1,7 +1,6 @@
 """RUN.hilcal: one SQLite file with immutable readings and appended model revisions."""
 
 import json
-import os
 import sqlite3
 from collections.abc import Mapping
 from dataclasses import replace
@@ -14,6 +13,7 @@ import numpy as np
 from hilcal import __version__
 from hilcal.data import rows, schema
 from hilcal.data.command_line import typed_now
+from hilcal.data.new_campaign import write_new
 from hilcal.data.readings import Readings
 from hilcal.data.records import Layout, content_hash, layout_of, read_layout
 from hilcal.data.revision import RevisionRecord, fitted_to, from_text, to_text, utc_now
@@ -65,21 +65,13 @@ class CampaignFile:
             InputError: the file exists, or cannot be written.
         """
         path = Path(path)
-        new = path.with_name(f".{path.name}.new")
         meta = dict(
             zip(_META, (config_json, base_dir, source, utc_now(), __version__), strict=True)
         )
         try:
             kept = robot_file_of(config_json, base_dir)
             meta |= {**typed_now(), **kept, **(more or {})}
-            may_write(path, overwrite)
-            for leftover in (new, *_sidecars(new)):
-                leftover.unlink(missing_ok=True)
-            new.touch()
-            _fill(new, meta)
-            for leftover in _sidecars(path):  # a journal of another file would be rolled back in
-                leftover.unlink(missing_ok=True)
-            os.replace(new, path)
+            write_new(path, meta, overwrite)
         except OSError as e:
             raise InputError(f"{path}: cannot be written ({e.strerror})") from e
         return cls.open(path)
@@ -376,35 +368,3 @@ class CampaignFile:
         number = np.array([names.index(name) for name in readings.target_names])
         states = replace(readings.states, target=number[readings.target])
         return replace(readings, states=states, target_names=tuple(names))
-
-
-def _sidecars(path: Path) -> tuple[Path, ...]:
-    return tuple(path.with_name(path.name + end) for end in ("-journal", "-wal", "-shm"))
-
-
-def may_write(path: Path, overwrite: bool) -> None:
-    """Refuse to replace a file that is no campaign, or any without `overwrite`.
-
-    Raises:
-        InputError: names the file and the reason.
-    """
-    if not path.exists():
-        return
-    if not overwrite:
-        raise InputError(f"{path}: the file exists; choose another name or ask to overwrite it")
-    if not path.is_file() or (path.stat().st_size > 0 and not schema.is_campaign(path)):
-        raise InputError(f"{path}: exists and is not a campaign; it is not overwritten")
-
-
-def _fill(path: Path, meta: dict[str, str]) -> None:
-    with schema.sqlite_errors(path):
-        connection = schema.connect(path)
-        try:
-            connection.execute("PRAGMA journal_mode = DELETE")
-            with schema.transaction(connection):
-                for statement in schema.statements():
-                    connection.execute(statement)
-                for key, value in meta.items():
-                    rows.insert_meta(connection, key, value)
-        finally:
-            connection.close()

@@ -5,7 +5,8 @@ from datetime import UTC, datetime
 import numpy as np
 
 from hilcal.data.grid import Cell, Grid
-from hilcal.data.mapping import SECONDS, Time
+from hilcal.data.mapping_sections import Time
+from hilcal.data.units import SECONDS
 from hilcal.errors import InputError
 from hilcal.types import Floats
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hilcal.data.mapping import FileFormat
+from hilcal.data.mapping_sections import FileFormat
 from hilcal.errors import InputError
 from hilcal.types import Bools, Floats, Ints
 

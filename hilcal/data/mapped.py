@@ -6,15 +6,15 @@ from pathlib import Path
 
 import numpy as np
 
-from hilcal.data import checks, columns
-from hilcal.data import mapping as units
+from hilcal.data import checks, columns, units
 from hilcal.data.clock import seconds
 from hilcal.data.covariance import TrackerNoise
 from hilcal.data.csvfile import CsvTable
 from hilcal.data.following import own_columns
 from hilcal.data.grid import Grid
 from hilcal.data.imported import ImportResult
-from hilcal.data.mapping import Column, Mapping
+from hilcal.data.mapping import Mapping
+from hilcal.data.mapping_sections import Column
 from hilcal.data.orientation import defect, rotations
 from hilcal.data.sheets import open_tables
 from hilcal.data.stated import stated_covariance

@@ -15,7 +15,8 @@ import numpy as np
 
 from hilcal.data import matfile
 from hilcal.data.grid import Cell, Grid, content_of, joined, read_text, table, unique
-from hilcal.data.mapping import FileFormat, Mapping
+from hilcal.data.mapping import Mapping
+from hilcal.data.mapping_sections import FileFormat
 from hilcal.errors import InputError
 from hilcal.toml import suggest
 

@@ -19,7 +19,7 @@ from hilcal.data.grid import (
     number,
     records,
 )
-from hilcal.data.mapping import FileFormat
+from hilcal.data.mapping_sections import FileFormat
 from hilcal.data.sheets import REFUSED, open_grid, sheet_names, sheet_rows
 from hilcal.errors import InputError
 

@@ -5,11 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.data import mapping as units
+from hilcal.data import units
 from hilcal.data.covariance import TrackerNoise, tracker_covariance
 from hilcal.data.csvfile import CsvTable
 from hilcal.data.grid import Grid
-from hilcal.data.mapping import Column, CovarianceColumns, Mapping, Std
+from hilcal.data.mapping import Mapping
+from hilcal.data.mapping_sections import Column, CovarianceColumns, Std
 from hilcal.data.orientation import angle_axes
 from hilcal.data.stated_noise import floored
 from hilcal.errors import InputError

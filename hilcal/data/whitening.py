@@ -13,17 +13,17 @@ together. The blocks are kept stacked by size; nothing of size (readings)² exis
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
+from hilcal.data.reading_groups import arrival_groups, deflection_groups, has_unloaded
 from hilcal.data.readings import Readings
 from hilcal.errors import InputError
 from hilcal.robot import se3
 from hilcal.robot.batch import chunks
-from hilcal.types import Bools, Floats, Ints
+from hilcal.types import Floats, Ints
 
 Scaling = Literal["none", "gu", "gc"]
 Mode = Literal["deflection", "absolute"]
@@ -225,7 +225,8 @@ def whitening(readings: Readings, mode: Mode, scaling: Scaling = "gc") -> Whiten
     v, m = readings.covariance, readings.m
     buckets = []
     rank = 0
-    for loaded, reference, weights in _groups(readings, mode):
+    groups = deflection_groups if mode == "deflection" else arrival_groups
+    for loaded, reference, weights in groups(readings):
         covariance = _group_covariance(readings, loaded, reference, weights)
         factor = inverse_root(covariance, scaling)
         rank += int(np.count_nonzero(factor.any(axis=-1)))
@@ -259,102 +260,9 @@ def relative_rotation(r: Floats, w: Whitening) -> Floats:
     return np.concatenate(out)
 
 
-_Group = tuple[Ints, Ints, Floats]
-"""Rows (G, L) of the measured and (G, U) of the unloaded readings, and weights (L, U)."""
-
-
-def _groups(readings: Readings, mode: Mode) -> list[_Group]:
-    """Return the groups of readings that share an error, those of equal shape stacked."""
-    if mode == "deflection":
-        return _deflections(readings)
-    count = len(readings)
-    arrival = np.arange(count) if readings.common is None else readings.arrivals
-    order = np.argsort(arrival, kind="stable")
-    starts = np.flatnonzero(np.diff(arrival[order], prepend=-1))
-    sizes = np.diff(np.append(starts, count))
-    if len(starts) == count:
-        order = np.arange(count)
-    found = []
-    for size in np.unique(sizes):
-        rows = order[starts[sizes == size][:, None] + np.arange(size)]
-        none = np.empty((len(rows), 0), dtype=np.int64)
-        found.append((rows, none, np.zeros((size, 0))))
-    return found
-
-
 def _each_alone(buckets: tuple[Bucket, ...]) -> bool:
     """Whether no absolute readings share an error, so that they are in their own order."""
     return len(buckets) == 1 and buckets[0].loaded.shape[1] == 1
-
-
-def _deflections(readings: Readings) -> list[_Group]:
-    """Group loaded readings with the unloaded ones of their pose, cycle and target.
-
-    Targets that share the scatter of an arrival are in one group. A loaded reading whose target,
-    of several, was not read unloaded in its pose and cycle makes no deflection.
-    """
-    if len(readings) and readings.unloaded.all():
-        raise InputError("readings = deflection: there is no loaded reading; use absolute")
-    _refuse_without_unloaded(readings)
-    keys = [readings.pose, readings.cycle]
-    rows = np.flatnonzero(_has_unloaded(readings, [*keys, readings.target]))
-    unloaded, target = readings.unloaded[rows], readings.target[rows]
-    if readings.common is None:
-        keys.append(readings.target)
-    group = _numbered([k[rows] for k in keys])
-    order = np.lexsort((target, ~unloaded, group))
-    starts = np.flatnonzero(np.diff(group[order], prepend=-1))
-    sizes = np.diff(np.append(starts, len(rows)))
-    count = np.add.reduceat(unloaded[order].astype(np.int64), starts)
-    alike = np.zeros_like(starts)
-    if readings.common is not None:
-        kinds: dict[bytes, int] = {}
-        for k, mine in enumerate(np.split(target[order], starts[1:])):
-            alike[k] = kinds.setdefault(mine.tobytes(), len(kinds))
-    shapes = np.stack([sizes, count, alike], axis=1)
-    found = []
-    for shape in np.unique(shapes, axis=0):
-        size, u = int(shape[0]), int(shape[1])
-        if size == u:
-            continue
-        at = order[starts[np.all(shapes == shape, axis=1)][:, None] + np.arange(size)]
-        same = target[at[0, u:], None] == target[at[0, :u]]
-        found.append((rows[at[:, u:]], rows[at[:, :u]], same / same.sum(axis=1, keepdims=True)))
-    if not found:
-        raise InputError(
-            "readings = deflection: no target was read both loaded and unloaded in one pose and "
-            "cycle; use absolute"
-        )
-    return found
-
-
-def _numbered(keys: Sequence[Ints]) -> Ints:
-    """(N,) number of the combination of keys (N,)."""
-    return np.unique(np.stack(keys, axis=1), axis=0, return_inverse=True)[1].reshape(-1)
-
-
-def _has_unloaded(readings: Readings, keys: Sequence[Ints]) -> Bools:
-    """(N,) whether an unloaded reading has the same keys."""
-    group = _numbered(keys)
-    has = np.zeros(int(group.max()) + 1, dtype=bool)
-    has[group[readings.unloaded]] = True
-    return np.asarray(has[group])
-
-
-def _refuse_without_unloaded(readings: Readings) -> None:
-    """Refuse a pose and cycle without any unloaded reading.
-
-    Raises:
-        InputError: names it.
-    """
-    has = has_unloaded(readings)
-    if not has.all():
-        row = int(np.argmin(has))
-        name = readings.pose_names[readings.pose[row]]
-        raise InputError(
-            f"pose {name}, cycle {readings.cycle[row]}: no unloaded reading (load = none), which "
-            "a deflection needs; measure it, or use --readings absolute"
-        )
 
 
 def _difference(b: Bucket, x: Floats) -> Floats:
@@ -402,8 +310,3 @@ def usual_mode(readings: Readings) -> Mode:
     if readings.unloaded.all():
         return "absolute"
     return "deflection" if has_unloaded(readings).all() else "absolute"
-
-
-def has_unloaded(readings: Readings) -> Bools:
-    """Return (N,) which readings have an unloaded one, or are one, in their pose and cycle."""
-    return _has_unloaded(readings, [readings.pose, readings.cycle])

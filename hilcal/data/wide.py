@@ -3,7 +3,8 @@
 import numpy as np
 
 from hilcal.data.grid import Cell, Grid
-from hilcal.data.mapping import Column, Mapping, Name, Position
+from hilcal.data.mapping import Mapping
+from hilcal.data.mapping_sections import Column, Name, Position
 
 TARGET = "target of [position]"
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilcal.data.whitening import Mode
-from hilcal.diagnose.change import Changes
+from hilcal.diagnose.change_found import Changes
 from hilcal.identify.errors import error_block
 from hilcal.identify.extrapolation import Extrapolation, extrapolation
 from hilcal.identify.fit import Fit

@@ -23,8 +23,8 @@ from hilcal.effects.protocol import (
     Role,
     Situation,
     source_of,
-    total,
 )
+from hilcal.effects.total import total
 from hilcal.errors import HilcalError, InputError
 from hilcal.robot.deviation import Deviation
 from hilcal.robot.statics import slot_wrenches

@@ -18,8 +18,8 @@ from hilcal.cell import Cell
 from hilcal.data.readings import States
 from hilcal.effects.changed import Changeable
 from hilcal.effects.options import Options
+from hilcal.effects.total import total
 from hilcal.errors import InputError
-from hilcal.robot.batch import zeros
 from hilcal.robot.chain import Chain
 from hilcal.robot.deviation import Deviation
 from hilcal.robot.statics import Load
@@ -371,25 +371,6 @@ class Effect(ABC):
     def deviation(self, theta: Floats, s: Situation) -> Deviation:
         """Deviation of N states at parameters theta (P,)."""
         return total(self.checked_columns(s), theta, s)
-
-
-def total(columns: tuple[Columns, ...], theta: Floats, s: Situation) -> Deviation:
-    """Return the deviation Σ columns_p θ_p of N states."""
-    count, n = s.angle.shape
-    width = {"dq": (n,), "twist": (n + 1, 6), "scale": ()}
-    fields: dict[str, Floats] = {}
-    for c in columns:
-        field = fields.setdefault(c.field, zeros(count, *width.get(c.field, (6,))))
-        t = theta[c.parameter]
-        if c.field in ("dq", "twist"):
-            for e, mine in c.runs():
-                if mine.stop - mine.start == 1:
-                    field[:, e] += c.values[:, mine.start] * t[mine.start]
-                else:
-                    field[:, e] += np.tensordot(c.values[:, mine], t[mine], axes=(1, 0))
-        else:
-            field += np.einsum("np...,p->n...", c.values, t)
-    return Deviation(**fields)
 
 
 def source_of(kind: type[Effect]) -> str:

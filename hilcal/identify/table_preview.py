@@ -11,10 +11,11 @@ from hilcal.config import CellConfig
 from hilcal.data.guess_values import BY_VALUES, RIVALS
 from hilcal.data.guesser import FAR, GUESSED, SIDE_BY_SIDE, TURN
 from hilcal.data.importing import import_readings
-from hilcal.data.mapping import ANGLES, LENGTHS, Mapping
+from hilcal.data.mapping import Mapping
 from hilcal.data.orientation import rotations
 from hilcal.data.proposal import Proposal, Understood
 from hilcal.data.propose import Proposed, propose
+from hilcal.data.units import ANGLES, LENGTHS
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify import description_words
 from hilcal.identify.conventions import CLEARER, Fit, choose_convention

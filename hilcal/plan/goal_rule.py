@@ -9,8 +9,9 @@ import numpy as np
 from hilcal.acquire.progress import GoalStatus
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
+from hilcal.data.reading_groups import has_unloaded
 from hilcal.data.readings import Readings
-from hilcal.data.whitening import Mode, has_unloaded
+from hilcal.data.whitening import Mode
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import HilcalError, InputError
 from hilcal.identify.baseline import with_effects

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from hilcal.acquire.dry_run import dry_run
-from hilcal.calibration.calibration import Calibration, Compensation
+from hilcal.calibration.calibration import Calibration
+from hilcal.calibration.compensated import Compensation
 from hilcal.calibration.tool import tool_of, tool_poses
 from hilcal.cell import Cell
 from hilcal.config import CellConfig

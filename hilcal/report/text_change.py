@@ -5,8 +5,9 @@ from dataclasses import asdict
 
 from rich.console import RenderableType
 
-from hilcal.diagnose.change import LEVEL, POWER, Change, Limit, Size
+from hilcal.diagnose.change import LEVEL, POWER
 from hilcal.diagnose.change_candidates import Candidate
+from hilcal.diagnose.change_found import Change, Limit, Size
 from hilcal.diagnose.comparison import Comparison
 from hilcal.identify.parameter_differences import Differences
 from hilcal.report import numbers, text

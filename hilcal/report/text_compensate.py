@@ -5,7 +5,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from rich.console import RenderableType
 
-from hilcal.calibration.calibration import Calibration, Compensation
+from hilcal.calibration.calibration import Calibration
+from hilcal.calibration.compensated import Compensation
 from hilcal.calibration.measured import Outside
 from hilcal.calibration.poses import BAND
 from hilcal.report import numbers, text

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from hilcal.data import matfile
-from hilcal.data.mapping import FileFormat
+from hilcal.data.mapping_sections import FileFormat
 from hilcal.data.sheets import open_grid
 from hilcal.errors import InputError
 from tests.fuzz.bench import Bench

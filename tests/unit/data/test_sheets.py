@@ -17,7 +17,8 @@ from scipy.io import savemat
 
 from hilcal.data.covariance import TrackerNoise
 from hilcal.data.mapped import import_mapped
-from hilcal.data.mapping import FileFormat, Mapping
+from hilcal.data.mapping import Mapping
+from hilcal.data.mapping_sections import FileFormat
 from hilcal.data.propose import propose
 from hilcal.data.readings import Readings
 from hilcal.data.sheets import open_grid

@@ -13,8 +13,9 @@ from drivers.simulated.truth import Truth
 from drivers.simulated.world import stand
 from hilcal.cell import Cell
 from hilcal.config import load_config
-from hilcal.diagnose.change import Changes, find_changes
+from hilcal.diagnose.change import find_changes
 from hilcal.diagnose.change_candidates import candidates
+from hilcal.diagnose.change_found import Changes
 from hilcal.effects.spec import effect
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.baseline import with_effects

@@ -17,7 +17,8 @@ from scipy.io import savemat
 from drivers.simulated.own_law import check_hash
 from hilcal.cli import main
 from hilcal.data import sheets
-from hilcal.data.mapping import FileFormat, load_mapping
+from hilcal.data.mapping import load_mapping
+from hilcal.data.mapping_sections import FileFormat
 from hilcal.data.rows import text_crc
 from hilcal.data.sheets import open_grid
 from hilcal.errors import InputError

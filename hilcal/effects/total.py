@@ -1,0 +1,31 @@
+"""The deviation that an effect's columns and parameters make."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hilcal.robot.batch import zeros
+from hilcal.robot.deviation import Deviation
+from hilcal.types import Floats
+
+if TYPE_CHECKING:
+    from hilcal.effects.protocol import Columns, Situation
+
+
+def total(columns: "tuple[Columns, ...]", theta: Floats, s: "Situation") -> Deviation:
+    """Return the deviation Σ columns_p θ_p of N states."""
+    count, n = s.angle.shape
+    width = {"dq": (n,), "twist": (n + 1, 6), "scale": ()}
+    fields: dict[str, Floats] = {}
+    for c in columns:
+        field = fields.setdefault(c.field, zeros(count, *width.get(c.field, (6,))))
+        t = theta[c.parameter]
+        if c.field in ("dq", "twist"):
+            for e, mine in c.runs():
+                if mine.stop - mine.start == 1:
+                    field[:, e] += c.values[:, mine.start] * t[mine.start]
+                else:
+                    field[:, e] += np.tensordot(c.values[:, mine], t[mine], axes=(1, 0))
+        else:
+            field += np.einsum("np...,p->n...", c.values, t)
+    return Deviation(**fields)
