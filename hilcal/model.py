@@ -22,6 +22,7 @@ from hilcal.robot.chain import Chain
 from hilcal.robot.deviation import Deviation
 from hilcal.robot.geometric_stiffness import geometric_stiffness
 from hilcal.robot.statics import Load, slot_wrenches
+from hilcal.threads import in_threads
 from hilcal.types import Floats, Ints
 
 if TYPE_CHECKING:  # a value that a model only carries along; fits know what it means
@@ -226,8 +227,8 @@ class Model:
         place[live] = np.arange(len(live))
         places = np.split(place, np.cumsum(sizes)[:-1]) if sizes else []
         out = np.empty((count, m, len(live)))
-        for rows in chunks(count, m * len(live)):
-            self._fill(out[rows], effects, places, prediction[rows], theta)
+        parts = chunks(count, m * len(live))
+        in_threads(lambda r: self._fill(out[r], effects, places, prediction[r], theta), parts)
         return out
 
     def _fill(

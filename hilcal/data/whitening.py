@@ -23,6 +23,7 @@ from hilcal.data.readings import Readings
 from hilcal.errors import InputError
 from hilcal.robot import se3
 from hilcal.robot.batch import chunks
+from hilcal.threads import in_threads
 from hilcal.types import Floats, Ints
 
 Scaling = Literal["none", "gu", "gc"]
@@ -200,12 +201,15 @@ class Whitening:
         start = 0
         for b in self.buckets:
             size = b.factor.shape[-1]
-            for groups in chunks(len(b.loaded), size * width):
+
+            def scale(groups: slice, b: Bucket = b, size: int = size, begin: int = start) -> None:
                 factor = b.factor[groups]
-                stop = start + len(factor) * size
-                block = flat[start:stop].reshape(len(factor), size, -1)
-                to[start:stop] = (factor @ block).reshape(stop - start, -1)
-                start = stop
+                rows = slice(begin + groups.start * size, begin + groups.stop * size)
+                block = flat[rows].reshape(len(factor), size, -1)
+                to[rows] = (factor @ block).reshape(len(factor) * size, -1)
+
+            in_threads(scale, chunks(len(b.loaded), size * width))
+            start += len(b.loaded) * size
         return out
 
     def rows_of(self, measurements: Ints) -> Ints:

@@ -1,8 +1,10 @@
 """What the readings say of a fit, each part computed when it is first needed, and once."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
 from functools import cached_property
 
+from hilcal import threads
 from hilcal.data.arm_scatter import ArmScatter
 from hilcal.diagnose.arm_repeatability import instrument_instead
 from hilcal.diagnose.backward_elimination import backward_elimination, spoken_against
@@ -28,6 +30,10 @@ from hilcal.identify.fit import Fit, fit
 from hilcal.identify.linearisation import Linearisation, linearise
 from hilcal.regression.distributions import chi2
 from hilcal.regression.evidence import FamilyScore
+
+BESIDE = 20_000
+"""Rows up to which parts of a judgement are computed beside each other; a choice, for memory: with
+many more, the columns of the catalogue beside a refit would double what a refinement needs."""
 
 
 class Evidence:
@@ -67,6 +73,22 @@ class Evidence:
     def effects(self) -> tuple[Effect, ...]:
         """Effects that are not in the model and can be computed."""
         return candidates(self.fit)
+
+    @contextmanager
+    def beside(self, *parts: Callable[[], object]) -> Iterator[None]:
+        """Compute parts of the evidence, which are kept, beside the block; after it if large."""
+        _ = self.linearisation.left_out  # all parts need it
+
+        def compute() -> None:
+            for part in parts:
+                part()
+
+        if len(self.fit.white) > BESIDE:
+            yield
+            compute()
+            return
+        with threads.beside(compute):
+            yield
 
     @cached_property
     def suspects(self) -> tuple[Suspect, ...]:

@@ -107,14 +107,20 @@ def judge(e: Evidence, history: History) -> Diagnosis:
 def _judged(e: Evidence, history: History) -> Diagnosis:
     """Judge by the evidence as it is."""
     suspects = ranked(e.suspects, history.rejected)
-    alternatives = e.alternatives(history.added, history.removed)
     lead = suspects[0] if suspects and suspects[0].passes else None
     insufficiency, noise, scatter = None, None, e.fit.readings.arm_scatter
     rivals: tuple[Separability, ...] = ()
     reason: Reason
+    rest = (
+        lambda: e.misfit_breakdown,
+        lambda: e.alternatives(history.added, history.removed),
+        lambda: e.redundant,
+    )
     if lead is not None:
+        trees: tuple[Callable[[], object], ...] = (lambda: e.tree_share,) if e.misfit else ()
+        with e.beside(*trees, *rest):
+            insufficiency = e.insufficiency
         regression = ResidualRegression(e.tree_share if e.misfit else 0.0, ())
-        insufficiency = e.insufficiency
         predicted = max(regression.share, lead.holdout_share) if e.misfit else 0.0
         if insufficiency is not None:
             reason = "insufficient_catalogue"
@@ -124,7 +130,8 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
             reason = "inseparable_suspects" if rivals else "one_suspect"
         follows = _carrying(regression)
     else:
-        regression = e.regression if e.misfit else ResidualRegression(0.0, ())
+        with e.beside(*rest):
+            regression = e.regression if e.misfit else ResidualRegression(0.0, ())
         significant = _significant(e.misfit_breakdown)
         follows = _carrying(regression) or tuple(v.variable for v in significant)
         sizes = [
@@ -155,7 +162,7 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
         elif noise.off and not noise.misjudged:
             reason = "no_suspect"
         else:
-            in_doubt = any(a.inseparable for a in alternatives)
+            in_doubt = any(a.inseparable for a in e.alternatives(history.added, history.removed))
             reason = "inseparable_addition" if in_doubt else "residual_is_noise"
     alone = None
     if reason in ("misjudged_noise", "no_suspect") and e.misfit and not _predicted(e, regression):
@@ -175,7 +182,7 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
         redundant=e.redundant,
         separability=rivals,
         insufficiency=insufficiency,
-        alternatives=alternatives,
+        alternatives=e.alternatives(history.added, history.removed),
         scatter=scatter,
         pose_alone=alone,
     )

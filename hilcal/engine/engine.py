@@ -12,7 +12,6 @@ A worker that dies costs no result: what it held is computed again. Ctrl-C leave
 """
 
 import logging
-import os
 import signal
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -24,6 +23,7 @@ import numpy as np
 
 from hilcal.engine.tasks import Task, compute, versions
 from hilcal.errors import HilcalError, InputError
+from hilcal.threads import cores
 
 if TYPE_CHECKING:  # takes half a second to import
     from distributed import Client
@@ -135,11 +135,6 @@ class Engine:
 
 def _seeds(seed: int | None, count: int) -> Sequence[np.random.SeedSequence | None]:
     return [None] * count if seed is None else np.random.SeedSequence(seed).spawn(count)
-
-
-def cores() -> int:
-    """Return how many processors this process may use."""
-    return len(os.sched_getaffinity(0))
 
 
 @contextmanager

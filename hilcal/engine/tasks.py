@@ -14,6 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from hilcal import __version__
 from hilcal.errors import InputError
+from hilcal.threads import one_thread
 
 Versions = tuple[tuple[str, str], ...]
 
@@ -62,6 +63,7 @@ class Task:
                     "workers from an environment of the same lock"
                 )
         one_blas_thread()
+        one_thread()
         return compute(self.function, item, seed)
 
 

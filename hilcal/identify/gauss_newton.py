@@ -20,6 +20,7 @@ from hilcal.identify.regularisation import LinearProblem, spent_parameters
 from hilcal.identify.residual import residual
 from hilcal.model import Model, Prediction
 from hilcal.regression.normal_equations import Basis, NormalEquations
+from hilcal.regression.products import gram
 from hilcal.regression.projection import Projection, projection
 from hilcal.types import Bools, Floats, Ints
 
@@ -143,14 +144,16 @@ def solve(
         coordinates = coordinates.felt(a)
     problem = _Problem(model, coordinates, w.scaling != "none", readings, w)
     y = None if start is None else coordinates.of_theta(start)
-    point, by, iterations, converged = minimise(problem, y, prior)
+    found = minimise(problem, y, prior)
+    point, by = found.point, found.by
     live = np.flatnonzero(by.prior > 0)
-    rows = by.basis.rows(problem.columns(point, live))
+    a = problem.columns(point, live) if found.rows is None else found.rows
+    rows = by.basis.rows(a)
     beta = point.mean_square(len(by.basis.singular)) if w.scaling == "none" else by.beta
     # Formed anew at the solution, so that folds can be taken out of them exactly.
     basis = over_all_parameters(by.basis, live, model.size)
     target = point.white + rows @ prior_coordinates(basis, point.y, by.prior)
-    equations = NormalEquations(basis, rows.T @ rows, rows.T @ target)
+    equations = NormalEquations(basis, gram(rows), rows.T @ target)
     return Solution(
         theta=point.theta,
         y=point.y,
@@ -164,8 +167,8 @@ def solve(
         raw=point.raw,
         white=point.white,
         effective=spent_parameters(equations, beta, prior_of(model)[1]),
-        iterations=iterations,
-        converged=converged,
+        iterations=found.iterations,
+        converged=found.converged,
     )
 
 

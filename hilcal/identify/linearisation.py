@@ -20,6 +20,7 @@ from hilcal.regression.backward_elimination import ReducedModel, eliminate_colum
 from hilcal.regression.evidence import FamilyScore, Spectrum, score_family
 from hilcal.regression.leave_out import Fold, left_out_of_families, left_out_residual
 from hilcal.regression.paired_test import improves
+from hilcal.regression.products import gram
 from hilcal.regression.projection import Projection
 from hilcal.types import Floats, Ints
 
@@ -242,7 +243,7 @@ def model_columns(fit: Fit) -> ModelColumns:
     scale = s.space.scales(scales_of(model))[parameter]
     white = columns_of(model, s.space, s.prediction, s.theta, w, parameter)
     white *= scale
-    return ModelColumns(parameter, scale, white, white.T @ white)
+    return ModelColumns(parameter, scale, white, gram(white))
 
 
 def eliminate_effect(fit: Fit, columns: ModelColumns, effect: str) -> ReducedModel:

@@ -23,6 +23,7 @@ from hilcal.identify.regularisation import (
 )
 from hilcal.model import Model
 from hilcal.regression.normal_equations import TALL
+from hilcal.regression.products import gram
 from hilcal.regression.triangle import triangle_of
 from hilcal.types import Floats
 
@@ -67,6 +68,26 @@ class Point:
 
 
 P = TypeVar("P", bound=Point)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Minimum(Generic[P]):
+    """Where the steps ended.
+
+    Attributes:
+        point: the last point.
+        by: what its linear problem is regularised by.
+        iterations: steps taken.
+        converged: whether the last step was negligible.
+        rows: (R, L) rows of the last linearisation, where the point is within a negligible step of
+            it; else None.
+    """
+
+    point: P
+    by: Regularisation
+    iterations: int
+    converged: bool
+    rows: Floats | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,13 +140,11 @@ def linear_problem(
         triangle = triangle_of(a, white)
         a, white = triangle[:, :-1], triangle[:, -1]
     target = white + a @ (point.y - origin)[live]
-    return LinearProblem(live, origin, a, a.T @ a, target, rank, noise, whitened, rows)
+    return LinearProblem(live, origin, a, gram(a), target, rank, noise, whitened, rows)
 
 
-def minimise(
-    problem: Problem[P], start: Floats | None, prior: Floats | None
-) -> tuple[P, Regularisation, int, bool]:
-    """Return the minimum, what it was regularised by, the steps, and whether they converged."""
+def minimise(problem: Problem[P], start: Floats | None, prior: Floats | None) -> Minimum[P]:
+    """Return the minimum from a start (P,) on, with priors (P,) that are kept where given."""
     model, of = problem.model, problem.coordinates
     sigma, groups = prior_of(model)
     choose = prior is None and bool((groups >= 0).any())
@@ -135,7 +154,7 @@ def minimise(
     by: Regularisation  # set in the first step
     square, settled, converged = np.inf, False, False
     path = Acceleration()
-    for iterations in range(1, MAX_ITERATIONS + 1):  # noqa: B007 - reported
+    for iterations in range(1, MAX_ITERATIONS + 1):
         linear = problem.linearise(point, sigma)
         if not settled:
             by = regularise(linear, scale, sigma, groups, choose)
@@ -145,15 +164,17 @@ def minimise(
         by, aim = _step(linear, by, weighed)
         moved = linear.rows @ (aim - point.y)[linear.live]
         shortcut = path.accelerated(aim, moved) if settled and problem.same_rows else None
-        point = _line_search(problem, point, aim, by, shortcut)
+        begin, point = point, _line_search(problem, point, aim, by, shortcut)
         before, square = square, point.mean_square(len(by.basis.singular))
         noise = max(square, by.beta) * linear.rank
         converged = settled and float(moved @ moved) <= CONVERGED**2 * noise
         if converged:
-            break
+            moved = linear.rows @ (point.y - begin.y)[linear.live]
+            near = float(moved @ moved) <= CONVERGED**2 * noise
+            return Minimum(point, by, iterations, True, linear.rows if near else None)
         del linear  # before the next one is made
         settled = (problem.whitened and square < 1) or abs(square / before - 1) <= SETTLED
-    return point, by, iterations, converged
+    return Minimum(point, by, iterations, False, None)
 
 
 def _step(

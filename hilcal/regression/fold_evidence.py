@@ -20,6 +20,7 @@ import scipy.linalg as sl
 
 from hilcal.regression.empirical_bayes import maximise_evidence
 from hilcal.regression.schur import eliminate
+from hilcal.threads import in_threads
 from hilcal.types import Bools, Floats, Ints
 
 
@@ -54,13 +55,14 @@ def solutions(p: FamilyProblem, fold: Ints) -> Floats:
         fold: (R,) fold of each row, from 0.
     """
     flat, count_of = len(p.pull), np.bincount(fold)
-    parts = [_products(p, fold == f) for f in range(len(count_of))]
+    parts = in_threads(lambda f: _products(p, fold == f), range(len(count_of)))
     gram, rhs = (reduce(np.add, of) for of in zip(*parts, strict=True))
     gram[:flat, :flat] += p.ridge
     rhs[:flat] += p.pull
     square = np.bincount(fold, weights=p.target**2)
-    out = []
-    for f, (own, side) in enumerate(parts):
+
+    def without(f: int) -> Floats:
+        own, side = parts[f]
         g, b, yy = gram - own, rhs - side, float(square.sum() - square[f])
         count = len(fold) - int(count_of[f]) - flat
         # Beside the unshrunk columns, which are eliminated once.
@@ -69,8 +71,9 @@ def solutions(p: FamilyProblem, fold: Ints) -> Floats:
         first = maximise_evidence(h, c, left, count, 0, p.groups, p.std, p.beta)
         start = _with_dropped(h, c, p.groups, first.std, first.beta)
         last = maximise_evidence(h, c, left, count, 0, p.groups, start, first.beta)
-        out.append(_solve(g, b, flat, last.std, last.beta)[0])
-    return np.array(out)
+        return _solve(g, b, flat, last.std, last.beta)[0]
+
+    return np.array(in_threads(without, range(len(parts))))
 
 
 def _products(p: FamilyProblem, rows: Bools) -> tuple[Floats, Floats]:

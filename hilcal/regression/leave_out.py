@@ -21,6 +21,7 @@ import numpy as np
 from hilcal.regression.normal_equations import NormalEquations
 from hilcal.regression.projection import Projection
 from hilcal.regression.schur import inverse_root, positive_solve
+from hilcal.threads import in_threads
 from hilcal.types import Bools, Floats, Ints
 
 ROUNDING = 1e-6
@@ -83,13 +84,14 @@ def folds(
     pull[flat] = per_magnitude.T @ (np.where(basis.flat, theta, 0.0) / magnitude)
     pull[flat.stop :] = theta[held] / prior[held]
     rhs = p.rows.T @ white - beta * pull
-    out = []
-    for f in range(int(fold.max()) + 1):
+
+    def without(f: int) -> Fold:
         mine = fold == f
         rows = p.rows[mine]
         root = inverse_root(h - rows.T @ rows)
-        out.append(Fold(mine, root, rhs - rows.T @ white[mine]))
-    return tuple(out)
+        return Fold(mine, root, rhs - rows.T @ white[mine])
+
+    return tuple(in_threads(without, range(int(fold.max()) + 1)))
 
 
 def left_out_residual(
@@ -129,18 +131,22 @@ def left_out_of_families(
         white: (R,) residual of the model fitted to all rows.
         families: (R, F) whitened columns and ridge of each.
     """
-    parts: list[list[_Products]] = [[] for _ in families]
-    for fold in folds:
+
+    def products(fold: Fold) -> list[_Products]:
         own, y = p.rows[fold.out], white[fold.out]
-        for of, (x, _) in zip(parts, families, strict=True):
-            of.append(_Products.of(own, x[fold.out], y))
-    whole = [reduce(_Products.plus, of) for of in parts]
+        return [_Products.of(own, x[fold.out], y) for x, _ in families]
+
+    parts = in_threads(products, folds)
+    whole = [reduce(_Products.plus, of) for of in zip(*parts, strict=True)]
     found = [np.zeros(len(white)) for _ in families]
-    for f, fold in enumerate(folds):
-        own = p.rows[fold.out]
-        for (x, ridge), of, total, left in zip(families, parts, whole, found, strict=True):
-            back, step = _without(fold, total, of[f], ridge)
-            left[fold.out] = white[fold.out] - own @ back - x[fold.out] @ step
+
+    def predict(f: int) -> None:
+        out, own = folds[f].out, p.rows[folds[f].out]
+        for (x, ridge), of, total, left in zip(families, parts[f], whole, found, strict=True):
+            back, step = _without(folds[f], total, of, ridge)
+            left[out] = white[out] - own @ back - x[out] @ step
+
+    in_threads(predict, range(len(folds)))
     return found
 
 

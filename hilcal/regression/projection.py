@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hilcal.regression import products
 from hilcal.regression.schur import inverse_root
 from hilcal.types import Floats
 
@@ -47,8 +48,9 @@ class Projection:
             x: (R, P) whitened columns.
             gram: (P, P) XᵀX where it is known.
         """
-        lifted = self.inverse_root @ (self.rows.T @ x)
-        return np.asarray((x.T @ x if gram is None else gram) - lifted.T @ lifted)
+        lifted = self.inverse_root @ products.cross(self.rows, x)
+        own = products.gram(x) if gram is None else gram
+        return np.asarray(own - lifted.T @ lifted)
 
     def residual(self, y: Floats, z: Floats) -> Floats:
         """Return the residual (R,) after the model's own remaining step.
@@ -84,5 +86,5 @@ def projection(rows: Floats, ridge: Floats, gram: Floats | None = None) -> Proje
         ridge: Λ, at least zero.
         gram: (K, K) BᵀB where it is known.
     """
-    h = (rows.T @ rows if gram is None else gram) + np.diag(ridge)
+    h = (products.gram(rows) if gram is None else gram) + np.diag(ridge)
     return Projection(rows, ridge, inverse_root(h))

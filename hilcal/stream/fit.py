@@ -345,7 +345,8 @@ def _solved(problem: _Stream, theta: Floats) -> _Found:
         CannotAnswerError: fewer measured elements than parameters.
     """
     space = problem.coordinates
-    point, by, _, converged = minimise(problem, space.of_theta(theta), None)
+    found = minimise(problem, space.of_theta(theta), None)
+    point, by, converged = found.point, found.by, found.converged
     if point.rank <= by.basis.structural:
         raise CannotAnswerError(
             f"{point.rank} measured elements for {by.basis.structural} parameters: nothing is left "

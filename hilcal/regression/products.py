@@ -1,0 +1,49 @@
+"""Products of tall matrices, on two processors where they are large.
+
+Columns are halved by the size alone, so that the bits of a product do not depend on the number of
+processors.
+"""
+
+import numpy as np
+
+from hilcal.threads import in_threads
+from hilcal.types import Floats
+
+LARGE = 1e8
+"""Multiplications from which a product is halved, 5 ms of one processor; a choice by timing."""
+
+
+def gram(a: Floats) -> Floats:
+    """Return AᵀA (P, P) of A (R, P)."""
+    count, size = a.shape
+    if count * size**2 < LARGE:
+        return np.asarray(a.T @ a)
+    half = size // 2
+    out = np.empty((size, size))
+    first, second = a[:, :half], a[:, half:]
+
+    def fill(part: int) -> None:
+        if part:  # a symmetric product takes half as long
+            out[:half, :half] = first.T @ first
+            out[half:, half:] = second.T @ second
+        else:
+            out[:half, half:] = first.T @ second
+
+    in_threads(fill, range(2))
+    out[half:, :half] = out[:half, half:].T
+    return out
+
+
+def cross(a: Floats, b: Floats) -> Floats:
+    """Return AᵀB (P, Q) of A (R, P) and B (R, Q)."""
+    count, size = b.shape
+    if count * size * a.shape[1] < LARGE or size < 2:
+        return np.asarray(a.T @ b)
+    half = size // 2
+    out = np.empty((a.shape[1], size))
+
+    def fill(columns: slice) -> None:
+        np.matmul(a.T, b[:, columns], out=out[:, columns])
+
+    in_threads(fill, (slice(0, half), slice(half, size)))
+    return out
