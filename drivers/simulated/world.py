@@ -167,7 +167,9 @@ class World:
         """Return the (N, n) torque that weight and load exert at each drive, N·m."""
         return self.cell.arm.drive_torques(self.rest(states).torque[:, self.drives])
 
-    def sight(self, states: States, slip: Floats | None = None) -> IdealReading:
+    def sight(
+        self, states: States, slip: Floats | None = None, rest: Equilibrium | None = None
+    ) -> IdealReading:
         """Return what the tracker would read of N states without noise of its own.
 
         T_sensor_target = exp(t [drift]) T_sensor_base exp([base_frame]) T_base_flange
@@ -175,11 +177,16 @@ class World:
         long, about the origin of the sensor's axes. An effect of a user's own displaces the target
         before drift and scale.
 
+        Args:
+            states: commanded joints and wrenches.
+            slip: as for `rest`.
+            rest: the equilibrium of these states, where it is known.
+
         Raises:
             InputError: the states lack what a hidden effect depends on, e.g. a drifting
                 tracker without time stamps.
         """
-        hidden, rest = self.physics, self.rest(states, slip)
+        hidden, rest = self.physics, rest or self.rest(states, slip)
         target = np.array(self.cell.target_of(states.target))
         target[..., :3, 3] += hidden.target_offset
         if self.offsets is not None:

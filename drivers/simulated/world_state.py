@@ -220,7 +220,7 @@ class WorldState:
         rest = world.rest(states, slip)
         targets = np.full((MOST_TARGETS, 3), np.nan)
         if world.cell.targets is None:
-            sight = world.sight(states, slip)
+            sight = world.sight(states, slip, rest)
         else:
             count = len(world.cell.targets)
             each = replace(states[np.zeros(count, dtype=np.int64)], target=np.arange(count))

@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from math import factorial
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from hilcal.robot.batch import empty, zeros
 from hilcal.types import Floats
@@ -70,6 +69,8 @@ def rotation(w: Floats) -> Floats:
 
 def rotation_vector(r: Floats) -> Floats:
     """Rotation vector of a rotation matrix, angle in [0, π]; (..., 3, 3) -> (..., 3)."""
+    from scipy.spatial.transform import Rotation  # slow to import
+
     flat = Rotation.from_matrix(r.reshape(-1, 3, 3)).as_rotvec()
     return np.asarray(flat, dtype=float).reshape(r.shape[:-1])
 
