@@ -163,22 +163,17 @@ def shaken(
         if a == b:
             continue
         i, j = min(a, b), max(a, b)
-        if turn:
-            part = way[i : j + 1]
-            new = part[::-1]
-        elif a < b:  # the stop at a goes to b
-            part = way[i : j + 1]
-            new = [*part[1:], part[0]]
-        else:
-            part = way[i : j + 1]
-            new = [part[-1], *part[:-1]]
-        old_ends, new_ends = (way[i - 1], *part, way[j + 1]), (way[i - 1], *new, way[j + 1])
-        if turn and symmetric:
-            gain = w[way[i - 1]][new[0]] + w[new[-1]][way[j + 1]]
-            gain -= w[way[i - 1]][part[0]] + w[part[-1]][way[j + 1]]
-        else:
-            gain = sum(w[x][y] for x, y in pairwise(new_ends))
-            gain -= sum(w[x][y] for x, y in pairwise(old_ends))
+        part = way[i : j + 1]
+        # either turned, or the stop at a goes to b
+        new = part[::-1] if turn else [*part[1:], part[0]] if a < b else [part[-1], *part[:-1]]
+        before, after = way[i - 1], way[j + 1]
+        gain = w[before][new[0]] - w[before][part[0]] + w[new[-1]][after] - w[part[-1]][after]
+        if not turn:  # within the part one way is new, and one was there before
+            one, other = (new[-2:], part[:2]) if a < b else (new[:2], part[-2:])
+            gain += w[one[0]][one[1]] - w[other[0]][other[1]]
+        elif not symmetric:
+            gain += sum(w[x][y] for x, y in pairwise(new))
+            gain -= sum(w[x][y] for x, y in pairwise(part))
         if here + gain <= max(budget, here):
             way[i : j + 1] = new
             here += gain
