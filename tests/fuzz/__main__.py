@@ -43,6 +43,8 @@ def main() -> int:
         found = found or bool(out.findings)
         if asked.out is not None:
             _add(asked.out, name, asked.seed, out, seconds)
+        if out.stopped:
+            break
     return int(found)
 
 

@@ -76,6 +76,7 @@ class Outcome:
         collisions: damaged readings that a sound checksum let pass, see `Collision`.
         kept: a file with an input for each.
         slowest_s: processor time of the slowest input.
+        stopped: whether it was told to end before.
     """
 
     inputs: int = 0
@@ -85,21 +86,31 @@ class Outcome:
     collisions: int = 0
     kept: dict[str, str] = field(default_factory=dict)
     slowest_s: float = 0.0
+    stopped: bool = False
 
 
 def fuzz(
     parser: Parser, inputs: int, seed: int, keep: Path | None = None, seconds: float = float("inf")
 ) -> Outcome:
-    """Give a parser so many damaged inputs, or as many as there is processor time for."""
+    """Give a parser so many damaged inputs, or as many as there is processor time for.
+
+    Ctrl-C ends it between two inputs and keeps the counts.
+    """
     out = Outcome()
     end = time.process_time() + seconds
-    with limited(), warnings.catch_warnings():
+
+    def stop(*_: object) -> None:
+        out.stopped = True
+
+    with limited(), handled(signal.SIGINT, stop), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         batch = 0
-        while out.inputs < inputs and time.process_time() < end:
+        while out.inputs < inputs and time.process_time() < end and not out.stopped:
             rng = Random(f"{parser.name}/{seed}/{batch}")
             for _ in range(min(BATCH, inputs - out.inputs)):
                 _one(parser, parser.make(rng), out, keep)
+                if out.stopped:
+                    break
             batch += 1
     return out
 
@@ -164,13 +175,22 @@ def limited() -> Iterator[None]:
     def hung(*_: object) -> None:
         raise Hung
 
-    before = signal.signal(signal.SIGPROF, hung)
     limits = resource.getrlimit(resource.RLIMIT_AS)
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     most = pages * resource.getpagesize() + MEMORY
     resource.setrlimit(resource.RLIMIT_AS, (most, limits[1]))
     try:
-        yield
+        with handled(signal.SIGPROF, hung):
+            yield
     finally:
         resource.setrlimit(resource.RLIMIT_AS, limits)
-        signal.signal(signal.SIGPROF, before)
+
+
+@contextmanager
+def handled(number: signal.Signals, handler: Callable[..., None]) -> Iterator[None]:
+    """Give a signal another handler for a while."""
+    before = signal.signal(number, handler)
+    try:
+        yield
+    finally:
+        signal.signal(number, before)

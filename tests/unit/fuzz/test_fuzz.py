@@ -1,6 +1,7 @@
 """A short run of `python -m tests.fuzz`, and what longer ones have found."""
 
 import json
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +37,21 @@ def test_damage_ends_in_an_error_of_the_programs_own(name: str, tmp_path: Path) 
     assert out.inputs == FEW.get(name, 150)
     if not name.endswith("chain"):  # two inputs prove nothing of the following
         assert out.read > 0, "the harness never reaches the inside"
+
+
+def test_an_interrupt_keeps_the_counts() -> None:
+    def parse(data: bytes) -> bool:
+        if len(given) == 7:
+            signal.raise_signal(signal.SIGINT)
+        given.append(data)
+        return True
+
+    given: list[bytes] = []
+    before = signal.getsignal(signal.SIGINT)
+    out = harness.fuzz(harness.Parser("interrupted", lambda by: by.randbytes(4), parse), 1000, 0)
+    assert (out.inputs, out.read, out.stopped) == (8, 8, True)
+    assert not out.findings
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_the_harness_sees_what_it_should(tmp_path: Path) -> None:
