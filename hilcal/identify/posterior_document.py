@@ -59,7 +59,7 @@ def from_json(content: Mapping[str, Any]) -> Posterior:
         )
     try:
         return _read(content)
-    except (LookupError, TypeError, ValueError, AttributeError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise InputError(f"a damaged prior: {error!r}") from None
 
 

@@ -3,6 +3,7 @@
 import json
 import signal
 from pathlib import Path
+from random import Random
 
 import numpy as np
 import pytest
@@ -105,6 +106,24 @@ def test_a_toml_file_nested_too_deeply(tmp_path: Path) -> None:
     path.write_text("a = " + "[" * 5000)
     with pytest.raises(InputError, match="nested too deeply"):
         load_mapping(path)
+
+
+def test_a_prior_whose_number_of_columns_is_infinite(tmp_path: Path) -> None:
+    """An OverflowError: Python's JSON reads 1e999 as infinity."""
+    path, rng = tmp_path / "prior.json", Random(0)
+    sound = next(d for d in iter(lambda: PARSERS["posterior"].make(rng), b"") if _is_prior(d))
+    content = json.loads(sound)
+    content["prints"]["columns"] = float("inf")
+    path.write_text(json.dumps(content).replace("Infinity", "1e999"))
+    with pytest.raises(InputError, match="a damaged prior"):
+        posterior_document.read(path)
+
+
+def _is_prior(data: bytes) -> bool:
+    try:
+        return PARSERS["posterior"].parse(data)
+    except HilcalError:
+        return False
 
 
 def test_correlations_that_have_no_eigenvalues() -> None:
