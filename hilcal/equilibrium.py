@@ -29,6 +29,8 @@ room for states whose loads are several times the mean."""
 MAX_TERMS = 40
 TORQUE = 5
 """Component of a slot's wrench about the axis of its joint."""
+FORCE, MOMENT = slice(0, 3), slice(3, 6)
+"""Components of a slot's wrench."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,7 +41,7 @@ class Block:
         slot: whose wrench.
         to: which joint (index) or slot deviates.
         joint: whether it is a joint displacement, else a twist.
-        components: range of the components of the wrench.
+        components: range of the components of the wrench: of its force, or of its moment.
         elements: range of the elements of the deviation.
         values: (N, I, E) or (1, I, E).
     """
@@ -55,9 +57,21 @@ class Block:
 def compliance(parts: Sequence[tuple[Effect, Floats]], s: Situation) -> list[Block]:
     """Derivative of the elastic deviations by the slot wrenches, without what is zero."""
     blocks = (b for e, theta in parts if theta.any() for b in _of_effect(e, theta, s))
-    found = [pruned for b in blocks if (pruned := _pruned(b)) is not None]
+    whole = (pruned for b in blocks if (pruned := _pruned(b)) is not None)
+    found = [part for b in whole for part in _halves(b)]
     drive = s.cell.arm.drive
     return found if drive is None else [c for b in found for c in _of_joints(b, drive)]
+
+
+def _halves(b: Block) -> Iterator[Block]:
+    """Yield the parts of a block by the force and by the moment."""
+    first, last = b.components.start, b.components.stop
+    if first >= MOMENT.start or last <= FORCE.stop:
+        yield b
+        return
+    middle = MOMENT.start - first
+    yield replace(b, components=slice(first, FORCE.stop), values=b.values[:, :middle])
+    yield replace(b, components=slice(MOMENT.start, last), values=b.values[:, middle:])
 
 
 def _of_joints(b: Block, drive: Floats) -> Iterator[Block]:
@@ -96,8 +110,8 @@ def at_equilibrium(moves: Motion, stiffness: GeometricStiffness, blocks: list[Bl
     for _ in range(MAX_TERMS):
         gradient = stiffness.gradient(term)
         term = by_wrenches(blocks, gradient.joint, partial(_by_twist, gradient, moves.frames))
-        for slot, b in term.items():
-            form[slot] = form[slot] + b
+        for place, b in term.items():
+            form[place] = form[place] + b
         now = _norm(term)
         # The terms shrink by one factor; what is missing of B is about the next one, and of A
         # smaller by that factor once more.
@@ -114,8 +128,10 @@ def at_equilibrium(moves: Motion, stiffness: GeometricStiffness, blocks: list[Bl
 def by_wrench_changes(moves: Motion, blocks: list[Block], change: Floats) -> Floats:
     """Motion (N, m, P) of a reading by P changes (N, P, n + 1, 6) of the slot wrenches."""
     out = zeros(len(moves.dq), moves.m, change.shape[1])
-    for slot, rows in by_wrenches(blocks, lambda j: moves.dq[:, :, j], moves.by_slot).items():
-        out += rows_times(rows, change[:, :, slot], transposed=True)
+    form = by_wrenches(blocks, lambda j: moves.dq[:, :, j], moves.by_slot)
+    for (slot, moment), rows in form.items():
+        half = change[:, :, slot, MOMENT if moment else FORCE]
+        out += rows_times(rows, half, transposed=True)
     return out
 
 
@@ -123,8 +139,10 @@ def by_wrenches(
     blocks: list[Block],
     by_joint: Callable[[int], Floats],
     by_slot: Callable[[int, slice], Floats],
-) -> dict[int, Floats]:
-    """Derivatives (N, m, 6) by the wrench of each slot, from those by the deviation.
+) -> dict[tuple[int, bool], Floats]:
+    """Derivatives (N, m, 3) by the force (False) and moment (True) of each slot.
+
+    From those by the deviation; those that are zero are left out.
 
     Args:
         blocks: the compliance.
@@ -138,29 +156,32 @@ def by_wrenches(
             start, stop = min(old.start, b.elements.start), max(old.stop, b.elements.stop)
             used[b.to] = slice(start, stop)
     twists = {to: by_slot(to, elements) for to, elements in used.items()}
-    out: dict[int, Floats] = {}
+    out: dict[tuple[int, bool], Floats] = {}
     for b in blocks:
         if b.joint:
             found = by_joint(b.to)[..., None]
         else:
             e = used[b.to].start
             found = twists[b.to][..., b.elements.start - e : b.elements.stop - e]
-        if b.slot not in out:
-            out[b.slot] = zeros(*found.shape[:2], 6)
-        to = out[b.slot][..., b.components]
-        if b.values.size == 1:
-            to += float(b.values[0, 0, 0]) * found
-        else:
+        moment = b.components.start >= MOMENT.start
+        first = MOMENT.start if moment else FORCE.start
+        to = out.setdefault((b.slot, moment), zeros(*found.shape[:2], 3))
+        to = to[..., b.components.start - first : b.components.stop - first]
+        if len(b.values) > 1:
             to += np.einsum("nme,nie->nmi", found, b.values)
+            continue
+        for i, element in zip(*np.nonzero(b.values[0]), strict=True):
+            to[..., i] += found[..., element] * b.values[0, i, element]
     return out
 
 
 def _by_twist(gradient: MotionGradient, frames: SlotFrames, slot: int, elements: slice) -> Floats:
     """Derivative (N, m, E) by elements of the twist of a slot, from that by its motion."""
-    return frames.by_twist(slot, gradient.displacement(slot), gradient.turn(slot), elements)
+    v = gradient.displacement(slot) if frames.need_displacement(slot, elements) else None
+    return frames.by_twist(slot, v, gradient.turn(slot), elements)
 
 
-def _norm(form: Mapping[int, Floats]) -> float:
+def _norm(form: Mapping[tuple[int, bool], Floats]) -> float:
     """Root of the sum of squares of the coefficients of the wrenches, in SI units."""
     flat = (b.ravel(order="K") for b in form.values())
     return math.sqrt(sum(float(b @ b) for b in flat))
@@ -186,10 +207,10 @@ def _of_effect(effect: Effect, theta: Floats, s: Situation) -> Iterator[Block]:
 
 def _pruned(b: Block) -> Block | None:
     """Return the block without components and elements that are zero in all states."""
+    if not b.values.any():
+        return None
     there = np.any(b.values, axis=0)
     i, e = np.flatnonzero(there.any(axis=1)), np.flatnonzero(there.any(axis=0))
-    if not len(i):
-        return None
     components, elements = slice(i[0], i[-1] + 1), slice(e[0], e[-1] + 1)
     return replace(
         b, components=components, elements=elements, values=b.values[:, components, elements]

@@ -12,6 +12,7 @@ from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.effects.options import typical_compliances
 from hilcal.effects.protocol import Columns, Effect, Situation
 from hilcal.effects.spec import EffectSpec
+from hilcal.effects.total import total
 from hilcal.equilibrium import Block, at_equilibrium, by_wrench_changes, compliance
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.observe import Motion, Observation, motion, observe
@@ -166,20 +167,21 @@ class Model:
         angle = states.q if states.q_actual is None else states.q_actual
         angle = along_states(angle)
         parts = self._parts(theta)
-        chain = chains.evaluate(cell.arm, angle)
+        turns = chains.turns(cell.arm, angle)
+        chain = chains.evaluate(cell.arm, angle, nominal=turns)
         nothing = zeros(len(states), cell.arm.n + 1, 6)
         recorded = self._load(states, theta)
         turned = along_states(cell.arm.drive_angles(angle))
         s = Situation(cell, states, turned, chain, nothing, recorded, self._compliance(theta))
-        rigid = sum((e.deviation(t, s) for e, t in parts if not e.elastic), Deviation())
+        rigid = _deviation([(e, t) for e, t in parts if not e.elastic], s)
         elastic = [(e, t) for e, t in parts if e.elastic]
         before: float | None = None
         for _ in range(MAX_EQUILIBRIUM_STEPS):
             load = self._corrected(recorded, replace(s, chain=chain), theta)
             wrench = slot_wrenches(cell.arm, chain, load)
             s = replace(s, chain=chain, wrench=wrench, load=load)
-            deviation = sum((e.deviation(t, s) for e, t in elastic), rigid)
-            chain = chains.evaluate(cell.arm, angle, deviation)
+            deviation = _deviation(elastic, s, rigid)
+            chain = chains.evaluate(cell.arm, angle, deviation, turns)
             moved = _flange_motion(s.chain, chain, cell.arm.reach)
             # The steps shrink geometrically: what is missing is about the next one.
             missing = moved if before is None else moved * (moved / before)
@@ -325,6 +327,20 @@ class Model:
         changes = [e.wrench_change(t, s) for e, t in self._parts(theta)]
         given = [c for c in changes if c is not None]
         return replace(recorded, wrench=sum(given, recorded.wrench)) if given else recorded
+
+
+def _deviation(
+    parts: list[tuple[Effect, Floats]], s: Situation, start: Deviation | None = None
+) -> Deviation:
+    """Return the sum of the deviations of effects at their parameters, added to `start`."""
+    columns: list[Columns] = []
+    first = 0
+    for e, t in parts:
+        found = e.checked_columns(s)
+        columns += (replace(c, parameter=c.parameter + first) for c in found)
+        first += len(t)
+    theta = np.concatenate([t for _, t in parts]) if parts else np.zeros(0)
+    return total(tuple(columns), theta, s, start)
 
 
 def _sum_columns(

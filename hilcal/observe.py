@@ -15,7 +15,7 @@ from hilcal.robot import se3
 from hilcal.robot.batch import along_states, empty, zeros
 from hilcal.robot.chain import Chain, joint_jacobian, twist_jacobian
 from hilcal.robot.deviation import Deviation
-from hilcal.robot.geometric_stiffness import MotionGradient, rows_times
+from hilcal.robot.geometric_stiffness import MotionGradient, rows_times, rows_times_constant
 from hilcal.types import Floats, Ints
 
 ALL = slice(0, 6)
@@ -49,17 +49,17 @@ def observe(
     rotation = chain.rotation[-1]
     if deviation.target is not None:
         offset = offset + deviation.target[:, :3]
-        rotation = se3.product(rotation, se3.rotation(deviation.target[:, 3:]))
+        rotation = se3.product(rotation, se3.rotation(_once(deviation.target[:, 3:])))
     rotation = se3.product(rotation, turn)
     base_position = position = chain.point(offset)
     if deviation.base is not None:
-        base_r, base_p = se3.exp(deviation.base)
+        base_r, base_p = se3.exp(_once(deviation.base))
         position = base_p + se3.apply(base_r, position)
         rotation, axes = se3.product(base_r, rotation), se3.product(axes, base_r)
     position = origin + se3.apply(cell.registration[:3, :3], position)
     rotation = se3.product(cell.registration[:3, :3], rotation)
     if deviation.station is not None:
-        station_r, station_p = se3.exp(deviation.station)
+        station_r, station_p = se3.exp(_once(deviation.station))
         position = station_p + se3.apply(station_r, position)
         rotation, axes = se3.product(station_r, rotation), se3.product(station_r, axes)
     if deviation.scale is not None:
@@ -132,8 +132,10 @@ class Motion:
         """Motion (N, m, E) by some elements of the twist of a slot."""
         v, w = self._rigid(slot)
         if self.yielding is not None:
-            more = self.yielding.displacement(slot)
-            v, w = v if more is None else v + more, w + self.yielding.turn(slot)
+            w = w + self.yielding.turn(slot)
+            if self.frames.need_displacement(slot, elements):
+                more = self.yielding.displacement(slot)
+                v = v if more is None else v + more
         return self.frames.by_twist(slot, v, w, elements)
 
     def _rigid(self, slot: int) -> tuple[Floats, Floats]:
@@ -150,15 +152,16 @@ class Motion:
 
     def by_base(self) -> Floats:
         """Motion (N, m, 6) by the twist of the base."""
-        o = self.observation
-        moved = twist_jacobian(_still(o), o.base_position, self.deviation.base)
+        o, base = self.observation, self.deviation.base
+        base = None if base is None else _once(base)
+        moved = twist_jacobian(np.eye(3)[None], o.base_position, base)
         return _to_sensor(o, self.deviation, moved, self.m)
 
     def by_station(self) -> Floats:
         """Motion (N, m, 6) by the twist of the station; exp(ξ + δ) = exp(J_r(−ξ) δ) exp(ξ)."""
         station, scale = self.deviation.station, self.deviation.scale
-        back = None if station is None else -station
-        moved = twist_jacobian(_still(self.observation), self._unscaled(), back)
+        back = None if station is None else -_once(station)
+        moved = twist_jacobian(np.eye(3)[None], self._unscaled(), back)
         if scale is not None:
             moved[:, :3] *= 1 + scale[:, None, None]
         return moved[:, : self.m]
@@ -171,8 +174,8 @@ class Motion:
         moved[:, :3, :3] = moved[:, 3:, 3:] = flange
         if self.deviation.target is not None:
             # The turn as read is exp(ω) before the target's own axes: ∂ = J_r(−ω).
-            turn = zeros(len(self.dq), 6)
-            turn[:, 3:] = -self.deviation.target[:, 3:]
+            turn = -_once(self.deviation.target)
+            turn[:, :3] = 0.0
             moved[:, 3:, 3:] = se3.product(flange, se3.right_jacobian_blocks(turn)[0])
         return _to_sensor(self.observation, self.deviation, moved, self.m)
 
@@ -221,13 +224,17 @@ class SlotFrames:
                 out[..., split:] += rows_times(v, shift[..., turns])
         return out
 
+    def need_displacement(self, slot: int, elements: slice) -> bool:
+        """Whether these elements of the twist of a slot displace what is beyond it."""
+        return elements.start < 3 or self._blocks(slot)[1] is not None
+
     def _blocks(self, slot: int) -> tuple[Floats, Floats | None]:
         if slot not in self.known:
             r, shift = self.chain.rotation[slot], None
             twist = None if self.chain.twist is None else self.chain.twist[slot]
-            if twist is not None and np.any(twist):
+            if twist is not None and twist.any():
                 j, q = se3.right_jacobian_blocks(twist)
-                shift = se3.product(r, q) if np.any(twist[:, :3]) else None
+                shift = se3.product(r, q) if twist[:, :3].any() else None
                 r = se3.product(r, j)
             self.known[slot] = r, shift
         return self.known[slot]
@@ -247,15 +254,16 @@ def _range(elements: Sequence[int]) -> slice:
     return slice(min(elements), max(elements) + 1) if elements else slice(5, 6)
 
 
-def _still(o: Observation) -> Floats:
-    """(N, 3, 3) identities."""
-    return np.broadcast_to(np.eye(3), o.axes.shape)
+def _once(x: Floats) -> Floats:
+    """Return x (N, E), or one row of it (1, E) where all are the same."""
+    return x[:1] if len(x) and (x == x[:1]).all() else x
 
 
 def _per_column(moved: Floats, values: Floats) -> Floats:
     """Motion (N, m, P) by P changes (N or 1, P, E), from the motion (N, m, E) per element."""
-    out = empty(*moved.shape[:2], values.shape[1])
-    return np.asarray(np.einsum("nie,npe->nip", moved, along_states(values), out=out))
+    if len(values) == 1:
+        return rows_times_constant(moved, values[0].T)
+    return rows_times(moved, along_states(values), transposed=True)
 
 
 def _to_sensor(o: Observation, deviation: Deviation, moved: Floats, m: int) -> Floats:

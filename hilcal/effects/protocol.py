@@ -9,7 +9,7 @@ returns `load_change` or `wrench_change`, and their derivative `wrench_columns`.
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import groupby
 from typing import ClassVar, Literal, Self
 
 import numpy as np
@@ -115,9 +115,10 @@ class Columns:
 
     def runs(self) -> Iterator[tuple[int, slice]]:
         """Yield each joint or slot that moves, and successive columns that move it."""
-        starts = np.flatnonzero(np.diff(self.element, prepend=-1)).tolist()
-        for start, end in pairwise([*starts, len(self.element)]):
-            yield int(self.element[start]), slice(start, end)
+        end = 0
+        for element, run in groupby(self.element.tolist()):
+            start, end = end, end + len(list(run))
+            yield element, slice(start, end)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -246,7 +247,7 @@ class Effect(ABC):
         for c in found:
             if len(c.values) not in (1, len(s.angle)):
                 wrong = f"{len(c.values)} states; expected {len(s.angle)} or 1"
-            elif not np.isfinite(c.values).all():
+            elif not _finite(c.values):
                 wrong = "which some are not finite"
             else:
                 continue
@@ -371,6 +372,12 @@ class Effect(ABC):
     def deviation(self, theta: Floats, s: Situation) -> Deviation:
         """Deviation of N states at parameters theta (P,)."""
         return total(self.checked_columns(s), theta, s)
+
+
+def _finite(values: Floats) -> bool:
+    """Whether all values are finite: as their sum is, but where it overflows."""
+    with np.errstate(all="ignore"):
+        return bool(np.isfinite(values.sum()) or np.isfinite(values).all())
 
 
 def source_of(kind: type[Effect]) -> str:

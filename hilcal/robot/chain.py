@@ -5,6 +5,7 @@
 evaluated exactly; there is no loop over states, only over the n joints.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,37 +38,87 @@ class Chain:
         return np.asarray(self.position[-1] + se3.apply(self.rotation[-1], offset))
 
 
-def evaluate(arm: Arm, q: Floats, deviation: Deviation | None = None) -> Chain:
-    """Evaluate the deviated chain at the controller's values q (N, n); exact, batched."""
+Turns = tuple[Floats, Floats]
+"""Cosines and sines (N, n) of the angles of the chain."""
+
+
+def turns(arm: Arm, q: Floats) -> Turns:
+    """Return the turns of the chain at the controller's values q (N, n)."""
+    angle = along_states(arm.chain_angles(q))
+    return np.cos(angle), np.sin(angle)
+
+
+def _turned(nominal: Turns, dq: Floats) -> Turns:
+    """Turn on by displacements (N, n), by the addition theorems: they cost less where small."""
+    (cos, sin), t2 = nominal, dq * dq
+    b, c = se3.coefficients(t2)
+    by_cos, by_sin = 1 - b * t2, dq * (1 - c * t2)
+    return cos * by_cos - sin * by_sin, sin * by_cos + cos * by_sin
+
+
+def evaluate(
+    arm: Arm, q: Floats, deviation: Deviation | None = None, nominal: Turns | None = None
+) -> Chain:
+    """Evaluate the deviated chain at the controller's values q (N, n); exact, batched.
+
+    `nominal`: `turns` at q where they are known.
+    """
     deviation = deviation or Deviation()
-    turned = arm.chain_angles(q)
-    angle = along_states(turned if deviation.dq is None else turned + arm.driven(deviation.dq))
+    cos, sin = turns(arm, q) if nominal is None else nominal
+    if deviation.dq is not None:
+        cos, sin = _turned((cos, sin), along_states(arm.driven(deviation.dq)))
     twist = deviation.twist
     if twist is not None:
         twist = np.swapaxes(along_states(twist), 0, 1)
-    count, n = angle.shape
-    cos, sin = np.cos(angle)[..., None], np.sin(angle)[..., None]
+    count, n = cos.shape
+    cos, sin = cos[..., None], sin[..., None]
     rotation = np.moveaxis(empty(count, 3, 3, n + 1), -1, 0)
     position = np.moveaxis(empty(count, 3, n + 1), -1, 0)
     com = np.moveaxis(empty(count, 3, n), -1, 0)
-    body, p = empty(count, 3, 3), np.zeros(3)  # the frame that link k starts from
-    body[...] = np.eye(3)
-    for k, link in enumerate(arm.links):
-        r = rotation[k]
-        position[k] = p + se3.apply(body, link[:3, 3])
-        np.einsum("nij,jk->nik", body, link[:3, :3], out=r)
-        if twist is not None and np.any(twist[k]):
-            step_r, step_p = se3.exp(twist[k])
-            position[k] += se3.apply(r, step_p)
-            r[...] = se3.product(r, step_r)
+    body, linked = empty(count, 3, 3), empty(count, 3, 3)
+    body[...] = np.eye(3)  # the frame that link k starts from
+    p: Floats = np.zeros(3)
+    coms = arm.coms.tolist()
+    for k, link in enumerate(np.swapaxes(arm.links, 1, 2).tolist()):
+        turned_by = twist is not None and twist[k].any()
+        r = linked if turned_by else rotation[k]
+        for axis in range(3):
+            _combine(body, link[axis][:3], r[..., axis])
+        position[k] = _offset(p, body, link[3])
+        if twist is not None and turned_by:
+            step_r = se3.rotation(twist[k][:, 3:])
+            if twist[k][:, :3].any():
+                position[k] += se3.apply(r, se3.exp(twist[k])[1])
+            r = np.einsum("nij,njk->nik", linked, step_r, out=rotation[k])
         p = position[k]
         if k < n:
             c, s = cos[:, k], sin[:, k]
-            body[..., 0] = r[..., 0] * c + r[..., 1] * s
-            body[..., 1] = r[..., 1] * c - r[..., 0] * s
+            np.multiply(r[..., 0], c, out=body[..., 0])
+            body[..., 0] += r[..., 1] * s
+            np.multiply(r[..., 1], c, out=body[..., 1])
+            body[..., 1] -= r[..., 0] * s
             body[..., 2] = r[..., 2]
-            com[k] = p + se3.apply(body, arm.coms[k])
+            com[k] = _offset(p, body, coms[k])
     return Chain(rotation, position, com, twist)
+
+
+def _combine(axes: Floats, weights: Sequence[float], out: Floats) -> None:
+    """Write Σ_j w_j axes_j of axes (N, 3, 3), in their columns, and weights (3,), to (N, 3).
+
+    Links turn by quarter turns mostly: most weights are zero.
+    """
+    first, *others = [j for j in range(3) if weights[j]] or [0]
+    np.multiply(axes[..., first], weights[first], out=out)
+    for j in others:
+        out += axes[..., j] * weights[j]
+
+
+def _offset(p: Floats, axes: Floats, offset: Sequence[float]) -> Floats:
+    """Points p (N, 3), or one, moved by an offset (3,) along axes (N, 3, 3)."""
+    for j in range(3):
+        if offset[j]:
+            p = p + axes[..., j] * offset[j]
+    return p
 
 
 def joint_jacobian(chain: Chain, x: Floats) -> Floats:
@@ -111,7 +162,7 @@ def twist_jacobian(r: Floats, lever: Floats, twist: Floats | None) -> Floats:
     shift: Floats | float = 0.0
     if twist is not None and np.any(twist):
         j, q = se3.right_jacobian_blocks(twist)
-        r, shift = se3.product(r, j), se3.product(r, q)
+        r, shift = se3.product(r, j), se3.product(r, q) if q.any() else 0.0
     out[:, :3, :3] = out[:, 3:, 3:] = r
     out[:, 3:, :3] = 0.0
     columns = np.swapaxes(r, 1, 2)

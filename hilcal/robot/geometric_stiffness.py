@@ -20,12 +20,13 @@ fingers*, Int. J. Robotics Research 19 (2000) 835-847.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
-from hilcal.robot.batch import empty
+from hilcal.robot.batch import empty, zeros
 from hilcal.robot.chain import Chain
 from hilcal.robot.statics import Load, body_axes
 from hilcal.types import Floats
@@ -39,6 +40,7 @@ class GeometricStiffness:
         chain: the deviated chain.
         force: (n + 1,) list of (N, 3) f_k, N.
         dyad: (n + 1,) list of (N, 3, 3) D_k, N·m.
+        spun: (n,) list of (N, 3) D_j z_j, N·m.
         moment: (N, 3, 3) [m]×, N·m; None where there is no moment.
         load_point: (N, 3) where the load acts, m.
         following: (N, 6, 6) change of the load's wrench at the load point by a displacement and
@@ -48,39 +50,43 @@ class GeometricStiffness:
     chain: Chain
     force: list[Floats]
     dyad: list[Floats]
+    spun: list[Floats]
     moment: Floats | None
     load_point: Floats
     following: Floats | None = None
 
-    def gradient(self, form: Mapping[int, Floats]) -> "MotionGradient":
-        """Gradient by the motions of Σ_k b_k · (f_k, t_k), `form` b_k (N, m, 6) by slot."""
+    def gradient(self, form: Mapping[tuple[int, bool], Floats]) -> "MotionGradient":
+        """Gradient by the motions of a linear form of the slot wrenches.
+
+        Args:
+            form: its coefficients (N, m, 3) by the force (False) and moment (True) of slots.
+        """
         chain, slots = self.chain, len(self.force)
         still: list[Floats | None] = [None]
         along: list[Floats | None] = [None] * (slots + 1)
         load: Floats | None = None
         for k in range(slots):
-            b = form.get(k)
-            if b is None:
-                still.append(still[-1])
-                continue
-            by_moment = rows_times(b[..., 3:], chain.rotation[k], transposed=True)
+            by_force, by_moment = (
+                None if b is None else rows_times(b, chain.rotation[k], transposed=True)
+                for b in (form.get((k, False)), form.get((k, True)))
+            )
             still.append(_sum(still[-1], by_moment))
-            dyad = self.dyad[k] if self.moment is None else self.dyad[k] - self.moment
-            turn = rows_times(by_moment, dyad, transposed=True)
-            if b[..., :3].any():
-                by_force = rows_times(b[..., :3], chain.rotation[k], transposed=True)
-                turn -= se3.cross(self.force[k][:, None], by_force)
+            if by_moment is not None:
+                dyad = self.dyad[k] if self.moment is None else self.dyad[k] - self.moment
+                along[k] = rows_times(by_moment, dyad, transposed=True)
+                if self.following is not None:
+                    lever = self.load_point - chain.position[k]
+                    load = _sum(load, se3.cross(by_moment, lever[:, None]))
+            if by_force is not None:
+                along[k] = _sum(along[k], se3.cross(by_force, self.force[k][:, None]))
                 load = _sum(load, by_force) if self.following is not None else None
-            if self.following is not None:
-                lever = self.load_point - chain.position[k]
-                load = _sum(load, se3.cross(by_moment, lever[:, None]))
-            along[k] = turn
         for k in range(slots - 1, -1, -1):
             along[k] = _sum(along[k], along[k + 1])
         flange = None
         if self.following is not None and load is not None and still[-1] is not None:
             flange = rows_times(np.concatenate([load, still[-1]], axis=2), self.following)
-        return MotionGradient(self, still, along, flange)
+        rows = next(iter(form.values())).shape[:2]
+        return MotionGradient(self, rows, still, along, flange)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,6 +95,7 @@ class MotionGradient:
 
     Attributes:
         stiffness: the load.
+        rows: N and m.
         still: (n + 2,) sums (N, m, 3) over the slots i < k of the moments' coefficients, base
             axes; None for zero, here and below.
         along: (n + 2,) gradients (N, m, 3) by a turn that carries the slots i ≥ k along.
@@ -97,14 +104,21 @@ class MotionGradient:
     """
 
     stiffness: GeometricStiffness
+    rows: tuple[int, ...]
     still: list[Floats | None]
     along: list[Floats | None]
     flange: Floats | None
 
     def joint(self, j: int) -> Floats:
         """(N, m) gradient by the displacement of joint j + 1."""
-        turn, z = self._turn(j, j + 1), self.stiffness.chain.rotation[j, :, :, 2]
-        return np.einsum("nmi,ni->nm", turn, z, out=empty(*turn.shape[:2]))
+        z, arm = self.stiffness.chain.rotation[j, :, :, 2], self.stiffness
+        parts = [(self.along[j + 1], z), (self.still[j + 1], arm.spun[j])]
+        if self.flange is not None:
+            lever = arm.chain.position[-1] - arm.chain.position[j]
+            parts += [(self.flange[..., 3:], z), (self.flange[..., :3], se3.cross(z, lever))]
+        found = (None if a is None else _rows_dot(a, by) for a, by in parts)
+        out = reduce(_sum, found)
+        return zeros(*self.rows) if out is None else out
 
     def displacement(self, j: int) -> Floats | None:
         """(N, m, 3) gradient by the displacement of all beyond slot j, base axes."""
@@ -116,19 +130,14 @@ class MotionGradient:
 
     def turn(self, j: int) -> Floats:
         """(N, m, 3) gradient by the turn of all beyond slot j about p_j, base axes."""
-        return self._turn(j, j)
-
-    def _turn(self, j: int, first: int) -> Floats:
-        """Gradient by a turn about p_j that carries the slots from `first` along."""
-        out, still = self.along[first], self.still[first]
+        out, still = self.along[j], self.still[j]
         chain, flange = self.stiffness.chain, self.flange
         if still is not None:
             out = _sum(out, rows_times(still, self.stiffness.dyad[j]))
         if flange is not None:
             lever = (chain.position[-1] - chain.position[j])[:, None]
             out = _sum(out, flange[..., 3:] + se3.cross(lever, flange[..., :3]))
-        assert out is not None  # noqa: S101 - a slot either stands still or moves along
-        return out
+        return zeros(*self.rows, 3) if out is None else out
 
 
 def geometric_stiffness(
@@ -157,7 +166,8 @@ def geometric_stiffness(
             dyad[:, axis, axis] -= trace
     moment = load.wrench[:, 3:]
     turned = se3.skew(moment) if moment.any() else None
-    return GeometricStiffness(chain, forces, dyads, turned, point, following)
+    spun = [se3.apply(dyads[j], chain.rotation[j, :, :, 2]) for j in range(n)]
+    return GeometricStiffness(chain, forces, dyads, spun, turned, point, following)
 
 
 def rows_times(rows: Floats, matrix: Floats, *, transposed: bool = False) -> Floats:
@@ -165,6 +175,21 @@ def rows_times(rows: Floats, matrix: Floats, *, transposed: bool = False) -> Flo
     out = empty(*rows.shape[:2], matrix.shape[1 if transposed else 2])
     by = "nmi,nji->nmj" if transposed else "nmi,nij->nmj"
     return np.asarray(np.einsum(by, rows, matrix, out=out))
+
+
+def rows_times_constant(rows: Floats, matrix: Floats) -> Floats:
+    """Rows (N, m, i) times one matrix (i, j), which is zero for the most part."""
+    if np.array_equal(matrix, np.eye(len(matrix))):
+        return rows
+    out = zeros(*rows.shape[:2], matrix.shape[1])
+    for i, j in zip(*np.nonzero(matrix), strict=True):
+        out[..., j] += rows[..., i] * matrix[i, j]
+    return out
+
+
+def _rows_dot(rows: Floats, vector: Floats) -> Floats:
+    """Rows (N, m, i) times vectors (N, i)."""
+    return np.einsum("nmi,ni->nm", rows, vector, out=empty(*rows.shape[:2]))
 
 
 def _sum(a: Floats | None, b: Floats | None) -> Floats | None:

@@ -22,16 +22,16 @@ from hilcal.types import Floats
 _NEAR = 0.25
 """θ² below which b and c are summed as series: the closed forms cancel near zero."""
 _TERMS = 8
-_B = np.array([(-1) ** k / factorial(2 * k + 2) for k in range(_TERMS)])
-_C = np.array([(-1) ** k / factorial(2 * k + 3) for k in range(_TERMS)])
-_B_SLOPE, _C_SLOPE = np.polynomial.polynomial.polyder(_B), np.polynomial.polynomial.polyder(_C)
+_B = [(-1) ** k / factorial(2 * k + 2) for k in range(_TERMS)]
+_C = [(-1) ** k / factorial(2 * k + 3) for k in range(_TERMS)]
+_B_SLOPE, _C_SLOPE = ([k * c for k, c in enumerate(of)][1:] for of in (_B, _C))
 
 
 def cross(a: Floats, b: Floats) -> Floats:
     """Cross product a × b over the last axis; (..., 3), broadcast."""
     a1, a2, a3 = a[..., 0], a[..., 1], a[..., 2]
     b1, b2, b3 = b[..., 0], b[..., 1], b[..., 2]
-    out = empty(*np.broadcast_shapes(a.shape, b.shape))
+    out = empty(*_shape(a.shape, b.shape))
     out[..., 0] = a2 * b3 - a3 * b2
     out[..., 1] = a3 * b1 - a1 * b3
     out[..., 2] = a1 * b2 - a2 * b1
@@ -40,13 +40,13 @@ def cross(a: Floats, b: Floats) -> Floats:
 
 def apply(r: Floats, v: Floats) -> Floats:
     """Matrices times vectors; (..., 3, 3), (..., 3) -> (..., 3), broadcast."""
-    out = empty(*np.broadcast_shapes(r.shape[:-1], v.shape))
+    out = empty(*_shape(r.shape[:-1], v.shape))
     return np.asarray(np.einsum("...ij,...j->...i", r, v, out=out))
 
 
 def product(a: Floats, b: Floats) -> Floats:
     """Matrices times matrices; (..., i, j), (..., j, k) -> (..., i, k), broadcast."""
-    lead = np.broadcast_shapes(a.shape[:-2], b.shape[:-2])
+    lead = _shape(a.shape[:-2], b.shape[:-2])
     out = empty(*lead, a.shape[-2], b.shape[-1])
     return np.asarray(np.einsum("...ij,...jk->...ik", a, b, out=out))
 
@@ -63,7 +63,7 @@ def skew(a: Floats) -> Floats:
 def rotation(w: Floats) -> Floats:
     """Rotation matrix exp([ω]×) = cos θ I + sin θ/θ [ω]× + b ω ωᵀ; (..., 3) -> (..., 3, 3)."""
     t2 = _square(w)
-    b, c = _coefficients(t2)
+    b, c = coefficients(t2)
     return _combine(1 - b * t2, 1 - c * t2, b, w)
 
 
@@ -82,10 +82,10 @@ def exp(twist: Floats) -> tuple[Floats, Floats]:
     """
     v, w = twist[..., :3], twist[..., 3:]
     t2 = _square(w)
-    b, c = _coefficients(t2)
+    b, c = coefficients(t2)
     r = _combine(1 - b * t2, 1 - c * t2, b, w)
     if not v.any():
-        return r, zeros(*v.shape)
+        return r, np.broadcast_to(0.0, v.shape)
     turned = cross(w, v)
     return r, v + b[..., None] * turned + c[..., None] * cross(w, turned)
 
@@ -137,10 +137,10 @@ def right_jacobian_blocks(twist: Floats) -> tuple[Floats, Floats]:
     """
     v, w = twist[..., :3], twist[..., 3:]
     t2 = _square(w)
-    b, c = _coefficients(t2)
+    b, c = coefficients(t2)
     j = _combine(1 - c * t2, -b, c, w)
     if not v.any():
-        return j, zeros(*j.shape)
+        return j, np.broadcast_to(0.0, j.shape)
     b_slope, c_slope = _slopes(t2, b, c)
     twice = 2 * np.sum(v * w, axis=-1)
     q = _combine(-twice * (c + c_slope * t2), -twice * b_slope, twice * c_slope, w)
@@ -151,28 +151,36 @@ def right_jacobian_blocks(twist: Floats) -> tuple[Floats, Floats]:
     return j, q
 
 
+def _shape(a: tuple[int, ...], b: tuple[int, ...]) -> tuple[int, ...]:
+    """Shape of the result; where they are the same, at once."""
+    return a if a == b else np.broadcast_shapes(a, b)
+
+
 def _square(w: Floats) -> Floats:
     """Squared length over the last axis."""
-    return np.asarray(np.sum(w * w, axis=-1))
+    x, y, z = w[..., 0], w[..., 1], w[..., 2]
+    return np.asarray(x * x + y * y + z * z)
 
 
 def _combine(i: Floats, k: Floats, s: Floats, w: Floats) -> Floats:
     """Return i I + k [ω]× + s ω ωᵀ; coefficients (...), ω (..., 3) -> (..., 3, 3)."""
     out = empty(*w.shape, 3)
-    sw, kw = s[..., None] * w, k[..., None] * w
     for row in range(3):
         right, left = (row + 1) % 3, (row + 2) % 3
-        out[..., row, row] = i + sw[..., row] * w[..., row]
-        out[..., row, right] = sw[..., row] * w[..., right] - kw[..., left]
-        out[..., row, left] = sw[..., row] * w[..., left] + kw[..., right]
+        turn, both = k * w[..., left], s * w[..., row]
+        both_sides = both * w[..., right]
+        np.add(i, both * w[..., row], out=out[..., row, row])
+        np.subtract(both_sides, turn, out=out[..., row, right])
+        np.add(both_sides, turn, out=out[..., right, row])
     return out
 
 
-def _coefficients(t2: Floats) -> tuple[Floats, Floats]:
-    """Return b and c as functions of θ²."""
+def coefficients(t2: Floats) -> tuple[Floats, Floats]:
+    """Return b = (1 − cos θ)/θ² and c = (θ − sin θ)/θ³ as functions of θ²."""
+    largest = float(t2.max(initial=0.0))
+    if largest < _NEAR:
+        return _series(_B, t2, largest), _series(_C, t2, largest)
     near = t2 < _NEAR
-    if near.all():
-        return _series(_B, t2), _series(_C, t2)
     far = np.where(near, 1.0, t2)
     t = np.sqrt(far)
     b, c = (1 - np.cos(t)) / far, (t - np.sin(t)) / (far * t)
@@ -192,9 +200,15 @@ def _slopes(t2: Floats, b: Floats, c: Floats) -> tuple[Floats, Floats]:
     )
 
 
-def _series(coefficients: Floats, t2: Floats) -> Floats:
-    """Power series in θ², as far as its terms show in double precision."""
-    largest = t2.max(initial=0.0)
-    terms = np.abs(coefficients) * largest ** np.arange(len(coefficients))
-    kept = max(int(np.count_nonzero(terms > 1e-18)), 1)
-    return np.asarray(np.polynomial.polynomial.polyval(t2, coefficients[:kept], tensor=False))
+def _series(coefficients: Sequence[float], t2: Floats, largest: float = _NEAR) -> Floats:
+    """Power series in θ² ≤ `largest`, as far as its terms show in double precision."""
+    last, power = 0, 1.0
+    for k, coefficient in enumerate(coefficients):
+        if abs(coefficient) * power > 1e-18:
+            last = k
+        power *= largest
+    out = np.full_like(t2, coefficients[last])
+    for coefficient in coefficients[:last][::-1]:
+        out *= t2
+        out += coefficient
+    return out

@@ -1,6 +1,7 @@
 """Gradients of the slot wrenches by motions of the chain, against differences."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -34,8 +35,9 @@ def test_gradient_by_joints_and_twists(arm):
         return (up - down) / (2 * STEP)
 
     chain = chains.evaluate(cell.arm, s.angle, Deviation(dq=dq, twist=twist))
+    slots = product(range(n + 1), (False, True))
     gradient = geometric_stiffness(cell.arm, chain, load).gradient(
-        {k: b[:, :, k] for k in range(n + 1)}
+        {(k, moment): b[:, :, k, 3:] if moment else b[:, :, k, :3] for k, moment in slots}
     )
     for j in range(n):
         expected = slope(np.eye(n)[j], 0.0)
