@@ -146,11 +146,6 @@ class Evidence:
         return Evidence(found, self._refit, self._say, self._regressions)
 
     @cached_property
-    def tree_share(self) -> float:
-        """Share of the misfit that trees predict on poses left out."""
-        return self._regressions.tree_share(self.linearisation)
-
-    @cached_property
     def redundant(self) -> tuple[str, ...]:
         """Effects of the model without which the readings are explained as well."""
         found = backward_elimination(self.fit, self._eliminated)
@@ -161,6 +156,10 @@ class Evidence:
     def insufficiency(self) -> Insufficiency | None:
         """What all effects of the catalogue together leave, where it is not noise."""
         return insufficiency(self.fit, self._refit, self._say, self._regressions)
+
+    def tree_share(self, beyond: float) -> float:
+        """Return the share of the misfit that trees predict, where that is more than another."""
+        return self._regressions.tree_share(self.linearisation, beyond)
 
     def alternatives(
         self, effects: Collection[str], excluded: Collection[str]

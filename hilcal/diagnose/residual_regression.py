@@ -12,9 +12,7 @@ the chosen laws predict of the poses left out is the predictable share. A variab
 share that the prediction loses when its values are exchanged at random between poses and loads.
 Source of the latter: Breiman, *Random forests*, Machine Learning 45 (2001) 5-32, section 10.
 
-Where the laws predict little, extremely randomised trees predict the residual, in units of its
-noise, from everything that is recorded of the state. Source: Geurts, Ernst and Wehenkel,
-*Extremely randomized trees*, Machine Learning 63 (2006) 3-42; implementation of scikit-learn.
+Where the laws predict little, trees predict the residual, see `tree_share`.
 """
 
 from dataclasses import dataclass, replace
@@ -31,6 +29,7 @@ from hilcal.diagnose.recorded import (
     motions,
     recorded,
 )
+from hilcal.diagnose.tree_share import tree_share
 from hilcal.identify.fit import Fit
 from hilcal.identify.folds import random_folds
 from hilcal.identify.linearisation import Linearisation
@@ -45,13 +44,9 @@ SHUFFLES = 4
 LEAST_EVIDENCE = 8.0
 """Gain in log evidence that a law needs, for the many that are tried; a guess."""
 STRENGTHS = np.logspace(-2, 3, 21)
-TREES = 60
-LEAF = 3
-MOST_MEASUREMENTS = 4000
-"""Measurements that trees use at most, for speed; a guess."""
+"""Prior standard deviations that are tried: fewer than for effects, since laws are many."""
 LITTLE = 0.1
 """Share that smooth laws predict below which trees are fitted as well; a guess."""
-"""Prior standard deviations that are tried: fewer than for effects, since laws are many."""
 AT_ONCE = 16
 """Laws whose columns are worked on together; a choice by memory."""
 DETERMINED = 2.0
@@ -117,72 +112,28 @@ class Regressions:
     def __init__(self) -> None:
         """Begin with none."""
         self._of: WeakKeyDictionary[Fit, ResidualRegression] = WeakKeyDictionary()
-        self._trees: WeakKeyDictionary[Fit, float] = WeakKeyDictionary()
+        self._trees: WeakKeyDictionary[Fit, dict[float, float]] = WeakKeyDictionary()
 
     def of(self, p: Linearisation) -> ResidualRegression:
         """Return what is predicted on poses left out of the misfit, and what carries it."""
         if p.fit not in self._of:
             found = smooth_laws(p)
             if found.share < LITTLE:
-                found = replace(found, share=max(found.share, self.tree_share(p)))
+                found = replace(found, share=max(found.share, self.tree_share(p, found.share)))
             self._of[p.fit] = found
         return self._of[p.fit]
 
-    def tree_share(self, p: Linearisation) -> float:
-        """Return the share of the misfit that trees predict on poses left out, within [0, 1]."""
-        if p.fit not in self._trees:
-            self._trees[p.fit] = tree_share(p)
-        return self._trees[p.fit]
+    def tree_share(self, p: Linearisation, beyond: float) -> float:
+        """Return what trees predict on poses left out, where that is more than another share."""
+        known = self._trees.setdefault(p.fit, {})
+        if beyond not in known:
+            known[beyond] = tree_share(p, beyond)
+        return known[beyond]
 
 
 def residual_regression(p: Linearisation) -> ResidualRegression:
     """Return the share of the misfit that is predicted on poses left out, and what carries it."""
     return Regressions().of(p)
-
-
-def tree_share(p: Linearisation) -> float:
-    """Return the share of the misfit that trees predict on poses left out, within [0, 1]."""
-    from sklearn.ensemble import ExtraTreesRegressor
-
-    fit, w = p.fit, p.fit.whitening
-    std = np.sqrt(np.trace(w.covariance[:, :3, :3], axis1=1, axis2=2) / 3)
-    axes = fit.solution.prediction.observation.axes[w.reading]
-    # A measurement without any stated noise has no weight, as in whitening.
-    weight = np.where(std > 0, 1.0, 0.0) / np.where(std > 0, std, 1.0)
-    target = np.einsum("dji,dj->di", axes, fit.raw[:, :3]) * weight[:, None]
-    features = _features(p)
-    chosen = np.arange(len(target))
-    if len(chosen) > MOST_MEASUREMENTS:
-        chosen = np.random.default_rng(0).choice(chosen, MOST_MEASUREMENTS, replace=False)
-    fold = random_folds(fit.pose, FOLDS)[chosen]
-    features, target = features[chosen], target[chosen]
-    left = target.copy()
-    for f in range(int(fold.max()) + 1):
-        mine = fold == f
-        if mine.all() or not mine.any():
-            continue
-        trees = ExtraTreesRegressor(TREES, min_samples_leaf=LEAF, random_state=0, n_jobs=-1)
-        left[mine] -= trees.fit(features[~mine], target[~mine]).predict(features[mine])
-    total = max(float(np.sum(target**2)), 1e-300)
-    gain = (total - float(np.sum(left**2))) / total
-    return float(np.clip(gain * p.rss / p.misfit(), 0.0, 1.0))
-
-
-def _features(p: Linearisation) -> Floats:
-    """(D, F) everything recorded of the state of each measurement."""
-    fit, w = p.fit, p.fit.whitening
-    s = fit.readings[~fit.outlier].states[w.reading]
-    situation = fit.solution.prediction.situation
-    angle = situation.angle[w.reading]
-    columns = [angle, np.cos(angle), np.sin(angle), situation.torque[w.reading], s.wrench]
-    order = np.flatnonzero(~fit.outlier).astype(float)[w.reading]
-    for extra in (order if s.time is None else s.time, s.load_time, s.air_temperature):
-        if extra is not None:
-            columns.append(extra[:, None])
-    for wide in (s.joint_temperature, s.approach):
-        if wide is not None:
-            columns.append(wide)
-    return np.concatenate(columns, axis=1)
 
 
 class _Laws:

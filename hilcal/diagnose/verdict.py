@@ -117,10 +117,13 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
         lambda: e.redundant,
     )
     if lead is not None:
-        trees: tuple[Callable[[], object], ...] = (lambda: e.tree_share,) if e.misfit else ()
+        beyond = lead.holdout_share
+        trees: tuple[Callable[[], object], ...] = ()
+        if e.misfit:
+            trees = (lambda: e.tree_share(beyond),)
         with e.beside(*trees, *rest):
             insufficiency = e.insufficiency
-        regression = ResidualRegression(e.tree_share if e.misfit else 0.0, ())
+        regression = ResidualRegression(e.tree_share(beyond) if e.misfit else 0.0, ())
         predicted = max(regression.share, lead.holdout_share) if e.misfit else 0.0
         if insufficiency is not None:
             reason = "insufficient_catalogue"

@@ -43,20 +43,21 @@ def test_the_residual_of_a_fit_is_regressed_once(
     found: Fit, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     alone = residual_regression(linearise(found))
-    grown: list[Linearisation] = []
+    grown: list[float] = []
     trees = regression.tree_share
 
-    def counted(p: Linearisation) -> float:
-        grown.append(p)
-        return trees(p)
+    def counted(p: Linearisation, beyond: float) -> float:
+        grown.append(beyond)
+        return trees(p, beyond)
 
     monkeypatch.setattr(regression, "tree_share", counted)
     made = Regressions()
     first = made.of(linearise(found))
     assert (first.share, len(first.dependences)) == (alone.share, len(alone.dependences))
     assert made.of(linearise(found)) is first
-    assert made.tree_share(linearise(found)) == made.tree_share(linearise(found))
-    assert len(grown) == 1
+    assert made.tree_share(linearise(found), 0.5) == made.tree_share(linearise(found), 0.5)
+    assert len(grown) == len(set(grown))
+    assert 0.5 in grown
 
 
 def test_redundant_effects_by_scores_that_the_alternatives_made(found: Fit) -> None:
