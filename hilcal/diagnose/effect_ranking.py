@@ -236,10 +236,11 @@ def ranked(suspects: Iterable[Suspect], rejected: Collection[str] = ()) -> tuple
 
 
 def _suspect(p: Linearisation, of: EffectColumns, bare: Unloaded | None, level: float) -> Suspect:
-    s = p.information(of.white)
+    (products,) = p.products([of.white])
+    s = p.information(products)
     of_s, largest = spectrum(s), most(of, bare)
     result = p.score(of.white, of_s, largest)
-    held = p.held_out(of.white, result)
+    (held,) = p.held_out([(products, result)])
     effect = of.effect
     columns: Callable[[], EffectColumns] = lambda: of  # noqa: E731 - of the small ones alone
     if of.white.size > MOST_KEPT:

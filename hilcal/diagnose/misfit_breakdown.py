@@ -115,8 +115,9 @@ def _batches(columns: Iterable[_Named]) -> Iterator[list[_Named]]:
 
 def _shares(p: Linearisation, batch: list[_Named]) -> list[MisfitShare]:
     """Score named columns (R, F)."""
-    scores = [p.score(x) for _, x in batch]
-    held = p.held_out_each([(x, s) for (_, x), s in zip(batch, scores, strict=True)])
+    products = p.products(x for _, x in batch)
+    scores = [p.score(of.x, p.information(of)) for of in products]
+    held = p.held_out(list(zip(products, scores, strict=True)))
     return [
         MisfitShare(name, max(of.share, 0.0), score.p_value)
         for (name, _), score, of in zip(batch, scores, held, strict=True)

@@ -4,7 +4,7 @@ The ranking of effects that could be missing and the planning of measurements th
 both use it, so that the planner's power and the diagnosis's test are of the same information.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -18,7 +18,13 @@ from hilcal.identify.holdout import folds_of
 from hilcal.identify.priors import scales_of
 from hilcal.regression.backward_elimination import ReducedModel, eliminate_columns
 from hilcal.regression.evidence import FamilyScore, Spectrum, score_family
-from hilcal.regression.leave_out import Fold, left_out_of_families, left_out_residual
+from hilcal.regression.leave_out import (
+    FamilyProducts,
+    Fold,
+    family_products,
+    left_out_of_families,
+    left_out_residual,
+)
 from hilcal.regression.paired_test import improves
 from hilcal.regression.products import gram
 from hilcal.regression.projection import Projection
@@ -106,9 +112,15 @@ class Linearisation:
         """Return M X of whitened columns X (R, P)."""
         return self.projection.project_out(x)
 
-    def information(self, x: Floats) -> Floats:
-        """Return S = Xᵀ M X (P, P) of whitened columns X (R, P)."""
+    def information(self, x: Floats | FamilyProducts) -> Floats:
+        """Return S = Xᵀ M X (P, P) of whitened columns X (R, P), or of their products."""
+        if isinstance(x, FamilyProducts):
+            return self.projection.schur(x.whole.gram, x.whole.cross)
         return self.projection.information(x)
+
+    def products(self, families: Iterable[Floats]) -> list[FamilyProducts]:
+        """Return the products of families of whitened columns, which `held_out` needs."""
+        return family_products(self.folds, self.projection, self.fit.white, families)
 
     def score(
         self, x: Floats, s: Floats | Spectrum | None = None, most: float = np.inf
@@ -132,18 +144,14 @@ class Linearisation:
         """Share of the misfit that a reduction of ‖r‖² is, within [0, 1]."""
         return float(np.clip(gain / self.misfit(), 0.0, 1.0))
 
-    def held_out(self, x: Floats, found: FamilyScore) -> HeldOut:
-        """Return the reduction of the held-out error by a family; see `regression.leave_out`.
+    def held_out(self, families: Sequence[tuple[FamilyProducts, FamilyScore]]) -> list[HeldOut]:
+        """Return the reductions of the held-out error by families; see `regression.leave_out`.
 
         Args:
-            x: (R, P) whitened columns of the family.
-            found: their score, for the ridge.
+            families: products of each, which stands beside the model by itself, and its score,
+                for the ridge.
         """
-        return self.held_out_each([(x, found)])[0]
-
-    def held_out_each(self, families: Sequence[tuple[Floats, FamilyScore]]) -> list[HeldOut]:
-        """Return `held_out` of several families, each beside the model by itself."""
-        seen = [(x, found.ridge) for x, found in families if found.rank]
+        seen = [(of, found.ridge) for of, found in families if found.rank]
         left = iter(left_out_of_families(self.folds, self.projection, self.fit.white, seen))
         return [
             self._held_out(next(left)) if found.rank else HeldOut(0.0, False)

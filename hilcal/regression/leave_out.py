@@ -12,9 +12,8 @@ standard deviation is their magnitude in the full fit. A direction that the othe
 the model without it where it is not.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import reduce
 
 import numpy as np
 
@@ -115,36 +114,75 @@ def left_out_residual(
         for fold in folds:
             left[fold.out] = white[fold.out] - p.rows[fold.out] @ fold.step()
         return left
-    return left_out_of_families(folds, p, white, [(x, ridge)])[0]
+    return left_out_of_families(
+        folds, p, white, [(of, ridge) for of in family_products(folds, p, white, [x])]
+    )[0]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FamilyProducts:
+    """Products of a family's columns with themselves and with the model's, in each fold.
+
+    Their sums over the folds serve the tests of the whole family.
+
+    Attributes:
+        x: (R, F) whitened columns.
+        parts: of each fold.
+        whole: of all rows.
+    """
+
+    x: Floats
+    parts: tuple["_Products", ...]
+    whole: "_Products"
+
+
+def family_products(
+    folds: tuple[Fold, ...], p: Projection, white: Floats, families: Iterable[Floats]
+) -> list[FamilyProducts]:
+    """Form the products of families of whitened columns (R, F).
+
+    A fold's rows of the model's columns are copied once for all families.
+
+    Args:
+        folds: of the model; each row is in one.
+        p: the model's columns.
+        white: (R,) residual of the model fitted to all rows.
+        families: X of each.
+    """
+    every = list(families)
+
+    def products(fold: Fold) -> list[_Products]:
+        own, y = p.rows[fold.out], white[fold.out]
+        return [_Products.of(own, x[fold.out], y) for x in every]
+
+    by_fold = in_threads(products, folds)
+    return [
+        FamilyProducts(x, parts, _Products.sum(parts))
+        for x, parts in zip(every, zip(*by_fold, strict=True), strict=True)
+    ]
 
 
 def left_out_of_families(
-    folds: tuple[Fold, ...], p: Projection, white: Floats, families: Sequence[tuple[Floats, float]]
+    folds: tuple[Fold, ...],
+    p: Projection,
+    white: Floats,
+    families: Sequence[tuple[FamilyProducts, float]],
 ) -> list[Floats]:
     """Return `left_out_residual` (R,) of each family, each beside the model by itself.
-
-    A fold's rows of the model's columns are copied once for all of them.
 
     Args:
         folds: of the model.
         p: the model's columns.
         white: (R,) residual of the model fitted to all rows.
-        families: (R, F) whitened columns and ridge of each.
+        families: products and ridge of each.
     """
-
-    def products(fold: Fold) -> list[_Products]:
-        own, y = p.rows[fold.out], white[fold.out]
-        return [_Products.of(own, x[fold.out], y) for x, _ in families]
-
-    parts = in_threads(products, folds)
-    whole = [reduce(_Products.plus, of) for of in zip(*parts, strict=True)]
     found = [np.zeros(len(white)) for _ in families]
 
     def predict(f: int) -> None:
         out, own = folds[f].out, p.rows[folds[f].out]
-        for (x, ridge), of, total, left in zip(families, parts[f], whole, found, strict=True):
-            back, step = _without(folds[f], total, of, ridge)
-            left[out] = white[out] - own @ back - x[out] @ step
+        for (of, ridge), left in zip(families, found, strict=True):
+            back, step = _without(folds[f], of.whole, of.parts[f], ridge)
+            left[out] = white[out] - own @ back - of.x[out] @ step
 
     in_threads(predict, range(len(folds)))
     return found
@@ -154,11 +192,12 @@ def _without(
     fold: Fold, whole: "_Products", own: "_Products", ridge: float
 ) -> tuple[Floats, Floats]:
     """Return the steps (K,) of the model and (F,) of a family without a fold."""
-    least = max(ridge, FAMILY_ROUNDING * float(whole.gram.max(initial=0.0)))
+    least = max(ridge, FAMILY_ROUNDING * float(np.diagonal(whole.gram).max(initial=0.0)))
     # Eliminate the model's own coordinates, then solve for the family.
-    lifted = fold.inverse_root @ np.column_stack([whole.cross - own.cross, fold.rhs])
-    along, size = lifted[:, :-1], lifted[:, -1]
-    h = whole.gram - own.gram - along.T @ along
+    along = fold.inverse_root @ (whole.cross - own.cross)
+    size = fold.inverse_root @ fold.rhs
+    h = whole.gram - own.gram
+    h -= along.T @ along
     h[np.diag_indices_from(h)] += least
     step = positive_solve(h, whole.rhs - own.rhs - along.T @ size)
     return fold.inverse_root.T @ (size - along @ step), step
@@ -177,9 +216,16 @@ class _Products:
         """Form them."""
         return cls(rows.T @ x, x.T @ x, x.T @ white)
 
-    def plus(self, other: "_Products") -> "_Products":
-        """Return those of both."""
-        return _Products(self.cross + other.cross, self.gram + other.gram, self.rhs + other.rhs)
+    @classmethod
+    def sum(cls, of: Sequence["_Products"]) -> "_Products":
+        """Return those of the rows of all."""
+        first = of[0]
+        out = cls(first.cross.copy(), first.gram.copy(), first.rhs.copy())
+        for more in of[1:]:
+            np.add(out.cross, more.cross, out=out.cross)
+            np.add(out.gram, more.gram, out=out.gram)
+            np.add(out.rhs, more.rhs, out=out.rhs)
+        return out
 
 
 class FamilyFolds:

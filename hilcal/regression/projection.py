@@ -48,9 +48,13 @@ class Projection:
             x: (R, P) whitened columns.
             gram: (P, P) XᵀX where it is known.
         """
-        lifted = self.inverse_root @ products.cross(self.rows, x)
         own = products.gram(x) if gram is None else gram
-        return np.asarray(own - lifted.T @ lifted)
+        return self.schur(own, products.cross(self.rows, x))
+
+    def schur(self, gram: Floats, cross: Floats) -> Floats:
+        """Return Xᵀ M X (P, P) from XᵀX (P, P) and BᵀX (K, P)."""
+        lifted = self.inverse_root @ cross
+        return np.asarray(gram - lifted.T @ lifted)
 
     def residual(self, y: Floats, z: Floats) -> Floats:
         """Return the residual (R,) after the model's own remaining step.

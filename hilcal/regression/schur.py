@@ -80,9 +80,10 @@ def positive_solve(m: Floats, rhs: Floats) -> Floats:
     """
     scale = np.sqrt(np.maximum(np.diagonal(m), 0.0))
     if len(m) and scale.all():
-        scaled = m / np.outer(scale, scale)
+        scaled = m / scale
+        scaled /= scale[:, None]
         norm = float(np.abs(scaled).sum(axis=0).max())
-        low, failed = sl.lapack.dpotrf(scaled.T, lower=1, clean=0)
+        low, failed = sl.lapack.dpotrf(scaled.T, lower=1, clean=0, overwrite_a=1)
         if not failed:
             condition, _ = sl.lapack.dpocon(low, norm, uplo="L")
             if condition * norm > len(m) * DETERMINED / _SOUND:

@@ -7,6 +7,7 @@ from hilcal.regression.backward_elimination import eliminate_columns
 from hilcal.regression.leave_out import (
     FamilyFolds,
     Fold,
+    family_products,
     folds,
     left_out_of_families,
     left_out_residual,
@@ -73,10 +74,15 @@ def test_families_together_are_predicted_as_each_by_itself() -> None:
     each, p, white, x = model(1.0)
     other = np.random.default_rng(5).standard_normal((60, 4))
     families = [(x, 0.8), (other, 3.0), (other[:, :1], 0.1)]
-    together = left_out_of_families(each, p, white, families)
+    products = family_products(each, p, white, [columns for columns, _ in families])
+    ridges = [ridge for _, ridge in families]
+    together = left_out_of_families(each, p, white, list(zip(products, ridges, strict=True)))
     for (columns, ridge), left in zip(families, together, strict=True):
         alone = left_out_residual(each, p, white, columns, ridge)
         np.testing.assert_allclose(left, alone, rtol=1e-11, atol=1e-13)
+    for of in products:
+        whole = p.schur(of.whole.gram, of.whole.cross)
+        np.testing.assert_allclose(whole, p.information(of.x), rtol=1e-11, atol=1e-12)
 
 
 @pytest.mark.parametrize("ridge", [0.0, 0.8, 40.0])
