@@ -6,6 +6,7 @@ import sys
 
 import dashboard_client
 import rtde_control
+import rtde_io
 import rtde_receive
 
 UPLOAD = rtde_control.RTDEControlInterface.FLAG_UPLOAD_SCRIPT
@@ -17,6 +18,8 @@ def opened(part, host, *arguments):
         return rtde_control.RTDEControlInterface(host, 125.0, UPLOAD | UPPER)
     if part == "receive":
         return rtde_receive.RTDEReceiveInterface(host, 125.0, *arguments)
+    if part == "io":
+        return rtde_io.RTDEIOInterface(host)
     dashboard = dashboard_client.DashboardClient(host)
     dashboard.connect()
     return dashboard

@@ -1,8 +1,11 @@
 """The simulated devices as programs of others meet them: clients written here from the protocols'
-documents alone, and byte transcripts of the makers' manuals.
+documents alone, libraries of others (ur_rtde, pymodbus), and byte transcripts of the makers'
+manuals. UR's own library for Python is in no package registry; its recipes are asked for here.
 """
 
+import csv
 import struct
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,7 +16,7 @@ from drivers.frames import crc_modbus, crc_x25
 from drivers.ft300 import STREAM, STREAM_REGISTER
 from drivers.simulated.force.ft300 import Ft300
 from drivers.simulated.geocom.protocol import crc16_arc
-from tests.support.sim_ur_cases import SimulatedUr, Wire, start
+from tests.support.sim_ur_cases import ClientError, SimulatedUr, Wire, client, start
 
 
 @pytest.fixture
@@ -89,6 +92,29 @@ def test_a_control_loop_writes_and_two_cannot_hold_one_register(arm: SimulatedUr
                 break
         else:
             raise AssertionError("the registers stay taken")
+
+
+def test_ur_rtde_records_and_writes_inputs(arm: SimulatedUr, tmp_path: Path) -> None:
+    """Its own record and control of inputs, by a library of the University of Southern Denmark."""
+    path = tmp_path / "record.csv"
+    with client(arm.host, "receive", "io") as run, client(arm.host) as other:
+        assert run("receive", "startFileRecording", str(path))
+        assert run("io", "setInputIntRegister", 19, -7)
+        assert run("io", "setInputDoubleRegister", 19, 1.5)
+        assert run("io", "setStandardDigitalOut", 1, True)
+        with pytest.raises(ClientError, match="already in use"):
+            other("io", "open", arm.host)
+        deadline = time.monotonic() + 5.0
+        while not run("receive", "getActualDigitalOutputBits") & 1 << 1:
+            assert time.monotonic() < deadline, "the output is never set"
+        assert run("receive", "stopFileRecording")
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    stamps = np.array([float(row["timestamp"]) for row in rows])
+    assert len(np.unique(stamps)) > 2
+    assert np.all(np.diff(stamps) >= 0.0)  # the library may write a package twice
+    joints = [[float(row[f"actual_q_{j}"]) for j in range(6)] for row in rows]
+    np.testing.assert_allclose(joints[-1], arm.admin()["q"], atol=1e-3)
 
 
 def test_an_unknown_protocol_is_not_spoken(arm: SimulatedUr) -> None:

@@ -1,14 +1,24 @@
-"""The simulated FT 300 and HEX sensors, read by pyserial and minimalmodbus."""
+"""The simulated FT 300 and HEX sensors, read by pyserial, minimalmodbus and pymodbus."""
 
 from collections.abc import Iterator
 
 import minimalmodbus
 import numpy as np
 import pytest
+from pymodbus.client import ModbusSerialClient
+from pymodbus.exceptions import ModbusIOException
 
 from drivers.simulated.force.ft300 import crc16_modbus
 from drivers.simulated.force.gauge import DRIFT_STD, ROOM
-from tests.support.sim_force_cases import WRENCH, Reader, assert_normal, expected, modbus, streaming
+from tests.support.sim_force_cases import (
+    STREAM,
+    WRENCH,
+    Reader,
+    assert_normal,
+    expected,
+    modbus,
+    streaming,
+)
 from tests.support.sim_serial_cases import Instrument, force_sensor
 
 
@@ -39,6 +49,47 @@ def test_ft300_says_who_it_is_over_modbus(ft300: Instrument) -> None:
         client.address = 8
         with pytest.raises(minimalmodbus.NoResponseError):
             client.read_register(180)
+
+
+def test_ft300_serves_a_modbus_library_that_no_driver_uses(ft300: Instrument) -> None:
+    """The FT 300's driver uses minimalmodbus; this is pymodbus."""
+    client = ModbusSerialClient(str(ft300.port), baudrate=19200, timeout=0.5, retries=0)
+    assert client.connect()
+
+    def held(address: int, count: int, kind: object) -> object:
+        found = client.read_holding_registers(address, count=count, device_id=9)
+        return client.convert_from_registers(found.registers, kind)
+
+    try:
+        assert held(500, 5, client.DATATYPE.STRING) == "SIM-1.0.10"
+        assert held(510, 4, client.DATATYPE.STRING) == "F3004242"
+        found = client.read_input_registers(180, count=6, device_id=9)
+        counts = client.convert_from_registers(found.registers, client.DATATYPE.INT16)
+        wrench = np.array(counts) / np.repeat((100, 1000), 3)
+        noise = np.repeat((0.1, 0.005), 3)
+        drift = 5 * DRIFT_STD.max() * 0.5
+        now = expected(ft300.admin("state"))
+        np.testing.assert_array_less(np.abs(wrench - now), 6 * noise + drift)
+        for refused, code in (
+            (client.read_holding_registers(600, device_id=9), 2),
+            (client.write_registers(180, [1, 2], device_id=9), 2),
+            (client.write_coil(1, True, device_id=9), 1),
+        ):
+            assert refused.isError()
+            assert refused.exception_code == code
+        with pytest.raises(ModbusIOException, match="No response"):
+            client.read_holding_registers(500, device_id=8)
+        started = client.write_register(410, STREAM, device_id=9)
+        assert not started.isError()
+        assert ft300.admin("state")["streaming"]
+    finally:
+        client.close()
+        with Reader(ft300, "ft300") as reader:
+            reader.port.write(b"\xff" * 50)
+            reader.port.flush()
+            while reader.port.read(1000):
+                pass
+    assert not ft300.admin("state")["streaming"]
 
 
 def test_ft300_streams_on_request_until_told_to_stop(ft300: Instrument) -> None:

@@ -22,6 +22,8 @@ from drivers.simulated.ur.state import ArmState
 
 FREQUENCY = 500.0
 """Of the controller, Hz."""
+_DIGITAL_OUTPUTS = {"standard": (0, 0xFF), "configurable": (8, 0xFF), "tool": (16, 3)}
+"""First bit in `actual_digital_output_bits` and mask of each group; UR, "RTDE guide"."""
 _INT, _DOUBLE = "input_int_register_", "input_double_register_"
 _BACKLOG = 1 << 20  # bytes that a client may leave unread before it is cut off
 
@@ -205,4 +207,10 @@ class RtdeLink:
                 arm.registers.in_double[int(name.removeprefix(_DOUBLE))] = value
         if values.get("speed_slider_mask") and "speed_slider_fraction" in values:
             arm.slider = min(1.0, max(0.0, values["speed_slider_fraction"]))
+        for group, (first, bits) in _DIGITAL_OUTPUTS.items():
+            if f"{group}_digital_output" in values:
+                given = int(values[f"{group}_digital_output"]) & bits
+                mask = int(values.get(f"{group}_digital_output_mask", 0)) & bits
+                kept = arm.digital_outputs & ~(mask << first)
+                arm.digital_outputs = kept | (given & mask) << first
         self._links.taken()

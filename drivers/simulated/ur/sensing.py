@@ -112,6 +112,7 @@ class Sensors:
             ),
             "runtime_state": lambda: (arm.runtime,),
             "joint_position_deviation_ratio": self._deviation,
+            "actual_digital_output_bits": lambda: (arm.digital_outputs,),
             "speed_scaling": lambda: (arm.scaling,),
             "target_speed_fraction": lambda: (arm.slider,),
         }

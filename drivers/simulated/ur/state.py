@@ -105,6 +105,7 @@ class ArmState:
         remote: whether it takes orders from the network.
         scaling: further factor on the speed, as the controller applies it by itself.
         slider: the speed slider.
+        digital_outputs: RTDE `actual_digital_output_bits`.
         refuses_motion: whether a motion that is commanded ends the program instead.
         fault_ns: `time.monotonic_ns` of the last fault that was switched on.
         input_ns: the same of the last input package.
@@ -125,6 +126,7 @@ class ArmState:
     remote: bool = True
     scaling: float = 1.0
     slider: float = 1.0
+    digital_outputs: int = 0
     refuses_motion: bool = False
     fault_ns: int = 0
     input_ns: int = 0
