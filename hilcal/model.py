@@ -229,8 +229,11 @@ class Model:
         place[live] = np.arange(len(live))
         places = np.split(place, np.cumsum(sizes)[:-1]) if sizes else []
         out = np.empty((count, m, len(live)))
-        parts = chunks(count, m * len(live))
-        in_threads(lambda r: self._fill(out[r], effects, places, prediction[r], theta), parts)
+
+        def fill(rows: slice) -> None:
+            self._fill(out[rows], effects, places, prediction[rows], theta)
+
+        in_threads(fill, chunks(count, m * len(live)), count * m)
         return out
 
     def _fill(

@@ -51,6 +51,7 @@ from hilcal.report.text_prior import prior_lines
 from hilcal.report.text_registration import fitted_lines, other_arm_line
 from hilcal.report.text_unknown import curves
 from hilcal.report.verdict_words import message
+from hilcal.threads import later
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -247,10 +248,13 @@ def refine(
                 nonlocal first
                 number = next(numbers_to_be) if first is None else first.number
                 first = None
+                of = step.fit
+                ahead(lambda: of.uncertainty, len(of.white))
                 if live is not None:
                     live.revised(chapter_of(number, step))
 
-            found = refine_model(model, fitted, mode, say, how, laws, seen)
+            with later() as ahead:
+                found = refine_model(model, fitted, mode, say, how, laws, seen)
             if laws is not None:
                 laws.write(found.names)
             rows: list[Row] = []

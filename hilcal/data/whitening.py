@@ -208,7 +208,7 @@ class Whitening:
                 block = flat[rows].reshape(len(factor), size, -1)
                 to[rows] = (factor @ block).reshape(len(factor) * size, -1)
 
-            in_threads(scale, chunks(len(b.loaded), size * width))
+            in_threads(scale, chunks(len(b.loaded), size * width), len(out))
             start += len(b.loaded) * size
         return out
 

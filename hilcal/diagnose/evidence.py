@@ -31,10 +31,6 @@ from hilcal.identify.linearisation import Linearisation, linearise
 from hilcal.regression.distributions import chi2
 from hilcal.regression.evidence import FamilyScore
 
-BESIDE = 20_000
-"""Rows up to which parts of a judgement are computed beside each other; a choice, for memory: with
-many more, the columns of the catalogue beside a refit would double what a refinement needs."""
-
 
 class Evidence:
     """Statistics of a fit that a judgement combines; they do not depend on the model's history."""
@@ -76,18 +72,14 @@ class Evidence:
 
     @contextmanager
     def beside(self, *parts: Callable[[], object]) -> Iterator[None]:
-        """Compute parts of the evidence, which are kept, beside the block; after it if large."""
+        """Compute parts of the evidence, which are kept, beside the block."""
         _ = self.linearisation.left_out  # all parts need it
 
         def compute() -> None:
             for part in parts:
                 part()
 
-        if len(self.fit.white) > BESIDE:
-            yield
-            compute()
-            return
-        with threads.beside(compute):
+        with threads.beside(compute, len(self.fit.white)):
             yield
 
     @cached_property

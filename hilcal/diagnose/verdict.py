@@ -106,22 +106,20 @@ def judge(e: Evidence, history: History) -> Diagnosis:
 
 def _judged(e: Evidence, history: History) -> Diagnosis:
     """Judge by the evidence as it is."""
-    suspects = ranked(e.suspects, history.rejected)
+    with e.beside(
+        lambda: e.misfit_breakdown,
+        lambda: e.alternatives(history.added, history.removed),
+        lambda: e.redundant,
+    ):
+        scored = e.suspects
+    suspects = ranked(scored, history.rejected)
     lead = suspects[0] if suspects and suspects[0].passes else None
     insufficiency, noise, scatter = None, None, e.fit.readings.arm_scatter
     rivals: tuple[Separability, ...] = ()
     reason: Reason
-    rest = (
-        lambda: e.misfit_breakdown,
-        lambda: e.alternatives(history.added, history.removed),
-        lambda: e.redundant,
-    )
     if lead is not None:
         beyond = lead.holdout_share
-        trees: tuple[Callable[[], object], ...] = ()
-        if e.misfit:
-            trees = (lambda: e.tree_share(beyond),)
-        with e.beside(*trees, *rest):
+        with e.beside(lambda: e.tree_share(beyond) if e.misfit else 0.0):
             insufficiency = e.insufficiency
         regression = ResidualRegression(e.tree_share(beyond) if e.misfit else 0.0, ())
         predicted = max(regression.share, lead.holdout_share) if e.misfit else 0.0
@@ -133,8 +131,7 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
             reason = "inseparable_suspects" if rivals else "one_suspect"
         follows = _carrying(regression)
     else:
-        with e.beside(*rest):
-            regression = e.regression if e.misfit else ResidualRegression(0.0, ())
+        regression = e.regression if e.misfit else ResidualRegression(0.0, ())
         significant = _significant(e.misfit_breakdown)
         follows = _carrying(regression) or tuple(v.variable for v in significant)
         sizes = [

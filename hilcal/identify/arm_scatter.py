@@ -30,6 +30,7 @@ from hilcal.regression.variance_components import (
     VarianceComponents,
     variance_components,
 )
+from hilcal.threads import in_threads
 from hilcal.types import Floats, Ints
 
 MOST_ROWS = 4000
@@ -127,11 +128,15 @@ def estimate_arm_scatter(fit: Fit) -> ArmScatter | None:
     """
     data, ridge = _whitened(fit), fit.solution.equations.basis.prior_precision
     cell, price = fit.model.cell, 0.5 * float(np.log(fit.dof))
-    found: dict[ScatterKind, VarianceComponents] = {}
-    for kind in KINDS:
+
+    def maximised(kind: ScatterKind | None) -> VarianceComponents:
+        if kind is None:  # a noisier instrument
+            return variance_components(data.blocks([data.instrument()]), ridge)
         parts = [data.component(f) for f in factors(cell, data.readings, kind)]
-        found[kind] = variance_components(data.blocks(parts), ridge)
-    noisier = variance_components(data.blocks([data.instrument()]), ridge)
+        return variance_components(data.blocks(parts), ridge)
+
+    *by_kind, noisier = in_threads(maximised, (*KINDS, None), len(data.y))
+    found = dict(zip(KINDS, by_kind, strict=True))
     evidence = {kind: v.log_likelihood - len(v.variance) * price for kind, v in found.items()}
     best = max(KINDS, key=lambda kind: evidence[kind])
     variance = found[best].variance

@@ -24,6 +24,7 @@ from hilcal.identify.outliers import bulk, limit
 from hilcal.identify.smooth_nuisance import smooth_nuisance_columns
 from hilcal.model import Model
 from hilcal.regression.distributions import binom
+from hilcal.regression.products import times
 from hilcal.regression.projection import projection
 from hilcal.regression.small_forms import quadratic_forms
 from hilcal.types import Bools, Floats, Ints
@@ -201,7 +202,7 @@ class _Elimination:
         local = self._local.get(members.start, shifts)
         along = self._c @ (seen[k].T @ inverse_root)
         flat = seen.reshape(-1, seen.shape[2])  # one product of matrices is faster than N
-        slope = -(flat @ along).reshape(*seen.shape[:2], -1)
+        slope = -times(flat, along).reshape(*seen.shape[:2], -1)
         mine = local[:, own] @ inverse_root
         slope[members] += (local.T @ mine).reshape(-1, m, mine.shape[1])
         self._c += along @ along.T

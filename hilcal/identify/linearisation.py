@@ -191,10 +191,11 @@ def columns_of_each(fit: Fit, effects: Sequence[Effect]) -> Iterator[EffectColum
     rows = w.m * len(s.prediction.situation.angle)
     for group in _groups(effects, rows):
         jacobian = fit.model.jacobian_of(group, s.prediction, s.theta, w.m)
+        scales = [np.array([q.scale for q in effect.parameters]) for effect in group]
+        jacobian *= np.concatenate(scales)
         start = 0
-        for effect in group:
-            scale = np.array([q.scale for q in effect.parameters])
-            own = jacobian[:, :, start : start + len(scale)] * scale
+        for effect, scale in zip(group, scales, strict=True):
+            own = jacobian[:, :, start : start + len(scale)]  # whitened where it is if it is all
             at_reading = own[:, :3].copy()
             motion, start = w.raw(at_reading), start + len(scale)
             yield EffectColumns(effect, scale, w.whiten_readings(own), motion, at_reading)

@@ -11,6 +11,7 @@ import numpy as np
 
 from hilcal.regression.empirical_bayes import maximise_evidence, spent_by_groups
 from hilcal.regression.normal_equations import Basis, NormalEquations, find_basis, normal_equations
+from hilcal.regression.products import keep_columns
 from hilcal.types import Floats, Ints
 
 NOISE_STEPS = 50
@@ -46,13 +47,17 @@ class LinearProblem:
     rows: Floats
 
     def restricted(self, prior: Floats) -> "LinearProblem":
-        """Return the problem without the parameters that a prior (P,) of zero holds at zero."""
+        """Return the problem without the parameters that a prior (P,) of zero holds at zero.
+
+        It takes over the memory of the rows: this one cannot be used any more.
+        """
         kept = prior[self.live] > 0
         if kept.all():
             return self
         gram = self.gram[np.ix_(kept, kept)]
-        a = self.a[:, kept]
-        rows = a if self.rows is self.a else self.rows[:, kept]
+        same = self.rows is self.a
+        a = keep_columns(self.a, kept)
+        rows = a if same else keep_columns(self.rows, kept)
         return replace(self, live=self.live[kept], a=a, gram=gram, rows=rows)
 
     def basis(self, scale: Floats, prior: Floats, spread: float) -> Basis:
@@ -104,7 +109,8 @@ def regularise(
     beta = 1.0 if p.whitened else spread**2
     if choose:
         prior, beta = _family_priors(p, scale, prior, groups, spread)
-    return Regularisation(prior, beta, p.restricted(prior).basis(scale, prior, spread))
+    basis = p.basis(scale, prior, spread).restricted(prior[p.live] > 0)
+    return Regularisation(prior, beta, basis)
 
 
 def _attainable_spread(p: LinearProblem, scale: Floats, prior: Floats) -> float:

@@ -54,18 +54,23 @@ class ReducedModel:
             gram: (Q, Q) XᵀX.
             products: (P, Q) of all columns of the model with X.
         """
+        return self._information(self.flat.T @ x, gram, products)
+
+    def _information(self, flat: Floats, gram: Floats, products: Floats) -> Floats:
+        """Return `information` of X from the products (F, Q) of the flat directions with X."""
         held, count = self.basis.held, self.flat.shape[1]
         sigma = self.basis.transform[held, count + np.arange(len(held))]
-        cross = np.vstack([self.flat.T @ x, sigma[:, None] * products[held]])
-        lifted = self.inverse_root @ cross
+        lifted = self.inverse_root @ np.vstack([flat, sigma[:, None] * products[held]])
         return np.asarray(gram - lifted.T @ lifted)
 
     def score(self) -> FamilyScore:
         """Score the eliminated columns against the model without them."""
         products = self.gram[:, self.out]
-        x = self.columns[:, self.out]
-        s = self.information(x, products[self.out], products)
-        return score_family(s, x.T @ self.residual, self.rss, self.dof)
+        # Of all columns: those that are taken out would be copied.
+        flat = (self.flat.T @ self.columns)[:, self.out]
+        s = self._information(flat, products[self.out], products)
+        slope = (self.columns.T @ self.residual)[self.out]
+        return score_family(s, slope, self.rss, self.dof)
 
 
 def eliminate_columns(

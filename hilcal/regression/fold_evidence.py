@@ -55,7 +55,7 @@ def solutions(p: FamilyProblem, fold: Ints) -> Floats:
         fold: (R,) fold of each row, from 0.
     """
     flat, count_of = len(p.pull), np.bincount(fold)
-    parts = in_threads(lambda f: _products(p, fold == f), range(len(count_of)))
+    parts = in_threads(lambda f: _products(p, fold == f), range(len(count_of)), len(fold))
     gram, rhs = (reduce(np.add, of) for of in zip(*parts, strict=True))
     gram[:flat, :flat] += p.ridge
     rhs[:flat] += p.pull
@@ -73,7 +73,7 @@ def solutions(p: FamilyProblem, fold: Ints) -> Floats:
         last = maximise_evidence(h, c, left, count, 0, p.groups, start, first.beta)
         return _solve(g, b, flat, last.std, last.beta)[0]
 
-    return np.array(in_threads(without, range(len(parts))))
+    return np.array(in_threads(without, range(len(parts)), len(fold)))
 
 
 def _products(p: FamilyProblem, rows: Bools) -> tuple[Floats, Floats]:

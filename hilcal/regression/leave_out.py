@@ -90,7 +90,7 @@ def folds(
         root = inverse_root(h - rows.T @ rows)
         return Fold(mine, root, rhs - rows.T @ white[mine])
 
-    return tuple(in_threads(without, range(int(fold.max()) + 1)))
+    return tuple(in_threads(without, range(int(fold.max()) + 1), len(white)))
 
 
 def left_out_residual(
@@ -155,7 +155,7 @@ def family_products(
         own, y = p.rows[fold.out], white[fold.out]
         return [_Products.of(own, x[fold.out], y) for x in every]
 
-    by_fold = in_threads(products, folds)
+    by_fold = in_threads(products, folds, len(white))
     return [
         FamilyProducts(x, parts, _Products.sum(parts))
         for x, parts in zip(every, zip(*by_fold, strict=True), strict=True)
@@ -184,7 +184,7 @@ def left_out_of_families(
             back, step = _without(folds[f], of.whole, of.parts[f], ridge)
             left[out] = white[out] - own @ back - of.x[out] @ step
 
-    in_threads(predict, range(len(folds)))
+    in_threads(predict, range(len(folds)), len(white))
     return found
 
 

@@ -13,7 +13,7 @@ directions are rotated and scaled to be orthonormal before the normal equations 
 so that forming them costs no accuracy.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg as sl
@@ -63,6 +63,19 @@ class Basis:
     structural: int
     condition_unscaled: float
     condition_scaled: float
+
+    def restricted(self, kept: Bools) -> "Basis":
+        """Return the basis over some of the parameters (P,), where the others are held at zero."""
+        if kept.all():
+            return self
+        place = np.cumsum(kept) - 1
+        return replace(
+            self,
+            transform=self.transform[kept],
+            null=self.null[kept],
+            flat=self.flat[kept],
+            held=place[self.held],
+        )
 
     def flat_rows(self, a: Floats) -> Floats:
         """Return rows (R, F) by the flat coordinates of rows A (R, P) by the parameters."""

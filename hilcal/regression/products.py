@@ -7,10 +7,25 @@ processors.
 import numpy as np
 
 from hilcal.threads import in_threads
-from hilcal.types import Floats
+from hilcal.types import Bools, Floats
 
 LARGE = 1e8
 """Multiplications from which a product is halved, 5 ms of one processor; a choice by timing."""
+
+ROWS = 4096
+"""Rows that are copied at a time; a choice by memory."""
+
+
+def keep_columns(a: Floats, kept: Bools) -> Floats:
+    """Return the columns of A (R, P) that are kept, in the memory of A, which is used up."""
+    if not a.flags.c_contiguous:
+        return np.asarray(a[:, kept])
+    count, size = len(a), int(np.count_nonzero(kept))
+    out = a.reshape(-1)[: count * size].reshape(count, size)
+    for start in range(0, count, ROWS):
+        rows = slice(start, start + ROWS)
+        out[rows] = a[rows][:, kept]  # of rows that have been read
+    return np.asarray(out)
 
 
 def gram(a: Floats) -> Floats:
@@ -31,6 +46,21 @@ def gram(a: Floats) -> Floats:
 
     in_threads(fill, range(2))
     out[half:, :half] = out[:half, half:].T
+    return out
+
+
+def times(a: Floats, b: Floats) -> Floats:
+    """Return AB (R, Q) of A (R, P) and B (P, Q)."""
+    count, size = a.shape
+    if count * size * b.shape[1] < LARGE / 4:
+        return np.asarray(a @ b)
+    half = count // 2
+    out = np.empty((count, b.shape[1]))
+
+    def fill(rows: slice) -> None:
+        np.matmul(a[rows], b, out=out[rows])
+
+    in_threads(fill, (slice(0, half), slice(half, count)))
     return out
 
 

@@ -79,7 +79,7 @@ class Projection:
 
     def root(self) -> Floats:
         """Return Q (R, K) with M = 1 − Q Qᵀ."""
-        return np.asarray(self.rows @ self.inverse_root.T)
+        return products.times(self.rows, self.inverse_root.T)
 
 
 def projection(rows: Floats, ridge: Floats, gram: Floats | None = None) -> Projection:

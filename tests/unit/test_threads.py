@@ -1,6 +1,7 @@
 """Parts of a computation on several processors: the order of the items, the same bits."""
 
 import threading
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from hilcal.diagnose.verdict import diagnose
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import fit
 from hilcal.model import Model
-from hilcal.regression.products import cross, gram
+from hilcal.regression.products import ROWS, cross, gram, keep_columns, times
 from tests.support.campaigns import campaign
 
 
@@ -65,15 +66,56 @@ def test_what_is_beside_a_block_is_done_after_it(
     assert sorted(done) == ["beside", "block"]
 
 
-@pytest.mark.parametrize("shape", [(40, 3), (700, 401)])
+def test_many_rows_are_worked_off_in_this_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    processors(monkeypatch, 2)
+    own = threading.get_ident()
+    found = threads.in_threads(lambda _: threading.get_ident(), range(3), threads.MANY + 1)
+    assert set(found) == {own}
+    done: list[int] = []
+    with threads.beside(lambda: done.append(threading.get_ident()), threads.MANY + 1):
+        assert not done
+    assert done == [own]
+
+
+def test_what_is_asked_for_later_is_computed_beside_the_block_where_it_may_be(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    done: list[str] = []
+    for count in (1, 2):
+        processors(monkeypatch, count)
+        first = threading.Event()
+
+        def compute(name: str = f"on {count}", first: threading.Event = first) -> None:
+            done.append(name)
+            first.set()
+
+        with threads.later() as ahead:
+            ahead(compute, threads.MANY + 1)
+            assert not first.is_set()
+            ahead(compute, threads.MANY)
+            assert count == 1 or first.wait(10)
+    assert done == ["on 2"]
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_columns_are_kept_in_their_own_memory(order: Literal["C", "F"]) -> None:
+    a = np.array(np.random.default_rng(2).normal(size=(2 * ROWS + 7, 5)), order=order)
+    kept = np.array([True, False, True, True, False])
+    wanted = a[:, kept].copy()
+    np.testing.assert_array_equal(keep_columns(a, kept), wanted)
+
+
+@pytest.mark.parametrize("shape", [(40, 3), (701, 401)])
 def test_products_by_halves(monkeypatch: pytest.MonkeyPatch, shape: tuple[int, int]) -> None:
     rng = np.random.default_rng(1)
     a, b = rng.normal(size=shape), rng.normal(size=(shape[0], shape[1] + 1))
     found = []
     for count in (1, 2, 3):
         processors(monkeypatch, count)
-        found.append((gram(a), cross(a, b)))
-    for whole, of_both in found:
+        found.append((gram(a), cross(a, b), times(a, b[: shape[1]])))
+    for whole, of_both, product in found:
+        np.testing.assert_allclose(product, a @ b[: shape[1]], atol=1e-10)
+        assert np.array_equal(product, found[0][2])
         np.testing.assert_allclose(whole, a.T @ a, atol=1e-10)
         np.testing.assert_allclose(of_both, a.T @ b, atol=1e-10)
         assert np.array_equal(whole, found[0][0])
