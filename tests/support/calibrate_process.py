@@ -12,6 +12,7 @@ import psutil
 from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.run_log import RunLog
 from hilcal.procedure.state import Files
+from tests.support.campaign_run import LOOK_S
 
 ROOT = Path(__file__).resolve().parents[2]
 CELL = """\
@@ -78,9 +79,9 @@ class Calibration:
         """Start it, and kill its process group so long after; False where it ended before."""
         process = self.start()
         end = time.monotonic() + seconds
-        while time.monotonic() < end and process.poll() is None:
+        while (left := end - time.monotonic()) > 0 and process.poll() is None:
             self.look(process.pid)
-            time.sleep(0.02)
+            time.sleep(min(left, LOOK_S))
         self.look(process.pid)
         ended = process.poll() is not None
         if not ended:

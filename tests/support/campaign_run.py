@@ -22,6 +22,9 @@ BEGUN = "waiting for the operator to take everything off"
 TAKEN = re.compile(r"\d+/\d+ ")
 SLOW = 0.1
 """Position of the speed slider while an arm is to be stopped on its way."""
+LOOK_S = 0.25
+"""Time between two looks at the processes that a run has started; each reads those of the whole
+machine."""
 FAR_RAD = 0.5
 """The arm is stopped so far from its goal; at that speed it would take 0.8 s to arrive."""
 
@@ -61,6 +64,7 @@ class Run:
                 preexec_fn=None if limit is None else lambda: _limited(limit),
             )
         self._family: set[int] = {self.process.pid}
+        self._looked = 0.0
         site.runs.append(self)
 
     @property
@@ -76,7 +80,7 @@ class Run:
         """
         end = time.monotonic() + DEADLINE
         while not what():
-            self.family()
+            self._look()
             if self.process.poll() is not None:
                 raise EndedError(f"it ended before {words}:\n{self.words}")
             assert time.monotonic() < end, f"no {words} in {DEADLINE} s:\n{self.words}"
@@ -128,6 +132,12 @@ class Run:
             pass
         return self._family
 
+    def _look(self) -> None:
+        """Note what it has started meanwhile, now and then."""
+        if time.monotonic() - self._looked > LOOK_S:
+            self.family()
+            self._looked = time.monotonic()
+
     def interrupt(self) -> None:
         """Ctrl-C at the terminal: the whole group gets it."""
         self.family()
@@ -142,7 +152,7 @@ class Run:
         """Wait for its end; returns the exit code and what it said."""
         end = time.monotonic() + longest
         while self.process.poll() is None:
-            self.family()
+            self._look()
             assert time.monotonic() < end, f"it hangs:\n{self.words}"
             time.sleep(0.02)
         return self.process.wait(), self.words
