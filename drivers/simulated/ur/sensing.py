@@ -54,7 +54,9 @@ class Sensors:
     def value(self, name: str) -> Numbers:
         """Return the numbers of an output variable at this instant."""
         if name not in self._known:
-            self._known[name] = tuple(float(x) for x in self._read(name))
+            found = self._read(name)
+            numbers = found.tolist() if isinstance(found, np.ndarray) else map(float, found)
+            self._known[name] = tuple(numbers)
         return self._known[name]
 
     def integers(self, name: str) -> tuple[int, ...]:
@@ -66,13 +68,13 @@ class Sensors:
         return self.value(name) if OUTPUTS[name] in _REAL else self.integers(name)
 
     def _read(self, name: str) -> Floats | Numbers:
+        if name in self._readers:
+            return self._readers[name]()
         register = _REGISTER.fullmatch(name)
         if register:
             registers = self._arm.registers
             file = registers.out_int if register[1] == "int" else registers.out_double
             return (file[int(register[2])],)
-        if name in self._readers:
-            return self._readers[name]()
         return (0.0,) * _ZEROS.get(OUTPUTS[name], 1)
 
     def _table(self) -> dict[str, Callable[[], Floats | Numbers]]:
