@@ -177,7 +177,7 @@ def _feasible(cell: Cell, q: Floats, pulls: Floats) -> Bools:
 def _rigid(cell: Cell, q: Floats, pull: Floats) -> tuple[Floats, Floats]:
     """Return flange poses (N, 4, 4) and drive torques (N, n) of the rigid arm, N·m."""
     arm = cell.arm
-    tree = build(arm, arm.links, cell.tool_mass, cell.tool_com, cell.gravity)
+    tree = build(arm, arm.links, cell.tool_mass, cell.tool_com, cell.gravity, tilts=False)
     none = np.zeros(arm.n)
     law = elasticity(tree, none, none, none, np.zeros(3), np.zeros((0, 2)))
     wrench = np.broadcast_to(pull, (len(q), 6))

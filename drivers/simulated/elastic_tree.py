@@ -23,8 +23,8 @@ class ElasticTree:
 
     Attributes:
         model: the Pinocchio model, v degrees of freedom.
-        base: (3,) indices of the base's tilts about x, y, z.
-        tilt: (n, 2) indices of the bearings' tilts about the axes across each joint.
+        base: (3,) indices of the base's tilts about x, y, z; (0,) where nothing tilts.
+        tilt: (n, 2) indices of the bearings' tilts about the axes across each joint; or (n, 0).
         drive: (n,) indices of the joints themselves: command, errors and elasticity add.
         beam: (b, 5) indices of the tips: two displacements, twist, two rotations.
         beam_length: (b,) lengths, m.
@@ -63,6 +63,7 @@ def build(
     tool_com: Floats,
     gravity: Floats,
     *,
+    tilts: bool = True,
     beams: bool = False,
     tool: bool = False,
     moments: Floats | None = None,
@@ -75,6 +76,7 @@ def build(
         tool_mass: what the flange carries permanently, kg.
         tool_com: (3,) its centre of mass, flange axes, m.
         gravity: (3,) base axes, m/s².
+        tilts: whether base and bearings can tilt.
         beams: whether long links get elastic tips.
         tool: whether the flange can tilt; only then no constant transform is left behind the
             last degree of freedom.
@@ -91,18 +93,19 @@ def build(
         here = pin.SE3.Identity()
         return int(model.idx_qs[last])
 
-    base = [
-        add(pin.JointModelRX(), "base_x"),
-        add(pin.JointModelRY(), "base_y"),
-        add(pin.JointModelRZ(), "base_z"),
-    ]
+    base = []
+    if tilts:
+        base = [
+            add(pin.JointModelRX(), "base_x"),
+            add(pin.JointModelRY(), "base_y"),
+            add(pin.JointModelRZ(), "base_z"),
+        ]
     here = pin.SE3(links[0])
     tilt, drive, beam = [], [], []
     bent = long_links(arm) if beams else np.zeros(0, dtype=np.int64)
     for j in range(arm.n):
-        tilt.append(
-            [add(pin.JointModelRX(), f"tilt_x{j + 1}"), add(pin.JointModelRY(), f"tilt_y{j + 1}")]
-        )
+        kinds = ((pin.JointModelRX(), "x"), (pin.JointModelRY(), "y")) if tilts else ()
+        tilt.append([add(kind, f"tilt_{axis}{j + 1}") for kind, axis in kinds])
         drive.append(add(pin.JointModelRZ(), f"drive{j + 1}"))
         body = _body(float(arm.masses[j]), arm.coms[j], None if moments is None else moments[j])
         model.appendBodyToJoint(last, body, pin.SE3.Identity())
@@ -110,14 +113,14 @@ def build(
         if j + 1 in bent:
             tip = pin.SE3(_beam_axes(links[j + 1][:3, 3]), links[j + 1][:3, 3])
             here = tip
-            kinds = (
+            moves = (
                 pin.JointModelPY(),
                 pin.JointModelPZ(),
                 pin.JointModelRX(),
                 pin.JointModelRY(),
                 pin.JointModelRZ(),
             )
-            beam.append([add(kind, f"beam{j + 1}_{i}") for i, kind in enumerate(kinds)])
+            beam.append([add(kind, f"beam{j + 1}_{i}") for i, kind in enumerate(moves)])
             here = tip.inverse() * pin.SE3(links[j + 1])
     hand = []
     if tool:
@@ -130,8 +133,8 @@ def build(
     model.appendBodyToJoint(last, carried, here)
     return ElasticTree(
         model=model,
-        base=np.array(base),
-        tilt=np.array(tilt),
+        base=np.array(base, dtype=np.int64),
+        tilt=np.array(tilt, dtype=np.int64),
         drive=np.array(drive),
         beam=np.array(beam, dtype=np.int64).reshape(-1, 5),
         beam_length=np.linalg.norm(links[bent, :3, 3], axis=1),

@@ -101,7 +101,7 @@ def elasticity(
     """
     size = tree.model.nv
     linear, cubic = np.zeros((size, size)), np.zeros(size)
-    linear[tree.base, tree.base] = base
+    linear[tree.base, tree.base] = base[: len(tree.base)]
     linear[tree.drive, tree.drive] = joint
     linear[tree.tilt, tree.tilt] = tilt[:, None]
     cubic[tree.drive] = stiffening

@@ -14,7 +14,7 @@ from hilcal.errors import InputError
 from hilcal.types import Floats, Ints
 
 _ITERATIONS = 40
-_STEP = 1e-12  # rad or m; Newton's next step is its square
+_STEP = 1e-9  # rad or m; Newton's next step, about its square, is below rounding
 _AT_ONCE = 512  # states that are solved together; a choice by memory
 
 
@@ -157,7 +157,8 @@ class _Loaded:
                 f"{wrench[moves[0]].tolist()}; "
                 "valid: compliances and loads that bend the arm by less than about 0.5 rad"
             )
-        there = self.pull(start + delta, wrench, growth)
+        # A rigid arm is where it was first looked at.
+        there = self.pull(start + delta, wrench, growth) if delta.any() else pull
         flange = there.place @ self.tree.flange
         turn = there.place[:, :3, :3]
         twist = there.jacobian[:, :, self.tree.drive]
@@ -173,8 +174,10 @@ class _Loaded:
         """
         count, size, last = len(q), self.tree.model.nv, self.tree.last
         place, jac = np.empty((count, 4, 4)), np.empty((count, 6, size))
+        grows = bool(self.links) or bool(np.any(growth != 1.0))
         for i in range(count):
-            self.grow(growth[i])
+            if grows:
+                self.grow(growth[i])
             pin.computeJointJacobians(self.model, self.data, q[i])
             place[i] = self.data.oMi[last].homogeneous
             jac[i] = pin.getJointJacobian(self.model, self.data, last, pin.LOCAL)
@@ -190,7 +193,8 @@ class _Loaded:
         turn[:, 3:] += self.lever @ turn[:, :3]
         torque, slope = np.empty((count, size)), np.empty((count, size, size))
         for i in range(count):
-            self.grow(growth[i])
+            if grows:
+                self.grow(growth[i])
             self.forces[last].vector = acts[i]
             slope[i] = pin.computeStaticTorqueDerivatives(self.model, self.data, q[i], self.forces)
             torque[i] = self.data.tau

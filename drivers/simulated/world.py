@@ -82,6 +82,9 @@ class World:
             self.cell.tool_mass,
             self.cell.tool_com,
             self.cell.gravity,
+            tilts=bool(
+                np.any(self.physics.joint_tilt_compliance) or np.any(self.physics.base_compliance)
+            ),
             beams=bool(np.any(self.physics.link_compliance)),
             tool=bool(np.any(self.physics.tool_compliance) or np.any(self.physics.thermal_growth)),
             moments=self.physics.link_mass,
