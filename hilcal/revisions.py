@@ -29,6 +29,8 @@ from hilcal.types import Floats
 
 _LARGEST = 1e9
 """No parameter and no length of a frame is as large, in SI units."""
+_WIDEST = 1e100
+"""No prior is as wide: its square, times those of whitened rows, is within double precision."""
 SOURCES = "effects_from"
 """Key among the options of a revision: the files that its effects are from."""
 
@@ -139,7 +141,8 @@ def _prior(record: RevisionRecord) -> Floats:
     """Standard deviations (P,) of the priors of a stored fit; infinite for none."""
     stored = record.parameters_json["prior"]
     prior = np.array([np.inf if s is None else float(s) for s in stored], dtype=float)
-    if len(prior) != len(record.parameters_json["theta"]) or not np.all(prior >= 0.0):
+    possible = (prior >= 0.0) & ((prior <= _WIDEST) | np.isinf(prior))
+    if len(prior) != len(record.parameters_json["theta"]) or not np.all(possible):
         raise ValueError("priors that are no standard deviations of its parameters")
     return prior
 

@@ -87,6 +87,20 @@ def test_parameters_of_another_program_are_refused() -> None:
         restore_model(replace(record, parameters_json=other), r.cell, r.readings)
 
 
+@pytest.mark.parametrize("wide", [1e154, 1.7e308, -1.0])
+def test_a_prior_that_no_fit_can_have_had_is_damage(wide: float) -> None:
+    """Found by fuzzing: products of 1e154 are infinite, and their eigenvalues do not converge."""
+    r = rehearsal("nothing")
+    record = record_of(r, baseline_fit(r))
+    prior = [wide, *record.parameters_json["prior"][1:]]
+    with pytest.raises(InputError, match="is damaged"):
+        restore(
+            replace(record, parameters_json={**record.parameters_json, "prior": prior}),
+            r.cell,
+            r.readings,
+        )
+
+
 def test_the_registration_that_is_reported_is_the_true_one() -> None:
     r = rehearsal("nothing", poses=30)
     found = baseline_fit(r)
