@@ -165,8 +165,9 @@ def by_wrenches(
             found = twists[b.to][..., b.elements.start - e : b.elements.stop - e]
         moment = b.components.start >= MOMENT.start
         first = MOMENT.start if moment else FORCE.start
-        to = out.setdefault((b.slot, moment), zeros(*found.shape[:2], 3))
-        to = to[..., b.components.start - first : b.components.stop - first]
+        if (b.slot, moment) not in out:
+            out[b.slot, moment] = zeros(*found.shape[:2], 3)
+        to = out[b.slot, moment][..., b.components.start - first : b.components.stop - first]
         if len(b.values) > 1:
             to += np.einsum("nme,nie->nmi", found, b.values)
             continue

@@ -18,7 +18,7 @@ from hilcal.errors import CannotAnswerError, InputError
 from hilcal.observe import Motion, Observation, motion, observe
 from hilcal.robot import chain as chains
 from hilcal.robot import se3
-from hilcal.robot.batch import along_states, by_field, chunks, put, room, take, zeros
+from hilcal.robot.batch import along_states, by_field, chunks, empty, put, room, take, zeros
 from hilcal.robot.chain import Chain
 from hilcal.robot.deviation import Deviation
 from hilcal.robot.geometric_stiffness import geometric_stiffness
@@ -180,7 +180,7 @@ class Model:
             load = self._corrected(recorded, replace(s, chain=chain), theta)
             wrench = slot_wrenches(cell.arm, chain, load)
             s = replace(s, chain=chain, wrench=wrench, load=load)
-            deviation = _deviation(elastic, s, rigid)
+            deviation = _deviation(elastic, s, rigid, checked=before is None)
             chain = chains.evaluate(cell.arm, angle, deviation, turns)
             moved = _flange_motion(s.chain, chain, cell.arm.reach)
             # The steps shrink geometrically: what is missing is about the next one.
@@ -189,6 +189,7 @@ class Model:
                 break
             before = moved
         else:
+            _deviation(elastic, s, rigid)  # refuses columns that are not finite
             raise CannotAnswerError(
                 "no static equilibrium: with these parameters the elastic deviations of "
                 f"{', '.join(e.name for e, _ in elastic)} grow instead of settling; measure "
@@ -247,6 +248,7 @@ class Model:
         """Write the derivative of a chunk of states; `places`: columns of `out`, −1 for none."""
         s = prediction.situation
         m = out.shape[1]
+        whole = empty(*out.shape)
         moves, blocks = self._motion(prediction, theta, m)
         mine = self._parts(theta)
         for e, place in zip(effects, places, strict=True):
@@ -266,7 +268,8 @@ class Model:
                 block = block + by_wrench_changes(moves, blocks, change[:, wanted])
             # A slice is written several times as fast as columns by index.
             at_once = slice(place[wanted[0]], place[wanted[-1]] + 1)
-            out[:, :, at_once] = block
+            whole[:, :, at_once] = block
+        out[...] = whole  # turned over in memory once
 
     def _motion(self, prediction: Prediction, theta: Floats, m: int) -> tuple[Motion, list[Block]]:
         """Derivative of a chunk of readings by the deviation, at equilibrium; the compliance."""
@@ -333,13 +336,16 @@ class Model:
 
 
 def _deviation(
-    parts: list[tuple[Effect, Floats]], s: Situation, start: Deviation | None = None
+    parts: list[tuple[Effect, Floats]],
+    s: Situation,
+    start: Deviation | None = None,
+    checked: bool = True,
 ) -> Deviation:
     """Return the sum of the deviations of effects at their parameters, added to `start`."""
     columns: list[Columns] = []
     first = 0
     for e, t in parts:
-        found = e.checked_columns(s)
+        found = e.checked_columns(s) if checked else e.columns(s)
         columns += (replace(c, parameter=c.parameter + first) for c in found)
         first += len(t)
     theta = np.concatenate([t for _, t in parts]) if parts else np.zeros(0)

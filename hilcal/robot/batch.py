@@ -15,8 +15,10 @@ import numpy as np
 
 from hilcal.types import Floats
 
-CHUNK = 8192
-"""States of a chunk, at most; a choice by timing."""
+CHUNK = 8200
+"""States of a chunk, at most; a choice by timing. No power of two: the components of an array would
+all fall into the same few lines of the processor's cache, and what is turned over in memory take
+four times as long."""
 BUDGET = 1 << 20
 """Numbers of a chunk's largest array, 8 MB; a choice by timing."""
 LEAST_CHUNK = 256

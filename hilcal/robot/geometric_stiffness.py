@@ -40,8 +40,8 @@ class GeometricStiffness:
         chain: the deviated chain.
         force: (n + 1,) list of (N, 3) f_k, N.
         dyad: (n + 1,) list of (N, 3, 3) D_k, N·m.
+        carried: (n + 1,) list of (N, 3, 3) D_k − [m]×, N·m, m the load's moment.
         spun: (n,) list of (N, 3) D_j z_j, N·m.
-        moment: (N, 3, 3) [m]×, N·m; None where there is no moment.
         load_point: (N, 3) where the load acts, m.
         following: (N, 6, 6) change of the load's wrench at the load point by a displacement and
             a turn of the flange; None where it stays as it is.
@@ -50,8 +50,8 @@ class GeometricStiffness:
     chain: Chain
     force: list[Floats]
     dyad: list[Floats]
+    carried: list[Floats]
     spun: list[Floats]
-    moment: Floats | None
     load_point: Floats
     following: Floats | None = None
 
@@ -72,8 +72,7 @@ class GeometricStiffness:
             )
             still.append(_sum(still[-1], by_moment))
             if by_moment is not None:
-                dyad = self.dyad[k] if self.moment is None else self.dyad[k] - self.moment
-                along[k] = rows_times(by_moment, dyad, transposed=True)
+                along[k] = rows_times(by_moment, self.carried[k], transposed=True)
                 if self.following is not None:
                     lever = self.load_point - chain.position[k]
                     load = _sum(load, se3.cross(by_moment, lever[:, None]))
@@ -81,7 +80,11 @@ class GeometricStiffness:
                 along[k] = _sum(along[k], se3.cross(by_force, self.force[k][:, None]))
                 load = _sum(load, by_force) if self.following is not None else None
         for k in range(slots - 1, -1, -1):
-            along[k] = _sum(along[k], along[k + 1])
+            mine, beyond = along[k], along[k + 1]
+            if mine is None or beyond is None:
+                along[k] = _sum(mine, beyond)
+            else:
+                mine += beyond
         flange = None
         if self.following is not None and load is not None and still[-1] is not None:
             flange = rows_times(np.concatenate([load, still[-1]], axis=2), self.following)
@@ -166,8 +169,9 @@ def geometric_stiffness(
             dyad[:, axis, axis] -= trace
     moment = load.wrench[:, 3:]
     turned = se3.skew(moment) if moment.any() else None
+    carried = dyads if turned is None else [dyad - turned for dyad in dyads]
     spun = [se3.apply(dyads[j], chain.rotation[j, :, :, 2]) for j in range(n)]
-    return GeometricStiffness(chain, forces, dyads, spun, turned, point, following)
+    return GeometricStiffness(chain, forces, dyads, carried, spun, point, following)
 
 
 def rows_times(rows: Floats, matrix: Floats, *, transposed: bool = False) -> Floats:

@@ -29,12 +29,14 @@ _B_SLOPE, _C_SLOPE = ([k * c for k, c in enumerate(of)][1:] for of in (_B, _C))
 
 def cross(a: Floats, b: Floats) -> Floats:
     """Cross product a × b over the last axis; (..., 3), broadcast."""
-    a1, a2, a3 = a[..., 0], a[..., 1], a[..., 2]
-    b1, b2, b3 = b[..., 0], b[..., 1], b[..., 2]
     out = empty(*_shape(a.shape, b.shape))
-    out[..., 0] = a2 * b3 - a3 * b2
-    out[..., 1] = a3 * b1 - a1 * b3
-    out[..., 2] = a1 * b2 - a2 * b1
+    # Into memory along the states even where one of both is the same in all states.
+    part = empty(*out.shape[:-1])
+    for axis in range(3):
+        j, k = (axis + 1) % 3, (axis + 2) % 3
+        np.multiply(a[..., j], b[..., k], out=out[..., axis])
+        np.multiply(a[..., k], b[..., j], out=part)
+        out[..., axis] -= part
     return out
 
 

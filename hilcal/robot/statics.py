@@ -48,20 +48,30 @@ def slot_wrenches(arm: Arm, chain: Chain, load: Load) -> Floats:
     force, weight = load.wrench[:, :3], load.tool_mass * load.gravity
     f = force + weight
     t = load.wrench[:, 3:] + se3.cross(chain.point(load.point) - flange, force)
-    t = t + se3.cross(chain.point(load.tool_com) - flange, weight)
+    if weight.any():
+        _add_moment(t, chain.point(load.tool_com) - flange, weight)
     out = empty(count, n + 1, 6)
     for k in range(n, -1, -1):
         if k < n:
             weight = arm.masses[k] * load.gravity
             t += se3.cross(chain.position[k + 1] - chain.position[k], f)
-            t += se3.cross(chain.com[k] - chain.position[k], weight)
-            f += weight
+            if weight.any():
+                _add_moment(t, chain.com[k] - chain.position[k], weight)
+                f += weight
             if load.first_moment is not None:
                 moment = se3.apply(body_axes(arm, chain, k), load.first_moment[k])
-                t += se3.cross(moment, load.gravity)
+                _add_moment(t, moment, load.gravity)
         np.einsum("nji,nj->ni", chain.rotation[k], f, out=out[:, k, :3])
         np.einsum("nji,nj->ni", chain.rotation[k], t, out=out[:, k, 3:])
     return out
+
+
+def _add_moment(t: Floats, lever: Floats, force: Floats) -> None:
+    """Add l × f of a force f (3,) that is the same in all states: along one axis mostly."""
+    for axis in np.flatnonzero(force):
+        after, before = (axis + 1) % 3, (axis + 2) % 3
+        t[:, after] += lever[:, before] * force[axis]
+        t[:, before] -= lever[:, after] * force[axis]
 
 
 def slot_wrench_change(chain: Chain, force: Floats, moment: Floats) -> Floats:
