@@ -35,6 +35,7 @@ from hilcal.identify.folds import random_folds
 from hilcal.identify.linearisation import Linearisation
 from hilcal.regression.block_selection import BlockSelection, block_evidence
 from hilcal.regression.schur import positive_solve
+from hilcal.threads import in_threads
 from hilcal.types import Bools, Floats, Ints
 
 FOLDS = 5
@@ -211,10 +212,14 @@ def smooth_laws(p: Linearisation) -> ResidualRegression:
     rng = np.random.default_rng(20250302)
     without = with_ = 0.0
     lost: dict[str, float] = {}
-    for f in range(count if count > 1 else 0):  # one pose: nothing to learn from
-        mine = of_row == f
+
+    def left(f: int) -> tuple[list[int], Floats, Floats, list[Floats]]:
         chosen = selection.without(f, MOST_LAWS, LEAST_EVIDENCE, STRENGTHS)
-        plain, (step, coefficients) = refits.without(f, [])[0], refits.without(f, chosen)
+        return chosen, refits.without(f, [])[0], *refits.without(f, chosen)
+
+    each = range(count if count > 1 else 0)  # one pose: nothing to learn from
+    for f, (chosen, plain, step, coefficients) in enumerate(in_threads(left, each, len(white))):
+        mine = of_row == f
         bare = white[mine] - p.rows[mine] @ plain
         base = white[mine] - p.rows[mine] @ step
         curves = list(zip(chosen, coefficients, strict=True))
@@ -253,15 +258,19 @@ def _dependences(
     total = sum(names.values())
     if total <= 0 or share <= 0:
         return ()
-    out = []
-    for name, value in sorted(names.items(), key=lambda item: -item[1]):
+
+    def dependence(item: tuple[str, float]) -> Dependence | None:
+        name, value = item
         mine = [k for k, of in enumerate(laws.variable) if name in laws.variables[of].names]
         v = next((v for v in laws.variables if v.names == (name,)), None)
         if value < 0.02 * total or v is None:
-            continue
+            return None
         way = laws.way[_best(p, laws, mine)]
-        out.append(_curve(p, v, way, laws.ways[way], share * value / total))
-    return tuple(out)
+        return _curve(p, v, way, laws.ways[way], share * value / total)
+
+    ordered = sorted(names.items(), key=lambda item: -item[1])
+    found = in_threads(dependence, ordered, len(p.rows))
+    return tuple(d for d in found if d is not None)
 
 
 def _best(p: Linearisation, laws: _Laws, mine: list[int]) -> int:

@@ -11,7 +11,7 @@ import numpy as np
 
 from hilcal.regression.empirical_bayes import maximise_evidence, spent_by_groups
 from hilcal.regression.normal_equations import Basis, NormalEquations, find_basis, normal_equations
-from hilcal.regression.products import keep_columns
+from hilcal.regression.products import keep_columns, submatrix
 from hilcal.types import Floats, Ints
 
 NOISE_STEPS = 50
@@ -54,7 +54,7 @@ class LinearProblem:
         kept = prior[self.live] > 0
         if kept.all():
             return self
-        gram = self.gram[np.ix_(kept, kept)]
+        gram = submatrix(self.gram, np.flatnonzero(kept))
         same = self.rows is self.a
         a = keep_columns(self.a, kept)
         rows = a if same else keep_columns(self.rows, kept)
@@ -194,7 +194,7 @@ def _family_priors(
     of_family = np.append(np.zeros(len(basis.singular), dtype=bool), family[p.live[basis.held]])
     order = np.argsort(of_family, kind="stable")
     others = int(np.sum(~of_family))
-    gram = equations.gram[np.ix_(order, order)]
+    gram = submatrix(equations.gram, order)
     gram[np.arange(others), np.arange(others)] += beta * basis.prior_precision[order[:others]]
     found = maximise_evidence(
         gram,

@@ -17,6 +17,7 @@ import numpy as np
 
 from hilcal.regression.evidence import log_evidence, visible
 from hilcal.regression.schur import positive_solve
+from hilcal.threads import in_threads
 from hilcal.types import Bools, Floats, Ints
 
 SPANNED = 1e-6
@@ -82,7 +83,8 @@ class BlockSelection:
         self._own, self._ridge, self._y = own, ridge, y
         self._x = x.reshape(len(y), -1)
         self._fold = fold
-        self._of = [self._sums(fold == f) for f in range(int(fold.max()) + 1)]
+        folds = range(int(fold.max()) + 1)
+        self._of = in_threads(lambda f: self._sums(fold == f), folds, len(y))
         self._all = reduce(_Sums.plus, self._of)
 
     def _sums(self, rows: Bools) -> _Sums:

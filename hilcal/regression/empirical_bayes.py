@@ -22,6 +22,7 @@ import scipy.linalg as sl
 from scipy.special import exp1
 
 from hilcal.regression.distributions import chi2
+from hilcal.regression.products import submatrix
 from hilcal.regression.schur import eliminate
 from hilcal.types import Floats, Ints
 
@@ -84,7 +85,7 @@ def maximise_evidence(
     active = (variance > 0) & (reach > 0)
     effective = 0.0
     keep = np.flatnonzero(active[groups])
-    g, b = g[np.ix_(keep, keep)], b[keep]
+    g, b = submatrix(g, keep), b[keep]
     for iteration in range(ITERATIONS):
         if not len(keep):
             effective = 0.0
@@ -92,7 +93,8 @@ def maximise_evidence(
             break
         group = groups[keep]
         std = np.sqrt(variance[group])
-        h = std[:, None] * g * (std / beta)
+        h = g * (std / beta)
+        h *= std[:, None]
         inverse = _inverse_root(h)
         posterior = np.einsum("ij,ij->j", inverse, inverse)
         z = inverse.T @ (inverse @ (std * b / beta))
@@ -115,7 +117,7 @@ def maximise_evidence(
         variance, active = updated, active & ~gone
         left = active[group]
         if not left.all():
-            keep, g, b = keep[left], g[np.ix_(left, left)], b[left]
+            keep, g, b = keep[left], submatrix(g, np.flatnonzero(left)), b[left]
         if not weighty.any() or change[weighty].max() < TOLERANCE:
             break
     std_all = np.sqrt(np.where(active, variance, 0.0))[groups]
@@ -166,11 +168,14 @@ def _inverse_root(h: Floats) -> Floats:
     """Return T (K, K) with Tᵀ T = (1 + H)⁻¹ of a positive semidefinite H, however large.
 
     Where H is so large that 1 is below its rounding, by its eigenvalues, which are at least zero.
+    The diagonal of H is used up.
     """
-    one = h.T.copy(order="F")  # in LAPACK's order, not turned over in memory
+    one = h.T  # in LAPACK's order, not turned over in memory; the other triangle stays
+    diagonal = np.diag(h).copy()
     one[np.diag_indices_from(one)] += 1.0
-    low, failed = sl.lapack.dpotrf(one, lower=1, overwrite_a=1)
+    low, failed = sl.lapack.dpotrf(one, lower=1)
     if not failed:
         return np.asarray(sl.lapack.dtrtri(low, lower=1, overwrite_c=1)[0])
+    one[np.diag_indices_from(one)] = diagonal
     values, vectors = np.linalg.eigh(h)
     return np.asarray((vectors / np.sqrt(1.0 + np.maximum(values, 0.0))).T)

@@ -18,7 +18,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.linalg as sl
 
-from hilcal.regression.schur import inverse_root
+from hilcal.regression.products import submatrix
+from hilcal.regression.schur import inverse_root, positive_solve
 from hilcal.regression.triangle import Triangle
 from hilcal.types import Bools, Floats, Ints
 
@@ -167,12 +168,16 @@ class NormalEquations:
 
     def inverse_root(self, beta: float) -> Floats:
         """T (K, K) with Tᵀ T = H⁻¹, by the rule of `schur` where H is singular."""
-        return inverse_root(self.gram + np.diag(beta * self.basis.prior_precision))
+        return inverse_root(self._h(beta))
+
+    def _h(self, beta: float) -> Floats:
+        h = self.gram.copy()
+        h[np.diag_indices_from(h)] += beta * self.basis.prior_precision
+        return h
 
     def solve(self, beta: float = 1.0) -> Floats:
         """Solution z (K,)."""
-        root = self.inverse_root(beta)
-        return np.asarray(root.T @ (root @ self.rhs))
+        return positive_solve(self._h(beta), self.rhs)
 
     def inverse(self, beta: float = 1.0) -> Floats:
         """H⁻¹ (K, K): covariance of z for unit noise variance."""
@@ -197,6 +202,8 @@ def normal_equations(a: Floats, target: Floats, basis: Basis, gram: Floats) -> N
         return NormalEquations(basis, full, rows.T @ target)
     full[:flat, flat:] = (rows.T @ a)[:, held] * sigma
     full[flat:, :flat] = full[:flat, flat:].T
-    full[flat:, flat:] = sigma[:, None] * gram[np.ix_(held, held)] * sigma
+    inner = submatrix(gram, held)
+    inner *= sigma
+    np.multiply(inner, sigma[:, None], out=full[flat:, flat:])
     rhs = np.concatenate([rows.T @ target, sigma * (a.T @ target)[held]])
     return NormalEquations(basis, full, rhs)

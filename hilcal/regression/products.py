@@ -7,7 +7,7 @@ processors.
 import numpy as np
 
 from hilcal.threads import in_threads
-from hilcal.types import Bools, Floats
+from hilcal.types import Bools, Floats, Ints
 
 LARGE = 1e8
 """Multiplications from which a product is halved, 5 ms of one processor; a choice by timing."""
@@ -26,6 +26,11 @@ def keep_columns(a: Floats, kept: Bools) -> Floats:
         rows = slice(start, start + ROWS)
         out[rows] = a[rows][:, kept]  # of rows that have been read
     return np.asarray(out)
+
+
+def submatrix(g: Floats, rows: Ints) -> Floats:
+    """Return G (K, K) of some rows and columns; two steps take a fraction of indexing both."""
+    return np.asarray(g.take(rows, axis=0).take(rows, axis=1))
 
 
 def gram(a: Floats) -> Floats:
