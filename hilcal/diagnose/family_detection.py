@@ -16,7 +16,7 @@ import numpy as np
 
 from hilcal.diagnose.minimum_detectable_effect import POWER, Strength
 from hilcal.identify.linearisation import EffectColumns, Linearisation, by_pose, effect_columns
-from hilcal.regression.evidence import LARGE_FAMILY, Spectrum, score_family
+from hilcal.regression.evidence import LARGE_FAMILY, FamilyScore, Spectrum, score_family
 from hilcal.regression.leave_out import FamilyFolds
 from hilcal.regression.paired_test import improves
 from hilcal.types import Floats
@@ -75,7 +75,7 @@ def _least(tests: "SuspectTests", full: EffectColumns, start: Strength) -> Stren
     moved = np.sqrt(np.mean(np.sum(np.einsum("dip,pk->dik", full.motion, beta) ** 2, axis=1)))
     for displacement in GRID * start.displacement_m:
         t = float(displacement / moved)
-        if np.mean(tests.found(t * signal + error)) >= POWER:
+        if np.mean(tests.found(t * signal + error, POWER)) >= POWER:
             own = tuple(
                 (unit, t * float(np.sqrt(np.mean(full.scale[_of_unit(full, unit)] ** 2))))
                 for unit, _ in start.parameters
@@ -112,16 +112,24 @@ class SuspectTests:
         p = self.p
         return FamilyFolds(p.folds, p.projection), FamilyFolds(p.folds, p.projection, self._x)
 
-    def found(self, y: Floats) -> list[bool]:
-        """Whether each of K simulated residuals y (R, K) would reveal the family."""
+    def found(self, y: Floats, enough: float = 0.0) -> list[bool]:
+        """Whether each of K simulated residuals y (R, K) would reveal the family.
+
+        Once a share of `enough` is out of reach, the remaining ones are not looked at and count as
+        not revealing it.
+        """
         p = self.p
         r = p.project_out(y)
         g, rss = self._x.T @ r, np.sum(r * y, axis=0)
-        scores = [
-            score_family(self._s, g[:, k], float(rss[k]), p.fit.dof, most=self._largest)
-            for k in range(y.shape[1])
-        ]
-        able = [c.p_value < self._level and c.log_evidence > 0 for c in scores]
+        scores: list[FamilyScore] = []
+        able = [False] * y.shape[1]
+        for k in range(len(able)):
+            c = score_family(self._s, g[:, k], float(rss[k]), p.fit.dof, most=self._largest)
+            scores.append(c)
+            able[k] = c.p_value < self._level and c.log_evidence > 0
+            failed = len(scores) - sum(able)
+            if 1.0 - failed / len(able) < enough:
+                return able
         if np.mean(able) < POWER:
             return able
         ridge = float(np.median([c.ridge for c in scores]))
