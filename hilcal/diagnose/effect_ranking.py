@@ -28,6 +28,7 @@ from hilcal.errors import InputError
 from hilcal.identify.fit import Fit
 from hilcal.identify.linearisation import (
     EffectColumns,
+    HeldOut,
     Linearisation,
     columns_of_each,
     effect_columns,
@@ -67,6 +68,22 @@ class Detection:
         return self._compute()
 
 
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """The reduction of the error on poses left out.
+
+    No verdict depends on that of an effect that fails the test of the fitted readings: it is
+    computed when it is first asked for.
+    """
+
+    _compute: Callable[[], HeldOut]
+
+    @cached_property
+    def found(self) -> HeldOut:
+        """The reduction."""
+        return self._compute()
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Suspect:
     """An effect that is not in the model, and what it would explain.
@@ -75,17 +92,16 @@ class Suspect:
         effect: canonical name.
         score: the joint test of the whole family.
         share: share of the misfit it explains.
-        holdout_share: the same on poses left out.
+        left_out: what it explains on poses left out.
         explains: whether it passes the tests of the fitted readings and of its share.
-        sure: whether the error on poses left out falls by more than it scatters from pose to
-            pose, beside geometry, too, where no load was hung (see `gravity`); not so where a refit
-            has shown that it does not fall.
         detection: the smallest strength of it that these readings would reveal, computed when it
             is first asked for.
         needs: where it is implausible, its size: (unit, rms of the parameters that it would need,
             rms that is plausible), SI.
         kept: share of what the linearisation promised that the exact model keeps; 1 where that
             was not looked at, since the suspect fails other tests.
+        refuted: whether the error on poses left out does not fall by it after all: beside geometry,
+            where no load was hung (see `gravity`), or as a refit has shown.
         same_as: other suspects that these readings do not separate from it.
         coarse: name of the effect of the model that it is finer than; empty for one that the model
             does not have.
@@ -94,14 +110,24 @@ class Suspect:
     effect: str
     score: FamilyScore
     share: float
-    holdout_share: float
+    left_out: LeftOut
     explains: bool
-    sure: bool
-    detection: "Detection"
+    detection: Detection
     needs: tuple[tuple[str, float, float], ...] = ()
     kept: float = 1.0
+    refuted: bool = False
     same_as: tuple[str, ...] = ()
     coarse: str = ""
+
+    @property
+    def holdout_share(self) -> float:
+        """Share of the misfit that it explains on poses left out."""
+        return self.left_out.found.share
+
+    @property
+    def sure(self) -> bool:
+        """Whether the error on poses left out falls by more than it scatters from pose to pose."""
+        return not self.refuted and self.left_out.found.sure
 
     @property
     def least(self) -> Strength:
@@ -172,21 +198,27 @@ def rank_suspects(
         refit: returns a fit with one more effect.
     """
     bare = unloaded_readings(p.fit)
-    columns = columns_of_each(p.fit, effects)
-    found = [_suspect(p, of, bare, level / len(effects)) for of in columns]
+    small: dict[int, EffectColumns] = {}
+    found = []
+    for k, of in enumerate(columns_of_each(p.fit, effects)):
+        if of.white.size <= MOST_KEPT:
+            small[k] = of
+        found.append(_suspect(p, of, bare, level, len(effects)))
     tested = max(sum(s.score.rank > 0 for s in found), 1)
     out: list[Suspect] = []
     geometry: Floats | None = None
-    for s, e in zip(found, effects, strict=True):
+    for k, s in enumerate(found):
         explains = s.score.p_value * tested < level and s.score.log_evidence > 0
         s = replace(s, explains=explains and s.holdout_share >= LEAST_SHARE)
-        if s.passes and unloaded(p) and through_load(e):
-            if geometry is None:
-                geometry = geometry_columns(p, effects)
-            s = replace(
-                s, sure=beyond_geometry(p, effect_columns(p.fit, e), geometry, SAME_EVIDENCE)
-            )
-        out.append(replace(s, kept=kept(p, e, s.score, refit)) if s.passes else s)
+        if s.passes:
+            own = small[k] if k in small else effect_columns(p.fit, effects[k])
+            if unloaded(p) and through_load(effects[k]):
+                if geometry is None:
+                    geometry = geometry_columns(p, effects)
+                s = replace(s, refuted=not beyond_geometry(p, own, geometry, SAME_EVIDENCE))
+            if s.passes:
+                s = replace(s, kept=kept(p, own, s.score, refit))
+        out.append(s)
     return ranked(out)
 
 
@@ -215,7 +247,7 @@ def ranked(suspects: Iterable[Suspect], rejected: Collection[str] = ()) -> tuple
         suspects: in any order.
         rejected: names of those whose addition did not lower the error on poses left out.
     """
-    found = [replace(s, sure=s.sure and s.effect not in rejected) for s in suspects]
+    found = [replace(s, refuted=s.refuted or s.effect in rejected) for s in suspects]
     found.sort(key=lambda s: (-s.passes, -s.explains, -s.score.log_evidence, s.score.p_value))
     return tuple(
         replace(
@@ -235,16 +267,21 @@ def ranked(suspects: Iterable[Suspect], rejected: Collection[str] = ()) -> tuple
     )
 
 
-def _suspect(p: Linearisation, of: EffectColumns, bare: Unloaded | None, level: float) -> Suspect:
-    (products,) = p.products([of.white])
-    s = p.information(products)
+def _suspect(
+    p: Linearisation, of: EffectColumns, bare: Unloaded | None, level: float, count: int
+) -> Suspect:
+    """Score one of `count` effects that are tested together."""
+    s = p.information(of.white)
     of_s, largest = spectrum(s), most(of, bare)
     result = p.score(of.white, of_s, largest)
-    (held,) = p.held_out([(products, result)])
     effect = of.effect
     columns: Callable[[], EffectColumns] = lambda: of  # noqa: E731 - of the small ones alone
     if of.white.size > MOST_KEPT:
         columns = partial(effect_columns, p.fit, effect)
+    left_out = LeftOut(lambda: _left_out(p, columns().white, result))
+    if result.p_value < level and result.log_evidence > 0:
+        held = _left_out(p, of.white, result)
+        left_out = LeftOut(lambda: held)
 
     def least() -> Strength:
         own = columns()
@@ -255,11 +292,11 @@ def _suspect(p: Linearisation, of: EffectColumns, bare: Unloaded | None, level: 
             tuple(q.unit for q in effect.parameters),
             p.fit.dof,
             max(p.fit.variance_factor, 1.0),
-            level,
+            level / count,
             of_s.rank,
         )
         if large(of_s, p.fit.dof):
-            return least_of_family(p, own, of_s, found, level, LEAST_SHARE, largest)
+            return least_of_family(p, own, of_s, found, level / count, LEAST_SHARE, largest)
         return found
 
     return Suspect(
@@ -267,18 +304,25 @@ def _suspect(p: Linearisation, of: EffectColumns, bare: Unloaded | None, level: 
         coarse=of.effect.coarse,
         score=result,
         share=p.share(result.gain),
-        holdout_share=held.share,
+        left_out=left_out,
         explains=False,
-        sure=held.sure,
         needs=_implausible(p, of, of_s, result, largest),
         detection=Detection(least),
     )
+
+
+def _left_out(p: Linearisation, x: Floats, score: FamilyScore) -> HeldOut:
+    """Reduction of the error on poses left out by whitened columns (R, P)."""
+    (held,) = p.held_out([(of, score) for of in p.products([x])])
+    return held
 
 
 def _implausible(
     p: Linearisation, of: EffectColumns, s: Spectrum, at_most: FamilyScore, largest: float
 ) -> tuple[tuple[str, float, float], ...]:
     """Size that an effect needs where plausible ones explain less, and plausible sizes, by unit."""
+    if not at_most.bounded:
+        return ()
     free = p.score(of.white, s)
     lost = free.log_evidence - at_most.log_evidence
     if lost <= max(SAME_EVIDENCE, LOST * free.log_evidence):

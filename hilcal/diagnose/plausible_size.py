@@ -18,7 +18,7 @@ import numpy as np
 
 from hilcal.identify.fit import Fit
 from hilcal.identify.linearisation import EffectColumns, columns_of_each
-from hilcal.types import Bools, Floats
+from hilcal.types import Floats
 
 ALLOWED = 2.0
 """Displacement that an effect may make in unloaded readings, in units of what the model misses
@@ -31,12 +31,10 @@ class Unloaded:
     """The unloaded readings of a campaign of deflections.
 
     Attributes:
-        rows: (N,) which of the fitted readings they are.
         frames: (K, F) orthonormal displacements by the frames.
         missed: s, m.
     """
 
-    rows: Bools
     frames: Floats
     missed: float
 
@@ -44,7 +42,7 @@ class Unloaded:
         """Return the largest strength of an effect that they allow."""
         if of.effect.elastic:
             return np.inf
-        x = of.at_reading[self.rows].reshape(-1, len(of.scale))
+        x = of.unloaded.reshape(-1, len(of.scale))
         free = x - self.frames @ (self.frames.T @ x)
         moved = float(np.sqrt(np.sum(free**2) / len(x)))
         return ALLOWED * self.missed / moved if moved > ROUNDING * self.missed else np.inf
@@ -58,15 +56,15 @@ def unloaded_readings(fit: Fit) -> Unloaded | None:
     rows = readings.unloaded
     kinds = model.catalogue.with_role("registration", "target")
     of = columns_of_each(fit, [kind(model.cell, readings.states) for kind in kinds])
-    frames = [each.at_reading[rows] for each in of]
-    columns = np.concatenate(frames, axis=2).reshape(3 * int(rows.sum()), -1)
+    columns = np.concatenate([each.unloaded for each in of], axis=2)
+    columns = columns.reshape(3 * int(rows.sum()), -1)
     u, s, _ = np.linalg.svd(columns, full_matrices=False)
     u = u[:, s > ROUNDING * s.max(initial=0.0)]
     off = readings.value[:, :3] - fit.solution.prediction.observation.position
     y = off[rows].reshape(-1)
     missed = y - u @ (u.T @ y)
     free = max(len(y) - u.shape[1], 1)
-    return Unloaded(rows, u, float(np.sqrt(missed @ missed / free)))
+    return Unloaded(u, float(np.sqrt(missed @ missed / free)))
 
 
 def most(of: EffectColumns, unloaded: Unloaded | None) -> float:

@@ -14,10 +14,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from hilcal.effects.protocol import Effect
 from hilcal.errors import CannotAnswerError
 from hilcal.identify.fit import Fit
-from hilcal.identify.linearisation import Linearisation, effect_columns
+from hilcal.identify.linearisation import EffectColumns, Linearisation
 from hilcal.identify.residual import residual
 from hilcal.regression.evidence import FamilyScore
 
@@ -41,19 +40,18 @@ def kept_by_refit(before: Fit, after: Fit, score: FamilyScore) -> float:
     return kept / promised(score)
 
 
-def kept_by_step(p: Linearisation, effect: Effect, score: FamilyScore) -> float:
+def kept_by_step(p: Linearisation, of: EffectColumns, score: FamilyScore) -> float:
     """Return the share of the promise that the exact model keeps where the promise is made.
 
     Args:
         p: linearisation of the fit.
-        effect: that is not in its model.
+        of: columns of an effect that is not in its model.
         score: of the effect.
     """
-    fit, of = p.fit, effect_columns(p.fit, effect)
-    s = fit.solution
+    fit, s = p.fit, p.fit.solution
     aim = s.white - of.white @ score.step
     z = p.projection.solve(p.rows.T @ aim - p.projection.ridge * s.coordinates())
-    model = replace(fit.model, effects=(*fit.model.effects, effect))
+    model = replace(fit.model, effects=(*fit.model.effects, of.effect))
     theta = [s.theta + s.transform @ z, of.scale * score.step]
     linear = float(np.sum((aim - p.rows @ z) ** 2))
     try:
@@ -66,17 +64,17 @@ def kept_by_step(p: Linearisation, effect: Effect, score: FamilyScore) -> float:
 
 
 def kept(
-    p: Linearisation, effect: Effect, score: FamilyScore, refit: Callable[[Fit, str], Fit]
+    p: Linearisation, of: EffectColumns, score: FamilyScore, refit: Callable[[Fit, str], Fit]
 ) -> float:
     """Return the share of the promise that is kept, by the step, or where that is little a refit.
 
     Args:
         p: linearisation of the fit.
-        effect: that is not in its model.
+        of: columns of an effect that is not in its model.
         score: of the effect.
         refit: returns a fit with one more effect.
     """
-    share = kept_by_step(p, effect, score)
+    share = kept_by_step(p, of, score)
     if share >= LEAST_KEPT:
         return share
-    return max(share, kept_by_refit(p.fit, refit(p.fit, effect.name), score))
+    return max(share, kept_by_refit(p.fit, refit(p.fit, of.effect.name), score))

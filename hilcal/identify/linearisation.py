@@ -45,14 +45,15 @@ class EffectColumns:
         scale: (P,) ordinary magnitudes, SI.
         white: (R, P) whitened columns.
         motion: (D, 3, P) displacement of each measured position, m.
-        at_reading: (N, 3, P) displacement of the target in each fitted reading, sensor axes, m.
+        unloaded: (U, 3, P) displacement of the target in each unloaded fitted reading, sensor axes,
+            m.
     """
 
     effect: Effect
     scale: Floats
     white: Floats
     motion: Floats
-    at_reading: Floats
+    unloaded: Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,16 +190,22 @@ def columns_of_each(fit: Fit, effects: Sequence[Effect]) -> Iterator[EffectColum
     """
     s, w = fit.solution, fit.whitening
     rows = w.m * len(s.prediction.situation.angle)
+    unloaded = fit.readings[~fit.outlier].unloaded
     for group in _groups(effects, rows):
         jacobian = fit.model.jacobian_of(group, s.prediction, s.theta, w.m)
         scales = [np.array([q.scale for q in effect.parameters]) for effect in group]
         jacobian *= np.concatenate(scales)
         start = 0
         for effect, scale in zip(group, scales, strict=True):
-            own = jacobian[:, :, start : start + len(scale)]  # whitened where it is if it is all
-            at_reading = own[:, :3].copy()
-            motion, start = w.raw(at_reading), start + len(scale)
-            yield EffectColumns(effect, scale, w.whiten_readings(own), motion, at_reading)
+            own = jacobian[:, :, start : start + len(scale)]
+            at_rest, start = own[unloaded, :3], start + len(scale)
+            if w.m == 3 and w.mode == "deflection":  # one difference serves both
+                motion = w.raw(own)
+                white = w.whiten(motion)
+            else:  # whitened where it is if it is all
+                motion = w.raw(own[:, :3].copy())
+                white = w.whiten_readings(own)
+            yield EffectColumns(effect, scale, white, motion, at_rest)
 
 
 def _groups(effects: Sequence[Effect], rows: int) -> Iterator[tuple[Effect, ...]]:

@@ -67,6 +67,7 @@ class FamilyScore:
         delta_bic: change of the Bayesian information criterion; negative speaks for it.
         step: (P,) posterior mean of the parameters, in ordinary magnitudes.
         root: (P, P) root of their posterior scale matrix; empty where no direction is visible.
+        bounded: whether a larger strength than is plausible has more evidence.
     """
 
     p_value: float
@@ -79,6 +80,7 @@ class FamilyScore:
     delta_bic: float
     step: Floats
     root: Floats
+    bounded: bool = False
 
 
 NOTHING = FamilyScore(
@@ -171,7 +173,7 @@ def score_family(
     values, vectors, seen, rank = of.values, of.vectors, of.seen, of.rank
     if rank == 0 or rss <= 0 or dof - spent <= 1:
         return NOTHING
-    lam, u = values[seen], vectors[:, seen]
+    lam, u = values[seen], vectors if rank == len(seen) else vectors[:, seen]
     c = u.T @ g
     explained = c**2 / lam
     free, small = dof - spent, rank <= LARGE_FAMILY * (dof - spent)
@@ -182,6 +184,7 @@ def score_family(
     else:
         p_value = ratio_tail(lam, free, float(c @ c) / rss)
     evidence = log_evidence(lam, explained, rss, dof)
+    freely = int(np.argmax(evidence))
     if np.isfinite(most):
         evidence = np.where(
             _posterior_strengths(lam, explained, rss, dof) <= most, evidence, -np.inf
@@ -204,4 +207,5 @@ def score_family(
         delta_bic=dof * float(np.log(max(1 - full / rss, 1e-300))) + count * float(np.log(dof)),
         step=u @ (shrunk * c / lam),
         root=vectors * np.sqrt(spread / (np.where(seen, values, 0.0) + ridge)),
+        bounded=best != freely,
     )

@@ -196,8 +196,9 @@ def _without(
     # Eliminate the model's own coordinates, then solve for the family.
     along = fold.inverse_root @ (whole.cross - own.cross)
     size = fold.inverse_root @ fold.rhs
-    h = whole.gram - own.gram
-    h -= along.T @ along
+    h = along.T @ along
+    np.subtract(whole.gram, h, out=h)
+    h -= own.gram
     h[np.diag_indices_from(h)] += least
     step = positive_solve(h, whole.rhs - own.rhs - along.T @ size)
     return fold.inverse_root.T @ (size - along @ step), step

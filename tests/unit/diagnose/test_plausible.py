@@ -92,7 +92,7 @@ def test_true_effects_keep_their_promise(effect: str) -> None:
     (e,) = (e for e in candidates(found) if e.name == effect)
     assert s.passes
     assert s.plausible
-    assert kept_by_step(p, e, s.score) == pytest.approx(1.0, abs=0.1)
+    assert kept_by_step(p, effect_columns(found, e), s.score) == pytest.approx(1.0, abs=0.1)
     assert kept_by_refit(found, add(found, effect), s.score) == pytest.approx(1.0, abs=0.15)
 
 
@@ -105,4 +105,4 @@ def test_a_refit_that_changes_nothing_keeps_nothing() -> None:
     assert s.keeps
     assert kept_by_refit(found, found, s.score) == 0.0
     far = replace(s.score, step=100 * s.score.step)
-    assert kept_by_step(p, e, far) < LEAST_KEPT
+    assert kept_by_step(p, effect_columns(found, e), far) < LEAST_KEPT

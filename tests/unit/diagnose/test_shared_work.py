@@ -33,7 +33,10 @@ def test_columns_of_several_effects_are_those_of_each(
     for effect, of in zip(effects, columns_of_each(found, effects), strict=True):
         assert of.effect is effect
         jacobian = found.model.jacobian_of((effect,), s.prediction, s.theta, w.m) * of.scale
-        np.testing.assert_allclose(of.at_reading, jacobian[:, :3], rtol=1e-11, atol=1e-15)
+        unloaded = jacobian[found.readings.unloaded, :3]
+        np.testing.assert_allclose(of.unloaded, unloaded, rtol=1e-11, atol=1e-15)
+        motion = w.raw(jacobian)[:, :3]
+        np.testing.assert_allclose(of.motion, motion, rtol=1e-11, atol=1e-15)
         white = w.whiten_readings(jacobian)
         atol = 1e-12 * np.abs(white).max(initial=0.0)
         np.testing.assert_allclose(of.white, white, rtol=1e-9, atol=atol)

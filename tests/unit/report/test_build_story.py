@@ -7,12 +7,14 @@ import pytest
 
 from drivers.simulated.rehearsal import Rehearsal
 from hilcal.diagnose.diagnosis import Diagnosis
+from hilcal.diagnose.effect_ranking import LeftOut
 from hilcal.diagnose.residual_regression import Dependence
 from hilcal.diagnose.verdict import diagnose
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import fit
 from hilcal.identify.full_prediction import full_prediction
+from hilcal.identify.linearisation import HeldOut
 from hilcal.refine import add
 from hilcal.report.build_story import Chapter, build_story, curve, pose_numbers
 from hilcal.report.story import Story, StoryRevision, check
@@ -131,7 +133,8 @@ def test_a_suspect_that_explains_little_leaves_the_picture_to_the_variable(
     explains: float, curves: int
 ) -> None:
     d, _ = judged(hidden("dq2 = sin 3 q4", "absolute", 0, 1.5))
-    lead = replace(d.suspects[1], holdout_share=explains, explains=True, sure=True)
+    left_out = LeftOut(lambda: HeldOut(explains, True))
+    lead = replace(d.suspects[1], left_out=left_out, explains=True)
     named = replace(d, reason="one_suspect", suspects=(lead, d.suspects[0]))
     r = build_story([Chapter(1, None, d.fit, named)]).revisions[0]
     assert r.suspects[0].effect == lead.effect
