@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import typer
 
 from hilcal.cli import application, execute
+from studies.carried_bands_command import carried_bands
 from studies.carry_command import carry
 from studies.carry_picture import carry_picture
 from studies.change_command import change
@@ -36,6 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     app.command("scaling")(scaling)
     app.command("real")(real)
     app.command("carry")(carry)
+    app.command("carried-bands")(carried_bands)
     app.command("carry-picture")(carry_picture)
     app.command("compensation")(compensation)
     app.command("change")(change)

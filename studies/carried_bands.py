@@ -1,0 +1,113 @@
+"""Simulated arms that are measured twice in other joint ranges, the first time as prior.
+
+A real arm is one draw: its errors where it was not measured have a few dozen degrees of freedom,
+and so has the share of its poses within a stated band. Whether bands are true is a question about
+many arms. Each has transmission errors, link and joint zero errors and joint compliance of its own
+by the mechanics of the simulated cell, and half of them something that the model lacks. Campaign A
+takes poses with joint 2 in one range, campaign B in another one that hardly meets it; tracker and
+target are set up anew.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from drivers.simulated.draw import Draw, typical_torque
+from drivers.simulated.injected_effects import nothing_hidden
+from drivers.simulated.rehearsal import measurement_noise
+from drivers.simulated.world import World, stand
+from hilcal.calibration.calibration import Calibration
+from hilcal.cell import cell_from_config
+from hilcal.config import CellConfig
+from hilcal.identify.arm_scatter import with_prior_scatter
+from hilcal.identify.baseline import baseline, with_effects
+from hilcal.identify.carried import carried_prior
+from hilcal.identify.fit import fit
+from hilcal.identify.posterior import Posterior
+from studies.change import GEOMETRY, measured
+from studies.compensation_command import judged
+from studies.study_cases import with_study_loads
+
+POSES_A = 250
+TESTED = 200
+"""Poses of B that a fit is tested on."""
+JOINT = 1
+"""The joint, from 0, whose range the campaigns do not share: joint 2, as in the IPA's series."""
+RANGES = ((-2.25, 0.07), (-3.14, -1.92))
+"""Of A and of B, rad: those of series B and C of the IPA UR10, which share a few degrees."""
+LACKING = ("joint_tilt_compliance", "link_compliance")
+"""What the model of every other arm lacks."""
+
+
+@dataclass(frozen=True, slots=True)
+class BandCase:
+    """One fit of N poses with the prior.
+
+    Attributes:
+        seed: of the arm.
+        lacking: what its model lacks; empty for nothing.
+        poses: N.
+        mean_m: mean 3-D error of the poses it is tested on.
+        inside: share of them in the stated 95 % band.
+    """
+
+    seed: int
+    lacking: str
+    poses: int
+    mean_m: float
+    inside: float
+
+
+def band_cases(
+    seed: int, *, config: CellConfig, robot: str, numbers: Sequence[int], first: int = POSES_A
+) -> list[BandCase]:
+    """Measure an arm twice, and fit N poses of the second campaign with the first as prior.
+
+    Args:
+        seed: of everything random.
+        config: the cell; robot and loads are replaced.
+        robot: name of the arm.
+        numbers: N.
+        first: poses of campaign A.
+    """
+    rng = np.random.default_rng([seed, 20261123])
+    own, _ = with_study_loads(config, robot)
+    cell = cell_from_config(own)
+    noise, joints = measurement_noise(own), own.repeatability.per_joint(cell.arm.n)
+    world = nothing_hidden(cell, rng, noise=noise, joint_std=joints)
+    draw = Draw(cell.arm, world.physics.joint_compliance, typical_torque(cell.arm))
+    lacking = LACKING[seed // 2 % len(LACKING)] if seed % 2 else ""
+    physics = world.physics
+    of_arm = ("link_geometry", "encoder_offset", "transmission_error")
+    for name in (*of_arm, lacking) if lacking else of_arm:
+        physics = physics.with_effect(name, draw.effect(name, rng))
+    world = replace(world, physics=physics)
+    readings = measured(_within(world, 0), [], first, rng)
+    learnt = fit(with_effects(cell, readings, "absolute", GEOMETRY), readings, "absolute")
+    prior = carried_prior(Posterior.of(learnt))
+    registration, station = stand(cell, rng)
+    again = _within(replace(world, registration=registration, station=station), 1)
+    second = measured(again, [], max(numbers) + TESTED, rng)
+    # A calibration states the arm's scatter itself; what it is tested by adds the tracker's.
+    tracker = replace(again, joint_std=np.zeros(cell.arm.n))
+    tracker_alone = tracker.covariance(again.sight(second.states), second.m)
+    out = []
+    for n in numbers:
+        order = rng.permutation(len(second))
+        some, rest = second[np.sort(order[:n])], np.sort(order[n:][:TESTED])
+        tested = replace(second[rest], covariance=tracker_alone[rest])
+        model = baseline(cell, some, "absolute", prior=prior)
+        found = fit(model, with_prior_scatter(model, some), "absolute")
+        of = Calibration.of(found)
+        errors, inside = judged(of, of.predict(tested.states.q, tested.states.wrench), tested)
+        out.append(BandCase(seed, lacking, n, float(errors.mean()), float(inside.mean())))
+    return out
+
+
+def _within(world: World, campaign: int) -> World:
+    """The world with the joint ranges of a campaign, from which poses are drawn."""
+    arm = world.cell.arm
+    low, high = arm.q_min.copy(), arm.q_max.copy()
+    low[JOINT], high[JOINT] = RANGES[campaign]
+    return replace(world, cell=replace(world.cell, arm=replace(arm, q_min=low, q_max=high)))
