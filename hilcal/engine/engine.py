@@ -14,9 +14,11 @@ A worker that dies costs no result: what it held is computed again. Ctrl-C leave
 import logging
 import signal
 import tempfile
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from types import FrameType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -41,6 +43,8 @@ WORKERS_S = 10.0
 END_S = 1.0
 """How long a worker may take to end by itself after Ctrl-C, before it is killed; a choice."""
 LOOPBACK = "127.0.0.1"
+SIGNALLED = 128
+"""Exit code of a program that a signal ended, less the signal's number, as shells have it."""
 
 
 class ClusterError(HilcalError):
@@ -206,7 +210,11 @@ def _cluster(address: str) -> Iterator["Client"]:
 @contextmanager
 def _own(count: int, threads: bool) -> Iterator["Client"]:
     """Yield a connection to workers of this machine, which nothing but this machine can reach."""
-    with _quiet(), tempfile.TemporaryDirectory(prefix="hilcal-workers-") as scratch:
+    with (
+        _quiet(),
+        _ended_in_order(),
+        tempfile.TemporaryDirectory(prefix="hilcal-workers-") as scratch,
+    ):
         from distributed import Client, LocalCluster
 
         # Ctrl-C is for this process: workers are born with it blocked, and those that replace
@@ -236,6 +244,29 @@ def _own(count: int, threads: bool) -> Iterator["Client"]:
                 if not threads:  # what is being computed would be waited for
                     cluster.sync(_end, list(cluster.workers.values()))
                 raise
+
+
+@contextmanager
+def _ended_in_order() -> Iterator[None]:
+    """Let a plea to end, or a closed terminal, leave the block as Ctrl-C does.
+
+    Their default ends the process at once, and leaves the workers' folder behind.
+    """
+
+    def end(number: int, frame: FrameType | None) -> None:
+        raise SystemExit(SIGNALLED + number)
+
+    kinds = []
+    if threading.current_thread() is threading.main_thread():
+        both = (signal.SIGTERM, signal.SIGHUP)
+        kinds = [kind for kind in both if signal.getsignal(kind) is signal.SIG_DFL]
+    for kind in kinds:
+        signal.signal(kind, end)
+    try:
+        yield
+    finally:
+        for kind in kinds:
+            signal.signal(kind, signal.SIG_DFL)
 
 
 async def _end(nannies: list[Any]) -> None:

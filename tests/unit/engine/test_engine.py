@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import psutil
 import pytest
@@ -88,10 +89,11 @@ def test_workers_of_this_machine_give_the_same_bits_and_listen_to_it_alone(threa
 
 
 @pytest.mark.slow
-def test_ctrl_c_leaves_no_process() -> None:
+@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_leaves_no_process_and_no_folder(kind: signal.Signals, tmp_path: Path) -> None:
     process = subprocess.Popen(
         [sys.executable, "-m", "tests.support.engine_cases"],
-        env=HERE,
+        env=HERE | {"TMPDIR": str(tmp_path)},
         cwd=ROOT,
         stderr=subprocess.PIPE,
         text=True,
@@ -102,12 +104,21 @@ def test_ctrl_c_leaves_no_process() -> None:
     workers = psutil.Process(process.pid).children(recursive=True)
     assert len(workers) >= 2
     time.sleep(0.5)
-    os.killpg(process.pid, signal.SIGINT)  # as a terminal sends it: to all of them
+    assert list(tmp_path.glob("hilcal-workers-*"))
+    if kind is signal.SIGINT:  # as a terminal sends it: to all of them
+        os.killpg(process.pid, kind)
+    else:  # as a service manager does
+        process.send_signal(kind)
     told = process.communicate(timeout=30)[1]
     _, alive = psutil.wait_procs(workers, timeout=5)
     assert not alive
-    assert told.count("Traceback") == 1  # of the program itself, which does not catch it
-    assert told.rstrip().endswith("KeyboardInterrupt")
+    assert not list(tmp_path.glob("hilcal-workers-*"))
+    if kind is signal.SIGINT:
+        assert told.count("Traceback") == 1  # of the program itself, which does not catch it
+        assert told.rstrip().endswith("KeyboardInterrupt")
+    else:
+        assert process.returncode == 128 + kind
+        assert "Traceback" not in told
 
 
 def test_what_is_no_cluster_is_said_in_one_line() -> None:
