@@ -52,6 +52,12 @@ class Excess:
         a, b = self.position, other.position
         return abs(a - b) <= SAME * max(a, b) and abs(self.attitude / other.attitude - 1) <= SAME
 
+    def halfway(self, other: "Excess") -> "Excess":
+        """Return one between this and another: the geometric mean, half where one has none."""
+        both = self.position, other.position
+        middle = float(np.sqrt(both[0] * both[1])) if min(both) > 0 else sum(both) / 2
+        return Excess(middle, float(np.sqrt(self.attitude * other.attitude)))
+
     def widened(self, covariance: Floats, share: float = 1.0) -> Floats:
         """Return covariances (N, m, m) with it; with a share of s²."""
         m = covariance.shape[-1]
@@ -65,7 +71,17 @@ class Excess:
         return replace(readings, covariance=self.widened(readings.covariance, share))
 
 
-def excess(raw: Floats, stated: Whitening, used: Whitening, rows: Floats, root: Floats) -> Excess:
+NONE = Excess()
+
+
+def excess(
+    raw: Floats,
+    stated: Whitening,
+    used: Whitening,
+    rows: Floats,
+    root: Floats,
+    before: Excess = NONE,
+) -> Excess:
     """Return what a residual has beyond the stated noise.
 
     Args:
@@ -73,7 +89,8 @@ def excess(raw: Floats, stated: Whitening, used: Whitening, rows: Floats, root: 
         stated: scaling by V.
         used: scaling by which C was found, of the same measurements.
         rows: (R, P) derivatives, whitened by `used`.
-        root: (P, K) root of C.
+        root: (P, K) root of C over the noise factor that it was found with.
+        before: what `used` has already; a part that has some is not asked for chance again.
     """
     spread = _spread(used, rows, root)
     every = np.linspace(0, len(raw) - 1, min(len(raw), SOME)).astype(int)
@@ -87,7 +104,10 @@ def excess(raw: Floats, stated: Whitening, used: Whitening, rows: Floats, root: 
         free = r.size - len(raw) * float(np.trace(share, axis1=1, axis2=2).mean())
         square = np.einsum("dij,di->dj", vectors, r) ** 2
         total = float(np.sum(square / values))
-        if free < 1.0 or total <= free or float(chi2.sf(total, free)) >= CHANCE:
+        known = before.attitude > 1.0 if part.start else before.position > 0.0
+        if free < 1.0 or total <= free:
+            continue
+        if not known and float(chi2.sf(total, free)) >= CHANCE:
             continue
         if part.start:
             attitude = total / free

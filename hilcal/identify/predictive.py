@@ -15,7 +15,8 @@ prior precision,
     C = (AᵀA/σ² + Λ)⁻¹,    Cov(measured − predicted) = κ (σ² W + J C Jᵀ)
 
 W is the stated covariance V, with more for positions or attitudes where their residual asks for it
-(`identify.excess`): a misfit has not the shape of an instrument's noise.
+(`identify.excess`): a misfit has not the shape of an instrument's noise. W, C and the residual that
+parameters with this W and Λ leave belong together; they are found by turns.
 κ, at least 1, makes the mean variance on poses left out, in units of V, equal to the mean square
 that was found there: what repeats itself in new poses. The variance is that of the folds as they
 are left out, F of rows Y, with X the same whitened by W and multiplied by the root of C: the mean
@@ -41,7 +42,7 @@ from hilcal.types import Floats, Ints
 
 ITERATIONS = 20
 """Fixed-point iterations of the noise factor; it converges within a few."""
-ROUNDS = 3
+ROUNDS = 6
 """Most times that the covariance of the parameters is computed anew as W changes; a choice."""
 MOST_LEVERAGE = 0.99
 """Bound on the leverage of a row, since that of a row which alone tells something is 1."""
@@ -115,17 +116,26 @@ def predictive(
     prediction = model.predict(fitted.states, theta)
     raw = residual(fitted, prediction, stated)
     of = coordinates_of(model)
+    chosen = of.prior(prior)
     std = of.prior(open_prior(model, theta, prior))
     std[np.isinf(std)] = 1.0
+    # What the fit's own prior pulls its parameters by, in coordinates of unit prior variance.
+    held = np.isfinite(chosen) & (chosen > 0)
+    pull = np.where(held, of.of_theta(theta) * std / np.where(held, chosen, 1.0) ** 2, 0.0)
     more, w = Excess(), stated
-    for _ in range(ROUNDS):
+    for step in range(ROUNDS):
         a = _rows(model, prediction, theta, of, std, w)
         values, vectors, noise = _spectrum(a, raw, w)
         root = vectors * np.sqrt(noise / (values + noise))
-        found = excess(raw, stated, w, a, root)
+        # Where the parameters are with this noise and this prior: a residual and its leverage.
+        moved = root @ (root.T @ (a.T @ w.whiten(raw).reshape(-1) / noise - pull))
+        at = model.predict(fitted.states, theta + of.transform(std * moved))
+        left = residual(fitted, at, stated)
+        found = excess(left, stated, w, a, root / np.sqrt(noise), more)
         if found.near(more):
             break
-        more, w = found, whitening(found.of_readings(fitted, mode), mode, "gc")
+        more = found if step == 0 else found.halfway(more)
+        w = whitening(more.of_readings(fitted, mode), mode, "gc")
     else:
         a = _rows(model, prediction, theta, of, std, w)
         values, vectors, noise = _spectrum(a, raw, w)

@@ -1,16 +1,20 @@
 """What is stated of poses left out is the mean square of their errors."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from hilcal.effects.catalogue import installed
 from hilcal.identify.baseline import with_effects
 from hilcal.identify.excess import Excess
+from hilcal.identify.fit import fit
 from hilcal.identify.predictive import (
     Predictive,
     _left_out,
     parameter_factor,
     position_factor,
+    predictive,
 )
 from tests.support.campaigns import campaign
 
@@ -47,3 +51,30 @@ def test_the_stated_mean_square_is_what_was_found_and_never_less_than_the_fit_ha
         assert p.scatter + by_v * p.left_out == pytest.approx(sigma**2)
         assert p.scatter_m2 + by_position * p.left_out_m2 == pytest.approx(metres**2)
     assert parameter_factor(p, 1.5) == position_factor(p, 9e-5) == 1.0
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_scatter_beyond_the_stated_noise_is_told_from_what_many_parameters_take(seed: int) -> None:
+    """120 coordinates, 144 parameters of a family and others: half of the residual is fitted away.
+
+    Taken by the stated noise alone, the parameters seem to have taken nearly all of it.
+    """
+    scatter = 30e-6
+    c = campaign("transmission_error", "absolute", seed=seed, poses=40, m=3)
+    r = c.readings[np.unique(c.readings.pose, return_index=True)[1]]
+    more = scatter * np.random.default_rng(seed).standard_normal(r.value.shape)
+    r = replace(r, value=r.value + more)
+    names = ("joint_compliance", "transmission_error")
+    options = {"transmission_error": {"harmonics": 12}}
+    found = fit(with_effects(c.cell, r, "absolute", names, options), r, "absolute")
+    p = predictive(
+        found.model,
+        found.theta,
+        found.solution.prior,
+        found.readings[~found.outlier],
+        "absolute",
+        found.holdout.rms_sigma,
+    )
+    assert p.excess.attitude == 1.0
+    assert scatter / 1.7 < np.sqrt(p.excess.position) < scatter * 1.7
+    assert p.noise < 1.2
