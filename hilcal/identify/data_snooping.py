@@ -24,7 +24,7 @@ from hilcal.identify.outliers import bulk, limit
 from hilcal.identify.smooth_nuisance import smooth_nuisance_columns
 from hilcal.model import Model
 from hilcal.regression.distributions import binom
-from hilcal.regression.products import times
+from hilcal.regression.products import cross, times
 from hilcal.regression.projection import projection
 from hilcal.regression.small_forms import quadratic_forms
 from hilcal.types import Bools, Floats, Ints
@@ -106,9 +106,11 @@ def _projection(
     model: Model, solution: Solution, readings: Readings, w: Whitening
 ) -> tuple[Floats, Floats]:
     """Residual (R,) and Q (R, K) with P = I − Q Qᵀ, off model and smooth nuisance columns."""
-    own = solution.projection()
     x = smooth_nuisance_columns(model, solution.prediction, readings, w)
-    p = projection(np.hstack([own.rows, x]), np.append(own.ridge, np.ones(x.shape[1])))
+    beside = cross(solution.rows, x)
+    gram = np.block([[solution.equations.gram, beside], [beside.T, x.T @ x]])
+    rows, ridge = np.hstack([solution.rows, x]), np.append(solution.ridge, np.ones(x.shape[1]))
+    p = projection(rows, ridge, gram)
     z = np.append(solution.coordinates(), np.zeros(x.shape[1]))
     return p.residual(solution.white, z), p.root()
 

@@ -71,10 +71,14 @@ class Solution:
         """(P,) parameters that are not held at zero."""
         return np.asarray((self.prior != 0) | self.space.carried(len(self.theta)))
 
+    @property
+    def ridge(self) -> Floats:
+        """(K,) prior precisions of z, weighed against the noise factor."""
+        return self.beta * self.equations.basis.prior_precision
+
     def projection(self) -> Projection:
         """Return the projection off the columns of the model."""
-        ridge = self.beta * self.equations.basis.prior_precision
-        return projection(self.rows, ridge, self.equations.gram)
+        return projection(self.rows, self.ridge, self.equations.gram)
 
     def coordinates(self) -> Floats:
         """Return z (K,) of the parameters that have a prior; zero for flat directions."""
