@@ -21,6 +21,8 @@ from hilcal.types import Floats, Ints
 
 FROM_TABLE = "covariance: from the table"
 FROM_TRACKER = "covariance: from the tracker's noise in [tracker]"
+LONGEST = 1e12
+"""No time of a campaign is as long, s: those since 1970 are 1e9, in nanoseconds they were 1e18."""
 PREVIEW = "hilcal import TABLE --preview proposes a mapping for --format"
 
 
@@ -241,8 +243,10 @@ def states_of(table: CsvTable, arm: Arm) -> States:
         _in_range(table, columns.temperature_columns(n), -50, 150, "°C")
     if "air_degC" in number:
         _in_range(table, ("air_degC",), -50, 80, "°C")
+    if "time_s" in number:
+        _in_range(table, ("time_s",), -LONGEST, LONGEST, "s")
     if "load_time_s" in number:
-        _in_range(table, ("load_time_s",), 0, np.inf, "s")
+        _in_range(table, ("load_time_s",), 0, LONGEST, "s")
     return States(
         q=q,
         wrench=wrench,

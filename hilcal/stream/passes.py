@@ -92,14 +92,13 @@ def reduce_group(group: int, work: Work, theta: Floats) -> Reduced:
     found: dict[int, Triangle] = {}
     count = rank = 0
     for c in _chunks(group, work, theta):
-        rows = np.empty((c.raw.size, size))
-        rows[:, :-1] = whitened_jacobian(work.model, c.prediction, theta, c.w, every)
-        rows[:, -1] = c.w.whiten(c.raw).reshape(-1)
+        rows = whitened_jacobian(work.model, c.prediction, theta, c.w, every)
+        right = c.w.whiten(c.raw).reshape(-1)
         kept = np.repeat(c.kept, c.w.m)
         for fold in np.unique(c.fold):
             mine = kept & np.repeat(c.fold == fold, c.w.m)
-            part = rows if mine.all() else rows[mine]
-            found.setdefault(int(fold), Triangle(size)).add(part)
+            some = slice(None) if mine.all() else mine
+            found.setdefault(int(fold), Triangle(size)).add(rows[some], right[some])
         count += int(c.kept.sum())
         rank += _rank(c)
     return Reduced({fold: t.r for fold, t in found.items()}, count, rank)

@@ -42,8 +42,12 @@ class Product:
     def __init__(self, size: int) -> None:
         self.r = np.zeros((size, size))
 
-    def add(self, rows: Floats) -> None:
-        self.r += rows.T @ rows
+    def add(self, rows: Floats, right: Floats | None = None) -> None:
+        count = rows.shape[1]
+        self.r[:count, :count] += rows.T @ rows
+        if right is not None:
+            self.r[:count, count] += right @ rows
+            self.r[count, count] += right @ right
 
 
 def rows_file(path: Path) -> None:

@@ -181,6 +181,10 @@ BAD: dict[str, tuple[Table, str]] = {
         with_cell(6, cov_x_x="4e-4", cov_x_y="0"),
         r"row 6: a standard deviation of 0.02 m .* m²",
     ),
+    "time in nanoseconds": (
+        with_column("time_s", "1.7e18"),
+        r"row 2, column 'time_s': 1.7e\+18 s cannot be right; expected -1e\+12 to 1e\+12 s",
+    ),
     "no load": (with_cell(3, load=" "), r"row 3, column 'load': the cell is empty"),
     "no pose": (with_cell(3, pose=""), r"row 3, column 'pose': the cell is empty"),
     "two lines": (with_cell(3, pose="a\nb"), r"row 3, column 'pose': 'a\\nb' holds unprintable"),
