@@ -32,6 +32,8 @@ if TYPE_CHECKING:  # a value that a model only carries along; fits know what it 
 EQUILIBRIUM_TOLERANCE = 1e-13
 """Motion of the flange that may be missing from the converged equilibrium, m."""
 MAX_EQUILIBRIUM_STEPS = 30
+WIDE = 64
+"""Columns of an effect that are written as they are where they are in order; a choice."""
 FLANGE_STEP = 1e-4
 """Step of a difference quotient, m or rad: rounding 1e-12, higher terms 1e-9 of the quotient."""
 
@@ -248,7 +250,8 @@ class Model:
         """Write the derivative of a chunk of states; `places`: columns of `out`, −1 for none."""
         s = prediction.situation
         m = out.shape[1]
-        whole = empty(*out.shape)
+        whole = empty(*out.shape)  # along the states; successive columns are turned over at once
+        turned: list[tuple[int, int]] = []
         moves, blocks = self._motion(prediction, theta, m)
         mine = self._parts(theta)
         for e, place in zip(effects, places, strict=True):
@@ -267,9 +270,16 @@ class Model:
             if change is not None:
                 block = block + by_wrench_changes(moves, blocks, change[:, wanted])
             # A slice is written several times as fast as columns by index.
-            at_once = slice(place[wanted[0]], place[wanted[-1]] + 1)
-            whole[:, :, at_once] = block
-        out[...] = whole  # turned over in memory once
+            begin, end = int(place[wanted[0]]), int(place[wanted[-1]]) + 1
+            if block.flags.c_contiguous and end - begin >= WIDE:
+                out[:, :, begin:end] = block
+                continue
+            whole[:, :, begin:end] = block
+            if turned and turned[-1][1] == begin:
+                begin = turned.pop()[0]
+            turned.append((begin, end))
+        for begin, end in turned:
+            out[:, :, begin:end] = whole[:, :, begin:end]
 
     def _motion(self, prediction: Prediction, theta: Floats, m: int) -> tuple[Motion, list[Block]]:
         """Derivative of a chunk of readings by the deviation, at equilibrium; the compliance."""

@@ -7,6 +7,7 @@ times; `make bench` prints the ratios at its end and stores them in `extra_info`
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -87,3 +88,17 @@ def test_scoring_against_a_fit_of_the_largest_model(
     claim(f"{what}: the whole diagnosis, s", f"{seconds['diagnose']:.2f}", aim)
     suspects = benchmark.pedantic(score, args=(found,), rounds=1)
     assert "hysteresis" in {s.effect for s in suspects}
+
+
+@pytest.mark.parametrize("mode", ["absolute", "deflection"])
+def test_diagnosing_what_nothing_explains(mode: Mode, benchmark: Any, claim: Claim) -> None:
+    """`diagnose_s`: with smooth laws and trees on the residual, which a good suspect spares."""
+    c = campaign("none", mode, poses=1000 // LOADS)
+    readings = replace(c.readings, covariance=c.readings.covariance / 4)
+    found = fit(baseline(c.cell, readings, mode), readings, mode)
+    seconds = shortest({"diagnose": lambda: diagnose(found)})["diagnose"]
+    benchmark.extra_info["diagnose_s"] = seconds
+    what = f"1000 {mode} readings of twice the stated noise: the whole diagnosis, s"
+    claim(what, f"{seconds:.2f}", "aim: 1")
+    told = benchmark.pedantic(diagnose, args=(found,), rounds=1)
+    assert told.verdict == "noise_misjudged"
