@@ -91,13 +91,6 @@ class Clearance:
             out |= self.scene.touching(q, segment, margin)
         return out
 
-    def load_height(self, q: Floats, load: str) -> Floats:
-        """Return (N,) how high the lowest of what hangs or pulls is; inf where nothing is, m."""
-        low = np.full(len(q), np.inf)
-        for x in self.segments(q, load):
-            low = np.minimum(low, np.minimum(x.start[:, 2], x.end[:, 2]) - x.radius)
-        return low
-
     def problems(
         self, q: Floats, load: str, where: str, *, itself: bool = True
     ) -> dict[tuple[str, ...], str]:
@@ -110,12 +103,13 @@ class Clearance:
             itself: whether the arm is checked against itself; not where its shape is a guess.
         """
         out: dict[tuple[str, ...], str] = {}
-        named = self.scene.pairs(q, MARGIN, self.segments(q, load), itself=itself)
+        hung = self.segments(q, load)
+        named = self.scene.pairs(q, MARGIN, hung, itself=itself)
         for a, b in named:
             out[f"collision {a} {b}", where] = f"{where}: {a} and {b} collide"
         low = self.config.limits.workspace_min_m
         if low is not None and load != UNLOADED:
-            deep = low[2] - float(self.load_height(q, load).min(initial=np.inf))
+            deep = low[2] - float(_height(hung, len(q)).min(initial=np.inf))
             if deep > 0.0:
                 out[f"low {load}", where] = (
                     f"{where}: what hangs or pulls ({load}) reaches {deep:.3g} m below the "
@@ -123,6 +117,14 @@ class Clearance:
                     "[[loads]]"
                 )
         return out
+
+
+def _height(segments: tuple[Segment, ...], count: int) -> Floats:
+    """(N,) how high the lowest point of segments is, m; inf where there are none."""
+    low = np.full(count, np.inf)
+    for x in segments:
+        low = np.minimum(low, np.minimum(x.start[:, 2], x.end[:, 2]) - x.radius)
+    return low
 
 
 def clearance_of(cell: Cell, config: CellConfig, floor: float | None = None) -> Clearance:

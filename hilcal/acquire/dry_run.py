@@ -184,7 +184,8 @@ def _along(shapes: Clearance, q: Floats, load: str, where: str) -> _Problems:
     cell, config = shapes.cell, shapes.config
     out: _Problems = {}
     out.update(shapes.problems(q, load, where, itself=is_known(cell.arm)))
-    for name, axis, over, limit in workspace.outside(cell, config, q):
+    chain = chains.evaluate(cell.arm, q)
+    for name, axis, over, limit in workspace.outside(cell, config, chain):
         worst = float(over.max())
         if not worst <= _ROUNDING:
             out[f"box {name} {axis} {limit}", where] = (
@@ -195,7 +196,6 @@ def _along(shapes: Clearance, q: Floats, load: str, where: str) -> _Problems:
     if pull is None:
         return out
     arm, share = cell.arm, config.limits.torque_share
-    chain = chains.evaluate(arm, q)
     wrench = np.broadcast_to(pull, (len(q), 6))
     carried = Load(wrench, cell.load_point, cell.tool_mass, cell.tool_com, cell.gravity)
     about_axes = slot_wrenches(arm, chain, carried)[:, : arm.n, 5]

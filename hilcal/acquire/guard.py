@@ -8,6 +8,7 @@ from hilcal.acquire import workspace
 from hilcal.acquire.devices import ArmSample
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
+from hilcal.robot.chain import evaluate
 from hilcal.types import Floats
 
 NORMAL = "normal"
@@ -57,7 +58,8 @@ class Guard:
         return f"arm: {name} moves at {speed[k]:.3g} rad/s; joint_speed_rad_s is {limit:g}"
 
     def _place(self, sample: ArmSample) -> str | None:
-        for name, axis, over, limit in workspace.outside(self.cell, self.config, sample.q[None]):
+        chain = evaluate(self.cell.arm, sample.q[None])
+        for name, axis, over, limit in workspace.outside(self.cell, self.config, chain):
             if over[0] > SLACK_M:
                 return (
                     f"arm: {name} is {over[0]:.3g} m outside the workspace, whose {axis} ends at "

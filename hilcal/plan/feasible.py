@@ -58,6 +58,7 @@ class Space:
     config: CellConfig
     shapes: Clearance = field(init=False)
     sight: LineOfSight | None = field(init=False)
+    _last: list[tuple[Floats, Chain]] = field(init=False, repr=False, default_factory=list)
 
     def __post_init__(self) -> None:
         """Build the shapes once; without a workspace the mounting plane is the floor."""
@@ -200,9 +201,15 @@ class Space:
     def _limits(self, q: Floats, load: str) -> Bools:
         return np.asarray(np.all((q >= self.low) & (q <= self.high), axis=1))
 
+    def _chain(self, q: Floats) -> Chain:
+        """The chain in N states; kept for the next reason or load that asks for the same states."""
+        if not (self._last and np.array_equal(self._last[0][0], q)):
+            self._last[:] = [(q.copy(), evaluate(self.cell.arm, q))]
+        return self._last[0][1]
+
     def _workspace(self, q: Floats, load: str) -> Bools:
         good = np.ones(len(q), dtype=np.bool_)
-        for _, _, over, _ in workspace.outside(self.cell, self.config, q):
+        for _, _, over, _ in workspace.outside(self.cell, self.config, self._chain(q)):
             good &= over < -INSIDE
         return good
 
@@ -223,7 +230,7 @@ class Space:
         least = self.config.planning.singularity
         if least == 0.0 or not len(q):
             return np.ones(len(q), dtype=np.bool_)
-        chain = evaluate(self.cell.arm, q)
+        chain = self._chain(q)
         jacobian = np.array(joint_jacobian(chain, chain.position[-1]))
         jacobian[:, :3] /= self.cell.arm.reach
         sigma = np.linalg.svd(jacobian, compute_uv=False)
@@ -234,7 +241,7 @@ class Space:
         limit = _BELOW * self.config.limits.torque_share * np.asarray(arm.torque_max, dtype=float)
         pull = np.broadcast_to(self._pull(load), (len(q), 6))
         carried = Load(pull, cell.load_point, cell.tool_mass, cell.tool_com, cell.gravity)
-        about_axes = slot_wrenches(arm, evaluate(arm, q), carried)[:, : arm.n, 5]
+        about_axes = slot_wrenches(arm, self._chain(q), carried)[:, : arm.n, 5]
         torque = arm.drive_torques(about_axes)
         return np.asarray(np.all(np.abs(torque) <= limit, axis=1))
 
@@ -251,7 +258,7 @@ class Space:
         pull, weight = self._pull(load), cell.tool_mass * cell.gravity
         if load != UNLOADED and np.linalg.norm(pull[:3] + weight) > sensor.max_force_N:
             return np.zeros(len(q), dtype=np.bool_)
-        chain: Chain = evaluate(cell.arm, q)
+        chain = self._chain(q)
         origin = chain.point(np.asarray(sensor.origin_m))
         moment = pull[3:] + se3.cross(chain.point(cell.load_point) - origin, pull[:3])
         moment = moment + se3.cross(chain.point(cell.tool_com) - origin, weight)

@@ -14,6 +14,7 @@ from hilcal.acquire.workspace import points
 from hilcal.config import ForceSensor, Limits, Load, Motion, Tool
 from hilcal.data.plan import Plan, Step
 from hilcal.robot.catalogue import load_arm
+from hilcal.robot.chain import evaluate
 from tests.support.fake_bench import POSES, Bench, plan_of, usual_plan
 
 WIDE = Limits(workspace_min_m=(-3, -3, -3), workspace_max_m=(3, 3, 3))
@@ -73,7 +74,7 @@ def test_reference_at_a_joint_limit_is_approached_from_within(side: int) -> None
 
 def box(bench: Bench, q: Any) -> tuple[Any, Any]:
     """The smallest box around flange, target, load point, and the height of the joints."""
-    _, place = points(bench.cell, np.asarray(q))
+    _, place = points(bench.cell, evaluate(bench.cell.arm, np.asarray(q)))
     low = place[:, :3].min(axis=(0, 1))
     high = place[:, :3].max(axis=(0, 1))
     low[2], high[2] = place[:, :, 2].min(), place[:, :, 2].max()
@@ -115,7 +116,7 @@ def test_a_path_between_good_poses_may_be_bad() -> None:
     }
     plan = plan_of(("far", "none", 0), poses=poses)
     q = np.array(list(poses.values()))
-    _, ends = points(bench.cell, q)
+    _, ends = points(bench.cell, evaluate(bench.cell.arm, q))
     reach = float(ends[:, :3, 0].min())  # the arm points to -x at these poses
     limits = Limits(workspace_min_m=(reach - 0.03, -3, -3), workspace_max_m=(3, 3, 3))
     bench.config = bench.config.model_copy(update={"limits": limits})

@@ -9,6 +9,7 @@ from hilcal.acquire.devices import ArmSample
 from hilcal.acquire.guard import SLACK_M, Guard
 from hilcal.acquire.workspace import points
 from hilcal.config import ForceSensor, Limits
+from hilcal.robot.chain import evaluate
 from tests.support.fake_bench import POSES, Bench
 
 
@@ -103,7 +104,7 @@ def test_wrong_number_of_joints(bench: Bench) -> None:
 @pytest.mark.parametrize("axis", range(3))
 def test_workspace_of_the_actual_pose(bench: Bench, side: str, axis: int) -> None:
     """A box that ends at the outermost point, less and more than the slack."""
-    names, place = points(bench.cell, np.array(POSES["p1"])[None])
+    names, place = points(bench.cell, evaluate(bench.cell.arm, np.array(POSES["p1"])[None]))
     at = place[0, :3, axis]  # flange, target, load point
     if axis == 2:
         at = place[0, :, 2]
