@@ -81,6 +81,11 @@ LONG = (
     "test_report_page",
     "test_procedure",
     "test_demo",
+    "test_outliers",
+    "test_p_values",
+    "test_study_plans",
+    "test_docs",
+    "test_effect_jacobian",
 )
 """Files that take longest: they begin first, so that none of them is left over at the end."""
 

@@ -19,7 +19,7 @@ from hilcal.model import Model
 from hilcal.types import Floats
 from tests.support.campaigns import campaign as simulated
 from tests.support.campaigns import plan
-from tests.support.cli_cases import CELL, ok, refused, start
+from tests.support.cli_cases import CELL, ok, refused
 from tests.support.user_effect_cases import CLASS, COLUMNS
 
 Capsys = pytest.CaptureFixture[str]
@@ -136,12 +136,10 @@ def test_it_can_be_fitted_and_added_by_name(run_file: Path, file: Path, capsys: 
 
 
 def test_a_process_of_its_own_and_an_installed_package(
-    run_file: Path, file: Path, tmp_path: Path
+    run_file: Path, file: Path, tmp_path: Path, capsys: Capsys
 ) -> None:
-    shown = start("effects", "--effects-from", file, "--json")
-    out, err = shown.communicate(timeout=120)
-    assert shown.returncode == 0, err
-    assert NAME in [e["name"] for e in json.loads(out)["effects"]]
+    shown = ok(capsys, "effects", "--effects-from", file, "--json").document
+    assert NAME in [e["name"] for e in shown["effects"]]
 
     package = package_of(tmp_path / "site", file.read_text(encoding="utf-8"), "mine:SoftSide")
     code, out, err = hilcal(package, "diagnose", run_file, "--json")
