@@ -105,6 +105,11 @@ def sqlite_errors(path: Path) -> Iterator[None]:
             ) from e
         if "locked" in text or "busy" in text:
             raise InputError(f"{path}: another program is writing to the campaign") from e
+        if "readonly" in text or "unable to open" in text:
+            raise InputError(
+                f"{path}: cannot be written ({text}): the file or its folder is read-only; valid: "
+                "a copy in a folder that can be written"
+            ) from e
         raise InputError(f"{path}: the campaign file cannot be used ({text})") from e
 
 

@@ -20,6 +20,7 @@ from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.readings import Readings
 from hilcal.data.records import content_hash
 from hilcal.data.revision import RevisionRecord
+from hilcal.data.schema import sqlite_errors
 from hilcal.errors import InputError
 from tests.support.readings_cases import assert_same, readings, simple
 
@@ -331,3 +332,17 @@ def test_a_second_writer_waits_or_is_told(tmp_path: Path) -> None:
         one.append_readings(replace(simple(1), pose_names=("a",)))
         two.append_readings(replace(simple(1), pose_names=("b",)))
         assert one.readings().pose_names == ("p0", "p1", "a", "b")
+
+
+@pytest.mark.parametrize(
+    "words", ["attempt to write a readonly database", "unable to open database file"]
+)
+def test_a_read_only_file_or_folder_is_said(words: str) -> None:
+    """As SQLite words them: for the superuser, who may run the tests, nothing is read-only."""
+    with (
+        pytest.raises(
+            InputError, match=r"run\.hilcal: cannot be written .*read-only; valid: a copy"
+        ),
+        sqlite_errors(Path("run.hilcal")),
+    ):
+        raise sqlite3.OperationalError(words)
