@@ -168,14 +168,18 @@ def _feasible(cell: Cell, q: Floats, pulls: Floats) -> Bools:
     shoulder = origins[min(1, arm.n)]
     good &= np.linalg.norm(origins[arm.n] - shoulder, axis=1) < 0.85 * reach
     limit = np.asarray(arm.torque_max, dtype=float)
-    for pull in pulls:
-        rows = np.flatnonzero(good)
-        good[rows] &= np.all(np.abs(_rigid(cell, q[rows], pull)[1]) <= _MARGIN * limit, axis=1)
+    rows = np.flatnonzero(good)
+    every = np.tile(q[rows], (len(pulls), 1)), np.repeat(pulls, len(rows), axis=0)
+    torque = np.abs(_rigid(cell, *every)[1]).reshape(len(pulls), len(rows), arm.n)
+    good[rows] = np.all(torque <= _MARGIN * limit, axis=(0, 2))
     return good
 
 
 def _rigid(cell: Cell, q: Floats, pull: Floats) -> tuple[Floats, Floats]:
-    """Return flange poses (N, 4, 4) and drive torques (N, n) of the rigid arm, N·m."""
+    """Return flange poses (N, 4, 4) and drive torques (N, n) of the rigid arm, N·m.
+
+    `pull`: (6,) or (N, 6) wrench.
+    """
     arm = cell.arm
     tree = build(arm, arm.links, cell.tool_mass, cell.tool_com, cell.gravity, tilts=False)
     none = np.zeros(arm.n)
