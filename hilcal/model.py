@@ -265,7 +265,7 @@ class Model:
             if e in self.effects and e.compliance(at) is not None:
                 for other, part in mine:
                     columns += tuple(map(e.of_compliance, other.compliance_columns(part, s)))
-            block = _sum_columns(columns, within, moves, (len(s.states), m, len(wanted)))
+            block = moves.by_parameters(columns, within, (len(s.states), m, len(wanted)))
             change = e.wrench_columns(at, s) if blocks else None
             if change is not None:
                 block = block + by_wrench_changes(moves, blocks, change[:, wanted])
@@ -360,28 +360,6 @@ def _deviation(
         first += len(t)
     theta = np.concatenate([t for _, t in parts]) if parts else np.zeros(0)
     return total(tuple(columns), theta, s, start)
-
-
-def _sum_columns(
-    columns: tuple[Columns, ...], within: Ints, moves: Motion, shape: tuple[int, int, int]
-) -> Floats:
-    """Derivative (N, m, P) by the parameters with `within` ≥ 0, their places of the P.
-
-    One parameter may move several elements.
-    """
-    block: Floats | None = None
-    for c in columns:
-        c = c.only(within[c.parameter] >= 0)
-        at, moved = within[c.parameter], moves.by_columns(c)
-        if len(columns) == 1 and np.array_equal(at, np.arange(shape[2])):
-            return moved
-        block = zeros(*shape) if block is None else block
-        if len(np.unique(at)) == len(at):
-            block[:, :, at] += moved
-        else:
-            for column, place in enumerate(at):
-                block[:, :, place] += moved[:, :, column]
-    return zeros(*shape) if block is None else block
 
 
 def _flange_motion(a: Chain, b: Chain, reach: float) -> float:

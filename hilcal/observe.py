@@ -122,6 +122,30 @@ class Motion:
         sides = {"base": self.by_base, "station": self.by_station, "target": self.by_target}
         return _per_column(sides[c.field](), c.values)
 
+    def by_parameters(
+        self, columns: Sequence[Columns], within: Ints, shape: tuple[int, int, int]
+    ) -> Floats:
+        """Derivative (N, m, P) by parameters, one of which may move several elements.
+
+        Args:
+            columns: of an effect.
+            within: place of each of its parameters among the P; -1 for those left out.
+            shape: N, m, P.
+        """
+        block: Floats | None = None
+        for c in columns:
+            c = c.only(within[c.parameter] >= 0)
+            at, moved = within[c.parameter], self.by_columns(c)
+            if len(columns) == 1 and np.array_equal(at, np.arange(shape[2])):
+                return moved
+            block = zeros(*shape) if block is None else block
+            if len(np.unique(at)) == len(at):
+                block[:, :, at] += moved
+            else:
+                for column, place in enumerate(at):
+                    block[:, :, place] += moved[:, :, column]
+        return zeros(*shape) if block is None else block
+
     @property
     def drives(self) -> Floats:
         """(N, m, n) derivative by the displacements of the drives, `Deviation.dq`."""
