@@ -11,6 +11,7 @@ from drivers.simulated.ur.motion import line
 from drivers.ur_link import states
 from drivers.ur_link.motion import MARGIN_S, MotionInProgress, deceleration, duration
 from drivers.ur_link.reading import OUTPUTS, N, ReadingError, read
+from drivers.ur_link.survey import settled_rate
 from drivers.ur_link.worker import Worker, WorkerError
 
 FIELDS = {
@@ -90,3 +91,20 @@ def test_motion_is_overdue_only_after_its_time_and_margin(monkeypatch):
 def test_worker_that_cannot_start_says_so():
     with pytest.raises(WorkerError, match="exit code 1"):
         Worker("drivers.ur_link.no_such_worker", (), 10.0)
+
+
+def test_a_moment_without_packets_is_no_slow_line() -> None:
+    """A busy computer loses some tenths of a second; a slow network stays slow."""
+    counted: list[float] = []
+
+    def count(seconds: float, *rates: float) -> float:
+        counted.append(seconds)
+        return rates[len(counted) - 1]
+
+    assert settled_rate(lambda s: count(s, 124.0), 125.0) == 124.0
+    assert len(counted) == 1
+    counted.clear()
+    assert settled_rate(lambda s: count(s, 44.0, 125.0), 125.0) == 125.0
+    assert counted[1] > counted[0]
+    counted.clear()
+    assert settled_rate(lambda s: count(s, 44.0, 45.0), 125.0) == 45.0
