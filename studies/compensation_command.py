@@ -96,6 +96,8 @@ def compensation(
 ) -> None:
     """Fit one part of a real series, and correct the other part."""
     t = terminal(as_json)
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
     cell = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
     figures: list[Figure] = []
     document: list[dict[str, object]] = []
