@@ -2,10 +2,11 @@
 
 A model's misfit has not the shape of an instrument's noise, which is small along the beam, nor the
 same share of positions and attitudes. With r (3,) the residuals of the D positions, V their
-covariance and J C Jᵀ that of their predictions, s² solves (Mandel and Paule, for the scatter
-between laboratories beyond what each states)
+covariance, W = V + s² 1, and J C Jᵀ the covariance of their predictions, C that of parameters
+estimated with σ² W, s² solves (Mandel and Paule, for the scatter between laboratories beyond what
+each states)
 
-    Σ rᵀ (V + s² 1)⁻¹ r = 3 D − Σ tr V⁻¹ J C Jᵀ
+    Σ rᵀ W⁻¹ r = 3 D − Σ tr (σ² W)⁻¹ J C Jᵀ
 
 and the attitudes' part of V is multiplied by their χ² over its degrees of freedom. Either only
 where its own χ² is larger than chance allows.

