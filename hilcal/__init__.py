@@ -38,6 +38,7 @@ _PLACES = {
     "Refinement": "hilcal.refine",
     "States": "hilcal.data.readings",
     "baseline": "hilcal.library",
+    "bootstrap": "hilcal.library",
     "check_effect": "hilcal.effects.check",
     "compare": "hilcal.compare",
     "diagnose": "hilcal.diagnose.verdict",
@@ -78,6 +79,7 @@ if TYPE_CHECKING:
     from hilcal.identify.table_preview import preview_table
     from hilcal.library import (
         baseline,
+        bootstrap,
         fit,
         fit_stream,
         load_posterior,

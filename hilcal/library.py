@@ -21,6 +21,7 @@ from hilcal.effects.options import Options
 from hilcal.engine.engine import open_engine
 from hilcal.errors import InputError
 from hilcal.identify import baseline as starting_models
+from hilcal.identify import bootstrap as bootstraps
 from hilcal.identify import fit as fits
 from hilcal.identify import posterior_document
 from hilcal.identify.arm_scatter import with_prior_scatter
@@ -97,6 +98,38 @@ def fit_stream(
     named: dict[str, Options] | None = None if effects is None else {name: {} for name in effects}
     with open_engine(workers, scheduler) as engine:
         return streams.fit_stream(stream, cell, engine, named, prior=prior)
+
+
+def bootstrap(
+    found: Fit,
+    draws: int = bootstraps.DRAWS,
+    *,
+    seed: int = 0,
+    workers: int | None = 1,
+    scheduler: str | None = None,
+) -> bootstraps.Bootstrap:
+    """Draw the poses of a fit again and again, and fit its model to each draw.
+
+    >>> cell = hc.Cell.load(CELL)
+    >>> readings = hc.read_table(TABLE, cell)
+    >>> found = hc.bootstrap(hc.fit(hc.baseline(cell, readings), readings), draws=20)
+    >>> found.theta.shape, found.interval(0.9).shape
+    ((20, 12), (2, 12))
+
+    Args:
+        found: the fit whose standard uncertainties are in question; `ratio` compares them.
+        draws: how many.
+        seed: of the draws; the result does not depend on the workers.
+        workers: processes of this machine; None is one per processor, for scripts that begin with
+            `if __name__ == "__main__"`.
+        scheduler: address of a Dask cluster in their place.
+
+    Raises:
+        InputError: too few draws.
+        CannotAnswerError: too few poses.
+    """
+    with open_engine(None if scheduler is not None else workers, scheduler) as engine:
+        return bootstraps.bootstrap(found, engine, draws, seed)
 
 
 def baseline(

@@ -35,7 +35,7 @@ SECTIONS = {
     "Measure": ("run", "import", "info"),
     "Fit, and find what is missing": (
         *("identify", "compare", "diagnose", "add", "remove", "refine", "discover", "next"),
-        "workbench",
+        *("bootstrap", "workbench"),
     ),
     "Many arms": ("fleet",),
     "Use the result": ("validate", "compensate", "accept", "report", "view", "export"),
@@ -97,6 +97,10 @@ COMMANDS = {
     "next": Command(
         "next:next_",
         "Plan the measurements that separate the leading suspects; exit 4 where none are in doubt.",
+    ),
+    "bootstrap": Command(
+        "bootstrapping:bootstrap",
+        "Draw the poses again, refit, and compare the scatter with the stated uncertainties.",
     ),
     "fleet": Command(
         "fleeting:fleet",

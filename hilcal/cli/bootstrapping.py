@@ -1,0 +1,46 @@
+"""`bootstrap`: whether the stated standard uncertainties hold, by drawing the poses again."""
+
+from typing import Annotated
+
+import typer
+
+from hilcal.campaign import Campaign
+from hilcal.cli.effects_from import EffectsFrom, catalogue_with
+from hilcal.cli.engine import Scheduler, Workers
+from hilcal.cli.files import fit_of
+from hilcal.cli.terminal import Json, Revision, Run, terminal
+from hilcal.engine.engine import open_engine
+from hilcal.errors import InputError
+from hilcal.identify.bootstrap import DRAWS, check_draws
+from hilcal.identify.bootstrap import bootstrap as draw_again
+from hilcal.report.progress import counting, working
+from hilcal.report.text_bootstrap import bootstrap_report, to_json
+
+
+def bootstrap(
+    run: Run,
+    revision: Revision = None,
+    draws: Annotated[int, typer.Option("--draws", metavar="N", help="Campaigns drawn.")] = DRAWS,
+    seed: Annotated[int, typer.Option("--seed", help="Of the draws.")] = 0,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    effects_from: EffectsFrom = None,
+    as_json: Json = False,
+) -> None:
+    """Draw the poses again, refit, and compare the scatter with the stated uncertainties."""
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
+    check_draws(draws, seed)
+    if effects_from and (scheduler is not None or workers not in (None, 1)):
+        raise InputError("--effects-from: other processes do not have its effects; --workers 1")
+    with (
+        Campaign.open(run, catalogue, read_only=True) as o,
+        open_engine(1 if effects_from else workers, scheduler) as engine,
+    ):
+        with working(t.progress) as say:
+            number, fit = fit_of(t, o, say, revision)
+            say("computing standard uncertainties")
+            _ = fit.uncertainty
+        with counting(t.progress, "draws", draws) as advance:
+            found = draw_again(fit, engine, draws, seed, advance)
+    t.show(bootstrap_report(found))
+    t.document({"revision": number, "seed": seed, **to_json(found)})
