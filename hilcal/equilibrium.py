@@ -104,7 +104,7 @@ def at_equilibrium(moves: Motion, stiffness: GeometricStiffness, blocks: list[Bl
         stiffness: of the chain under its load.
         blocks: the compliance.
     """
-    term = by_wrenches(blocks, lambda j: moves.dq[:, :, j], moves.by_slot)
+    term = wrench_form(moves, blocks)
     form, whole = dict(term), _norm(term)
     before = whole
     for _ in range(MAX_TERMS):
@@ -125,10 +125,20 @@ def at_equilibrium(moves: Motion, stiffness: GeometricStiffness, blocks: list[Bl
     return replace(moves, dq=dq, yielding=yielding)
 
 
-def by_wrench_changes(moves: Motion, blocks: list[Block], change: Floats) -> Floats:
-    """Motion (N, m, P) of a reading by P changes (N, P, n + 1, 6) of the slot wrenches."""
-    out = zeros(len(moves.dq), moves.m, change.shape[1])
-    form = by_wrenches(blocks, lambda j: moves.dq[:, :, j], moves.by_slot)
+def wrench_form(moves: Motion, blocks: list[Block]) -> dict[tuple[int, bool], Floats]:
+    """Derivatives (N, m, 3) of a reading by the force (False) and moment (True) of each slot."""
+    return by_wrenches(blocks, lambda j: moves.dq[:, :, j], moves.by_slot)
+
+
+def by_wrench_changes(form: Mapping[tuple[int, bool], Floats], change: Floats, m: int) -> Floats:
+    """Motion (N, m, P) of a reading by P changes (N, P, n + 1, 6) of the slot wrenches.
+
+    Args:
+        form: derivatives by the wrenches, see `wrench_form`.
+        change: the changes.
+        m: elements of a reading.
+    """
+    out = zeros(len(change), m, change.shape[1])
     for (slot, moment), rows in form.items():
         half = change[:, :, slot, MOMENT if moment else FORCE]
         out += rows_times(rows, half, transposed=True)

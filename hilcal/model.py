@@ -13,12 +13,13 @@ from hilcal.effects.options import typical_compliances
 from hilcal.effects.protocol import Columns, Effect, Situation
 from hilcal.effects.spec import EffectSpec
 from hilcal.effects.total import total
-from hilcal.equilibrium import Block, at_equilibrium, by_wrench_changes, compliance
+from hilcal.equilibrium import Block, at_equilibrium, compliance
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.observe import Motion, Observation, motion, observe
+from hilcal.reading_columns import ReadingColumns
 from hilcal.robot import chain as chains
 from hilcal.robot import se3
-from hilcal.robot.batch import along_states, by_field, chunks, empty, put, room, take, zeros
+from hilcal.robot.batch import along_states, by_field, chunks, put, room, take, zeros
 from hilcal.robot.chain import Chain
 from hilcal.robot.deviation import Deviation
 from hilcal.robot.geometric_stiffness import geometric_stiffness
@@ -32,8 +33,6 @@ if TYPE_CHECKING:  # a value that a model only carries along; fits know what it 
 EQUILIBRIUM_TOLERANCE = 1e-13
 """Motion of the flange that may be missing from the converged equilibrium, m."""
 MAX_EQUILIBRIUM_STEPS = 30
-WIDE = 64
-"""Columns of an effect that are written as they are where they are in order; a choice."""
 FLANGE_STEP = 1e-4
 """Step of a difference quotient, m or rad: rounding 1e-12, higher terms 1e-9 of the quotient."""
 
@@ -97,7 +96,7 @@ class Model:
 
     def __post_init__(self) -> None:
         """Refuse an effect that is there twice."""
-        ends = accumulate((len(e.parameters) for e in self.effects), initial=0)
+        ends = accumulate((len(e.magnitudes) for e in self.effects), initial=0)
         # Asked for at every step; an effect with a thousand parameters takes long to name them.
         object.__setattr__(self, "_slices", tuple(slice(a, b) for a, b in pairwise(ends)))
         names = self.names
@@ -216,25 +215,28 @@ class Model:
         theta: Floats,
         m: int,
         live: Ints | None = None,
+        scale: Floats | None = None,
     ) -> Floats:
         """Derivative (N, m, P) of the readings by the parameters of `effects`.
 
         `effects` may or may not be in the model; one that is not is taken at zero. Analytic:
-        the static equilibrium is differentiated implicitly (`hilcal.equilibrium`).
+        the static equilibrium is differentiated implicitly (`hilcal.equilibrium`). With `scale`
+        (P,), by the parameters in these units.
         """
         count = len(prediction.situation.angle)
         if effects is self.effects:  # naming a thousand parameters takes long
             sizes = [s.stop - s.start for s in self.slices()]
         else:
-            sizes = [len(e.parameters) for e in effects]
+            sizes = [len(e.magnitudes) for e in effects]
         place = np.full(sum(sizes), -1)
         live = np.arange(len(place)) if live is None else live
         place[live] = np.arange(len(live))
         places = np.split(place, np.cumsum(sizes)[:-1]) if sizes else []
+        units = None if scale is None else scale[live]
         out = np.empty((count, m, len(live)))
 
         def fill(rows: slice) -> None:
-            self._fill(out[rows], effects, places, prediction[rows], theta)
+            self._fill(out[rows], effects, places, prediction[rows], theta, units)
 
         in_threads(fill, chunks(count, m * len(live)), count * m)
         return out
@@ -246,40 +248,27 @@ class Model:
         places: list[Ints],
         prediction: Prediction,
         theta: Floats,
+        scale: Floats | None,
     ) -> None:
         """Write the derivative of a chunk of states; `places`: columns of `out`, −1 for none."""
         s = prediction.situation
-        m = out.shape[1]
-        whole = empty(*out.shape)  # along the states; successive columns are turned over at once
-        turned: list[tuple[int, int]] = []
-        moves, blocks = self._motion(prediction, theta, m)
+        moves, blocks = self._motion(prediction, theta, out.shape[1])
+        columns = ReadingColumns(moves, blocks, scale)
         mine = self._parts(theta)
         for e, place in zip(effects, places, strict=True):
-            wanted = np.flatnonzero(place >= 0)
-            if not len(wanted):
+            if not (place >= 0).any():
                 continue
-            within = np.full(len(place), -1)
-            within[wanted] = np.arange(len(wanted))
             at = next((t for other, t in mine if other is e), np.zeros(len(place)))
-            columns = e.checked_columns(s)
+            for c in e.checked_columns(s):
+                columns.add(c, place)
             if e in self.effects and e.compliance(at) is not None:
                 for other, part in mine:
-                    columns += tuple(map(e.of_compliance, other.compliance_columns(part, s)))
-            block = moves.by_parameters(columns, within, (len(s.states), m, len(wanted)))
+                    for c in other.compliance_columns(part, s):
+                        columns.add(e.of_compliance(c), place)
             change = e.wrench_columns(at, s) if blocks else None
             if change is not None:
-                block = block + by_wrench_changes(moves, blocks, change[:, wanted])
-            # A slice is written several times as fast as columns by index.
-            begin, end = int(place[wanted[0]]), int(place[wanted[-1]]) + 1
-            if block.flags.c_contiguous and end - begin >= WIDE:
-                out[:, :, begin:end] = block
-                continue
-            whole[:, :, begin:end] = block
-            if turned and turned[-1][1] == begin:
-                begin = turned.pop()[0]
-            turned.append((begin, end))
-        for begin, end in turned:
-            out[:, :, begin:end] = whole[:, :, begin:end]
+                columns.add_wrench_changes(change, place)
+        columns.write(out)
 
     def _motion(self, prediction: Prediction, theta: Floats, m: int) -> tuple[Motion, list[Block]]:
         """Derivative of a chunk of readings by the deviation, at equilibrium; the compliance."""

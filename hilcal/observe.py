@@ -4,18 +4,16 @@ T_sensor_target = exp(station) T_sensor_base exp(base) T_base_flange T_flange_ta
 position read   = (1 + scale) · position
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.effects.protocol import Columns
 from hilcal.robot import se3
-from hilcal.robot.batch import along_states, empty, zeros
+from hilcal.robot.batch import empty, zeros
 from hilcal.robot.chain import Chain, joint_jacobian, twist_jacobian
 from hilcal.robot.deviation import Deviation
-from hilcal.robot.geometric_stiffness import MotionGradient, rows_times, rows_times_constant
+from hilcal.robot.geometric_stiffness import MotionGradient, rows_times
 from hilcal.types import Floats, Ints
 
 ALL = slice(0, 6)
@@ -97,55 +95,6 @@ class Motion:
     yielding: MotionGradient | None = None
     _known: dict[int, tuple[Floats, Floats]] = field(default_factory=dict, repr=False)
 
-    def by_columns(self, c: Columns) -> Floats:
-        """Motion (N, m, P) by the parameters of one block of columns."""
-        if c.field == "dq":
-            out = np.empty((len(self.dq), self.m, len(c.parameter)))
-            for joint, mine in c.runs():
-                moved = self.drives[:, :, joint, None]
-                np.multiply(moved, c.values[:, None, mine], out=out[:, :, mine])
-            return out
-        if c.field == "scale":
-            out = zeros(len(self.dq), self.m, len(c.parameter))
-            out[:, :3] = self._unscaled()[:, :, None] * c.values[:, None, :]
-            return out
-        if c.field == "twist":
-            out = empty(len(self.dq), self.m, len(c.parameter))
-            twists: dict[int, Floats] = {}
-            used = _range([e for e in range(6) if c.values[..., e].any()])
-            for slot, mine in c.runs():
-                if slot not in twists:
-                    twists[slot] = self.by_slot(slot, used)
-                values = along_states(c.values[:, mine, used])
-                np.einsum("nie,npe->nip", twists[slot], values, out=out[:, :, mine])
-            return out
-        sides = {"base": self.by_base, "station": self.by_station, "target": self.by_target}
-        return _per_column(sides[c.field](), c.values)
-
-    def by_parameters(
-        self, columns: Sequence[Columns], within: Ints, shape: tuple[int, int, int]
-    ) -> Floats:
-        """Derivative (N, m, P) by parameters, one of which may move several elements.
-
-        Args:
-            columns: of an effect.
-            within: place of each of its parameters among the P; -1 for those left out.
-            shape: N, m, P.
-        """
-        block: Floats | None = None
-        for c in columns:
-            c = c.only(within[c.parameter] >= 0)
-            at, moved = within[c.parameter], self.by_columns(c)
-            if len(columns) == 1 and np.array_equal(at, np.arange(shape[2])):
-                return moved
-            block = zeros(*shape) if block is None else block
-            if len(np.unique(at)) == len(at):
-                block[:, :, at] += moved
-            else:
-                for column, place in enumerate(at):
-                    block[:, :, place] += moved[:, :, column]
-        return zeros(*shape) if block is None else block
-
     @property
     def drives(self) -> Floats:
         """(N, m, n) derivative by the displacements of the drives, `Deviation.dq`."""
@@ -202,6 +151,12 @@ class Motion:
             turn[:, :3] = 0.0
             moved[:, 3:, 3:] = se3.product(flange, se3.right_jacobian_blocks(turn)[0])
         return _to_sensor(self.observation, self.deviation, moved, self.m)
+
+    def by_scale(self) -> Floats:
+        """Motion (N, m, 1) by the scale error."""
+        moved = zeros(len(self.dq), self.m, 1)
+        moved[:, :3, 0] = self._unscaled()
+        return moved
 
     def _unscaled(self) -> Floats:
         """Position (N, 3) before the scale error, sensor axes."""
@@ -273,21 +228,9 @@ def motion(
     return Motion(cell, observation, chain, deviation, m, SlotFrames(chain), dq)
 
 
-def _range(elements: Sequence[int]) -> slice:
-    """Range of the elements of a twist that covers some of them; one where there is none."""
-    return slice(min(elements), max(elements) + 1) if elements else slice(5, 6)
-
-
 def _once(x: Floats) -> Floats:
     """Return x (N, E), or one row of it (1, E) where all are the same."""
     return x[:1] if len(x) and (x == x[:1]).all() else x
-
-
-def _per_column(moved: Floats, values: Floats) -> Floats:
-    """Motion (N, m, P) by P changes (N or 1, P, E), from the motion (N, m, E) per element."""
-    if len(values) == 1:
-        return rows_times_constant(moved, values[0].T)
-    return rows_times(moved, along_states(values), transposed=True)
 
 
 def _to_sensor(o: Observation, deviation: Deviation, moved: Floats, m: int) -> Floats:

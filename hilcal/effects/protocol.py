@@ -9,6 +9,7 @@ returns `load_change` or `wrench_change`, and their derivative `wrench_columns`.
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import groupby
 from typing import ClassVar, Literal, Self
 
@@ -112,6 +113,11 @@ class Columns:
         return Columns(
             self.field, self.parameter[wanted], self.element[wanted], self.values[:, wanted]
         )
+
+    def times(self, factor: Floats) -> "Columns":
+        """Return the columns times a factor (P,) each."""
+        by = factor if self.values.ndim == 2 else factor[:, None]
+        return Columns(self.field, self.parameter, self.element, self.values * by)
 
     def runs(self) -> Iterator[tuple[int, slice]]:
         """Yield each joint or slot that moves, and successive columns that move it."""
@@ -232,6 +238,11 @@ class Effect(ABC):
     @abstractmethod
     def parameters(self) -> tuple[Parameter, ...]:
         """The parameters, in order."""
+
+    @cached_property
+    def magnitudes(self) -> Floats:
+        """(P,) ordinary magnitudes of the parameters, asked for more often than their names."""
+        return np.array([p.scale for p in self.parameters], dtype=float)
 
     @abstractmethod
     def columns(self, s: Situation) -> tuple[Columns, ...]:

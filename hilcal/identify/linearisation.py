@@ -10,6 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
+from hilcal.data.whitening import Whitening
 from hilcal.effects.protocol import Effect
 from hilcal.identify.fit import Fit
 from hilcal.identify.folds import random_folds
@@ -28,15 +29,18 @@ from hilcal.regression.leave_out import (
 from hilcal.regression.paired_test import improves
 from hilcal.regression.products import gram
 from hilcal.regression.projection import Projection
-from hilcal.types import Floats, Ints
+from hilcal.types import Bools, Floats, Ints
 
 TOGETHER = 8_000_000
 """Numbers of the columns of effects that are computed together, 64 MB; a choice by memory."""
+WHITENED = 2_000_000
+"""Numbers of the columns that are whitened together, 16 MB, and kept while one of their effects is;
+a choice by memory."""
 LEAST_MISFIT = 3.0
 """A misfit counts as at least so many standard deviations of χ²; a choice."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class EffectColumns:
     """The columns of an effect in ordinary magnitudes of its parameters.
 
@@ -44,16 +48,27 @@ class EffectColumns:
         effect: the effect.
         scale: (P,) ordinary magnitudes, SI.
         white: (R, P) whitened columns.
-        motion: (D, 3, P) displacement of each measured position, m.
-        unloaded: (U, 3, P) displacement of the target in each unloaded fitted reading, sensor axes,
-            m.
+        readings: (N, m, P) motion of the fitted readings, sensor axes, m and rad.
+        whitening: of the readings.
+        bare: (N,) which readings are unloaded.
     """
 
     effect: Effect
     scale: Floats
     white: Floats
-    motion: Floats
-    unloaded: Floats
+    readings: Floats
+    whitening: Whitening
+    bare: Bools
+
+    @cached_property
+    def motion(self) -> Floats:
+        """(D, 3, P) displacement of each measured position, m."""
+        return self.whitening.raw(self.readings[:, :3])
+
+    @cached_property
+    def unloaded(self) -> Floats:
+        """(U, 3, P) displacement of the target in each unloaded reading, sensor axes, m."""
+        return np.asarray(self.readings[self.bare, :3])
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,35 +201,38 @@ def effect_columns(fit: Fit, effect: Effect) -> EffectColumns:
 def columns_of_each(fit: Fit, effects: Sequence[Effect]) -> Iterator[EffectColumns]:
     """Yield `effect_columns` of several effects.
 
-    The equilibrium is differentiated once for as many of them as have `TOGETHER` numbers.
+    The equilibrium is differentiated once for as many of them as have `TOGETHER` numbers; as many
+    as have `WHITENED` are whitened together.
     """
     s, w = fit.solution, fit.whitening
     rows = w.m * len(s.prediction.situation.angle)
-    unloaded = fit.readings[~fit.outlier].unloaded
-    for group in _groups(effects, rows):
-        jacobian = fit.model.jacobian_of(group, s.prediction, s.theta, w.m)
-        scales = [np.array([q.scale for q in effect.parameters]) for effect in group]
-        jacobian *= np.concatenate(scales)
+    bare = fit.readings[~fit.outlier].unloaded
+    for group in _groups(effects, rows, TOGETHER):
+        scale = np.concatenate([effect.magnitudes for effect in group])
+        jacobian = fit.model.jacobian_of(group, s.prediction, s.theta, w.m, scale=scale)
+        parts = tuple(_groups(group, rows, WHITENED))
         start = 0
-        for effect, scale in zip(group, scales, strict=True):
-            own = jacobian[:, :, start : start + len(scale)]
-            at_rest, start = own[unloaded, :3], start + len(scale)
-            if w.m == 3 and w.mode == "deflection":  # one difference serves both
-                motion = w.raw(own)
-                white = w.whiten(motion)
-            else:  # whitened where it is if it is all
-                motion = w.raw(own[:, :3].copy())
-                white = w.whiten_readings(own)
-            yield EffectColumns(effect, scale, white, motion, at_rest)
+        for part in parts:
+            ends = np.cumsum([0] + [len(effect.magnitudes) for effect in part]).tolist()
+            own = jacobian[:, :, start : start + ends[-1]]
+            start += ends[-1]
+            if len(parts) > 1:  # what is kept of a part does not keep the others
+                own = own.copy()
+            white = w.whitened(own)
+            for effect, *at in zip(part, ends[:-1], ends[1:], strict=True):
+                mine = slice(*at)
+                yield EffectColumns(
+                    effect, effect.magnitudes, white[:, mine], own[:, :, mine], w, bare
+                )
 
 
-def _groups(effects: Sequence[Effect], rows: int) -> Iterator[tuple[Effect, ...]]:
-    """Split effects into successive groups of at most `TOGETHER` numbers, or of one effect."""
+def _groups(effects: Sequence[Effect], rows: int, most: int) -> Iterator[tuple[Effect, ...]]:
+    """Split effects into successive groups of at most `most` numbers, or of one effect."""
     group: list[Effect] = []
     size = 0
     for effect in effects:
-        numbers = rows * len(effect.parameters)
-        if group and size + numbers > TOGETHER:
+        numbers = rows * len(effect.magnitudes)
+        if group and size + numbers > most:
             yield tuple(group)
             group, size = [], 0
         group.append(effect)

@@ -39,4 +39,4 @@ def names_of(model: Model) -> tuple[str, ...]:
 
 def scales_of(model: Model) -> Floats:
     """(P,) ordinary magnitudes of the parameters."""
-    return np.array([p.scale for e in model.effects for p in e.parameters])
+    return np.concatenate([np.zeros(0), *(e.magnitudes for e in model.effects)])

@@ -7,6 +7,7 @@ import pytest
 
 from hilcal.effects.protocol import Columns
 from hilcal.observe import Motion, Observation, motion, observe
+from hilcal.reading_columns import ReadingColumns
 from hilcal.robot import se3
 from hilcal.robot.chain import evaluate
 from hilcal.robot.deviation import Deviation
@@ -134,7 +135,10 @@ def test_motion_by_columns_is_a_slope(field: str, d: Deviation, constant: bool) 
     tail = () if field in ("dq", "scale") else (6,)
     values = rng.normal(size=(count, size, *tail))
     block = Columns(field, np.arange(size), element, values)  # type: ignore[arg-type]
-    found = motion_of(d).by_columns(block)
+    found = np.empty((COUNT, 6, size))
+    columns = ReadingColumns(motion_of(d), [])
+    columns.add(block, np.arange(size))
+    columns.write(found)
     for p in range(size):
         change = np.zeros(SHAPES[field])
         if per_element:

@@ -1,0 +1,96 @@
+"""The derivative by many effects at once is the sum of its products, column by column."""
+
+from typing import get_args
+
+import numpy as np
+import pytest
+
+from hilcal.effects.protocol import Columns, Field
+from hilcal.observe import Motion
+from hilcal.reading_columns import WIDE, ReadingColumns
+from hilcal.types import Floats, Ints
+from tests.unit.model.test_observe import COUNT, FULL, motion_of
+
+SIZE = WIDE + 30
+PER_ELEMENT = {"dq": 6, "twist": 7}
+
+
+def drawn(rng: np.random.Generator) -> list[tuple[Columns, Ints]]:
+    """Blocks of all fields: parameters left out, in any order, twice in one block, in several."""
+    out = []
+    for _ in range(30):
+        field = rng.choice(get_args(Field))
+        count = int(rng.integers(1, 9))
+        element = np.sort(rng.integers(0, PER_ELEMENT.get(field, 1), count))
+        parameter = rng.integers(0, count, count) if rng.random() < 0.3 else np.arange(count)
+        place = rng.permutation(SIZE - 10)[:count]
+        if rng.random() < 0.5:
+            place = np.arange(count) + int(rng.integers(SIZE - 20))
+        place[rng.random(count) < 0.2] = -1
+        tail = () if field in ("dq", "scale") else (6,)
+        values = rng.normal(size=(COUNT if rng.random() < 0.6 else 1, count, *tail))
+        if tail:
+            values[..., rng.random(6) < 0.5] = 0.0
+        out.append((Columns(field, parameter, element, values), place))
+    return out
+
+
+def wide(rng: np.random.Generator) -> tuple[Columns, Ints]:
+    values = rng.normal(size=(COUNT, WIDE))
+    element = np.full(WIDE, 4)
+    return Columns("dq", np.arange(WIDE), element, values), np.arange(WIDE) + 20
+
+
+def expected(moves: Motion, blocks: list[tuple[Columns, Ints]], scale: Floats) -> Floats:
+    """Sum them one by one."""
+    out = np.zeros((COUNT, moves.m, SIZE))
+    sides = {"base": moves.by_base, "station": moves.by_station, "target": moves.by_target}
+    for c, place in blocks:
+        for k, at in enumerate(place[c.parameter]):
+            if at < 0:
+                continue
+            values = np.broadcast_to(c.values[:, k], (COUNT, *c.values.shape[2:])) * scale[at]
+            if c.field == "dq":
+                out[:, :, at] += moves.dq[:, :, c.element[k]] * values[:, None]
+            elif c.field == "scale":
+                out[:, :, at] += moves.by_scale()[:, :, 0] * values[:, None]
+            else:
+                moved = moves.by_slot(c.element[k]) if c.field == "twist" else sides[c.field]()
+                out[:, :, at] += np.einsum("nme,ne->nm", moved, values)
+    return out
+
+
+def written(moves: Motion, blocks: list[tuple[Columns, Ints]], scale: Floats | None) -> Floats:
+    columns, out = ReadingColumns(moves, [], scale), np.full((COUNT, moves.m, SIZE), np.nan)
+    for c, place in blocks:
+        columns.add(c, place)
+    columns.write(out)
+    return out
+
+
+@pytest.mark.parametrize("m", [3, 6])
+@pytest.mark.parametrize("seed", range(4))
+def test_columns_of_all_fields_together_are_those_one_by_one(seed: int, m: int) -> None:
+    rng = np.random.default_rng(seed)
+    moves, blocks = motion_of(FULL, m), drawn(rng)
+    if seed % 2:
+        blocks.insert(seed, wide(rng))
+    scale = rng.uniform(0.5, 2.0, SIZE)
+    for units in (None, scale):
+        found = written(moves, blocks, units)
+        aim = expected(moves, blocks, np.ones(SIZE) if units is None else units)
+        np.testing.assert_allclose(found, aim, rtol=0, atol=1e-13 * np.abs(aim).max())
+
+
+def test_many_columns_of_one_joint_are_written_as_they_are() -> None:
+    rng = np.random.default_rng(1)
+    moves, (c, place) = motion_of(FULL), wide(rng)
+    found = written(moves, [(c, place)], None)
+    np.testing.assert_array_equal(
+        found[:, :, place], moves.dq[:, :, 4, None] * c.values[:, None], strict=True
+    )
+    assert not found[:, :, : place[0]].any()
+
+
+def test_nothing_added_is_zero() -> None:
+    assert not written(motion_of(FULL), [], None).any()
