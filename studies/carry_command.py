@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import asdict, dataclass, replace
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated
 
@@ -11,8 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from hilcal.calibration.calibration import Calibration
 from hilcal.cell import Cell
+from hilcal.cli.engine import Jobs, Scheduler
 from hilcal.cli.terminal import Json, terminal
 from hilcal.data.readings import Readings
+from hilcal.engine.engine import open_engine
 from hilcal.errors import CannotAnswerError
 from hilcal.identify.arm_scatter import with_prior_scatter
 from hilcal.identify.baseline import baseline
@@ -21,7 +24,7 @@ from hilcal.identify.fit import Fit, fit
 from hilcal.identify.posterior import Posterior
 from hilcal.library import read_table
 from hilcal.refine import refine
-from hilcal.report.progress import working
+from hilcal.report.progress import counting, working
 from hilcal.robot.catalogue import configs_dir
 from hilcal.types import Floats
 from studies.carry_picture import PICTURE, Point
@@ -61,6 +64,8 @@ def carry(
         Path | None,
         typer.Option("--without-of", metavar="F.json", help="An earlier record's errors without."),
     ] = None,
+    jobs: Jobs = 1,
+    scheduler: Scheduler = None,
     keep_file: Keep = None,
     as_json: Json = False,
 ) -> None:
@@ -71,38 +76,24 @@ def carry(
     figures: list[Figure] = []
     points: list[Point] = []
     with working(t.progress) as say:
-        b = read_table(first, cell, "ipa-ur10")
-        half = np.random.default_rng(0).permutation(len(b))
-        mine, rest = b[np.sort(half[: len(b) // 2])], b[np.sort(half[len(b) // 2 :])]
         say("refining half of the first series")
+        mine = _readings("half of B", first)
         learnt = refine(baseline(cell, mine, "absolute"), mine, "absolute").fit
         prior = carried_prior(Posterior.of(learnt))
-        cases = [("B", rest, _numbers(poses))]
-        if second is not None:
-            cases.append(("C", read_table(second, cell, "ipa-ur10"), _numbers(other_poses)))
-        for name, readings, numbers in cases:
-            for n in numbers:
-                with_it, alone = [], []
-                for draw in range(draws):
-                    rng = np.random.default_rng([draw, n])
-                    order = rng.permutation(len(readings))
-                    anew = set_up_anew(readings, rng)
-                    some = anew[np.sort(order[:n])]
-                    tested = anew[np.sort(order[n:][:MOST_TESTED])]
-                    say(f"{name}, {n} poses, draw {draw + 1} of {draws}")
-                    with_it.append(outcome(_carried(cell, some, prior), tested))
-                    if without:
-                        alone.append(outcome(_alone(cell, some), tested))
-                figures += _figures(name, n, with_it, alone, known.get((name, n)))
-                points.append(
-                    Point(
-                        name,
-                        n,
-                        [o.mean_m for o in with_it],
-                        [o.mean_m for o in alone] or known.get((name, n), []),
-                    )
-                )
-                t.show(f"{figures[-1].what}: {figures[-1].measured}")
+    cases = [("B", first, n) for n in _numbers(poses)]
+    if second is not None:
+        cases += [("C", second, n) for n in _numbers(other_poses)]
+    run = partial(_drawn, prior=prior, draws=draws, without=without)
+    with (
+        open_engine(None if scheduler else jobs, scheduler) as engine,
+        counting(t.progress, "numbers of poses", len(cases)) as advance,
+    ):
+        done = engine.map(run, cases, advance=advance)
+    for (name, _, n), (with_it, alone) in zip(cases, done, strict=True):
+        figures += _figures(name, n, with_it, alone, known.get((name, n)))
+        errors = [o.mean_m for o in alone] or known.get((name, n), [])
+        points.append(Point(name, n, [o.mean_m for o in with_it], errors))
+        t.show(f"{figures[-1].what}: {figures[-1].measured}")
     title = "A real UR10 measured again: half of Series B as prior, tracker and target set up anew"
     if not _numbers(poses):
         title = (
@@ -112,6 +103,38 @@ def carry(
     more = {"picture": PICTURE, "points": [asdict(p) for p in points]}
     keep(keep_file, title, figures, more)
     t.document({"figures": [{"what": f.what, "measured": f.measured} for f in figures]})
+
+
+@cache
+def _readings(which: str, path: Path) -> Readings:
+    """Return "half of B", its other half as "B", or all of a series as "C"."""
+    cell = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
+    readings = read_table(path, cell, "ipa-ur10")
+    if which == "C":
+        return readings
+    order = np.random.default_rng(0).permutation(len(readings))
+    first, second = np.split(order, [len(readings) // 2])
+    return readings[np.sort(first if which == "half of B" else second)]
+
+
+def _drawn(
+    case: tuple[str, Path, int], prior: CarriedPrior, draws: int, without: bool
+) -> tuple[list[Outcome], list[Outcome]]:
+    """Fit n poses of a series, drawn several times, with the prior and without any."""
+    name, path, n = case
+    cell = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
+    readings = _readings(name, path)
+    with_it, alone = [], []
+    for draw in range(draws):
+        rng = np.random.default_rng([draw, n])
+        order = rng.permutation(len(readings))
+        anew = set_up_anew(readings, rng)
+        some = anew[np.sort(order[:n])]
+        tested = anew[np.sort(order[n:][:MOST_TESTED])]
+        with_it.append(outcome(_carried(cell, some, prior), tested))
+        if without:
+            alone.append(outcome(_alone(cell, some), tested))
+    return with_it, alone
 
 
 def set_up_anew(readings: Readings, rng: np.random.Generator) -> Readings:

@@ -7,9 +7,9 @@ no longer than the radius that 95 % of errors with the covariance Î£ + V have, Î
 and V of the instrument that measured it.
 """
 
-import time
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -19,15 +19,17 @@ import typer
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.poses import BAND, ToolPoses, band
 from hilcal.cell import Cell
+from hilcal.cli.engine import Jobs, Scheduler
 from hilcal.cli.terminal import Json, terminal
 from hilcal.data.readings import Readings
+from hilcal.engine.engine import open_engine
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import fit
 from hilcal.library import read_table
 from hilcal.refine import refine
 from hilcal.report.numbers import length
-from hilcal.report.progress import working
+from hilcal.report.progress import counting
 from hilcal.robot.catalogue import configs_dir
 from hilcal.types import Bools, Floats
 from studies.records import Figure, Keep, keep
@@ -91,6 +93,8 @@ def compensation(
         Path | None,
         typer.Option("--calibrations", metavar="DIR", help="Keep them there; use what is there."),
     ] = None,
+    jobs: Jobs = 1,
+    scheduler: Scheduler = None,
     keep_file: Keep = None,
     as_json: Json = False,
 ) -> None:
@@ -98,24 +102,17 @@ def compensation(
     t = terminal(as_json)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
-    cell = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
+    cases = [(path, k) for path in series for k in range(splits + (share == HALF))]
+    run = partial(_split, splits=splits, share=share, folder=folder)
+    with (
+        open_engine(None if scheduler else jobs, scheduler) as engine,
+        counting(t.progress, "splits", len(cases)) as advance,
+    ):
+        done = engine.map(run, cases, advance=advance)
     figures: list[Figure] = []
     document: list[dict[str, object]] = []
     for path in series:
-        readings = read_table(path, cell, "ipa-ur10")
-        found: list[Left] = []
-        for name, fitted in _parts(len(readings), splits, share):
-            begun = time.monotonic()
-            with working(t.progress) as say:
-                say(f"{path.parent.name}, {name}: refining {int(fitted.sum())} readings")
-                stem = f"{path.parent.name}-{name}".replace(" ", "-")
-                calibrations = _calibrations(cell, readings[fitted], folder, stem)
-                before = _before(cell, readings[fitted], readings[~fitted])
-            found += [
-                _left(name, which, c, readings[~fitted], before)
-                for which, c in calibrations.items()
-            ]
-            t.notice(f"{path.parent.name}, {name}: {time.monotonic() - begun:.0f} s")
+        found = [x for (of, _), left in zip(cases, done, strict=True) if of == path for x in left]
         figures += _figures(path.parent.name, found)
         document.append({"series": path.parent.name, "splits": [asdict(x) for x in found]})
     for f in figures:
@@ -123,6 +120,18 @@ def compensation(
     part = "" if share == HALF else f", {100 * share:.0f} % fitted"
     keep(keep_file, f"A real UR10: corrections at poses that were not fitted{part}", figures)
     t.document({"series": document})
+
+
+def _split(case: tuple[Path, int], splits: int, share: float, folder: Path | None) -> list[Left]:
+    """Fit the k-th part of a series, and correct the rest."""
+    path, k = case
+    cell = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
+    readings = read_table(path, cell, "ipa-ur10")
+    name, fitted = list(_parts(len(readings), splits, share))[k]
+    stem = f"{path.parent.name}-{name}".replace(" ", "-")
+    calibrations = _calibrations(cell, readings[fitted], folder, stem)
+    before = _before(cell, readings[fitted], readings[~fitted])
+    return [_left(name, which, c, readings[~fitted], before) for which, c in calibrations.items()]
 
 
 def _parts(count: int, splits: int, share: float) -> Iterator[tuple[str, Bools]]:

@@ -3,15 +3,18 @@
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from hilcal.cli.demo import CELL
-from hilcal.cli.terminal import Json, terminal
-from hilcal.config import load_config
+from hilcal.cli.engine import Jobs, Scheduler
+from hilcal.cli.terminal import Json, Terminal, terminal
+from hilcal.config import CellConfig, load_config
 from hilcal.data.whitening import MODES, Mode
+from hilcal.engine.engine import open_engine
 from hilcal.report import text
 from hilcal.report.progress import counting
 from hilcal.robot.catalogue import configs_dir
@@ -47,6 +50,8 @@ def discover(
         list[Path] | None,
         typer.Option("--counted", help="Count the cases of such files instead; repeatable."),
     ] = None,
+    jobs: Jobs = None,
+    scheduler: Scheduler = None,
     keep_file: Keep = None,
     as_json: Json = False,
 ) -> None:
@@ -63,13 +68,8 @@ def discover(
         ]
     )
     done = [_outcome(line) for path in counted or () for line in path.read_text().splitlines()]
-    with counting(t.progress, "campaigns", len(asked)) as advance:
-        for a in asked:
-            done.append(run_case(config, a))
-            if cases is not None:
-                with cases.open("a", encoding="utf-8") as stream:
-                    stream.write(json.dumps(asdict(done[-1])) + "\n")
-            advance(1)
+    if asked:
+        done += _run(config, asked, cases, t, (jobs, scheduler))
     outcomes = [o for o in done if not o.impossible]
     table = text.table(
         "hidden", "arm", "site", "variables", "correlation", "fresh error", "law found", left=(0, 6)
@@ -91,6 +91,28 @@ def discover(
         title = f"Laws discovered: {', '.join(law)}"
     keep(keep_file, title, figures, {"cases": [_brief(o) for o in done]} if counted else None)
     t.document({"cases": [asdict(o) for o in outcomes], "figures": [asdict(f) for f in figures]})
+
+
+def _run(
+    config: CellConfig,
+    asked: Sequence[Asked],
+    cases: Path | None,
+    t: Terminal,
+    workers: tuple[int | None, str | None],
+) -> list[Outcome]:
+    """Run the cases on several workers; each is in the file of cases as soon as it is done."""
+    found: dict[int, Outcome] = {}
+    with (
+        open_engine(*workers) as engine,
+        counting(t.progress, "campaigns", len(asked)) as advance,
+    ):
+        for k, outcome in engine.results(partial(run_case, config), asked):
+            found[k] = outcome
+            if cases is not None:
+                with cases.open("a", encoding="utf-8") as stream:
+                    stream.write(json.dumps(asdict(outcome)) + "\n")
+            advance(1)
+    return [found[k] for k in range(len(asked))]
 
 
 def _brief(o: Outcome) -> dict[str, object]:

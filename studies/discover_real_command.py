@@ -9,17 +9,19 @@ import numpy as np
 import typer
 
 from hilcal.cell import Cell
+from hilcal.cli.engine import Jobs, Scheduler
 from hilcal.cli.terminal import Json, terminal
 from hilcal.diagnose.residual_regression import residual_regression
 from hilcal.discover.discovery import Discovery, discover
 from hilcal.discover.write_effect import effect_class
+from hilcal.engine.engine import open_engine
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.linearisation import linearise
 from hilcal.library import read_table
 from hilcal.refine import refine
 from hilcal.report.numbers import length, percent
-from hilcal.report.progress import Say, working
+from hilcal.report.progress import counting
 from hilcal.report.text_discover import coefficient
 from hilcal.robot.catalogue import configs_dir
 from studies.records import Figure, Keep, keep
@@ -47,15 +49,18 @@ def discover_real(
         list[Path],
         typer.Argument(metavar="F.csv F.csv", help="measurements_joint_configurations.csv, …"),
     ],
+    jobs: Jobs = 1,
+    scheduler: Scheduler = None,
     keep_file: Keep = None,
     as_json: Json = False,
 ) -> None:
     """Search a law for what refinement leaves of the IPA UR10's series; try it on the other one."""
     t = terminal(as_json)
-    done = []
-    for path in series:
-        with working(t.progress) as say:
-            done.append(_searched(path, say))
+    with (
+        open_engine(None if scheduler else jobs, scheduler) as engine,
+        counting(t.progress, "series", len(series)) as advance,
+    ):
+        done = engine.map(_searched, series, advance=advance)
     figures = [f for s in done for f in _of_series(s)]
     figures += [_carried(a, b) for a, b in permutations(done, 2) if a.found.laws]
     for f in figures:
@@ -64,14 +69,12 @@ def discover_real(
     t.document({"figures": [{"what": f.what, "measured": f.measured} for f in figures]})
 
 
-def _searched(path: Path, say: Say) -> Series:
+def _searched(path: Path) -> Series:
     cell = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
-    say(f"reading {path}")
     readings = read_table(path, cell, "ipa-ur10")
-    last = refine(baseline(cell, readings, "absolute"), readings, "absolute", say).fit
+    last = refine(baseline(cell, readings, "absolute"), readings, "absolute").fit
     left = fit(last.model, last.readings.as_stated(), last.mode, start=last.theta)
-    found = discover(left, say)
-    say("asking what is predictable at all")
+    found = discover(left)
     return Series(path.parent.name, left, residual_regression(linearise(left)).share, found)
 
 

@@ -10,12 +10,14 @@ does not know.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from studies.plans_errors import Arm, Errors, run_campaign, subject
+from hilcal.engine.engine import ALONE, Engine
+from studies.plans_errors import Arm, Errors, Prepared, Subject, prepared, run_campaign, subject
 from studies.plans_kinds import Chosen, Scene, at_random, grid, matching, optimal, scene
 from studies.plans_statistics import Measured, Summary, summary
 
@@ -142,6 +144,7 @@ def plans_study(
     campaigns: int = 50,
     candidates: int | None = None,
     seed: int = 0,
+    engine: Engine = ALONE,
     advance: Callable[[int], None] = lambda step: None,
 ) -> PlansStudy:
     """Compare plans on one robot.
@@ -157,6 +160,7 @@ def plans_study(
         campaigns: of each kind of plan.
         candidates: poses that plans choose from; as configured by default.
         seed: of everything.
+        engine: what the campaigns run on; this process by default.
         advance: told of each campaign that is done.
 
     Raises:
@@ -172,14 +176,15 @@ def plans_study(
             fixed[name] = optimal(of, criterion, readings, rng, robust=robust)
     many = {RANDOM: readings, DOUBLE: 2 * readings}
     kinds = kinds_of(config)
-    errors: dict[str, list[Errors]] = {kind: [] for kind in kinds}
+    asked: list[_Campaign] = []
     for number in range(campaigns):
         arm = subject(of, make_arm(cell, config, number))
         for index, kind in enumerate(kinds):
             noise = np.random.default_rng([seed, number, index])
             chosen = fixed[kind] if kind in fixed else at_random(of, many[kind], noise)
-            errors[kind].append(run_campaign(of, chosen, arm, noise))
-            advance(1)
+            asked.append(_Campaign(prepared(chosen), arm, noise))
+    done = engine.map(partial(_run, cell=cell, config=config), asked, advance=advance)
+    errors = {kind: done[index :: len(kinds)] for index, kind in enumerate(kinds)}
     opened = {k: of.with_others(fixed[k]) if k in fixed else None for k in kinds}
     lines = tuple(
         Line(
@@ -193,6 +198,19 @@ def plans_study(
         for kind in kinds
     )
     return PlansStudy(config.robot.model, of.exact.mode, readings, campaigns, of.work.what, lines)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Campaign:
+    """A plan, the arm that it is carried out on, and the noise."""
+
+    plan: Prepared
+    arm: Subject
+    noise: np.random.Generator
+
+
+def _run(asked: _Campaign, cell: Cell, config: CellConfig) -> Errors:
+    return run_campaign(cell, config, asked.plan, asked.arm, asked.noise)
 
 
 def kinds_of(config: CellConfig) -> tuple[str, ...]:

@@ -13,9 +13,11 @@ from drivers.simulated.rehearsal import measurement_noise, simulate
 from drivers.simulated.world import World
 from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.demo import CELL
+from hilcal.cli.engine import Jobs, Scheduler
 from hilcal.cli.terminal import Json, terminal
 from hilcal.config import CellConfig, load_config
 from hilcal.data.readings import Readings, States
+from hilcal.engine.engine import open_engine
 from hilcal.errors import InputError
 from hilcal.plan.nominal_model import nominal_tracker_place
 from hilcal.report.progress import counting
@@ -49,6 +51,8 @@ def plans(
         int | None, typer.Option("--candidates", help="Poses to choose from; as configured.")
     ] = None,
     seed: Annotated[int, typer.Option("--seed", help="Of everything that is random.")] = 0,
+    jobs: Jobs = None,
+    scheduler: Scheduler = None,
     keep_file: Keep = None,
     as_json: Json = False,
 ) -> None:
@@ -67,13 +71,16 @@ def plans(
     settings = [with_robot(here, model, base) for model in models]
     total = sum(campaigns * len(kinds_of(config)) for config in settings)
     studies = []
-    with counting(t.progress, "campaigns", total) as advance:
+    with (
+        open_engine(jobs, scheduler) as engine,
+        counting(t.progress, "campaigns", total) as advance,
+    ):
         for config in settings:
             studies.append(
                 plans_study(
                     cell_from_config(config, base), config, arms(seed),
                     readings=readings, campaigns=campaigns, candidates=candidates,
-                    seed=seed, advance=advance,
+                    seed=seed, engine=engine, advance=advance,
                 )
             )  # fmt: skip
     for study in studies:

@@ -6,6 +6,8 @@ from typing import Protocol
 
 import numpy as np
 
+from hilcal.cell import Cell
+from hilcal.config import CellConfig
 from hilcal.data.plan import UNLOADED
 from hilcal.data.readings import Readings, States
 from hilcal.data.whitening import Mode
@@ -119,7 +121,44 @@ def _of_interest(position: Floats, unloaded: Ints) -> Floats:
     return np.asarray(position[: len(unloaded)] - position[unloaded])
 
 
-def run_campaign(of: Scene, chosen: Chosen, subject: Subject, rng: np.random.Generator) -> Errors:
+@dataclass(frozen=True, slots=True, eq=False)
+class Prepared:
+    """What a campaign needs of a plan; it travels to other processes.
+
+    Attributes:
+        asked: the readings.
+        std: predicted standard uncertainties by parameter, SI.
+        ordinary: ordinary magnitudes by parameter, SI.
+        position: predicted RMS error over the test poses, m.
+        readings: number of readings.
+        poses: number of different poses.
+    """
+
+    asked: Asked
+    std: Mapping[str, float]
+    ordinary: Mapping[str, float]
+    position: float
+    readings: int
+    poses: int
+
+
+def prepared(chosen: Chosen) -> Prepared:
+    """Return what a campaign needs of a plan."""
+    told = chosen.predicted
+    assert told.position is not None  # noqa: S101 - every scene has test poses
+    return Prepared(
+        asked=readings_asked(chosen),
+        std=told.by_name(),
+        ordinary={t.name: t.scale for t in chosen.problem.terms if not t.potential},
+        position=told.position,
+        readings=chosen.readings,
+        poses=chosen.poses,
+    )
+
+
+def run_campaign(
+    cell: Cell, config: CellConfig, plan: Prepared, subject: Subject, rng: np.random.Generator
+) -> Errors:
     """Simulate a campaign of a plan, identify, and compare with the truth.
 
     Compared are the parameters of the planned effects; those of the frames show in the
@@ -128,12 +167,12 @@ def run_campaign(of: Scene, chosen: Chosen, subject: Subject, rng: np.random.Gen
     Raises:
         CannotAnswerError: the readings do not determine the parameters.
     """
-    mode, names = of.config.planning.readings, planned_effects(of.config, installed())
-    readings = subject.arm.measure(readings_asked(chosen), rng)
-    found = fit(with_effects(of.cell, readings, mode, names, names), readings, mode)
+    mode, names = config.planning.readings, planned_effects(config, installed())
+    readings = subject.arm.measure(plan.asked, rng)
+    found = fit(with_effects(cell, readings, mode, names, names), readings, mode)
     at_test = found.model.predict(subject.test, found.theta).observation.position
     error = _of_interest(at_test, subject.unloaded) - subject.truth
-    told, true = chosen.predicted, subject.arm.parameters
+    true = subject.arm.parameters
     off: dict[str, float] = {}
     for e, s in zip(found.model.effects, found.model.slices(), strict=True):
         if e.name in names and len(true.get(e.name, ())) == len(e.parameters):
@@ -141,22 +180,19 @@ def run_campaign(of: Scene, chosen: Chosen, subject: Subject, rng: np.random.Gen
             off |= dict(zip(own, found.theta[s] - true[e.name], strict=True))
     if not off:
         raise CannotAnswerError(f"of {', '.join(names)} the simulated arm knows no true parameters")
-    std = told.by_name()
-    ordinary = {t.name: t.scale for t in chosen.problem.terms if not t.potential}
-    if unknown := [name for name in off if not np.isfinite(std.get(name, np.inf))]:
+    if unknown := [name for name in off if not np.isfinite(plan.std.get(name, np.inf))]:
         raise CannotAnswerError(
-            f"{chosen.readings} readings of a plan do not determine {', '.join(unknown)}; "
+            f"{plan.readings} readings of a plan do not determine {', '.join(unknown)}; "
             "compare plans of more readings"
         )
-    assert told.position is not None  # noqa: S101 - every scene has test poses
     return Errors(
         parameter=np.array([off[k] for k in off]),
-        std=np.array([std[k] for k in off]),
-        ordinary=np.array([ordinary[k] for k in off]),
+        std=np.array([plan.std[k] for k in off]),
+        ordinary=np.array([plan.ordinary[k] for k in off]),
         position=rms(np.linalg.norm(error, axis=1)),
-        position_std=told.position,
-        readings=chosen.readings,
-        poses=chosen.poses,
+        position_std=plan.position,
+        readings=plan.readings,
+        poses=plan.poses,
     )
 
 

@@ -1,20 +1,44 @@
 """`python -m studies real`: the public series of a real UR10, from the import to the last model."""
 
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from hilcal.cell import Cell
+from hilcal.cli.engine import Jobs, Scheduler
 from hilcal.cli.terminal import Json, terminal
+from hilcal.engine.engine import open_engine
 from hilcal.identify.baseline import baseline
 from hilcal.library import read_table
 from hilcal.refine import refine
 from hilcal.report.numbers import length
-from hilcal.report.progress import working
+from hilcal.report.progress import counting
 from hilcal.robot.catalogue import configs_dir
 from studies.records import Figure, Keep, keep
+
+
+@dataclass(frozen=True, slots=True)
+class Refined:
+    """What the refinement of a series came to.
+
+    Attributes:
+        series: name of its folder.
+        readings: their number.
+        mean_m: mean error of poses left out, of the baseline and of the last model.
+        model: effects of the last model.
+        verdict: of it.
+        seconds: that it took.
+    """
+
+    series: str
+    readings: int
+    mean_m: tuple[float, float]
+    model: tuple[str, ...]
+    verdict: str
+    seconds: float
 
 
 def real(
@@ -22,39 +46,46 @@ def real(
         list[Path],
         typer.Argument(metavar="F.csv...", help="measurements_joint_configurations.csv."),
     ],
+    jobs: Jobs = 1,
+    scheduler: Scheduler = None,
     keep_file: Keep = None,
     as_json: Json = False,
 ) -> None:
-    """Refine series of the IPA UR10 accuracy data; the cell knows the arm's type only."""
+    """Refine series of the IPA UR10 accuracy data; the cell knows the arm's type only.
+
+    One process refines one series after the other, each on all processors.
+    """
     t = terminal(as_json)
-    cell = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
-    figures, document = [], []
-    for path in series:
-        begun = time.monotonic()
-        with working(t.progress) as say:
-            say(f"reading {path}")
-            readings = read_table(path, cell, "ipa-ur10")
-            found = refine(baseline(cell, readings, "absolute"), readings, "absolute", say)
-        first, last = found.steps[0].fit, found.fit
-        errors = [length(f.holdout.mean_m) for f in (first, last)]
-        model = " + ".join(last.model.names)
-        seconds = time.monotonic() - begun
+    with (
+        open_engine(None if scheduler else jobs, scheduler) as engine,
+        counting(t.progress, "series", len(series)) as advance,
+    ):
+        done = engine.map(refined, series, advance=advance)
+    figures = []
+    for r in done:
+        first, last = map(length, r.mean_m)
         figures += [
             Figure(
-                f"{path.parent.name}, {len(readings)} readings: mean error of poses left out",
-                f"{errors[0]} → {errors[1]} ({seconds:.0f} s)",
+                f"{r.series}, {r.readings} readings: mean error of poses left out",
+                f"{first} → {last} ({r.seconds:.0f} s)",
             ),
-            Figure(f"{path.parent.name}: last model, verdict", f"{model}: {found.verdict}"),
+            Figure(f"{r.series}: last model, verdict", f"{' + '.join(r.model)}: {r.verdict}"),
         ]
-        document.append(
-            {
-                "series": path.parent.name,
-                "mean_m": [f.holdout.mean_m for f in (first, last)],
-                "model": list(last.model.names),
-                "verdict": found.verdict,
-            }
-        )
     for f in figures:
         t.show(f"{f.what}: {f.measured}")
     keep(keep_file, "A real UR10 under a laser tracker", figures)
-    t.document({"series": document})
+    names = ("series", "mean_m", "model", "verdict")
+    t.document({"series": [{name: getattr(r, name) for name in names} for r in done]})
+
+
+def refined(path: Path) -> Refined:
+    """Read a series and refine its model."""
+    begun = time.monotonic()
+    cell = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
+    readings = read_table(path, cell, "ipa-ur10")
+    found = refine(baseline(cell, readings, "absolute"), readings, "absolute")
+    first, last = (f.holdout.mean_m for f in (found.steps[0].fit, found.fit))
+    return Refined(
+        path.parent.name, len(readings), (first, last), found.fit.model.names, found.verdict,
+        time.monotonic() - begun,
+    )  # fmt: skip

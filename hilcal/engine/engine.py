@@ -137,6 +137,10 @@ class Engine:
             waiting.clear()
 
 
+ALONE = Engine(None, "this process")
+"""Computes in this process; BLAS has as many threads as it had."""
+
+
 def _seeds(seed: int | None, count: int) -> Sequence[np.random.SeedSequence | None]:
     return [None] * count if seed is None else np.random.SeedSequence(seed).spawn(count)
 

@@ -12,12 +12,13 @@ from rich.console import Console
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig, load_config
 from hilcal.data.readings import Readings, States
+from hilcal.engine.engine import open_engine
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.plan.noise_model import reading_covariance
 from hilcal.types import Floats
 from studies.plans import DOUBLE, GRID, PARAMETERS, RANDOM, TEST, PlansStudy, plans_study
 from studies.plans_command import SimulatedArm, arms, with_robot
-from studies.plans_errors import Asked, Errors, readings_asked, run_campaign, subject
+from studies.plans_errors import Asked, Errors, prepared, readings_asked, run_campaign, subject
 from studies.plans_kinds import Scene, at_random, grid, matching, optimal, scene
 from studies.plans_statistics import Measured, summary
 from studies.plans_table import as_predicted, halved, report
@@ -197,13 +198,14 @@ class Noisy:
 @pytest.mark.parametrize("factor", [pytest.param(1.0, marks=pytest.mark.slow), 2.0])
 def test_errors_are_those_of_the_noise_that_is_there(factor: float) -> None:
     of = scene_of(configured(known=True))
-    plan = at_random(of, 60, np.random.default_rng(0))
+    plan = prepared(at_random(of, 60, np.random.default_rng(0)))
     errors = []
     for number in range(16):
         made = arms(0)(of.cell, of.config, number)
         assert isinstance(made, SimulatedArm)
         told = subject(of, Noisy(made, factor))
-        errors.append(run_campaign(of, plan, told, np.random.default_rng([number, 1])))
+        noise = np.random.default_rng([number, 1])
+        errors.append(run_campaign(of.cell, of.config, plan, told, noise))
     s = summary(errors)
     for ratio in (s.spread, s.position_ratio):
         assert ratio.std < 0.1 * factor
@@ -213,15 +215,20 @@ def test_errors_are_those_of_the_noise_that_is_there(factor: float) -> None:
 def test_too_few_readings_are_refused(deflection: Scene) -> None:
     plan = at_random(deflection, 5, np.random.default_rng(0))
     told = subject(deflection, arms(0)(deflection.cell, deflection.config, 0))
+    rng = np.random.default_rng(0)
     with pytest.raises((CannotAnswerError, InputError)):
-        run_campaign(deflection, plan, told, np.random.default_rng(0))
+        run_campaign(deflection.cell, deflection.config, prepared(plan), told, rng)
 
 
 @pytest.mark.slow
 def test_the_study_depends_on_its_seed_alone(small: PlansStudy) -> None:
+    """Not on the number of workers either."""
     config = configured()
     cell = cell_from_config(config)
-    again = plans_study(cell, config, arms(0), readings=60, campaigns=3, candidates=80, seed=3)
+    with open_engine(2) as engine:
+        again = plans_study(
+            cell, config, arms(0), readings=60, campaigns=3, candidates=80, seed=3, engine=engine
+        )
     other = plans_study(cell, config, arms(1), readings=60, campaigns=3, candidates=80, seed=4)
     assert again == small
     assert other.of(RANDOM).result.position_real != small.of(RANDOM).result.position_real
