@@ -8,7 +8,7 @@ noise is known (ν infinite) the test is the χ² test.
 
 import numpy as np
 
-from hilcal.regression.distributions import chi2
+from hilcal.regression.distributions import chi2, ncf, ncx2
 from hilcal.regression.distributions import f as f_distribution
 from hilcal.regression.evidence import visible
 from hilcal.types import Floats
@@ -34,13 +34,11 @@ def family_power(s: Floats, beta: Floats, level: float, dof: float = np.inf) -> 
 
 def power_of_test(noncentrality: float, rank: int, rest: float, level: float) -> float:
     """Return the power of the F-test with `rank` and `rest` degrees of freedom."""
-    if noncentrality <= 0.0:  # SciPy's noncentral F is wrong at 0
+    if noncentrality <= 0.0:
         return level
-    from scipy.stats import ncf, ncx2  # slow to import
-
     if np.isinf(rest):
-        return float(ncx2.sf(chi2.isf(level, rank), rank, noncentrality))
-    return float(ncf.sf(f_distribution.isf(level, rank, rest), rank, rest, noncentrality))
+        return ncx2.sf(float(chi2.isf(level, rank)), rank, noncentrality)
+    return ncf.sf(float(f_distribution.isf(level, rank, rest)), rank, rest, noncentrality)
 
 
 def noncentrality_of_power(rank: int, rest: float, level: float, power: float) -> float:

@@ -14,6 +14,7 @@ from typing import Any
 
 import minimalmodbus
 import numpy as np
+from geocompy import geo
 from geocompy.geo import GeoCom
 
 from drivers import bota, ft300, geocom_line, modbus_rtu, onrobot_hex
@@ -138,7 +139,7 @@ def _geocom() -> Parser:
     link._connection = geocom_line._Connection(port)  # type: ignore[arg-type]
     link._instrument = GeoCom.__new__(GeoCom)
     port.held = b"".join(line(f"%R1P,0,{k}", body) for k, body in enumerate(("0", "0,15", "0")))
-    with instead(geocom_line, quiet):
+    with instead(geocom_line, quiet), instead(geo, {"sleep": lambda _: None}):
         GeoCom.__init__(link._instrument, link._connection, attempts=1, checksum=True)
     config = Tracker(driver="geocom", port="fuzz")
     tracker = GeoComTracker(link, config, Options(), Clock(1.0))

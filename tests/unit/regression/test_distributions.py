@@ -38,6 +38,21 @@ def test_quantile_of_f_has_its_tail(p: float, dfn: int, dfd: int) -> None:
     assert stats.f.sf(distributions.f.isf(p, dfn, dfd), dfn, dfd) == pytest.approx(p, rel=1e-7)
 
 
+@given(st.floats(1e-6, 1e3), st.integers(1, 300), st.integers(1, 3000), st.floats(1e-9, 0.5))
+def test_power_is_a_tail_of_the_noncentral(nc: float, dfn: int, dfd: int, p: float) -> None:
+    x = float(distributions.chi2.isf(p, dfn))
+    assert distributions.ncx2.sf(x, dfn, nc) == pytest.approx(stats.ncx2.sf(x, dfn, nc), rel=1e-9)
+    x = float(distributions.f.isf(p, dfn, dfd))
+    theirs = stats.ncf.sf(x, dfn, dfd, nc)
+    assert distributions.ncf.sf(x, dfn, dfd, nc) == pytest.approx(theirs, rel=1e-9)
+
+
+def test_a_noncentrality_of_nothing_or_very_much() -> None:
+    for nc, chance in ((0.0, 0.01), (1e7, 1.0)):
+        assert distributions.ncx2.sf(stats.chi2.isf(0.01, 6), 6, nc) == pytest.approx(chance)
+        assert distributions.ncf.sf(stats.f.isf(0.01, 6, 50), 6, 50, nc) == pytest.approx(chance)
+
+
 @given(st.floats(-30.0, 30.0), CHANCE, st.floats(1e-3, 1e3))
 def test_normal(x: float, p: float, scale: float) -> None:
     norm = distributions.norm
