@@ -27,8 +27,9 @@ from hilcal.errors import CannotAnswerError
 from hilcal.identify.earlier import Earlier
 from hilcal.identify.remeasured import Remeasured, Setting, remeasure
 from hilcal.regression.distributions import f as f_distribution
-from hilcal.regression.evidence import FamilyScore, log_evidence, score_family, visible
+from hilcal.regression.evidence import FamilyScore, log_evidence, score_family
 from hilcal.regression.power import noncentrality_of_power
+from hilcal.regression.spectrum import visible
 from hilcal.types import Floats
 
 LEVEL = 0.01

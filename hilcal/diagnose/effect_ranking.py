@@ -10,7 +10,7 @@ All is scored at plausible sizes: the standard deviation of the parameters is at
 effect is implausible, and the size that it would need is stated.
 """
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -20,7 +20,7 @@ import numpy as np
 from hilcal.diagnose.family_detection import large, least_of_family
 from hilcal.diagnose.gravity import beyond_geometry, geometry_columns, through_load, unloaded
 from hilcal.diagnose.minimum_detectable_effect import Strength, least_strength
-from hilcal.diagnose.plausible_size import Unloaded, most, unloaded_readings
+from hilcal.diagnose.plausible_size import Unloaded, frame_effects, most, unloaded_readings
 from hilcal.diagnose.promise import LEAST_KEPT, kept, kept_by_refit
 from hilcal.diagnose.stepwise import add
 from hilcal.effects.protocol import Effect
@@ -30,11 +30,13 @@ from hilcal.identify.linearisation import (
     EffectColumns,
     HeldOut,
     Linearisation,
+    columns_in_parts,
     columns_of_each,
     effect_columns,
     linearise,
 )
-from hilcal.regression.evidence import FamilyScore, Spectrum, spectrum
+from hilcal.regression.evidence import FamilyScore
+from hilcal.regression.spectrum import Spectrum, spectrum
 from hilcal.types import Floats
 
 SAME_EVIDENCE = 3.0
@@ -197,13 +199,14 @@ def rank_suspects(
         level: of the test over all of them together.
         refit: returns a fit with one more effect.
     """
-    bare = unloaded_readings(p.fit)
-    small: dict[int, EffectColumns] = {}
+    small: dict[str, EffectColumns] = {}
     found = []
-    for k, of in enumerate(columns_of_each(p.fit, effects)):
-        if of.white.size <= MOST_KEPT:
-            small[k] = of
-        found.append(_suspect(p, of, bare, level, len(effects)))
+    for part in _scored(p, effects, level):
+        for scored in part:
+            of = scored.of
+            if of.white.size <= MOST_KEPT:
+                small[of.effect.name] = of
+            found.append(_suspect(p, scored, level, len(effects)))
     tested = max(sum(s.score.rank > 0 for s in found), 1)
     out: list[Suspect] = []
     geometry: Floats | None = None
@@ -211,7 +214,7 @@ def rank_suspects(
         explains = s.score.p_value * tested < level and s.score.log_evidence > 0
         s = replace(s, explains=explains and s.holdout_share >= LEAST_SHARE)
         if s.passes:
-            own = small[k] if k in small else effect_columns(p.fit, effects[k])
+            own = small.get(s.effect) or effect_columns(p.fit, effects[k])
             if unloaded(p) and through_load(effects[k]):
                 if geometry is None:
                     geometry = geometry_columns(p, effects)
@@ -267,21 +270,61 @@ def ranked(suspects: Iterable[Suspect], rejected: Collection[str] = ()) -> tuple
     )
 
 
-def _suspect(
-    p: Linearisation, of: EffectColumns, bare: Unloaded | None, level: float, count: int
-) -> Suspect:
-    """Score one of `count` effects that are tested together."""
-    s = p.information(of.white)
-    of_s, largest = spectrum(s), most(of, bare)
-    result = p.score(of.white, of_s, largest)
-    effect = of.effect
+@dataclass(frozen=True, slots=True, eq=False)
+class _Scored:
+    """An effect that was scored, and what it was scored by.
+
+    Attributes:
+        of: its columns.
+        information: (P, P) S.
+        spectrum: of S.
+        gradient: (P,) g.
+        largest: largest plausible strength.
+        score: its score.
+        held: reduction of the error on poses left out; None where the fitted readings rule the
+            effect out.
+    """
+
+    of: EffectColumns
+    information: Floats
+    spectrum: Spectrum
+    gradient: Floats
+    largest: float
+    score: FamilyScore
+    held: HeldOut | None = None
+
+
+def _scored(
+    p: Linearisation, effects: Sequence[Effect], level: float
+) -> Iterator[tuple[_Scored, ...]]:
+    """Score effects, those together that were whitened together."""
+    frames = frame_effects(p.fit)
+    of_frames: list[EffectColumns] = []
+    bare: Unloaded | None = None
+    for part in columns_in_parts(p.fit, (*frames, *effects)):
+        rest = len(frames) - len(of_frames)
+        of_frames += part[:rest]
+        if len(of_frames) == len(frames) and bare is None:
+            bare = unloaded_readings(p.fit, of_frames)
+        scored = []
+        for of, (s, g) in zip(part[rest:], p.families(part[rest:]), strict=True):
+            of_s, largest = spectrum(s), most(of, bare)
+            scored.append(_Scored(of, s, of_s, g, largest, p.score_of(of_s, g, largest)))
+        able = [c for c in scored if c.score.p_value < level and c.score.log_evidence > 0]
+        held = iter(_left_out(p, [(c.of.white, c.score) for c in able]))
+        yield tuple(replace(c, held=next(held)) if c in able else c for c in scored)
+
+
+def _suspect(p: Linearisation, scored: _Scored, level: float, count: int) -> Suspect:
+    """Describe one of `count` effects that are tested together."""
+    of, of_s, result = scored.of, scored.spectrum, scored.score
+    s, largest, effect, known = scored.information, scored.largest, of.effect, scored.held
     columns: Callable[[], EffectColumns] = lambda: of  # noqa: E731 - of the small ones alone
     if of.white.size > MOST_KEPT:
         columns = partial(effect_columns, p.fit, effect)
-    left_out = LeftOut(lambda: _left_out(p, columns().white, result))
-    if result.p_value < level and result.log_evidence > 0:
-        held = _left_out(p, of.white, result)
-        left_out = LeftOut(lambda: held)
+    left_out = LeftOut(lambda: _left_out(p, [(columns().white, result)])[0])
+    if known is not None:
+        left_out = LeftOut(lambda: known)
 
     def least() -> Strength:
         own = columns()
@@ -300,37 +343,37 @@ def _suspect(
         return found
 
     return Suspect(
-        effect=of.effect.name,
-        coarse=of.effect.coarse,
+        effect=effect.name,
+        coarse=effect.coarse,
         score=result,
         share=p.share(result.gain),
         left_out=left_out,
         explains=False,
-        needs=_implausible(p, of, of_s, result, largest),
+        needs=_implausible(p, scored),
         detection=Detection(least),
     )
 
 
-def _left_out(p: Linearisation, x: Floats, score: FamilyScore) -> HeldOut:
-    """Reduction of the error on poses left out by whitened columns (R, P)."""
-    (held,) = p.held_out([(of, score) for of in p.products([x])])
-    return held
+def _left_out(p: Linearisation, families: Sequence[tuple[Floats, FamilyScore]]) -> list[HeldOut]:
+    """Reductions of the error on poses left out by families of whitened columns (R, P)."""
+    products = p.products(x for x, _ in families)
+    scores = [score for _, score in families]
+    return p.held_out(list(zip(products, scores, strict=True))) if families else []
 
 
-def _implausible(
-    p: Linearisation, of: EffectColumns, s: Spectrum, at_most: FamilyScore, largest: float
-) -> tuple[tuple[str, float, float], ...]:
+def _implausible(p: Linearisation, scored: _Scored) -> tuple[tuple[str, float, float], ...]:
     """Size that an effect needs where plausible ones explain less, and plausible sizes, by unit."""
+    of, at_most = scored.of, scored.score
     if not at_most.bounded:
         return ()
-    free = p.score(of.white, s)
+    free = p.score_of(scored.spectrum, scored.gradient)
     lost = free.log_evidence - at_most.log_evidence
     if lost <= max(SAME_EVIDENCE, LOST * free.log_evidence):
         return ()
     units = np.array([q.unit for q in of.effect.parameters])
     needed = of.scale * free.step
     return tuple(
-        (unit, _rms(needed[units == unit]), largest * _rms(of.scale[units == unit]))
+        (unit, _rms(needed[units == unit]), scored.largest * _rms(of.scale[units == unit]))
         for unit in dict.fromkeys(units.tolist())
     )
 

@@ -16,9 +16,10 @@ import numpy as np
 
 from hilcal.diagnose.minimum_detectable_effect import POWER, Strength
 from hilcal.identify.linearisation import EffectColumns, Linearisation, by_pose, effect_columns
-from hilcal.regression.evidence import LARGE_FAMILY, FamilyScore, Spectrum, score_family
+from hilcal.regression.evidence import LARGE_FAMILY, FamilyScore, score_family
 from hilcal.regression.leave_out import FamilyFolds
 from hilcal.regression.paired_test import improves
+from hilcal.regression.spectrum import Spectrum
 from hilcal.types import Floats
 
 DRAWS = 16

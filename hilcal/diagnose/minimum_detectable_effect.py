@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.regression.evidence import visible
 from hilcal.regression.power import noncentrality_of_power
+from hilcal.regression.spectrum import visible
 from hilcal.types import Floats
 
 POWER = 0.9

@@ -22,7 +22,7 @@ from hilcal.effects.protocol import Effect
 from hilcal.errors import HilcalError
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.linearisation import Linearisation, effect_columns, linearise
-from hilcal.regression.evidence import spectrum
+from hilcal.regression.spectrum import spectrum
 from hilcal.robot import se3
 
 DRAWS = 24

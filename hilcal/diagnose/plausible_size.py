@@ -12,10 +12,12 @@ parameter p, P the projection off the frames. Elastic effects are not held to th
 compensate for what gravity does.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from hilcal.effects.protocol import Effect
 from hilcal.identify.fit import Fit
 from hilcal.identify.linearisation import EffectColumns, columns_of_each
 from hilcal.types import Floats
@@ -48,15 +50,29 @@ class Unloaded:
         return ALLOWED * self.missed / moved if moved > ROUNDING * self.missed else np.inf
 
 
-def unloaded_readings(fit: Fit) -> Unloaded | None:
-    """Return the unloaded readings; None for a fit of absolute readings, which shows all itself."""
+def frame_effects(fit: Fit) -> tuple[Effect, ...]:
+    """Effects whose columns `unloaded_readings` needs; none for a fit of absolute readings."""
+    if fit.mode == "absolute":
+        return ()
+    states, model = fit.readings[~fit.outlier].states, fit.model
+    kinds = model.catalogue.with_role("registration", "target")
+    return tuple(kind(model.cell, states) for kind in kinds)
+
+
+def unloaded_readings(fit: Fit, frames: Sequence[EffectColumns] | None = None) -> Unloaded | None:
+    """Return the unloaded readings; None for a fit of absolute readings, which shows all itself.
+
+    Args:
+        fit: the fit.
+        frames: columns of `frame_effects`; computed where they are not given.
+    """
     if fit.mode == "absolute":
         return None
-    readings, model = fit.readings[~fit.outlier], fit.model
+    if frames is None:
+        frames = list(columns_of_each(fit, frame_effects(fit)))
+    readings = fit.readings[~fit.outlier]
     rows = readings.unloaded
-    kinds = model.catalogue.with_role("registration", "target")
-    of = columns_of_each(fit, [kind(model.cell, readings.states) for kind in kinds])
-    columns = np.concatenate([each.unloaded for each in of], axis=2)
+    columns = np.concatenate([each.unloaded for each in frames], axis=2)
     columns = columns.reshape(3 * int(rows.sum()), -1)
     u, s, _ = np.linalg.svd(columns, full_matrices=False)
     u = u[:, s > ROUNDING * s.max(initial=0.0)]

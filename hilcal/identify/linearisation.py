@@ -7,6 +7,7 @@ both use it, so that the planner's power and the diagnosis's test are of the sam
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -17,8 +18,9 @@ from hilcal.identify.folds import random_folds
 from hilcal.identify.gauss_newton import columns_of
 from hilcal.identify.holdout import folds_of
 from hilcal.identify.priors import scales_of
+from hilcal.regression import products
 from hilcal.regression.backward_elimination import ReducedModel, eliminate_columns
-from hilcal.regression.evidence import FamilyScore, Spectrum, score_family
+from hilcal.regression.evidence import FamilyScore, score_family
 from hilcal.regression.leave_out import (
     FamilyProducts,
     Fold,
@@ -27,8 +29,8 @@ from hilcal.regression.leave_out import (
     left_out_residual,
 )
 from hilcal.regression.paired_test import improves
-from hilcal.regression.products import gram
 from hilcal.regression.projection import Projection
+from hilcal.regression.spectrum import Spectrum
 from hilcal.types import Bools, Floats, Ints
 
 TOGETHER = 8_000_000
@@ -47,7 +49,8 @@ class EffectColumns:
     Attributes:
         effect: the effect.
         scale: (P,) ordinary magnitudes, SI.
-        white: (R, P) whitened columns.
+        part: (R, Q) whitened columns of all effects that were whitened together.
+        within: which of them are this effect's, P.
         readings: (N, m, P) motion of the fitted readings, sensor axes, m and rad.
         whitening: of the readings.
         bare: (N,) which readings are unloaded.
@@ -55,10 +58,16 @@ class EffectColumns:
 
     effect: Effect
     scale: Floats
-    white: Floats
+    part: Floats
+    within: slice
     readings: Floats
     whitening: Whitening
     bare: Bools
+
+    @property
+    def white(self) -> Floats:
+        """(R, P) whitened columns."""
+        return self.part[:, self.within]
 
     @cached_property
     def motion(self) -> Floats:
@@ -149,7 +158,27 @@ class Linearisation:
             most: largest plausible strength.
         """
         s = self.information(x) if s is None else s
-        return score_family(s, x.T @ self.residual, self.rss, self.fit.dof, most=most)
+        return self.score_of(s, x.T @ self.residual, most)
+
+    def score_of(self, s: Floats | Spectrum, g: Floats, most: float = np.inf) -> FamilyScore:
+        """Score a family by S, or its spectrum, and g = Xᵀ r (P,); see `families`."""
+        return score_family(s, g, self.rss, self.fit.dof, most=most)
+
+    def families(self, columns: Sequence[EffectColumns]) -> list[tuple[Floats, Floats]]:
+        """Return S (P, P) and g = Xᵀ r (P,) of effects that were whitened together.
+
+        The model's columns and the residual are multiplied by all of theirs at once.
+        """
+        if not columns:
+            return []
+        part = columns[0].part
+        both = products.cross(np.column_stack([self.rows, self.residual]), part)
+        lifted, rhs = self.projection.inverse_root @ both[:-1], both[-1]
+        out = []
+        for of in columns:
+            across = lifted[:, of.within]
+            out.append((products.gram(of.white) - across.T @ across, rhs[of.within]))
+        return out
 
     def misfit(self) -> float:
         """‖r‖² − dof, the misfit beyond the noise, at least `LEAST_MISFIT` of its σ."""
@@ -199,7 +228,12 @@ def effect_columns(fit: Fit, effect: Effect) -> EffectColumns:
 
 
 def columns_of_each(fit: Fit, effects: Sequence[Effect]) -> Iterator[EffectColumns]:
-    """Yield `effect_columns` of several effects.
+    """Yield `effect_columns` of several effects."""
+    return (of for part in columns_in_parts(fit, effects) for of in part)
+
+
+def columns_in_parts(fit: Fit, effects: Sequence[Effect]) -> Iterator[tuple[EffectColumns, ...]]:
+    """Yield `effect_columns` of several effects, those together that were whitened together.
 
     The equilibrium is differentiated once for as many of them as have `TOGETHER` numbers; as many
     as have `WHITENED` are whitened together.
@@ -219,11 +253,11 @@ def columns_of_each(fit: Fit, effects: Sequence[Effect]) -> Iterator[EffectColum
             if len(parts) > 1:  # what is kept of a part does not keep the others
                 own = own.copy()
             white = w.whitened(own)
-            for effect, *at in zip(part, ends[:-1], ends[1:], strict=True):
-                mine = slice(*at)
-                yield EffectColumns(
-                    effect, effect.magnitudes, white[:, mine], own[:, :, mine], w, bare
-                )
+            places = [slice(*at) for at in pairwise(ends)]
+            yield tuple(
+                EffectColumns(e, e.magnitudes, white, mine, own[:, :, mine], w, bare)
+                for e, mine in zip(part, places, strict=True)
+            )
 
 
 def _groups(effects: Sequence[Effect], rows: int, most: int) -> Iterator[tuple[Effect, ...]]:
@@ -277,7 +311,7 @@ def model_columns(fit: Fit) -> ModelColumns:
     scale = s.space.scales(scales_of(model))[parameter]
     white = columns_of(model, s.space, s.prediction, s.theta, w, parameter)
     white *= scale
-    return ModelColumns(parameter, scale, white, gram(white))
+    return ModelColumns(parameter, scale, white, products.gram(white))
 
 
 def eliminate_effect(fit: Fit, columns: ModelColumns, effect: str) -> ReducedModel:

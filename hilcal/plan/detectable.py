@@ -8,8 +8,8 @@ import numpy as np
 from hilcal.config import CellConfig
 from hilcal.plan.candidates import reading_derivatives
 from hilcal.plan.planner import Planned
-from hilcal.regression.evidence import VISIBLE
 from hilcal.regression.schur import schur_complement
+from hilcal.regression.spectrum import VISIBLE
 
 DRAWS = 5
 """Random directions of an effect whose median is its minimum detectable strength. A choice."""

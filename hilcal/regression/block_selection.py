@@ -15,8 +15,9 @@ from functools import reduce
 
 import numpy as np
 
-from hilcal.regression.evidence import log_evidence, visible
+from hilcal.regression.evidence import log_evidence
 from hilcal.regression.schur import positive_solve
+from hilcal.regression.spectrum import visible
 from hilcal.threads import in_threads
 from hilcal.types import Bools, Floats, Ints
 

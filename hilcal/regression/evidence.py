@@ -37,15 +37,11 @@ import numpy as np
 
 from hilcal.regression.distributions import f as f_distribution
 from hilcal.regression.quadratic_form import ratio_tail
-from hilcal.types import Bools, Floats
+from hilcal.regression.spectrum import Spectrum, spectrum
+from hilcal.types import Floats
 
 LARGE_FAMILY = 0.1
 """Share of the degrees of freedom from which a family counts as large; a guess."""
-VISIBLE = 1e-4
-"""Eigenvalues of S below this are left out of tests: such a direction moves all data together by
-less than 0.01 σ at ordinary magnitude; a guess."""
-RELATIVE = 1e-10
-"""Eigenvalues of S below this share of the largest are rounding."""
 ROUNDING = 1e-12
 STRENGTHS = np.logspace(-3, 3, 61)
 """Prior standard deviations τ that are tried, in ordinary magnitudes; t² = τ² ν / ‖r‖²."""
@@ -66,7 +62,8 @@ class FamilyScore:
         gain: reduction of ‖r‖² at that strength.
         delta_bic: change of the Bayesian information criterion; negative speaks for it.
         step: (P,) posterior mean of the parameters, in ordinary magnitudes.
-        root: (P, P) root of their posterior scale matrix; empty where no direction is visible.
+        spectrum: of S; None where no direction is visible.
+        noise: ‖r‖²_t / ν.
         bounded: whether a larger strength than is plausible has more evidence.
     """
 
@@ -79,19 +76,20 @@ class FamilyScore:
     gain: float
     delta_bic: float
     step: Floats
-    root: Floats
+    spectrum: Spectrum | None
+    noise: float
     bounded: bool = False
 
+    @property
+    def root(self) -> Floats:
+        """(P, P) root of the parameters' posterior scale matrix; empty for no visible direction."""
+        of = self.spectrum
+        if of is None:
+            return np.zeros((0, 0))
+        return of.vectors * np.sqrt(self.noise / (np.where(of.seen, of.values, 0.0) + self.ridge))
 
-NOTHING = FamilyScore(
-    1.0, 0.0, 0.0, np.inf, 0, 0.0, 0.0, 0.0, np.zeros(0), np.zeros((0, 0))
-)  # fmt: skip
 
-
-def visible(values: Floats) -> Bools:
-    """Return which eigenvalues (..., P) of S belong to directions that can be tested."""
-    largest = values.max(axis=-1, keepdims=True, initial=0.0)
-    return np.asarray(values > np.maximum(VISIBLE, RELATIVE * largest))
+NOTHING = FamilyScore(1.0, 0.0, 0.0, np.inf, 0, 0.0, 0.0, 0.0, np.zeros(0), None, 0.0)
 
 
 def log_evidence(
@@ -122,32 +120,6 @@ def _posterior_strengths(lam: Floats, explained: Floats, rss: float, dof: float)
     return np.asarray(STRENGTHS * np.sqrt(left / rss))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Spectrum:
-    """Eigenvalues and eigenvectors of S, which every score of a family needs.
-
-    Attributes:
-        values: (P,) eigenvalues, ascending.
-        vectors: (P, P) eigenvectors, in columns.
-        seen: (P,) which belong to directions that can be tested.
-    """
-
-    values: Floats
-    vectors: Floats
-    seen: Bools
-
-    @property
-    def rank(self) -> int:
-        """Number of directions that can be tested."""
-        return int(self.seen.sum())
-
-
-def spectrum(s: Floats) -> Spectrum:
-    """Return the spectrum of S (P, P)."""
-    values, vectors = np.linalg.eigh((s + s.T) / 2)
-    return Spectrum(values, vectors, visible(values))
-
-
 def score_family(
     s: Floats | Spectrum,
     g: Floats,
@@ -170,11 +142,10 @@ def score_family(
             it.
     """
     of = s if isinstance(s, Spectrum) else spectrum(s)
-    values, vectors, seen, rank = of.values, of.vectors, of.seen, of.rank
+    seen, rank = of.seen, of.rank
     if rank == 0 or rss <= 0 or dof - spent <= 1:
         return NOTHING
-    lam, u = values[seen], vectors if rank == len(seen) else vectors[:, seen]
-    c = u.T @ g
+    lam, c = of.values[seen], of.along(g)[seen]
     explained = c**2 / lam
     free, small = dof - spent, rank <= LARGE_FAMILY * (dof - spent)
     if small:
@@ -195,7 +166,8 @@ def score_family(
     shrunk = lam / (lam + ridge)
     effective, gain = float(shrunk.sum()), float(shrunk @ explained)
     full, count = (float(explained.sum()), rank) if small else (gain, effective)
-    spread = max(rss - gain, ROUNDING * rss) / dof
+    step = np.zeros(len(seen))
+    step[seen] = shrunk * c / lam
     return FamilyScore(
         p_value=p_value,
         log_evidence=float(evidence[best]),
@@ -205,7 +177,8 @@ def score_family(
         effective=effective,
         gain=gain,
         delta_bic=dof * float(np.log(max(1 - full / rss, 1e-300))) + count * float(np.log(dof)),
-        step=u @ (shrunk * c / lam),
-        root=vectors * np.sqrt(spread / (np.where(seen, values, 0.0) + ridge)),
+        step=of.combined(step),
+        spectrum=of,
+        noise=max(rss - gain, ROUNDING * rss) / dof,
         bounded=best != freely,
     )

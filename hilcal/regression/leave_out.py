@@ -25,6 +25,8 @@ from hilcal.types import Bools, Floats, Ints
 
 ROUNDING = 1e-6
 """Ridge of flat directions, whose gram is the identity."""
+SMALL = 48
+"""Parameters of a family up to which it is solved for in all folds at once; a choice by timing."""
 FAMILY_ROUNDING = 1e-10
 """Least ridge of a family, as a share of the largest square of a column."""
 
@@ -177,29 +179,55 @@ def left_out_of_families(
         families: products and ridge of each.
     """
     found = [np.zeros(len(white)) for _ in families]
+    small = [_in_all_folds(folds, of, ridge) for of, ridge in families]
 
     def predict(f: int) -> None:
         out, own = folds[f].out, p.rows[folds[f].out]
-        for (of, ridge), left in zip(families, found, strict=True):
-            back, step = _without(folds[f], of.whole, of.parts[f], ridge)
+        for (of, ridge), left, known in zip(families, found, small, strict=True):
+            back, step = known[f] if known else _without(folds[f], of.whole, of.parts[f], ridge)
             left[out] = white[out] - own @ back - of.x[out] @ step
 
     in_threads(predict, range(len(folds)), len(white))
     return found
 
 
+def _in_all_folds(
+    folds: tuple[Fold, ...], of: FamilyProducts, ridge: float
+) -> list[tuple[Floats, Floats]]:
+    """Return `_without` of each fold; nothing where the family is not small."""
+    if of.x.shape[1] > SMALL:
+        return []
+    root = np.stack([fold.inverse_root for fold in folds])
+    along = root @ (of.whole.cross - np.stack([own.cross for own in of.parts]))
+    across = np.swapaxes(along, 1, 2)
+    size = (root @ np.stack([fold.rhs for fold in folds])[..., None])[..., 0]
+    h = of.whole.gram - np.stack([own.gram for own in of.parts]) - across @ along
+    each = np.arange(h.shape[1])
+    h[:, each, each] += _least_ridge(of.whole, ridge)
+    rhs = of.whole.rhs - np.stack([own.rhs for own in of.parts])
+    inverse = inverse_root(h)
+    known = inverse @ (rhs[..., None] - across @ size[..., None])
+    step = (np.swapaxes(inverse, 1, 2) @ known)[..., 0]
+    back = np.swapaxes(root, 1, 2) @ (size[..., None] - along @ step[..., None])
+    return list(zip(back[..., 0], step, strict=True))
+
+
+def _least_ridge(whole: "_Products", ridge: float) -> float:
+    """Ridge of a family, at least what rounding asks for."""
+    return max(ridge, FAMILY_ROUNDING * float(np.diagonal(whole.gram).max(initial=0.0)))
+
+
 def _without(
     fold: Fold, whole: "_Products", own: "_Products", ridge: float
 ) -> tuple[Floats, Floats]:
     """Return the steps (K,) of the model and (F,) of a family without a fold."""
-    least = max(ridge, FAMILY_ROUNDING * float(np.diagonal(whole.gram).max(initial=0.0)))
     # Eliminate the model's own coordinates, then solve for the family.
     along = fold.inverse_root @ (whole.cross - own.cross)
     size = fold.inverse_root @ fold.rhs
     h = along.T @ along
     np.subtract(whole.gram, h, out=h)
     h -= own.gram
-    h[np.diag_indices_from(h)] += least
+    h[np.diag_indices_from(h)] += _least_ridge(whole, ridge)
     step = positive_solve(h, whole.rhs - own.rhs - along.T @ size)
     return fold.inverse_root.T @ (size - along @ step), step
 

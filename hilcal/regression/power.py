@@ -10,7 +10,7 @@ import numpy as np
 
 from hilcal.regression.distributions import chi2, ncf, ncx2
 from hilcal.regression.distributions import f as f_distribution
-from hilcal.regression.evidence import visible
+from hilcal.regression.spectrum import visible
 from hilcal.types import Floats
 
 

@@ -7,6 +7,7 @@ from hilcal.diagnose import effect_ranking
 from hilcal.diagnose import residual_regression as regression
 from hilcal.diagnose.backward_elimination import backward_elimination
 from hilcal.diagnose.effect_ranking import candidates, rank_suspects
+from hilcal.diagnose.plausible_size import most, unloaded_readings
 from hilcal.diagnose.residual_regression import Regressions, residual_regression
 from hilcal.diagnose.stepwise import add
 from hilcal.diagnose.stepwise_alternatives import StepwiseAlternatives
@@ -40,6 +41,21 @@ def test_columns_of_several_effects_are_those_of_each(
         white = w.whiten_readings(jacobian)
         atol = 1e-12 * np.abs(white).max(initial=0.0)
         np.testing.assert_allclose(of.white, white, rtol=1e-9, atol=atol)
+
+
+def test_scores_of_a_catalogue_are_those_of_each_effect_by_itself(found: Fit) -> None:
+    p, effects, w = linearise(found), candidates(found), found.whitening
+    ranked = {s.effect: s.score for s in rank_suspects(p, effects)}
+    bare = unloaded_readings(found)
+    for of in columns_of_each(found, effects):
+        jacobian = found.model.jacobian_of((of.effect,), found.solution.prediction, found.theta, 3)
+        x = w.whiten(w.raw(jacobian)) * of.scale
+        score = p.score(x, x.T @ p.project_out(x), most(of, bare))
+        together = ranked[of.effect.name]
+        assert (together.rank, together.strength) == (score.rank, score.strength)
+        assert together.log_evidence == pytest.approx(score.log_evidence, rel=1e-9, abs=1e-9)
+        assert together.gain == pytest.approx(score.gain, rel=1e-9, abs=1e-9)
+        assert together.p_value == pytest.approx(score.p_value, rel=1e-6)
 
 
 def test_the_residual_of_a_fit_is_regressed_once(
