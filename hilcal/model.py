@@ -200,13 +200,19 @@ class Model:
         return Prediction(s, deviation, observe(cell, chain, deviation, states.target))
 
     def jacobian(
-        self, prediction: Prediction, theta: Floats, m: int, live: Ints | None = None
+        self,
+        prediction: Prediction,
+        theta: Floats,
+        m: int,
+        live: Ints | None = None,
+        drives: Floats | None = None,
     ) -> Floats:
         """Derivative (N, m, P) of the readings by all parameters, sensor axes.
 
-        With `live`, an ascending list of L parameters, only those: (N, m, L).
+        With `live`, an ascending list of L parameters, only those: (N, m, L). Where `drives`
+        (N, m, n) is given, the derivative by displacements of the drives is written to it.
         """
-        return self.jacobian_of(self.effects, prediction, theta, m, live)
+        return self.jacobian_of(self.effects, prediction, theta, m, live, drives=drives)
 
     def jacobian_of(
         self,
@@ -216,6 +222,7 @@ class Model:
         m: int,
         live: Ints | None = None,
         scale: Floats | None = None,
+        drives: Floats | None = None,
     ) -> Floats:
         """Derivative (N, m, P) of the readings by the parameters of `effects`.
 
@@ -236,7 +243,9 @@ class Model:
         out = np.empty((count, m, len(live)))
 
         def fill(rows: slice) -> None:
-            self._fill(out[rows], effects, places, prediction[rows], theta, units)
+            moves = self._fill(out[rows], effects, places, prediction[rows], theta, units)
+            if drives is not None:
+                drives[rows] = moves.drives
 
         in_threads(fill, chunks(count, m * len(live)), count * m)
         return out
@@ -249,7 +258,7 @@ class Model:
         prediction: Prediction,
         theta: Floats,
         scale: Floats | None,
-    ) -> None:
+    ) -> Motion:
         """Write the derivative of a chunk of states; `places`: columns of `out`, −1 for none."""
         s = prediction.situation
         moves, blocks = self._motion(prediction, theta, out.shape[1])
@@ -269,6 +278,7 @@ class Model:
             if change is not None:
                 columns.add_wrench_changes(change, place)
         columns.write(out)
+        return moves
 
     def _motion(self, prediction: Prediction, theta: Floats, m: int) -> tuple[Motion, list[Block]]:
         """Derivative of a chunk of readings by the deviation, at equilibrium; the compliance."""

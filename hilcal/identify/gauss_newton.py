@@ -18,7 +18,9 @@ from hilcal.identify.minimise import Point, Problem, linear_problem, minimise
 from hilcal.identify.priors import prior_of
 from hilcal.identify.regularisation import LinearProblem, spent_parameters
 from hilcal.identify.residual import residual
+from hilcal.identify.wide_effects import whitened_columns
 from hilcal.model import Model, Prediction
+from hilcal.regression.factored import Tall, written
 from hilcal.regression.normal_equations import Basis, NormalEquations
 from hilcal.regression.products import gram
 from hilcal.regression.projection import Projection, projection
@@ -38,6 +40,7 @@ class Solution:
         equations: normal equations at the solution, in identifiable coordinates z of y.
         live: (L,) indices of the y that are not held at zero.
         rows: (R, K) whitened derivative of the measurements by z.
+        tall: the same, by its factors where that pays.
         prediction: prediction at the solution.
         raw: (D, m) residual.
         white: (R,) whitened residual.
@@ -54,6 +57,7 @@ class Solution:
     equations: NormalEquations
     live: Ints
     rows: Floats
+    tall: Tall
     prediction: Prediction
     raw: Floats
     white: Floats
@@ -118,8 +122,10 @@ class _Problem(Problem[_Point]):
         a = self.columns(point, live)
         return linear_problem(point, prior, a, point.white, self.w.rank, noise, self.whitened)
 
-    def columns(self, point: _Point, live: Ints) -> Floats:
+    def columns(self, point: _Point, live: Ints) -> Tall:
         """Whitened derivative (R, L) by the live coordinates."""
+        if not len(self.coordinates.index):
+            return whitened_columns(self.model, point.prediction, point.theta, self.w, live)
         return columns_of(self.model, self.coordinates, point.prediction, point.theta, self.w, live)
 
 
@@ -151,8 +157,9 @@ def solve(
     found = minimise(problem, y, prior)
     point, by = found.point, found.by
     live = np.flatnonzero(by.prior > 0)
-    a = problem.columns(point, live) if found.rows is None else found.rows
-    rows = by.basis.rows(a)
+    columns = problem.columns(point, live) if found.rows is None else found.rows
+    turned = by.basis.rows(columns)
+    rows = written(turned)
     beta = point.mean_square(len(by.basis.singular)) if w.scaling == "none" else by.beta
     # Formed anew at the solution, so that folds can be taken out of them exactly.
     basis = over_all_parameters(by.basis, live, model.size)
@@ -167,6 +174,7 @@ def solve(
         equations=equations,
         live=live,
         rows=rows,
+        tall=turned,
         prediction=point.prediction,
         raw=point.raw,
         white=point.white,

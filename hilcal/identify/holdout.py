@@ -13,9 +13,11 @@ fit where that is more.
 import numpy as np
 
 from hilcal.data.whitening import Whitening
-from hilcal.identify.gauss_newton import Solution, whitened_jacobian
+from hilcal.identify.gauss_newton import Solution
 from hilcal.identify.priors import FIRST_GUESS, prior_of, scales_of
+from hilcal.identify.wide_effects import measured_columns, whitened_columns
 from hilcal.model import Model
+from hilcal.regression.factored import beside, of_rows, ordered, scaled
 from hilcal.regression.fold_evidence import FamilyProblem, solutions
 from hilcal.regression.leave_out import Fold, folds
 from hilcal.types import Floats, Ints
@@ -86,10 +88,10 @@ def leave_out(model: Model, solution: Solution, fold: Ints, w: Whitening) -> Flo
     else:
         change = changes(model, solution, fold, w)
     moved = np.flatnonzero(np.any(change != 0, axis=0))
-    jacobian = w.raw(model.jacobian(solution.prediction, solution.theta, w.m, moved))
-    predicted = solution.raw.copy()
+    columns = measured_columns(model, solution.prediction, solution.theta, w, moved)
+    predicted, row = solution.raw.copy(), w.rows_of(fold)
     for f, by in enumerate(change[:, moved]):
-        predicted[fold == f] -= jacobian[fold == f] @ by
+        predicted[fold == f] -= (of_rows(columns, row == f) @ by).reshape(-1, w.m)
     return predicted
 
 
@@ -103,15 +105,12 @@ def _with_families(
     if len(dropped) * solution.raw.size > MOST_ELEMENTS:
         dropped = dropped[:0]
     guess = FIRST_GUESS * scales_of(model)[dropped]
-    more = whitened_jacobian(model, solution.prediction, solution.theta, w, dropped)
-    more *= guess
+    more = whitened_columns(model, solution.prediction, solution.theta, w, dropped)
     shrunk = groups[basis.held] >= 0
     others = np.concatenate([np.arange(flat), flat + np.flatnonzero(~shrunk)])
     kept = flat + np.flatnonzero(shrunk)
     family = np.concatenate([groups[basis.held[shrunk]], groups[dropped]])
     coordinates, order = solution.coordinates(), np.concatenate([others, kept])
-    in_order = np.array_equal(order, np.arange(count))
-    rows = solution.rows if in_order else solution.rows[:, order]
     # Flat parameters have the prior about zero of `folds_of`, unshrunk ones their own.
     magnitude = ordinary_y(model, solution)
     per = basis.transform[:, :flat] / magnitude[:, None]
@@ -121,7 +120,7 @@ def _with_families(
     ridge[np.arange(flat, len(others)), np.arange(flat, len(others))] = solution.beta
     found = solutions(
         FamilyProblem(
-            rows=(rows, more),
+            rows=beside(ordered(solution.tall, order), scaled(more, guess)),
             target=solution.white + solution.rows @ coordinates,
             ridge=ridge,
             pull=np.concatenate([-solution.beta * per.T @ own, np.zeros(len(others) - flat)]),

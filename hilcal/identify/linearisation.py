@@ -18,9 +18,11 @@ from hilcal.identify.folds import random_folds
 from hilcal.identify.gauss_newton import columns_of
 from hilcal.identify.holdout import folds_of
 from hilcal.identify.priors import scales_of
+from hilcal.identify.wide_effects import whitened_columns
 from hilcal.regression import products
 from hilcal.regression.backward_elimination import ReducedModel, eliminate_columns
 from hilcal.regression.evidence import FamilyScore, score_family
+from hilcal.regression.factored import Tall, gram, scaled, written
 from hilcal.regression.leave_out import (
     FamilyProducts,
     Fold,
@@ -309,9 +311,13 @@ def model_columns(fit: Fit) -> ModelColumns:
     kept = (s.prior > 0) | (np.array(scored, dtype=np.bool_) & ~carried)
     parameter = np.flatnonzero(kept)
     scale = s.space.scales(scales_of(model))[parameter]
-    white = columns_of(model, s.space, s.prediction, s.theta, w, parameter)
-    white *= scale
-    return ModelColumns(parameter, scale, white, products.gram(white))
+    columns: Tall
+    if len(s.space.index):
+        columns = columns_of(model, s.space, s.prediction, s.theta, w, parameter)
+    else:
+        columns = whitened_columns(model, s.prediction, s.theta, w, parameter)
+    columns = scaled(columns, scale)
+    return ModelColumns(parameter, scale, written(columns), gram(columns))
 
 
 def eliminate_effect(fit: Fit, columns: ModelColumns, effect: str) -> ReducedModel:

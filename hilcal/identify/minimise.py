@@ -22,8 +22,8 @@ from hilcal.identify.regularisation import (
     regularise,
 )
 from hilcal.model import Model
+from hilcal.regression.factored import Tall, gram, written
 from hilcal.regression.normal_equations import TALL
-from hilcal.regression.products import gram
 from hilcal.regression.triangle import triangle_of
 from hilcal.types import Floats
 
@@ -87,7 +87,7 @@ class Minimum(Generic[P]):
     by: Regularisation
     iterations: int
     converged: bool
-    rows: Floats | None
+    rows: Tall | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,7 +119,7 @@ class Problem(Generic[P]):
 def linear_problem(
     point: Point,
     prior: Floats,
-    a: Floats,
+    a: Tall,
     white: Floats,
     rank: int,
     noise: float,
@@ -137,7 +137,7 @@ def linear_problem(
     origin = np.where(np.isinf(prior), point.y, 0.0)
     rows = a
     if len(a) > TALL and 2 * np.count_nonzero(np.isinf(prior)) > len(live):
-        triangle = triangle_of(a, white)
+        triangle = triangle_of(written(a), white)
         a, white = triangle[:, :-1], triangle[:, -1]
     target = white + a @ (point.y - origin)[live]
     return LinearProblem(live, origin, a, gram(a), target, rank, noise, whitened, rows)

@@ -10,8 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilcal.regression.empirical_bayes import maximise_evidence, spent_by_groups
+from hilcal.regression.factored import Tall, keep_columns
 from hilcal.regression.normal_equations import Basis, NormalEquations, find_basis, normal_equations
-from hilcal.regression.products import keep_columns, submatrix
+from hilcal.regression.products import submatrix
 from hilcal.types import Floats, Ints
 
 NOISE_STEPS = 50
@@ -38,13 +39,13 @@ class LinearProblem:
 
     live: Ints
     origin: Floats
-    a: Floats
+    a: Tall
     gram: Floats
     target: Floats
     rank: int
     noise: float
     whitened: bool
-    rows: Floats
+    rows: Tall
 
     def restricted(self, prior: Floats) -> "LinearProblem":
         """Return the problem without the parameters that a prior (P,) of zero holds at zero.

@@ -21,9 +21,10 @@ from hilcal.data.readings import Readings
 from hilcal.data.whitening import Whitening
 from hilcal.identify.coordinates import Coordinates
 from hilcal.identify.folds import block_folds, region_folds
-from hilcal.identify.gauss_newton import Solution, whitened_jacobian
+from hilcal.identify.gauss_newton import Solution
 from hilcal.identify.holdout import changes
 from hilcal.identify.priors import prior_of, scales_of
+from hilcal.identify.wide_effects import whitened_columns
 from hilcal.model import Model
 from hilcal.regression.distributions import chi2
 from hilcal.regression.hyperparameter_uncertainty import (
@@ -113,7 +114,7 @@ def _hyperparameter_factors(
     dropped = np.flatnonzero((groups >= 0) & (solution.prior == 0))
     if w.scaling == "none" or not len(dropped) or not solution.rows.shape[1]:
         return factor
-    columns = whitened_jacobian(model, solution.prediction, solution.theta, w, dropped)
+    columns = whitened_columns(model, solution.prediction, solution.theta, w, dropped)
     transform = solution.transform
     return factor * dropped_group_factors(
         transform, solution.projection(), columns, groups[dropped], beta

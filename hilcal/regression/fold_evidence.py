@@ -19,6 +19,7 @@ import numpy as np
 import scipy.linalg as sl
 
 from hilcal.regression.empirical_bayes import maximise_evidence
+from hilcal.regression.factored import Tall, gram, of_rows
 from hilcal.regression.schur import eliminate
 from hilcal.threads import in_threads
 from hilcal.types import Bools, Floats, Ints
@@ -29,7 +30,7 @@ class FamilyProblem:
     """The linear problem y = A u: unshrunk columns first, then those of groups that share a prior.
 
     Attributes:
-        rows: (R, F + P) A, its columns in one or more parts.
+        rows: (R, F + P) A.
         target: (R,) y.
         ridge: (F, F) prior precision of the unshrunk columns, times β.
         pull: (F,) right-hand side that this prior adds.
@@ -38,7 +39,7 @@ class FamilyProblem:
         beta: noise variance factor by all rows.
     """
 
-    rows: tuple[Floats, ...]
+    rows: Tall
     target: Floats
     ridge: Floats
     pull: Floats
@@ -56,14 +57,14 @@ def solutions(p: FamilyProblem, fold: Ints) -> Floats:
     """
     flat, count_of = len(p.pull), np.bincount(fold)
     parts = in_threads(lambda f: _products(p, fold == f), range(len(count_of)), len(fold))
-    gram, rhs = (reduce(np.add, of) for of in zip(*parts, strict=True))
-    gram[:flat, :flat] += p.ridge
+    whole, rhs = (reduce(np.add, of) for of in zip(*parts, strict=True))
+    whole[:flat, :flat] += p.ridge
     rhs[:flat] += p.pull
     square = np.bincount(fold, weights=p.target**2)
 
     def without(f: int) -> Floats:
         own, side = parts[f]
-        g, b, yy = gram - own, rhs - side, float(square.sum() - square[f])
+        g, b, yy = whole - own, rhs - side, float(square.sum() - square[f])
         count = len(fold) - int(count_of[f]) - flat
         # Beside the unshrunk columns, which are eliminated once.
         h, c, left = eliminate(g, b, yy, slice(0, flat))
@@ -78,8 +79,8 @@ def solutions(p: FamilyProblem, fold: Ints) -> Floats:
 
 def _products(p: FamilyProblem, rows: Bools) -> tuple[Floats, Floats]:
     """AᵀA and Aᵀy of some rows."""
-    own = np.hstack([part[rows] for part in p.rows])
-    return own.T @ own, own.T @ p.target[rows]
+    own = of_rows(p.rows, rows)
+    return gram(own), own.T @ p.target[rows]
 
 
 def _solve(

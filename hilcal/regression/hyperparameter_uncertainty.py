@@ -23,6 +23,7 @@ prior for a global scale parameter*, Bayesian Analysis 7 (2012) 887-902.
 
 import numpy as np
 
+from hilcal.regression.factored import Tall, gram
 from hilcal.regression.projection import Projection
 from hilcal.regression.schur import inverse_root
 from hilcal.types import Floats, Ints
@@ -78,7 +79,7 @@ def _of_group(covariance: Floats, theta: Floats, prior: float) -> Floats:
 
 
 def dropped_group_factors(
-    transform: Floats, p: Projection, columns: Floats, groups: Ints, beta: float
+    transform: Floats, p: Projection, columns: Tall, groups: Ints, beta: float
 ) -> Floats:
     """Return the factors (P,), at least 1, by which groups that were dropped widen all others.
 
@@ -89,15 +90,15 @@ def dropped_group_factors(
         groups: (Q,) their groups.
         beta: noise factor that priors are weighed against.
     """
-    cross, gram = p.rows.T @ columns, columns.T @ columns
-    norm2 = np.diag(gram)
+    cross, own_gram = p.rows.T @ columns, gram(columns)
+    norm2 = np.diag(own_gram)
     free = np.maximum(norm2 - np.sum((p.inverse_root @ cross) ** 2, axis=0), 0.0)
     reach = np.bincount(groups, weights=free) / np.maximum(np.bincount(groups), 1)
     # Columns in the span of the others have no information of their own: left out.
     seen = reach[groups] > ROUNDING * np.maximum(norm2, 1e-300)
     if not seen.any():
         return np.ones(len(transform))
-    hidden = gram[np.ix_(seen, seen)] + np.diag(beta * reach[groups][seen] / HIDDEN)
+    hidden = own_gram[np.ix_(seen, seen)] + np.diag(beta * reach[groups][seen] / HIDDEN)
     own = p.rows.T @ p.rows + np.diag(p.ridge)
     explained = inverse_root(hidden) @ cross[:, seen].T
     wide = inverse_root(own - explained.T @ explained)

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.linalg as sl
 
+from hilcal.regression.factored import Factored, Tall, written
 from hilcal.regression.products import submatrix
 from hilcal.regression.schur import inverse_root, positive_solve
 from hilcal.regression.triangle import Triangle
@@ -78,12 +79,12 @@ class Basis:
             held=place[self.held],
         )
 
-    def flat_rows(self, a: Floats) -> Floats:
+    def flat_rows(self, a: Tall) -> Floats:
         """Return rows (R, F) by the flat coordinates of rows A (R, P) by the parameters."""
         flat = np.flatnonzero(self.flat)
         return np.asarray(a[:, flat] @ self.transform[flat, : len(self.singular)])
 
-    def rows(self, a: Floats) -> Floats:
+    def rows(self, a: Tall) -> Tall:
         """Return rows (R, K) by z of rows A (R, P) by the parameters: A T.
 
         A column with a prior is only scaled, and a part of the rows is worked on at a time: for a
@@ -93,6 +94,8 @@ class Basis:
         out = np.empty((len(a), self.transform.shape[1]))
         sigma = self.transform[self.held, count + np.arange(len(self.held))]
         turned = self.transform[flat, :count]
+        if isinstance(a, Factored):
+            return a.turned(flat, turned, self.held, sigma)
         for start in range(0, len(a), _ROWS):
             part = slice(start, start + _ROWS)
             out[part, :count] = a[part][:, flat] @ turned
@@ -100,7 +103,7 @@ class Basis:
         return out
 
 
-def find_basis(a: Floats, scale: Floats, prior: Floats, spread: float | None = 1.0) -> Basis:
+def find_basis(a: Tall, scale: Floats, prior: Floats, spread: float | None = 1.0) -> Basis:
     """Rank analysis of A (R, P): the identifiable directions of the flat parameters.
 
     Args:
@@ -132,11 +135,11 @@ def find_basis(a: Floats, scale: Floats, prior: Floats, spread: float | None = 1
     return Basis(transform, precision, null, flat, held, s[keep], structural, *conditions)
 
 
-def _triangle(a: Floats, columns: Ints, scale: Floats) -> Floats:
+def _triangle(a: Tall, columns: Ints, scale: Floats) -> Floats:
     """R of the QR of some columns of A (R, P), multiplied by their magnitudes (P,)."""
     if len(a) > TALL and len(columns):
         whole = Triangle(len(columns))
-        whole.add(a if len(columns) == a.shape[1] else a[:, columns])
+        whole.add(written(a) if len(columns) == a.shape[1] else a[:, columns])
         return np.asarray(whole.r * scale[columns])
     scaled = a[:, columns] * scale[columns]
     return np.asarray(sl.qr(scaled, mode="r", check_finite=False)[0], dtype=float)[: len(columns)]
@@ -185,7 +188,7 @@ class NormalEquations:
         return np.asarray(root.T @ root)
 
 
-def normal_equations(a: Floats, target: Floats, basis: Basis, gram: Floats) -> NormalEquations:
+def normal_equations(a: Tall, target: Floats, basis: Basis, gram: Floats) -> NormalEquations:
     """Form the normal equations of A (R, P) in the coordinates of a basis.
 
     The flat directions are formed from their rows, which are orthonormal, so that squaring

@@ -49,6 +49,7 @@ from hilcal.identify.uncertainty import (
 from hilcal.identify.variance_factor import WithVarianceFactor
 from hilcal.model import Model
 from hilcal.regression.distributions import chi2
+from hilcal.regression.factored import written
 from hilcal.regression.normal_equations import NormalEquations
 from hilcal.regression.triangle import combined
 from hilcal.stream.passes import Errors, Reduced, Work, errors_of_group, reduce_group, sample_group
@@ -357,7 +358,7 @@ def _solved(problem: _Stream, theta: Floats) -> _Found:
     z = prior_coordinates(basis, point.y, by.prior)
 
     def equations_of(triangle: Floats) -> NormalEquations:
-        rows = by.basis.rows(space.columns(triangle[:, :-1])[:, live])
+        rows = written(by.basis.rows(space.columns(triangle[:, :-1])[:, live]))
         return NormalEquations(basis, rows.T @ rows, rows.T @ (triangle[:, -1] + rows @ z))
 
     equations, size = equations_of(point.triangle), len(theta) + 1

@@ -25,7 +25,7 @@ def errors(seed: int) -> tuple[float, float, float]:
         return found.std, rhs, found.beta
 
     std, _, beta = fitted(a, y)
-    problem = FamilyProblem((a,), y, np.zeros((FLAT, FLAT)), np.zeros(FLAT), group, std, beta)
+    problem = FamilyProblem(a, y, np.zeros((FLAT, FLAT)), np.zeros(FLAT), group, std, beta)
     fold = np.arange(ROWS) % FOLDS
     honest = solutions(problem, fold)
 
@@ -59,7 +59,7 @@ def test_without_dropped_groups_and_shrinkage_a_fold_is_least_squares() -> None:
     a, truth = rng.normal(size=(200, 8)), rng.normal(size=8)
     y = a @ truth + 1e-3 * rng.normal(size=200)
     p = FamilyProblem(
-        (a / 1e-3,), y / 1e-3, np.zeros((2, 2)), np.zeros(2), np.arange(6) // 3, np.ones(6), 1.0
+        a / 1e-3, y / 1e-3, np.zeros((2, 2)), np.zeros(2), np.arange(6) // 3, np.ones(6), 1.0
     )
     fold = np.arange(200) % 5
     for f, u in enumerate(solutions(p, fold)):
