@@ -141,19 +141,20 @@ class Model:
         made = catalogue.make(spec.name, self.cell, states, spec.options, m)
         return replace(self, effects=(*self.effects, made), catalogue=catalogue)
 
-    def predict(self, states: States, theta: Floats) -> Prediction:
+    def predict(self, states: States, theta: Floats, near: Prediction | None = None) -> Prediction:
         """Equilibrium of N states: elastic deviations at the deflected configuration.
 
         The elastic deviations depend on the wrenches, those on the configuration, and the
         configuration on the deviations: a fixed point, which the iteration approaches by a
-        factor of about deflection/reach (1e-3) per step.
+        factor of about deflection/reach (1e-3) per step. It begins undeflected, or as the same
+        states are in a prediction `near`, which takes a step or two less.
 
         Raises:
             CannotAnswerError: the deviations grow instead of settling.
         """
         whole: Prediction | None = None
         for rows in chunks(len(states)):
-            part = self._equilibrium(states[rows], theta)
+            part = self._equilibrium(states[rows], theta, near[rows] if near else None)
             if len(part.situation.angle) == len(states):
                 return part
             # Written at once: chunks that are kept until the end take new memory each.
@@ -162,14 +163,15 @@ class Model:
         assert whole is not None  # noqa: S101 - there is always a chunk
         return whole
 
-    def _equilibrium(self, states: States, theta: Floats) -> Prediction:
+    def _equilibrium(self, states: States, theta: Floats, near: Prediction | None) -> Prediction:
         """Return the equilibrium of a chunk of states."""
         cell = self.cell
         angle = states.q if states.q_actual is None else states.q_actual
         angle = along_states(angle)
         parts = self._parts(theta)
         turns = chains.turns(cell.arm, angle)
-        chain = chains.evaluate(cell.arm, angle, nominal=turns)
+        chain = near.situation.chain if near else None
+        chain = chain or chains.evaluate(cell.arm, angle, nominal=turns)
         nothing = zeros(len(states), cell.arm.n + 1, 6)
         recorded = self._load(states, theta)
         turned = along_states(cell.arm.drive_angles(angle))

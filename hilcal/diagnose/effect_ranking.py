@@ -250,24 +250,19 @@ def ranked(suspects: Iterable[Suspect], rejected: Collection[str] = ()) -> tuple
         suspects: in any order.
         rejected: names of those whose addition did not lower the error on poses left out.
     """
-    found = [replace(s, refuted=s.refuted or s.effect in rejected) for s in suspects]
+    found = [replace(s, refuted=True) if s.effect in rejected else s for s in suspects]
     found.sort(key=lambda s: (-s.passes, -s.explains, -s.score.log_evidence, s.score.p_value))
-    return tuple(
-        replace(
-            s,
-            same_as=tuple(
-                o.effect
-                for o in found
-                if o is not s
-                and o.plausible
-                and o.keeps
-                and o.effect not in rejected
-                and min(o.score.log_evidence, s.score.log_evidence) > SAME_EVIDENCE
-                and abs(o.score.log_evidence - s.score.log_evidence) < SAME_EVIDENCE
-            ),
-        )
-        for s in found
-    )
+    evident = [s for s in found if s.score.log_evidence > SAME_EVIDENCE]
+    others = [s for s in evident if s.plausible and s.keeps and s.effect not in rejected]
+
+    def same_as(s: Suspect) -> tuple[str, ...]:
+        if s.score.log_evidence <= SAME_EVIDENCE:
+            return ()
+        own = s.score.log_evidence
+        near = (o for o in others if abs(o.score.log_evidence - own) < SAME_EVIDENCE)
+        return tuple(o.effect for o in near if o is not s)
+
+    return tuple(replace(s, same_as=same_as(s)) for s in found)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -45,8 +45,8 @@ class Unloaded:
         if of.effect.elastic:
             return np.inf
         x = of.unloaded.reshape(-1, len(of.scale))
-        free = x - self.frames @ (self.frames.T @ x)
-        moved = float(np.sqrt(np.sum(free**2) / len(x)))
+        free = (x - self.frames @ (self.frames.T @ x)).ravel()
+        moved = float(np.sqrt(free @ free / len(x)))
         return ALLOWED * self.missed / moved if moved > ROUNDING * self.missed else np.inf
 
 

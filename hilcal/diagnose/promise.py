@@ -55,7 +55,8 @@ def kept_by_step(p: Linearisation, of: EffectColumns, score: FamilyScore) -> flo
     theta = [s.theta + s.transform @ z, of.scale * score.step]
     linear = float(np.sum((aim - p.rows @ z) ** 2))
     try:
-        found = model.predict(s.prediction.situation.states, np.concatenate(theta))
+        states = s.prediction.situation.states
+        found = model.predict(states, np.concatenate(theta), near=s.prediction)
     except CannotAnswerError:
         return 0.0
     w, readings = fit.whitening, fit.readings[~fit.outlier]

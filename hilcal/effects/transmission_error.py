@@ -1,5 +1,6 @@
 """`transmission_error`: gears and encoders err periodically with the joint angle."""
 
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -9,13 +10,15 @@ from hilcal.effects.changed import Changeable
 from hilcal.effects.per_joint import PerJoint
 from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
 from hilcal.errors import InputError
-from hilcal.types import Ints
+from hilcal.types import Floats, Ints
 
 MOST_HARMONICS = 120
 FEWEST_HARMONICS = 4
 POSES_PER_HARMONIC = 5
 """A harmonic has two amplitudes per joint, which every pose shows: five poses leave the data in the
 majority. A guess, as the bounds are: the upper one limits the cost."""
+ORDINARY = 5e-5
+"""Ordinary amplitude of a harmonic, rad."""
 SCORED_HARMONICS = 40
 """Bounds the cost of scoring; a guess."""
 
@@ -49,9 +52,11 @@ class TransmissionError(PerJoint):
     def setup(self, states: States) -> None:
         """Read or choose the number of harmonics."""
         super().setup(states)
-        poses = len(np.unique(np.round(states.q, 3), axis=0))
-        chosen = int(np.clip(poses // POSES_PER_HARMONIC, FEWEST_HARMONICS, MOST_HARMONICS))
-        count = self.options.setdefault("harmonics", chosen)
+        if "harmonics" not in self.options:
+            poses = len(np.unique(np.round(states.q, 3), axis=0))
+            chosen = np.clip(poses // POSES_PER_HARMONIC, FEWEST_HARMONICS, MOST_HARMONICS)
+            self.options["harmonics"] = int(chosen)
+        count = self.options["harmonics"]
         if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= 1000:
             raise InputError(f"effect {self.name}: harmonics = {count!r}; valid: 1 to 1000")
         self.harmonics = np.arange(1, count + 1)
@@ -60,7 +65,12 @@ class TransmissionError(PerJoint):
     def parameters(self) -> tuple[Parameter, ...]:
         """Cosine and sine amplitude of each harmonic of each joint."""
         kinds = {f".{w}{k}": "" for k in self.harmonics for w in ("cos", "sin")}
-        return self.group_parameters("rad", np.full(self.cell.arm.n, 5e-5), "", kinds)
+        return self.group_parameters("rad", np.full(self.cell.arm.n, ORDINARY), "", kinds)
+
+    @cached_property
+    def magnitudes(self) -> Floats:
+        """The same for all, however many there are."""
+        return np.full(2 * len(self.harmonics) * len(self.shared.labels), ORDINARY)
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:
         """Waves: ∂dq_j/∂a_jk = cos k q_j, ∂dq_j/∂b_jk = sin k q_j."""

@@ -110,14 +110,16 @@ def log_evidence(
     return np.asarray(-0.5 * np.log1p(t2 * lam).sum(axis=-1) - 0.5 * dof * np.log(left / rss))
 
 
-def _posterior_strengths(lam: Floats, explained: Floats, rss: float, dof: float) -> Floats:
-    """Prior standard deviations t σ (T,) of the parameters, σ² = ‖r‖²_t / ν, at each strength.
+def _by_strength(lam: Floats, explained: Floats, rss: float, dof: float) -> tuple[Floats, Floats]:
+    """`log_evidence` (T,) of one family, and prior standard deviations t σ (T,), σ² = ‖r‖²_t / ν.
 
     τ is t σ for the σ of the residual without the family, which holds what the family explains.
     """
-    shrunk = 1 - 1 / (1 + np.outer(STRENGTHS**2 * dof / rss, lam))
-    left = np.maximum(rss - shrunk @ explained, ROUNDING * rss)
-    return np.asarray(STRENGTHS * np.sqrt(left / rss))
+    grown = np.multiply.outer(STRENGTHS**2 * (dof / rss), lam)
+    grown += 1.0
+    left = np.maximum(rss - (float(explained.sum()) - (1.0 / grown) @ explained), ROUNDING * rss)
+    evidence = -0.5 * np.log(grown).sum(axis=1) - 0.5 * dof * np.log(left / rss)
+    return evidence, STRENGTHS * np.sqrt(left / rss)
 
 
 def score_family(
@@ -154,12 +156,10 @@ def score_family(
         p_value = float(f_distribution.sf(gain / rank / rest, rank, free - rank))
     else:
         p_value = ratio_tail(lam, free, float(c @ c) / rss)
-    evidence = log_evidence(lam, explained, rss, dof)
+    evidence, strengths = _by_strength(lam, explained, rss, dof)
     freely = int(np.argmax(evidence))
     if np.isfinite(most):
-        evidence = np.where(
-            _posterior_strengths(lam, explained, rss, dof) <= most, evidence, -np.inf
-        )
+        evidence = np.where(strengths <= most, evidence, -np.inf)
         evidence[0] = max(evidence[0], -1e300)
     best = int(np.argmax(evidence))
     ridge = rss / (dof * float(STRENGTHS[best]) ** 2)
