@@ -19,8 +19,11 @@ import numpy as np
 
 from hilcal.effects.protocol import Effect, Situation
 from hilcal.observe import Motion, SlotFrames
+from hilcal.robot import se3
 from hilcal.robot.batch import zeros
+from hilcal.robot.chain import Chain
 from hilcal.robot.geometric_stiffness import GeometricStiffness, MotionGradient, rows_times
+from hilcal.robot.statics import Load
 from hilcal.types import Floats
 
 TOLERANCE = 1e-8
@@ -142,6 +145,28 @@ def by_wrench_changes(form: Mapping[tuple[int, bool], Floats], change: Floats, m
     for (slot, moment), rows in form.items():
         half = change[:, :, slot, MOMENT if moment else FORCE]
         out += rows_times(rows, half, transposed=True)
+    return out
+
+
+def by_load(form: Mapping[tuple[int, bool], Floats], chain: Chain, load: Load, m: int) -> Floats:
+    """Derivative (N, m, 6) of a reading by the load's wrench at the load point, base axes.
+
+    A force f and a moment t there are R_kᵀ f and R_kᵀ (t + d_k × f) in slot k, d_k the lever.
+
+    Args:
+        form: derivatives by the slot wrenches, see `wrench_form`.
+        chain: the deviated chain.
+        load: where it acts.
+        m: elements of a reading.
+    """
+    point = chain.point(load.point)
+    out = zeros(len(point), m, 6)
+    for (slot, moment), rows in form.items():
+        turned = rows_times(rows, chain.rotation[slot], transposed=True)
+        if moment:
+            out[..., MOMENT] += turned
+            turned = se3.cross(turned, (point - chain.position[slot])[:, None])
+        out[..., FORCE] += turned
     return out
 
 

@@ -264,7 +264,7 @@ class Model:
         """Write the derivative of a chunk of states; `places`: columns of `out`, −1 for none."""
         s = prediction.situation
         moves, blocks = self._motion(prediction, theta, out.shape[1])
-        columns = ReadingColumns(moves, blocks, scale)
+        columns = ReadingColumns(moves, blocks, s.load, scale)
         mine = self._parts(theta)
         for e, place in zip(effects, places, strict=True):
             if not (place >= 0).any():
@@ -276,8 +276,11 @@ class Model:
                 for other, part in mine:
                     for c in other.compliance_columns(part, s):
                         columns.add(e.of_compliance(c), place)
-            change = e.wrench_columns(at, s) if blocks else None
-            if change is not None:
+            if not blocks:
+                continue
+            if (change := e.load_columns(at, s)) is not None:
+                columns.add_load_changes(change, place)
+            elif (change := e.wrench_columns(at, s)) is not None:
                 columns.add_wrench_changes(change, place)
         columns.write(out)
         return moves

@@ -5,14 +5,16 @@ there. Its motion is computed once, then multiplied by each parameter's share of
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
 from hilcal.effects.protocol import Columns
-from hilcal.equilibrium import Block, by_wrench_changes, wrench_form
+from hilcal.equilibrium import Block, by_load, by_wrench_changes, wrench_form
 from hilcal.observe import Motion
 from hilcal.robot.batch import along_states, empty
 from hilcal.robot.geometric_stiffness import rows_times, rows_times_constant
+from hilcal.robot.statics import Load
 from hilcal.types import Floats, Ints
 
 WIDE = 64
@@ -26,17 +28,21 @@ class ReadingColumns:
     of one joint are written where they belong at once.
     """
 
-    def __init__(self, moves: Motion, blocks: list[Block], scale: Floats | None = None) -> None:
+    def __init__(
+        self, moves: Motion, blocks: list[Block], load: Load, scale: Floats | None = None
+    ) -> None:
         """Begin without any.
 
         Args:
             moves: how the chunk's readings move.
             blocks: compliance of the arm.
+            load: what pulls at it.
             scale: (L,) units of the parameters; SI unless given.
         """
-        self._moves, self._blocks, self._scale = moves, blocks, scale
+        self._moves, self._blocks, self._load, self._scale = moves, blocks, load, scale
         self._columns: list[tuple[Columns, Ints]] = []
         self._wrenches: list[tuple[Floats, Ints]] = []
+        self._loads: list[tuple[Floats, Ints]] = []
 
     def add(self, c: Columns, place: Ints) -> None:
         """Add one block of an effect's columns.
@@ -47,16 +53,21 @@ class ReadingColumns:
         """
         c = c.only(place[c.parameter] >= 0)
         at = place[c.parameter]
-        self._columns.append((c if self._scale is None else c.times(self._scale[at]), at))
+        self._columns.append((c if self._scale is None else _scaled(c, self._scale[at]), at))
 
     def add_wrench_changes(self, change: Floats, place: Ints) -> None:
         """Add changes (N, P, n + 1, 6) of the slot wrenches by the P parameters of an effect."""
         wanted = place >= 0
         self._wrenches.append((change if wanted.all() else change[:, wanted], place[wanted]))
 
+    def add_load_changes(self, change: Floats, place: Ints) -> None:
+        """Add changes (N, P, 6) of the load's wrench at the load point, base axes."""
+        wanted = place >= 0
+        self._loads.append((change if wanted.all() else change[:, wanted], place[wanted]))
+
     def write(self, out: Floats) -> None:
         """Write the derivative (N, m, L) by all that was added; zero where nothing was."""
-        places = [at for _, at in (*self._columns, *self._wrenches)]
+        places = [at for _, at in (*self._columns, *self._wrenches, *self._loads)]
         uses = np.bincount(np.concatenate([np.zeros(0, int), *places]), minlength=out.shape[2])
         sums = _Sums(out, uses)
         fields: dict[str, list[tuple[Columns, list[int]]]] = {}
@@ -109,10 +120,16 @@ class ReadingColumns:
             sums.add(_times(moved, c.values), to)
 
     def _by_wrenches(self, sums: "_Sums") -> None:
-        """Add changes of the slot wrenches."""
-        form = wrench_form(self._moves, self._blocks) if self._wrenches else {}
-        for change, at in self._wrenches:
-            block = by_wrench_changes(form, change, self._moves.m)
+        """Add changes of the slot wrenches, and of the load's."""
+        moves = self._moves
+        if not self._wrenches and not self._loads:
+            return
+        form = wrench_form(moves, self._blocks)
+        found = [(by_wrench_changes(form, change, moves.m), at) for change, at in self._wrenches]
+        if self._loads:
+            moved = by_load(form, moves.chain, self._load, moves.m)
+            found += [(rows_times(moved, by, transposed=True), at) for by, at in self._loads]
+        for block, at in found:
             sums.add(block if self._scale is None else block * self._scale[at], at.tolist())
 
 
@@ -161,6 +178,11 @@ class _Sums:
         ends = np.flatnonzero(np.diff(np.concatenate([[False], self._summed, [False]])))
         for start, stop in ends.reshape(-1, 2).tolist():
             self._out[:, :, start:stop] = self._along[:, :, start:stop]
+
+
+def _scaled(c: Columns, by: Floats) -> Columns:
+    """Columns times a factor (P,) each."""
+    return replace(c, values=c.values * (by if c.values.ndim == 2 else by[:, None]))
 
 
 def _pieces(element: list[int], to: list[int]) -> Iterator[slice]:

@@ -223,6 +223,7 @@ def _results(effect: Effect, theta: Floats, s: Situation) -> None:
         ("response has twist", response.twist, (count, 2, n + 1, 6)),
         ("wrench_change is", effect.wrench_change(theta, s), (count, 6)),
         ("wrench_columns is", effect.wrench_columns(theta, s), (count, size, n + 1, 6)),
+        ("load_columns is", effect.load_columns(theta, s), (count, size, 6)),
         ("compliance is", effect.compliance(theta), (n,)),
         ("groups is", effect.groups(), (size,)),
         ("prior_std is", None if prior is None else prior > 0, (size,)),
@@ -308,6 +309,9 @@ def _load(effect: Effect, theta: Floats, s: Situation, scale: Floats) -> None:
     found = effect.wrench_columns(theta, s)
     given = np.zeros(1) if found is None else np.einsum("npki,p->nki", found, step)
     _agree("wrench_columns", "of the wrenches by the parameters: it", given, (up - down) / 2)
+    if (by_load := effect.load_columns(theta, s)) is not None:
+        by_slots = load_wrench_change(s.chain, s.load, by_load)
+        _agree("load_columns", "of the load's wrench by the parameters: it", by_slots, found)
 
 
 def _transmitted(effect: Effect, theta: Floats, s: Situation) -> Floats:

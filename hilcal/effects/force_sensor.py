@@ -57,9 +57,13 @@ class ForceSensorEffect(Effect):
         """Return −R h."""
         return acting_change(s, self.error(theta, recorded(s, self.axes)), self.axes)
 
+    def load_columns(self, theta: Floats, s: Situation) -> Floats:
+        """Derivative of −R h."""
+        return _acting(s, self.error_columns(theta, recorded(s, self.axes)), self.axes)
+
     def wrench_columns(self, theta: Floats, s: Situation) -> Floats:
         """Slot wrenches by the derivative of −R h."""
-        return acting_columns(s, self.error_columns(theta, recorded(s, self.axes)), self.axes)
+        return load_wrench_change(s.chain, s.load, self.load_columns(theta, s))
 
 
 def recorded(s: Situation, axes: Floats = ALONG_FLANGE) -> Floats:
@@ -79,13 +83,17 @@ def acting_change(s: Situation, error: Floats, axes: Floats = ALONG_FLANGE) -> F
 
 def acting_columns(s: Situation, columns: Floats, axes: Floats = ALONG_FLANGE) -> Floats:
     """Slot wrenches (N, P, n + 1, 6) by −R h, of the derivative (N or 1, P, 6) of h."""
-    change = -_turned(_sensor(s, axes)[:, None], columns)
-    return load_wrench_change(s.chain, s.load, change * _loaded(s)[:, None])
+    return load_wrench_change(s.chain, s.load, _acting(s, columns, axes))
 
 
 def sensor_error(s: Situation, change: Floats) -> Floats:
     """Return h (N, 6), flange axes, of a change −R h (N, 6) of the load's wrench."""
     return -_turned(np.swapaxes(_sensor(s, ALONG_FLANGE), 1, 2), change)
+
+
+def _acting(s: Situation, columns: Floats, axes: Floats) -> Floats:
+    """−R h (N, P, 6), base axes, of the derivative (N or 1, P, 6) of h."""
+    return -_turned(_sensor(s, axes)[:, None], columns) * _loaded(s)[:, None]
 
 
 def _sensor(s: Situation, axes: Floats) -> Floats:

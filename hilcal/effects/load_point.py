@@ -36,8 +36,13 @@ class LoadPoint(Effect):
         """Shift of the load point."""
         return LoadChange(point=theta)
 
-    def wrench_columns(self, theta: Floats, s: Situation) -> Floats:
-        """Moment (R e) × f at the flange for a unit shift along each flange axis e."""
+    def load_columns(self, theta: Floats, s: Situation) -> Floats:
+        """Moment (R e) × f for a unit shift along each flange axis e."""
         axes = np.swapaxes(s.chain.rotation[-1], 1, 2)
         moment = se3.cross(axes, s.load.wrench[:, None, :3])
-        return slot_wrench_change(s.chain, np.zeros_like(moment), moment)
+        return np.concatenate([np.zeros_like(moment), moment], axis=2)
+
+    def wrench_columns(self, theta: Floats, s: Situation) -> Floats:
+        """Moments of unit shifts, carried by all slots."""
+        change = self.load_columns(theta, s)
+        return slot_wrench_change(s.chain, change[..., :3], change[..., 3:])

@@ -19,6 +19,7 @@ from hilcal.cell import Cell
 from hilcal.data.readings import States
 from hilcal.effects.changed import Changeable
 from hilcal.effects.options import Options
+from hilcal.effects.source import source_of
 from hilcal.effects.total import total
 from hilcal.errors import InputError
 from hilcal.robot.chain import Chain
@@ -113,11 +114,6 @@ class Columns:
         return Columns(
             self.field, self.parameter[wanted], self.element[wanted], self.values[:, wanted]
         )
-
-    def times(self, factor: Floats) -> "Columns":
-        """Return the columns times a factor (P,) each."""
-        by = factor if self.values.ndim == 2 else factor[:, None]
-        return Columns(self.field, self.parameter, self.element, self.values * by)
 
     def runs(self) -> Iterator[tuple[int, slice]]:
         """Yield each joint or slot that moves, and successive columns that move it."""
@@ -294,6 +290,13 @@ class Effect(ABC):
         """
         return None
 
+    def load_columns(self, theta: Floats, s: Situation) -> Floats | None:
+        """Derivative (N, P, 6) of the load's wrench at the load point, base axes.
+
+        For effects whose `wrench_columns` follow from it; Jacobians then cost less.
+        """
+        return None
+
     def compliance(self, theta: Floats) -> Floats | None:
         """(n,) joint compliances for the laws of other effects, rad/(N·m); None where none."""
         return None
@@ -389,15 +392,6 @@ def _finite(values: Floats) -> bool:
     """Whether all values are finite: as their sum is, but where it overflows."""
     with np.errstate(all="ignore"):
         return bool(np.isfinite(values.sum()) or np.isfinite(values).all())
-
-
-def source_of(kind: type[Effect]) -> str:
-    """Return the file that an effect class is defined in; its module where that is unknown."""
-    for member in vars(kind).values():
-        function = getattr(member, "fget", getattr(member, "__func__", member))
-        if code := getattr(function, "__code__", None):
-            return str(code.co_filename)
-    return kind.__module__
 
 
 def _has(states: States, need: str) -> bool:

@@ -11,10 +11,12 @@ from hilcal.reading_columns import ReadingColumns
 from hilcal.robot import se3
 from hilcal.robot.chain import evaluate
 from hilcal.robot.deviation import Deviation
+from hilcal.robot.statics import Load
 from hilcal.types import Floats
 from tests.support.arm_cases import arm_of, cell_of, displacement, slope, slots_of, twisted
 
 COUNT = 5
+NO_LOAD = Load(np.zeros((COUNT, 6)), np.zeros(3), 0.0, np.zeros(3), np.zeros(3))
 CELL = cell_of(arm_of("ur10e"))
 RNG = np.random.default_rng(8)
 Q = RNG.uniform(-np.pi, np.pi, (COUNT, 6))
@@ -136,7 +138,7 @@ def test_motion_by_columns_is_a_slope(field: str, d: Deviation, constant: bool) 
     values = rng.normal(size=(count, size, *tail))
     block = Columns(field, np.arange(size), element, values)  # type: ignore[arg-type]
     found = np.empty((COUNT, 6, size))
-    columns = ReadingColumns(motion_of(d), [])
+    columns = ReadingColumns(motion_of(d), [], NO_LOAD)
     columns.add(block, np.arange(size))
     columns.write(found)
     for p in range(size):

@@ -9,7 +9,7 @@ from hilcal.effects.protocol import Columns, Field
 from hilcal.observe import Motion
 from hilcal.reading_columns import WIDE, ReadingColumns
 from hilcal.types import Floats, Ints
-from tests.unit.model.test_observe import COUNT, FULL, motion_of
+from tests.unit.model.test_observe import COUNT, FULL, NO_LOAD, motion_of
 
 SIZE = WIDE + 30
 PER_ELEMENT = {"dq": 6, "twist": 7}
@@ -61,7 +61,10 @@ def expected(moves: Motion, blocks: list[tuple[Columns, Ints]], scale: Floats) -
 
 
 def written(moves: Motion, blocks: list[tuple[Columns, Ints]], scale: Floats | None) -> Floats:
-    columns, out = ReadingColumns(moves, [], scale), np.full((COUNT, moves.m, SIZE), np.nan)
+    columns, out = (
+        ReadingColumns(moves, [], NO_LOAD, scale),
+        np.full((COUNT, moves.m, SIZE), np.nan),
+    )
     for c, place in blocks:
         columns.add(c, place)
     columns.write(out)
