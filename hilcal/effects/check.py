@@ -22,12 +22,12 @@ from hilcal.effects.protocol import (
     Response,
     Role,
     Situation,
-    source_of,
 )
+from hilcal.effects.source import source_of
 from hilcal.effects.total import total
 from hilcal.errors import HilcalError, InputError
 from hilcal.robot.deviation import Deviation
-from hilcal.robot.statics import slot_wrenches
+from hilcal.robot.statics import load_wrench_change, slot_wrenches
 from hilcal.types import Floats
 
 NAME = re.compile(r"[a-z][a-z0-9_]*")
@@ -309,7 +309,7 @@ def _load(effect: Effect, theta: Floats, s: Situation, scale: Floats) -> None:
     found = effect.wrench_columns(theta, s)
     given = np.zeros(1) if found is None else np.einsum("npki,p->nki", found, step)
     _agree("wrench_columns", "of the wrenches by the parameters: it", given, (up - down) / 2)
-    if (by_load := effect.load_columns(theta, s)) is not None:
+    if (by_load := effect.load_columns(theta, s)) is not None and found is not None:
         by_slots = load_wrench_change(s.chain, s.load, by_load)
         _agree("load_columns", "of the load's wrench by the parameters: it", by_slots, found)
 
