@@ -23,9 +23,10 @@ from hilcal.identify.gauss_newton import Solution
 from hilcal.identify.outliers import bulk, limit
 from hilcal.identify.smooth_nuisance import smooth_nuisance_columns
 from hilcal.model import Model
+from hilcal.regression import products, schur
 from hilcal.regression.distributions import binom
-from hilcal.regression.products import cross, times
-from hilcal.regression.projection import projection
+from hilcal.regression.factored import Factored, Tall, beside, of_rows, written
+from hilcal.regression.products import times
 from hilcal.regression.small_forms import quadratic_forms
 from hilcal.types import Bools, Floats, Ints
 
@@ -62,11 +63,10 @@ def find_gross_errors(
     More than twice as many, or too large a share of unloaded readings, is a misfit of the model:
     none is returned.
     """
-    e, q = _projection(model, solution, readings, w)
+    e, columns, root = _projection(model, solution, readings, w)
     c = _candidates(w)
     g = c.gradients(e[:, None])[:, :, 0]
-    off = _Elimination(c, c.gradients(q))
-    del q
+    off = _Elimination(c, columns, root)
     a = off.information()
     trace = np.trace(a, axis1=1, axis2=2)
     drop: list[Ints] = []
@@ -104,15 +104,19 @@ def find_gross_errors(
 
 def _projection(
     model: Model, solution: Solution, readings: Readings, w: Whitening
-) -> tuple[Floats, Floats]:
-    """Residual (R,) and Q (R, K) with P = I − Q Qᵀ, off model and smooth nuisance columns."""
+) -> tuple[Floats, Tall, Floats]:
+    """Residual (R,), columns B (R, K) of model and smooth nuisance, and T (K, K).
+
+    P = 1 − B TᵀT Bᵀ, see `regression.projection`.
+    """
     x = smooth_nuisance_columns(model, solution.prediction, readings, w)
-    beside = cross(solution.rows, x)
-    gram = np.block([[solution.equations.gram, beside], [beside.T, x.T @ x]])
-    rows, ridge = np.hstack([solution.rows, x]), np.append(solution.ridge, np.ones(x.shape[1]))
-    p = projection(rows, ridge, gram)
+    across = solution.tall.T @ x
+    gram = np.block([[solution.equations.gram, across], [across.T, products.gram(x)]])
+    columns, ridge = beside(solution.tall, x), np.append(solution.ridge, np.ones(x.shape[1]))
+    root = schur.inverse_root(gram + np.diag(ridge))
     z = np.append(solution.coordinates(), np.zeros(x.shape[1]))
-    return p.residual(solution.white, z), p.root()
+    step = root.T @ (root @ (columns.T @ solution.white - ridge * z))
+    return np.asarray(solution.white - columns @ step), columns, root
 
 
 def _inverse_root(a: Floats, trace: float) -> Floats:
@@ -153,8 +157,8 @@ class _Shifts:
         ]
         return np.concatenate(out)
 
-    def place(self, k: int) -> tuple[Floats, slice, slice]:
-        """Shifts (r, c·m) of the group of candidate k, its candidates, and its columns of them."""
+    def place(self, k: int) -> tuple[Floats, Ints, slice, slice]:
+        """Shifts (r, c·m) of candidate k's group, its rows, its candidates, and k's columns."""
         first = 0
         for rows, s in self.blocks:
             each = s.shape[2] // self.m
@@ -162,7 +166,7 @@ class _Shifts:
             if group < len(rows):
                 start = first + group * each
                 own = slice(i * self.m, (i + 1) * self.m)
-                return s[group], slice(start, start + each), own
+                return s[group], rows[group], slice(start, start + each), own
             first += len(rows) * each
         raise IndexError(k)
 
@@ -171,18 +175,26 @@ class _Elimination:
     """P of the model, and of the shifts that were selected, as the candidates see it.
 
     A shift acts on the rows of its own group alone. With L the projection off the selected shifts,
-    group by group, and P = I − Q Qᵀ before,
+    group by group, and P = I − Q Qᵀ before, Q = B Tᵀ,
 
         P = L − L Q C Qᵀ L,    C = (I − Qᵀ (I − L) Q)⁻¹
 
-    so that only G_k = S_kᵀ L Q (m, K) of each candidate and C (K, K) have to be kept.
+    so that only C (K, K) has to be kept, and S_kᵀ L Q (m, K) of the candidates whose group has a
+    selected shift. Of the others it is S_kᵀ B Tᵀ, of which only products are formed.
     """
 
-    def __init__(self, shifts: _Shifts, seen: Floats) -> None:
-        """Begin without selected shifts; `seen` (N, m, K) is SᵀQ, and is changed."""
-        self._shifts, self._seen = shifts, seen
-        self._c = np.eye(seen.shape[2])
+    def __init__(self, shifts: _Shifts, columns: Tall, root: Floats) -> None:
+        """Begin without selected shifts.
+
+        Args:
+            shifts: of the candidates.
+            columns: (R, K) B.
+            root: (K, K) T.
+        """
+        self._shifts, self._columns, self._root = shifts, columns, root
+        self._c = np.eye(len(root))
         self._local: dict[int, Floats] = {}
+        self._seen: dict[int, tuple[slice, Floats]] = {}
 
     def information(self) -> Floats:
         """(N, m, m) Sᵀ P S before the first selection."""
@@ -190,7 +202,17 @@ class _Elimination:
         for _, s in self._shifts.blocks:
             parts = s.reshape(*s.shape[:2], -1, m)
             own.append(np.einsum("grci,grcj->gcij", parts, parts).reshape(-1, m, m))
-        return np.asarray(np.concatenate(own) - self._seen @ np.swapaxes(self._seen, 1, 2))
+        return np.asarray(np.concatenate(own) - self._gone())
+
+    def _gone(self) -> Floats:
+        """(N, m, m) Sᵀ Q Qᵀ S."""
+        shifts, columns = self._shifts, self._columns
+        if isinstance(columns, Factored):  # each reading by itself
+            ((rows, s),) = shifts.blocks
+            forms = columns.forms(self._root)[rows[:, 0] // shifts.m]
+            return np.asarray(np.swapaxes(s, 1, 2) @ forms @ s)
+        seen = shifts.gradients(times(columns, self._root.T))
+        return np.asarray(seen @ np.swapaxes(seen, 1, 2))
 
     def eliminate(self, k: int, inverse_root: Floats) -> Floats:
         """Project off candidate k, too; returns Sᵀ P S_k times the root, (N, m, r).
@@ -199,20 +221,33 @@ class _Elimination:
             k: the candidate.
             inverse_root: (m, r) root of the pseudo-inverse of S_kᵀ P S_k.
         """
-        m, seen = self._shifts.m, self._seen
-        shifts, members, own = self._shifts.place(k)
+        m = self._shifts.m
+        shifts, rows, members, own = self._shifts.place(k)
         local = self._local.get(members.start, shifts)
-        along = self._c @ (seen[k].T @ inverse_root)
-        flat = seen.reshape(-1, seen.shape[2])  # one product of matrices is faster than N
-        slope = -times(flat, along).reshape(*seen.shape[:2], -1)
+        seen = self._of_group(members, shifts, rows)
+        ours = seen[k - members.start].T @ inverse_root
+        along = self._c @ ours
+        slope = -self._shifts.gradients(self._columns @ (self._root.T @ along))
+        for changed, of in self._seen.values():
+            slope[changed] = -(of @ along)
         mine = local[:, own] @ inverse_root
         slope[members] += (local.T @ mine).reshape(-1, m, mine.shape[1])
         self._c += along @ along.T
         unit, r = np.linalg.qr(mine)
-        gone = np.linalg.solve(r.T, inverse_root.T @ seen[k])
-        seen[members] -= ((local.T @ unit) @ gone).reshape(-1, m, seen.shape[2])
+        gone = np.linalg.solve(r.T, ours.T)
+        now = seen - ((local.T @ unit) @ gone).reshape(-1, m, seen.shape[2])
+        self._seen[members.start] = members, now
         self._local[members.start] = local - unit @ (unit.T @ local)
-        return np.asarray(slope)
+        return slope
+
+    def _of_group(self, members: slice, shifts: Floats, rows: Ints) -> Floats:
+        """(c, m, K) Sᵀ L Q of the candidates of a group."""
+        if members.start in self._seen:
+            return self._seen[members.start][1]
+        mine = np.zeros(len(self._columns), dtype=np.bool_)
+        mine[rows] = True
+        q = written(of_rows(self._columns, mine)) @ self._root.T
+        return np.asarray((shifts.T @ q).reshape(-1, self._shifts.m, q.shape[1]))
 
 
 def _candidates(w: Whitening) -> _Shifts:

@@ -22,6 +22,9 @@ from hilcal.types import Bools, Floats, Ints
 
 Places = slice | Ints
 
+TOGETHER = 128
+"""Measurements whose rows are written out together; a choice, so that they stay in the cache."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Factored:
@@ -207,6 +210,26 @@ class Factored:
         pairs = [(a, b) for a in range(len(runs)) for b in range(a, len(runs))]
         in_threads(fill, pairs, len(self))
         in_threads(beside, range(len(runs)), len(self))
+        return out
+
+    def forms(self, root: Floats) -> Floats:
+        """Return A_d TᵀT A_dᵀ (D, m, m) of the rows of each measurement, T a root (K, P)."""
+        (count, m, sites), size = self.direction.shape, len(root)
+        runs = self._runs()
+        to_own = np.ascontiguousarray(root[:, self.at].T)
+        to_runs = [np.ascontiguousarray(root[:, places].T) for _, _, places in runs]
+        out = np.empty((count, m, m))
+
+        def fill(start: int) -> None:
+            some = slice(start, min(start + TOGETHER, count))
+            along = np.zeros((some.stop - start, sites, size))
+            for (s, columns, _), to in zip(runs, to_runs, strict=True):
+                along[:, s] += self.coefficient[some, columns] @ to
+            seen = (self.own[m * start : m * some.stop] @ to_own).reshape(-1, m, size)
+            seen += self.direction[some] @ along
+            np.matmul(seen, np.swapaxes(seen, 1, 2), out=out[some])
+
+        in_threads(fill, range(0, count, TOGETHER), len(self))
         return out
 
     def _along(self, site: int, b: Floats) -> Floats:

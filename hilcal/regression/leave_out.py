@@ -20,7 +20,7 @@ import numpy as np
 from hilcal.regression.normal_equations import NormalEquations
 from hilcal.regression.projection import Projection
 from hilcal.regression.schur import inverse_root, positive_solve
-from hilcal.threads import in_threads
+from hilcal.threads import MANY, in_threads
 from hilcal.types import Bools, Floats, Ints
 
 ROUNDING = 1e-6
@@ -39,11 +39,17 @@ class Fold:
         out: (R,) rows of the fold.
         inverse_root: (K, K) T with Tᵀ T = H⁻¹ without them.
         rhs: (K,) right-hand side without them, for a step from the fit.
+        copied: the model's columns in these rows; None where they are too many to be kept.
     """
 
     out: Bools
     inverse_root: Floats
     rhs: Floats
+    copied: Floats | None
+
+    def rows(self, p: Projection) -> Floats:
+        """Return the model's columns in the rows of the fold."""
+        return np.asarray(p.rows[self.out]) if self.copied is None else self.copied
 
     def solve(self, rhs: Floats) -> Floats:
         """Return H⁻¹ times (K,) or (K, P)."""
@@ -90,7 +96,8 @@ def folds(
         mine = fold == f
         rows = p.rows[mine]
         root = inverse_root(h - rows.T @ rows)
-        return Fold(mine, root, rhs - rows.T @ white[mine])
+        kept = rows if len(white) <= MANY else None
+        return Fold(mine, root, rhs - rows.T @ white[mine], kept)
 
     return tuple(in_threads(without, range(int(fold.max()) + 1), len(white)))
 
@@ -114,7 +121,7 @@ def left_out_residual(
     if x is None:
         left = np.zeros(len(white))
         for fold in folds:
-            left[fold.out] = white[fold.out] - p.rows[fold.out] @ fold.step()
+            left[fold.out] = white[fold.out] - fold.rows(p) @ fold.step()
         return left
     return left_out_of_families(
         folds, p, white, [(of, ridge) for of in family_products(folds, p, white, [x])]
@@ -143,8 +150,6 @@ def family_products(
 ) -> list[FamilyProducts]:
     """Form the products of families of whitened columns (R, F).
 
-    A fold's rows of the model's columns are copied once for all families.
-
     Args:
         folds: of the model; each row is in one.
         p: the model's columns.
@@ -154,7 +159,7 @@ def family_products(
     every = list(families)
 
     def products(fold: Fold) -> list[_Products]:
-        own, y = p.rows[fold.out], white[fold.out]
+        own, y = fold.rows(p), white[fold.out]
         return [_Products.of(own, x[fold.out], y) for x in every]
 
     by_fold = in_threads(products, folds, len(white))
@@ -182,7 +187,7 @@ def left_out_of_families(
     small = [_in_all_folds(folds, of, ridge) for of, ridge in families]
 
     def predict(f: int) -> None:
-        out, own = folds[f].out, p.rows[folds[f].out]
+        out, own = folds[f].out, folds[f].rows(p)
         for (of, ridge), left, known in zip(families, found, small, strict=True):
             back, step = known[f] if known else _without(folds[f], of.whole, of.parts[f], ridge)
             left[out] = white[out] - own @ back - of.x[out] @ step
@@ -275,7 +280,7 @@ class FamilyFolds:
         self._of = []
         for fold in folds:
             out = x[fold.out]
-            c = cross - p.rows[fold.out].T @ out
+            c = cross - fold.rows(p).T @ out
             at = fold.solve(c)
             self._of.append((c, at, gram - out.T @ out - c.T @ at))
 
@@ -291,7 +296,7 @@ class FamilyFolds:
         least = max(ridge, self._rounding)
         left = np.zeros(y.shape)
         for fold, (c, at, gram) in zip(self._folds, self._of, strict=True):
-            out, own, r = x[fold.out], p.rows[fold.out], y[fold.out]
+            out, own, r = x[fold.out], fold.rows(p), y[fold.out]
             steps = fold.solve(total - own.T @ r)
             left[fold.out] = r - own @ steps
             if x.shape[1]:

@@ -95,3 +95,13 @@ def test_the_linear_problem_is_the_same_by_factors(a: Factored, dense: Floats) -
     close(found.rhs, expected.rhs)
     close(found.solve(), expected.solve())
     close(written(one.rows(a)), written(two.rows(dense)))
+
+
+@pytest.mark.parametrize(("a", "dense"), CASES)
+def test_forms_of_measurements_are_those_of_the_matrix_written_out(
+    a: Factored, dense: Floats
+) -> None:
+    root = np.random.default_rng(10).normal(size=(a.shape[1], a.shape[1]))
+    whole = dense @ root.T @ root @ dense.T
+    found = whole.reshape(COUNT, ROWS, COUNT, ROWS)[np.arange(COUNT), :, np.arange(COUNT)]
+    close(a.forms(root), found)
