@@ -12,7 +12,7 @@ import pytest
 
 from drivers.simulated.rehearsal import Rehearsal
 from hilcal.cli import main
-from hilcal.config import load_config
+from hilcal.config import CellConfig, load_config
 from hilcal.data.covariance import WHOLE
 from hilcal.data.table import write_table
 from hilcal.robot.catalogue import configs_dir
@@ -21,6 +21,12 @@ from studies.random_campaigns import rehearse
 
 CELL = configs_dir() / "cells" / "demo_ur10e.toml"
 POSES = 14
+
+
+def quickly_planned(config: CellConfig) -> CellConfig:
+    """The same cell, whose plans take a second: few candidates, no effect to look out for."""
+    planning = config.planning.model_copy(update={"candidates": 60, "against": ()})
+    return config.model_copy(update={"planning": planning})
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,13 @@ import pytest
 
 import hilcal as hc
 from hilcal.config import load_config
+from hilcal.config.write import to_toml
 from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.covariance import WHOLE
 from hilcal.data.table import write_table
 from hilcal.robot.catalogue import configs_dir
 from studies.random_campaigns import rehearse
-from tests.support.cli_cases import ok
+from tests.support.cli_cases import ok, quickly_planned
 from tests.support.paths import ROOT
 
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -49,10 +50,10 @@ def test_the_guide_to_the_library_runs_as_it_stands(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cell = configs_dir() / "cells" / "demo_ur10e.toml"
-    config = load_config(cell)
+    config = quickly_planned(load_config(cell))
     readings = rehearse(config, "creep", 3, 10).readings
     monkeypatch.chdir(tmp_path)
-    Path("CELL.toml").write_bytes(cell.read_bytes())
+    Path("CELL.toml").write_text(to_toml(config), encoding="utf-8")
     write_table(readings, Path("readings.csv"), WHOLE)
     with CampaignFile.create("run.hilcal", config.to_json(), str(cell.parent), "test") as file:
         file.append_readings(readings)

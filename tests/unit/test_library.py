@@ -15,12 +15,14 @@ import pytest
 
 import hilcal as hc
 from hilcal.config import load_config
+from hilcal.config.write import to_toml
 from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.covariance import WHOLE
 from hilcal.data.table import write_table
 from hilcal.robot.catalogue import configs_dir
 from studies.change import measured
 from studies.random_campaigns import rehearse
+from tests.support.cli_cases import quickly_planned
 from tests.support.paths import ROOT
 
 CELL = configs_dir() / "cells" / "demo_ur10e.toml"
@@ -52,7 +54,9 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     ):
         with CampaignFile.create(path, config.to_json(), str(CELL.parent), "test") as file:
             file.append_readings(content)
-    return SimpleNamespace(table=table, run=run, later=later, cell=CELL, folder=folder)
+    cell = folder / "CELL.toml"
+    cell.write_text(to_toml(quickly_planned(config)), encoding="utf-8")
+    return SimpleNamespace(table=table, run=run, later=later, cell=cell, folder=folder)
 
 
 def names() -> list[str]:
