@@ -14,9 +14,10 @@ from hilcal.diagnose.effect_ranking import SAME_EVIDENCE
 from hilcal.diagnose.stepwise import add
 from hilcal.errors import HilcalError
 from hilcal.identify.arm_scatter import estimate_arm_scatter, with_arm_scatter
+from hilcal.identify.effect_columns import effect_columns
 from hilcal.identify.fit import Fit
 from hilcal.identify.fit import fit as solve
-from hilcal.identify.linearisation import effect_columns, linearise
+from hilcal.identify.linearisation import linearise
 from hilcal.regression.distributions import chi2
 
 LEVEL = 0.01

@@ -25,17 +25,16 @@ from hilcal.diagnose.promise import LEAST_KEPT, kept, kept_by_refit
 from hilcal.diagnose.stepwise import add
 from hilcal.effects.protocol import Effect
 from hilcal.errors import InputError
-from hilcal.identify.fit import Fit
-from hilcal.identify.linearisation import (
+from hilcal.identify.effect_columns import (
     EffectColumns,
-    HeldOut,
-    Linearisation,
     columns_in_parts,
     columns_of_each,
     effect_columns,
-    linearise,
 )
+from hilcal.identify.fit import Fit
+from hilcal.identify.linearisation import HeldOut, Linearisation, linearise
 from hilcal.regression.evidence import FamilyScore
+from hilcal.regression.factored import Tall
 from hilcal.regression.spectrum import Spectrum, spectrum
 from hilcal.types import Floats
 
@@ -175,7 +174,7 @@ def candidates(fit: Fit) -> tuple[Effect, ...]:
 def catalogue_columns(fit: Fit) -> tuple[Floats, dict[str, slice], dict[str, float]]:
     """Return the columns (R, P) of all `candidates`, which are whose, and how large each may be."""
     families = list(columns_of_each(fit, candidates(fit)))
-    ends = np.cumsum([0] + [f.white.shape[1] for f in families])
+    ends = np.cumsum([0] + [len(f.scale) for f in families])
     columns = np.hstack([np.zeros((len(fit.white), 0)), *(f.white for f in families)])
     of = {
         f.effect.name: slice(int(a), int(b))
@@ -204,7 +203,7 @@ def rank_suspects(
     for part in _scored(p, effects, level):
         for scored in part:
             of = scored.of
-            if of.white.size <= MOST_KEPT:
+            if of.numbers <= MOST_KEPT:
                 small[of.effect.name] = of
             found.append(_suspect(p, scored, level, len(effects)))
     tested = max(sum(s.score.rank > 0 for s in found), 1)
@@ -306,7 +305,7 @@ def _scored(
             of_s, largest = spectrum(s), most(of, bare)
             scored.append(_Scored(of, s, of_s, g, largest, p.score_of(of_s, g, largest)))
         able = [c for c in scored if c.score.p_value < level and c.score.log_evidence > 0]
-        held = iter(_left_out(p, [(c.of.white, c.score) for c in able]))
+        held = iter(_left_out(p, [(c.of.tall, c.score) for c in able]))
         yield tuple(replace(c, held=next(held)) if c in able else c for c in scored)
 
 
@@ -315,9 +314,9 @@ def _suspect(p: Linearisation, scored: _Scored, level: float, count: int) -> Sus
     of, of_s, result = scored.of, scored.spectrum, scored.score
     s, largest, effect, known = scored.information, scored.largest, of.effect, scored.held
     columns: Callable[[], EffectColumns] = lambda: of  # noqa: E731 - of the small ones alone
-    if of.white.size > MOST_KEPT:
+    if of.numbers > MOST_KEPT:
         columns = partial(effect_columns, p.fit, effect)
-    left_out = LeftOut(lambda: _left_out(p, [(columns().white, result)])[0])
+    left_out = LeftOut(lambda: _left_out(p, [(columns().tall, result)])[0])
     if known is not None:
         left_out = LeftOut(lambda: known)
 
@@ -349,7 +348,7 @@ def _suspect(p: Linearisation, scored: _Scored, level: float, count: int) -> Sus
     )
 
 
-def _left_out(p: Linearisation, families: Sequence[tuple[Floats, FamilyScore]]) -> list[HeldOut]:
+def _left_out(p: Linearisation, families: Sequence[tuple[Tall, FamilyScore]]) -> list[HeldOut]:
     """Reductions of the error on poses left out by families of whitened columns (R, P)."""
     products = p.products(x for x, _ in families)
     scores = [score for _, score in families]

@@ -15,7 +15,8 @@ from functools import cached_property
 import numpy as np
 
 from hilcal.diagnose.minimum_detectable_effect import POWER, Strength
-from hilcal.identify.linearisation import EffectColumns, Linearisation, by_pose, effect_columns
+from hilcal.identify.effect_columns import EffectColumns, effect_columns
+from hilcal.identify.linearisation import Linearisation, by_pose
 from hilcal.regression.evidence import LARGE_FAMILY, FamilyScore, score_family
 from hilcal.regression.leave_out import FamilyFolds
 from hilcal.regression.paired_test import improves
@@ -69,8 +70,8 @@ def _least(tests: "SuspectTests", full: EffectColumns, start: Strength) -> Stren
     """`least_of_family` where the parameters of `full` are there and those of a family scored."""
     p = tests.p
     rng = np.random.default_rng(_SEED)
-    beta = rng.standard_normal((full.white.shape[1], DRAWS))
-    signal = full.white @ beta
+    beta = rng.standard_normal((len(full.scale), DRAWS))
+    signal = full.tall @ beta
     noise = max(p.fit.variance_factor, 1.0)
     error = np.sqrt(noise) * rng.standard_normal(signal.shape)
     moved = np.sqrt(np.mean(np.sum(np.einsum("dip,pk->dik", full.motion, beta) ** 2, axis=1)))

@@ -13,7 +13,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from hilcal.effects.protocol import Effect, Situation
-from hilcal.identify.linearisation import EffectColumns, Linearisation, by_pose, columns_of_each
+from hilcal.identify.effect_columns import EffectColumns, columns_of_each
+from hilcal.identify.linearisation import Linearisation, by_pose
 from hilcal.regression.evidence import score_family
 from hilcal.regression.leave_out import left_out_residual
 from hilcal.regression.paired_test import improves

@@ -116,7 +116,7 @@ def _batches(columns: Iterable[_Named]) -> Iterator[list[_Named]]:
 def _shares(p: Linearisation, batch: list[_Named]) -> list[MisfitShare]:
     """Score named columns (R, F)."""
     products = p.products(x for _, x in batch)
-    scores = [p.score(of.x, p.information(of)) for of in products]
+    scores = [p.score(x, p.information(of)) for (_, x), of in zip(batch, products, strict=True)]
     held = p.held_out(list(zip(products, scores, strict=True)))
     return [
         MisfitShare(name, max(of.share, 0.0), score.p_value)

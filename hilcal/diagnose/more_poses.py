@@ -20,8 +20,9 @@ from hilcal.diagnose.plausible_size import most, unloaded_readings
 from hilcal.diagnose.stepwise import add
 from hilcal.effects.protocol import Effect
 from hilcal.errors import HilcalError
+from hilcal.identify.effect_columns import effect_columns
 from hilcal.identify.fit import Fit, fit
-from hilcal.identify.linearisation import Linearisation, effect_columns, linearise
+from hilcal.identify.linearisation import Linearisation, linearise
 from hilcal.regression.spectrum import spectrum
 from hilcal.robot import se3
 

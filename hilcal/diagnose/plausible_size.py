@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilcal.effects.protocol import Effect
+from hilcal.identify.effect_columns import EffectColumns, columns_of_each
 from hilcal.identify.fit import Fit
-from hilcal.identify.linearisation import EffectColumns, columns_of_each
 from hilcal.types import Floats
 
 ALLOWED = 2.0

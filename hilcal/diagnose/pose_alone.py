@@ -21,7 +21,8 @@ from hilcal.diagnose.more_poses import enough
 from hilcal.diagnose.noise_verdict import MISFIT_ALARM
 from hilcal.diagnose.pose_constants import pose_constants
 from hilcal.effects.protocol import Effect
-from hilcal.identify.linearisation import Linearisation, effect_columns
+from hilcal.identify.effect_columns import effect_columns
+from hilcal.identify.linearisation import Linearisation
 from hilcal.regression.distributions import chi2
 
 LEAST = 0.9

@@ -15,8 +15,9 @@ from dataclasses import replace
 import numpy as np
 
 from hilcal.errors import CannotAnswerError
+from hilcal.identify.effect_columns import EffectColumns
 from hilcal.identify.fit import Fit
-from hilcal.identify.linearisation import EffectColumns, Linearisation
+from hilcal.identify.linearisation import Linearisation
 from hilcal.identify.residual import residual
 from hilcal.regression.evidence import FamilyScore
 
@@ -49,7 +50,7 @@ def kept_by_step(p: Linearisation, of: EffectColumns, score: FamilyScore) -> flo
         score: of the effect.
     """
     fit, s = p.fit, p.fit.solution
-    aim = s.white - of.white @ score.step
+    aim = s.white - of.tall @ score.step
     z = p.projection.solve(p.rows.T @ aim - p.projection.ridge * s.coordinates())
     model = replace(fit.model, effects=(*fit.model.effects, of.effect))
     theta = [s.theta + s.transform @ z, of.scale * score.step]

@@ -16,7 +16,8 @@ import numpy as np
 
 from hilcal.diagnose.effect_ranking import Suspect
 from hilcal.effects.protocol import Effect
-from hilcal.identify.linearisation import Linearisation, effect_columns
+from hilcal.identify.effect_columns import effect_columns
+from hilcal.identify.linearisation import Linearisation
 from hilcal.regression.schur import schur_complement
 
 NEEDED = 12.0

@@ -4,15 +4,13 @@ The ranking of effects that could be missing and the planning of measurements th
 both use it, so that the planner's power and the diagnosis's test are of the same information.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 
-from hilcal.data.whitening import Whitening
-from hilcal.effects.protocol import Effect
+from hilcal.identify.effect_columns import EffectColumns
 from hilcal.identify.fit import Fit
 from hilcal.identify.folds import random_folds
 from hilcal.identify.gauss_newton import columns_of
@@ -33,53 +31,10 @@ from hilcal.regression.leave_out import (
 from hilcal.regression.paired_test import improves
 from hilcal.regression.projection import Projection
 from hilcal.regression.spectrum import Spectrum
-from hilcal.types import Bools, Floats, Ints
+from hilcal.types import Floats, Ints
 
-TOGETHER = 8_000_000
-"""Numbers of the columns of effects that are computed together, 64 MB; a choice by memory."""
-WHITENED = 2_000_000
-"""Numbers of the columns that are whitened together, 16 MB, and kept while one of their effects is;
-a choice by memory."""
 LEAST_MISFIT = 3.0
 """A misfit counts as at least so many standard deviations of χ²; a choice."""
-
-
-@dataclass(frozen=True, eq=False)
-class EffectColumns:
-    """The columns of an effect in ordinary magnitudes of its parameters.
-
-    Attributes:
-        effect: the effect.
-        scale: (P,) ordinary magnitudes, SI.
-        part: (R, Q) whitened columns of all effects that were whitened together.
-        within: which of them are this effect's, P.
-        readings: (N, m, P) motion of the fitted readings, sensor axes, m and rad.
-        whitening: of the readings.
-        bare: (N,) which readings are unloaded.
-    """
-
-    effect: Effect
-    scale: Floats
-    part: Floats
-    within: slice
-    readings: Floats
-    whitening: Whitening
-    bare: Bools
-
-    @property
-    def white(self) -> Floats:
-        """(R, P) whitened columns."""
-        return self.part[:, self.within]
-
-    @cached_property
-    def motion(self) -> Floats:
-        """(D, 3, P) displacement of each measured position, m."""
-        return self.whitening.raw(self.readings[:, :3])
-
-    @cached_property
-    def unloaded(self) -> Floats:
-        """(U, 3, P) displacement of the target in each unloaded reading, sensor axes, m."""
-        return np.asarray(self.readings[self.bare, :3])
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +100,7 @@ class Linearisation:
             return self.projection.schur(x.whole.gram, x.whole.cross)
         return self.projection.information(x)
 
-    def products(self, families: Iterable[Floats]) -> list[FamilyProducts]:
+    def products(self, families: Iterable[Tall]) -> list[FamilyProducts]:
         """Return the products of families of whitened columns, which `held_out` needs."""
         return family_products(self.folds, self.projection, self.fit.white, families)
 
@@ -167,19 +122,22 @@ class Linearisation:
         return score_family(s, g, self.rss, self.fit.dof, most=most)
 
     def families(self, columns: Sequence[EffectColumns]) -> list[tuple[Floats, Floats]]:
-        """Return S (P, P) and g = Xᵀ r (P,) of effects that were whitened together.
+        """Return S (P, P) and g = Xᵀ r (P,) of effects whose columns were computed together.
 
-        The model's columns and the residual are multiplied by all of theirs at once.
+        The model's columns and the residual are multiplied by all that were whitened together at
+        once.
         """
-        if not columns:
-            return []
-        part = columns[0].part
-        both = products.cross(np.column_stack([self.rows, self.residual]), part)
-        lifted, rhs = self.projection.inverse_root @ both[:-1], both[-1]
+        own = np.column_stack([self.rows, self.residual])
+        together = next((of.together for of in columns if of.together is not None), None)
+        of_all = None if together is None else products.cross(own, together)
         out = []
         for of in columns:
-            across = lifted[:, of.within]
-            out.append((products.gram(of.white) - across.T @ across, rhs[of.within]))
+            if of_all is not None and of.together is together:
+                both = of_all[:, of.within]
+            else:
+                both = (of.tall.T @ own).T
+            lifted = self.projection.inverse_root @ both[:-1]
+            out.append((gram(of.tall) - lifted.T @ lifted, both[-1]))
         return out
 
     def misfit(self) -> float:
@@ -217,64 +175,6 @@ class Linearisation:
 def linearise(fit: Fit) -> Linearisation:
     """Return the linearisation of a gc-scaled fit."""
     return Linearisation(fit, fit.solution.projection(), fit.solution.projected_residual())
-
-
-def computable(fit: Fit, effect: Effect) -> bool:
-    """Whether the fitted readings have the columns that an effect needs."""
-    return type(effect).computable(fit.solution.prediction.situation.states)
-
-
-def effect_columns(fit: Fit, effect: Effect) -> EffectColumns:
-    """Return the columns of an effect that is not in the model, at the parameters of the fit."""
-    return next(columns_of_each(fit, (effect,)))
-
-
-def columns_of_each(fit: Fit, effects: Sequence[Effect]) -> Iterator[EffectColumns]:
-    """Yield `effect_columns` of several effects."""
-    return (of for part in columns_in_parts(fit, effects) for of in part)
-
-
-def columns_in_parts(fit: Fit, effects: Sequence[Effect]) -> Iterator[tuple[EffectColumns, ...]]:
-    """Yield `effect_columns` of several effects, those together that were whitened together.
-
-    The equilibrium is differentiated once for as many of them as have `TOGETHER` numbers; as many
-    as have `WHITENED` are whitened together.
-    """
-    s, w = fit.solution, fit.whitening
-    rows = w.m * len(s.prediction.situation.angle)
-    bare = fit.readings[~fit.outlier].unloaded
-    for group in _groups(effects, rows, TOGETHER):
-        scale = np.concatenate([effect.magnitudes for effect in group])
-        jacobian = fit.model.jacobian_of(group, s.prediction, s.theta, w.m, scale=scale)
-        parts = tuple(_groups(group, rows, WHITENED))
-        start = 0
-        for part in parts:
-            ends = np.cumsum([0] + [len(effect.magnitudes) for effect in part]).tolist()
-            own = jacobian[:, :, start : start + ends[-1]]
-            start += ends[-1]
-            if len(parts) > 1:  # what is kept of a part does not keep the others
-                own = own.copy()
-            white = w.whitened(own)
-            places = [slice(*at) for at in pairwise(ends)]
-            yield tuple(
-                EffectColumns(e, e.magnitudes, white, mine, own[:, :, mine], w, bare)
-                for e, mine in zip(part, places, strict=True)
-            )
-
-
-def _groups(effects: Sequence[Effect], rows: int, most: int) -> Iterator[tuple[Effect, ...]]:
-    """Split effects into successive groups of at most `most` numbers, or of one effect."""
-    group: list[Effect] = []
-    size = 0
-    for effect in effects:
-        numbers = rows * len(effect.magnitudes)
-        if group and size + numbers > most:
-            yield tuple(group)
-            group, size = [], 0
-        group.append(effect)
-        size += numbers
-    if group:
-        yield tuple(group)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

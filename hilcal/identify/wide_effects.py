@@ -86,12 +86,12 @@ def _wide(model: Model, one: Situation, theta: Floats, live: Ints) -> list[tuple
         if count < WIDE or effect.compliance(theta[mine]) is not None:
             continue
         loads = effect.wrench_columns(theta[mine], one) is not None
-        if not loads and _of_joints(effect.columns(one)) is not None:
+        if not loads and of_joints(effect.columns(one)) is not None:
             found.append((effect, mine))
     return found
 
 
-def _of_joints(columns: tuple[Columns, ...]) -> Columns | None:
+def of_joints(columns: tuple[Columns, ...]) -> Columns | None:
     """The columns where each parameter displaces one joint; else None."""
     if len(columns) != 1 or columns[0].field != "dq":
         return None

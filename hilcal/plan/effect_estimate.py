@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilcal.effects.protocol import Effect
-from hilcal.identify.linearisation import Linearisation, computable, effect_columns
+from hilcal.identify.effect_columns import computable, effect_columns
+from hilcal.identify.linearisation import Linearisation
 from hilcal.types import Floats
 
 SUPPORTED = 3.0

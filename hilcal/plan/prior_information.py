@@ -3,8 +3,8 @@
 import numpy as np
 
 from hilcal.effects.protocol import Effect
+from hilcal.identify.effect_columns import computable, effect_columns
 from hilcal.identify.gauss_newton import whitened_jacobian
-from hilcal.identify.linearisation import computable, effect_columns
 from hilcal.identify.priors import scales_of
 from hilcal.plan.nominal_model import NominalModel
 from hilcal.types import Floats

@@ -13,8 +13,9 @@ from hilcal.diagnose.effect_ranking import candidates
 from hilcal.diagnose.stepwise import Refits, add
 from hilcal.diagnose.verdict import diagnose
 from hilcal.identify.baseline import baseline
+from hilcal.identify.effect_columns import effect_columns
 from hilcal.identify.fit import Fit, fit
-from hilcal.identify.linearisation import effect_columns, linearise
+from hilcal.identify.linearisation import linearise
 from hilcal.report.diagnosis_document import to_json
 from hilcal.report.verdict_words import message
 from hilcal.robot.catalogue import configs_dir

@@ -6,8 +6,9 @@ from hilcal.diagnose.effect_ranking import candidates, rank_suspects
 from hilcal.diagnose.minimum_detectable_effect import least_strength
 from hilcal.diagnose.verdict import diagnose
 from hilcal.identify.baseline import baseline
+from hilcal.identify.effect_columns import effect_columns
 from hilcal.identify.fit import Fit, fit
-from hilcal.identify.linearisation import effect_columns, linearise
+from hilcal.identify.linearisation import linearise
 from hilcal.report.diagnosis_document import least
 from hilcal.report.text_seen import could_have_been_seen
 from tests.support.campaigns import campaign

@@ -7,8 +7,9 @@ import numpy as np
 from hilcal.diagnose.effect_ranking import candidates, rank_suspects
 from hilcal.diagnose.gravity import beyond_geometry, geometry_columns, through_load, unloaded
 from hilcal.identify.baseline import baseline
+from hilcal.identify.effect_columns import effect_columns
 from hilcal.identify.fit import Fit, fit
-from hilcal.identify.linearisation import effect_columns, linearise
+from hilcal.identify.linearisation import linearise
 from tests.support.campaigns import campaign, measured, plan
 
 POSES = 30

@@ -14,8 +14,9 @@ from hilcal.diagnose.verdict import diagnose
 from hilcal.effects.catalogue import BUILT_IN
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
+from hilcal.identify.effect_columns import effect_columns
 from hilcal.identify.fit import Fit, fit
-from hilcal.identify.linearisation import effect_columns, linearise
+from hilcal.identify.linearisation import linearise
 from hilcal.report.verdict_words import message
 from studies.study_cases import study_case
 from tests.support.campaigns import campaign, configuration

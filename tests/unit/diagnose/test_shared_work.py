@@ -11,10 +11,11 @@ from hilcal.diagnose.plausible_size import most, unloaded_readings
 from hilcal.diagnose.residual_regression import Regressions, residual_regression
 from hilcal.diagnose.stepwise import add
 from hilcal.diagnose.stepwise_alternatives import StepwiseAlternatives
-from hilcal.identify import linearisation
+from hilcal.identify import effect_columns
 from hilcal.identify.baseline import baseline
+from hilcal.identify.effect_columns import columns_of_each
 from hilcal.identify.fit import Fit, fit
-from hilcal.identify.linearisation import Linearisation, columns_of_each, linearise
+from hilcal.identify.linearisation import Linearisation, linearise
 from tests.support.campaigns import campaign
 
 
@@ -28,7 +29,7 @@ def found() -> Fit:
 def test_columns_of_several_effects_are_those_of_each(
     found: Fit, together: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(linearisation, "TOGETHER", together)
+    monkeypatch.setattr(effect_columns, "TOGETHER", together)
     effects = candidates(found)
     s, w = found.solution, found.whitening
     for effect, of in zip(effects, columns_of_each(found, effects), strict=True):

@@ -16,8 +16,9 @@ from hilcal.diagnose.stepwise import add, exchange, remove
 from hilcal.diagnose.stepwise_alternatives import PRICE, Alternative, StepwiseAlternatives
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
+from hilcal.identify.effect_columns import effect_columns
 from hilcal.identify.fit import Fit, fit
-from hilcal.identify.linearisation import effect_columns, linearise
+from hilcal.identify.linearisation import linearise
 from hilcal.refine import Path
 from hilcal.regression.power import noncentrality_of_power
 from tests.support.campaigns import NOTHING, Campaign, campaign, measured, plan, world_of

@@ -34,8 +34,9 @@ from hilcal.effects.catalogue import installed
 from hilcal.effects.check import check_effect
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
+from hilcal.identify.effect_columns import effect_columns
 from hilcal.identify.fit import Fit, fit
-from hilcal.identify.linearisation import effect_columns, linearise
+from hilcal.identify.linearisation import linearise
 from hilcal.refine import refine
 from hilcal.report.text_discover import (
     discovery_report,

@@ -23,8 +23,9 @@ from hilcal.diagnose.misfit_breakdown import MisfitShare
 from hilcal.diagnose.verdict import diagnose, judge
 from hilcal.identify.arm_scatter import estimate_arm_scatter, factors, with_arm_scatter
 from hilcal.identify.baseline import baseline
+from hilcal.identify.effect_columns import effect_columns
 from hilcal.identify.fit import Fit, fit
-from hilcal.identify.linearisation import effect_columns, linearise
+from hilcal.identify.linearisation import linearise
 from hilcal.identify.registration import register
 from hilcal.report.verdict_words import message
 from hilcal.robot import se3

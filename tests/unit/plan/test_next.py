@@ -10,8 +10,9 @@ from hilcal.cell import cell_from_config
 from hilcal.diagnose.effect_ranking import candidates
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.baseline import baseline
+from hilcal.identify.effect_columns import effect_columns
 from hilcal.identify.fit import Fit, fit
-from hilcal.identify.linearisation import effect_columns, linearise
+from hilcal.identify.linearisation import linearise
 from hilcal.plan.discriminated_pairs import (
     LEVEL,
     discriminated_pairs,

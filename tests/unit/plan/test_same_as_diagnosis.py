@@ -6,8 +6,9 @@ import pytest
 from hilcal.data.whitening import Mode
 from hilcal.diagnose.effect_ranking import candidates, rank_suspects
 from hilcal.identify.baseline import baseline
+from hilcal.identify.effect_columns import effect_columns
 from hilcal.identify.fit import Fit, fit
-from hilcal.identify.linearisation import effect_columns, linearise
+from hilcal.identify.linearisation import linearise
 from hilcal.plan.discriminated_pairs import LEVEL, discriminated_pairs, pair_of, power
 from hilcal.plan.effect_estimate import estimate
 from hilcal.plan.information import Problem, problem
