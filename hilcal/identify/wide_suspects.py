@@ -16,6 +16,10 @@ from hilcal.identify.wide_effects import WIDE, of_joints
 from hilcal.regression.factored import Factored
 from hilcal.types import Bools, Floats, Ints
 
+LEAST_NUMBERS = 250_000
+"""Numbers of an effect's columns from which on they are kept by their factors; a choice by timing:
+of fewer, the products of the factors are too small to pay."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WideColumns:
@@ -81,7 +85,8 @@ def wide_effect(effect: Effect, s: Situation, w: Whitening) -> WideEffect | None
         w: their whitening.
     """
     size = len(effect.magnitudes)
-    if size < WIDE or len(w.buckets) != 1:
+    few = len(s.angle) * w.m * size < LEAST_NUMBERS
+    if size < WIDE or few or len(w.buckets) != 1:
         return None
     theta = np.zeros(size)
     if effect.compliance(theta) is not None or effect.wrench_columns(theta, s) is not None:
