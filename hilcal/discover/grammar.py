@@ -25,6 +25,8 @@ MOST = 3
 """Complexity of a product; a choice, by the number of candidates (about 10⁶ with all sites)."""
 MOST_FACTORS = 2
 """Factors of a product; a choice, likewise."""
+SOME = 2000
+"""Products that are formed at a time; a choice, for memory."""
 FLAT = 0.1
 """Factors whose spread is a smaller share of their size are in no product: it would be the other
 factor's law to within that share. A choice."""
@@ -173,10 +175,7 @@ def grammar(known: list[Variable], s: Situation, poses: int = 0) -> Grammar:
             if cost[i] + cost[k] <= MOST and different(singles[i], singles[k]):
                 pairs.append((i, k))
     value = np.vstack([value, np.ones(value.shape[1])])
-    index = np.array(pairs)
-    products = value[index[:, 0]] * value[index[:, 1]]
-    size = np.sqrt(np.mean(products**2, axis=1))
-    kept = np.flatnonzero(size > 0)
+    values, size, kept = _products(value, np.array(pairs))
     amplitudes = tuple(
         Amplitude(tuple(singles[i] for i in pairs[k] if i >= 0)) for k in kept.tolist()
     )
@@ -186,8 +185,8 @@ def grammar(known: list[Variable], s: Situation, poses: int = 0) -> Grammar:
     return Grammar(
         known,
         amplitudes,
-        (products[kept] / size[kept, None]).astype(np.float32),
-        size[kept],
+        values,
+        size,
         np.array([a.cost for a in amplitudes]),
         partner,
         s,
@@ -197,6 +196,29 @@ def grammar(known: list[Variable], s: Situation, poses: int = 0) -> Grammar:
             if not same and f.shape not in (shapes.FINE_COS, shapes.FINE_SIN)
         ),
     )
+
+
+def _products(value: Floats, pairs: Ints) -> tuple[Floats, Floats, Ints]:
+    """Products of pairs of rows, each with root mean square 1, some at a time to save memory.
+
+    Args:
+        value: (C, N) functions.
+        pairs: (F, 2) rows of both factors.
+
+    Returns:
+        (F', N) products in single precision, (F',) what they were divided by, and which of the
+        pairs they are: those that are not zero throughout.
+    """
+    size = np.empty(len(pairs))
+    for part in (slice(a, a + SOME) for a in range(0, len(pairs), SOME)):
+        first, second = pairs[part].T
+        size[part] = np.sqrt(np.mean((value[first] * value[second]) ** 2, axis=1))
+    kept = np.flatnonzero(size > 0)
+    out: Floats = np.empty((len(kept), value.shape[1]), dtype=np.float32)
+    for part in (slice(a, a + SOME) for a in range(0, len(kept), SOME)):
+        first, second = pairs[kept[part]].T
+        out[part] = value[first] * value[second] / size[kept[part], None]
+    return out, size[kept], kept
 
 
 def _turned(singles: list[Factor]) -> dict[int, int]:
