@@ -24,7 +24,9 @@ from hilcal.data.readings import Readings
 from hilcal.data.whitening import Whitening, covariance_blocks, whitening
 from hilcal.identify.fit import Fit
 from hilcal.identify.full_covariance import joint_factors
+from hilcal.identify.wide_effects import measured_columns
 from hilcal.model import Model
+from hilcal.regression.factored import Factored, Tall
 from hilcal.regression.variance_components import (
     BlockRows,
     VarianceComponents,
@@ -92,7 +94,7 @@ class _Whitened:
     readings: Readings
     w: Whitening
     y: Floats
-    rows: Floats
+    rows: Tall
 
     def blocks(self, components: list[list[Floats]]) -> list[BlockRows]:
         """Rows in blocks, with the whitened blocks of each component."""
@@ -101,7 +103,9 @@ class _Whitened:
             groups, size = len(b.loaded), b.factor.shape[-1]
             stop = at + groups * size
             y = self.y[at:stop].reshape(groups, size)
-            rows = self.rows[at:stop].reshape(groups, size, self.rows.shape[1])
+            rows = self.rows
+            if not isinstance(rows, Factored):  # which has one bucket
+                rows = rows[at:stop].reshape(groups, size, rows.shape[1])
             out.append(BlockRows(y, rows, np.stack([c[k] for c in components])))
             at = stop
         return out
@@ -171,10 +175,21 @@ def _whitened(fit: Fit) -> _Whitened:
     place = np.zeros(len(kept), dtype=np.int64)
     place[fit.whitening.reading] = np.arange(len(fit.raw))
     white = w.whiten(fit.raw[place[chosen[w.reading]]]).reshape(-1)
-    jacobian = fit.model.jacobian(s.prediction, s.theta, w.m, live)[chosen]
-    columns = w.whiten(w.raw(jacobian)).reshape(len(white), len(live))
-    rows = columns @ s.transform[live]
+    rows = _rows(fit, w, chosen, live)
     return _Whitened(some, w, white + rows @ s.coordinates(), rows)
+
+
+def _rows(fit: Fit, w: Whitening, chosen: Ints, live: Ints) -> Tall:
+    """Columns (R, K) of a fit, by its identifiable coordinates, in some readings."""
+    s = fit.solution
+    if isinstance(s.tall, Factored) and w.by_reading:
+        columns = measured_columns(fit.model, s.prediction, s.theta, fit.whitening, live)
+        if isinstance(columns, Factored):
+            tall = columns.of(chosen).turned_rows(w.buckets[0].factor)
+            return s.equations.basis.restricted(s.estimated).rows(tall)
+    jacobian = fit.model.jacobian(s.prediction, s.theta, w.m, live)[chosen]
+    white = w.whiten(w.raw(jacobian)).reshape(w.m * len(w), len(live))
+    return np.asarray(white @ s.transform[live])
 
 
 def _some_poses(readings: Readings, size: int) -> Ints:

@@ -157,6 +157,12 @@ class Factored:
             np.append(self.along, count + b.along),
         )
 
+    def turned_rows(self, by: Floats) -> "Factored":
+        """Return the matrix with the rows of each measurement turned by (D, m, m)."""
+        count, m, _ = self.direction.shape
+        own = (by @ self.own.reshape(count, m, len(self.at))).reshape(self.own.shape)
+        return replace(self, own=own, direction=by @ self.direction)
+
     def of(self, measurements: Ints | Bools) -> "Factored":
         """Return the rows of some measurements (D,)."""
         direction, size = self.direction[measurements], len(self.at)
@@ -278,6 +284,14 @@ Tall = Floats | Factored
 def gram(a: Tall) -> Floats:
     """Return AᵀA (P, P)."""
     return a.gram() if isinstance(a, Factored) else products.gram(a)
+
+
+def forms(a: Tall, root: Floats, m: int) -> Floats:
+    """Return A_d TᵀT A_dᵀ (D, m, m) of each m rows of A (R, P), T a root (K, P)."""
+    if isinstance(a, Factored):
+        return a.forms(root)
+    seen = products.times(a, root.T).reshape(-1, m, len(root))
+    return np.asarray(seen @ np.swapaxes(seen, 1, 2))
 
 
 def keep_columns(a: Tall, kept: Bools) -> Tall:

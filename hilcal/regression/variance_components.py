@@ -27,6 +27,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hilcal.regression.factored import Factored, Tall, forms, gram
 from hilcal.regression.schur import inverse_root, positive_solve
 from hilcal.types import Floats
 
@@ -44,13 +45,19 @@ class BlockRows:
 
     Attributes:
         y: (G, S) residual.
-        rows: (G, S, K) columns B of the model.
+        rows: (G, S, K) columns B of the model; (G·S, K) by their factors.
         components: (C, G, S, S) blocks of the K_i.
     """
 
     y: Floats
-    rows: Floats
+    rows: Floats | Factored
     components: Floats
+
+    def turned(self, by: Floats) -> Tall:
+        """Return rows (G·S, K) of the columns, those of each block turned by (G, S, S)."""
+        if isinstance(self.rows, Factored):
+            return self.rows.turned_rows(by)
+        return _flat(by @ self.rows)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,26 +148,24 @@ def _at(blocks: Sequence[BlockRows], ridge: Floats, variance: Floats) -> _Point:
         log_det += 2 * float(np.log(np.diagonal(low, axis1=1, axis2=2)).sum())
         root = np.linalg.inv(low)
         inverses.append(np.swapaxes(root, 1, 2) @ root)
-        white = (root @ b.rows).reshape(b.y.size, -1)
-        h += white.T @ white
+        h += gram(b.turned(root))
     t = inverse_root(h)
     log_det += _log_det(t)
-    weighted = [inverse @ b.rows for inverse, b in zip(inverses, blocks, strict=True)]
+    weighted = [b.turned(inverse) for inverse, b in zip(inverses, blocks, strict=True)]
 
     def project(x: list[Floats]) -> list[Floats]:
         """P x of columns (G, S, Q)."""
-        cross = sum(_flat(w).T @ _flat(part) for w, part in zip(weighted, x, strict=True))
+        cross = sum(w.T @ _flat(part) for w, part in zip(weighted, x, strict=True))
         step = t.T @ (t @ cross)
         parts = zip(inverses, weighted, x, strict=True)
-        return [inverse @ part - w @ step for inverse, w, part in parts]
+        return [inverse @ part - (w @ step).reshape(part.shape) for inverse, w, part in parts]
 
     py = [part[:, :, 0] for part in project([b.y[:, :, None] for b in blocks])]
     square = sum(float(np.sum(b.y * p)) for b, p in zip(blocks, py, strict=True))
     trace = np.zeros(len(variance))
     moved = []
     for b, inverse, w, p in zip(blocks, inverses, weighted, py, strict=True):
-        root = (_flat(w) @ t.T).reshape(w.shape)  # one product is faster than G
-        own = inverse - root @ np.swapaxes(root, 1, 2)
+        own = inverse - forms(w, t, b.y.shape[1])
         trace += np.einsum("gij,cgji->c", own, b.components)
         moved.append(np.einsum("cgij,gj->gic", b.components, p))
     turned = project(moved)

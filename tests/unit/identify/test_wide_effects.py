@@ -8,6 +8,7 @@ import pytest
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode, Whitening, whitening
 from hilcal.identify import gauss_newton, wide_effects
+from hilcal.identify.arm_scatter import estimate_arm_scatter
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import fit
 from hilcal.identify.gauss_newton import whitened_jacobian
@@ -88,3 +89,19 @@ def test_a_fit_is_the_same_by_factors(monkeypatch: pytest.MonkeyPatch) -> None:
     again = replace(found, solution=replace(found.solution, tall=found.solution.rows))
     np.testing.assert_allclose(found.left_out, again.left_out, rtol=0, atol=1e-12)
     assert isinstance(found.fitted, Whitening)
+
+
+def test_the_arms_scatter_is_the_same_by_factors(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(wide_effects, "WIDE", 4)
+    model, readings = built()
+    readings = replace(readings, covariance=readings.covariance / 4)
+    found = fit(model, readings, "absolute")
+    assert isinstance(found.solution.tall, Factored)
+    scatter = estimate_arm_scatter(found)
+    plain = replace(found, solution=replace(found.solution, tall=found.solution.rows))
+    expected = estimate_arm_scatter(plain)
+    assert scatter is not None
+    assert expected is not None
+    assert scatter.kind == expected.kind
+    np.testing.assert_allclose(scatter.std, expected.std, rtol=1e-7, atol=1e-12)
+    assert scatter.log_evidence == pytest.approx(expected.log_evidence, rel=1e-8)
