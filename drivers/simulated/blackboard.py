@@ -126,6 +126,10 @@ class Blackboard:
             time.sleep(0)
         raise RuntimeError(f"blackboard: section {section} is never at rest (its writer died?)")
 
+    def written(self, section: str) -> int:
+        """Return a number that every write of a section changes."""
+        return int(self._sequence[section][0])
+
     @property
     def time(self) -> float:
         """World time, s since the world's start."""

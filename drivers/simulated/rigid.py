@@ -13,16 +13,12 @@ def displacement(twist: Floats) -> Floats:
 
 def turned(rotation: Floats) -> Floats:
     """Return (N, 3, 3) rotation matrices of (N, 3) rotation vectors, rad."""
-    from scipy.spatial.transform import Rotation  # slow to import
-
-    return np.asarray(Rotation.from_rotvec(rotation).as_matrix())
+    return np.array([pin.exp3(w) for w in rotation]).reshape(-1, 3, 3)
 
 
 def rotation_vector(matrix: Floats) -> Floats:
     """Return (N, 3) rotation vectors of (N, 3, 3) rotation matrices, rad, length at most pi."""
-    from scipy.spatial.transform import Rotation  # slow to import
-
-    return np.asarray(Rotation.from_matrix(matrix).as_rotvec())
+    return np.array([pin.log3(r) for r in matrix]).reshape(-1, 3)
 
 
 def inverse(transform: Floats) -> Floats:

@@ -89,11 +89,15 @@ class WorldState:
         self._log: list[dict[str, Any]] = []
         self._known: tuple[bytes, bytes, bool, int, bool] | None = None
         self._computed_ns = self._written_ns = 0
+        self._seen = -1  # number of the arm's last write that was looked at and needs no more
         self._arm = board.read("arm")
 
     def step(self, now_ns: int) -> None:
         """Publish what has changed; `now_ns` is the real time, `time.monotonic_ns`."""
         with self._lock:
+            number = self._board.written("arm")
+            if number == self._seen and now_ns - self._written_ns < _REFRESH_NS:
+                return
             arm = self._look()
             seen = (arm["q"].tobytes(), arm["side"].tobytes(), self._swings())
             known = (*seen, int(arm["arrivals"]), bool(arm["moving"]))
@@ -111,6 +115,7 @@ class WorldState:
             elif now_ns - self._written_ns >= _REFRESH_NS:
                 self._board.write("truth", **self._passing(arm))
                 self._written_ns = now_ns
+            self._seen = number if known == self._known else -1
 
     def hang(self, name: str | None) -> str | None:
         """Hang a load, or take it off (None); return what truly hangs: there are mistakes.

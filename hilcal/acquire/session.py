@@ -7,7 +7,6 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-import scipy.spatial.transform  # noqa: F401  (rotations: loaded before an arm moves, not while)
 
 from hilcal.acquire.arrival import ArrivalReader, TargetReading
 from hilcal.acquire.clock import Clock

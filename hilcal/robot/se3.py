@@ -70,11 +70,28 @@ def rotation(w: Floats) -> Floats:
 
 
 def rotation_vector(r: Floats) -> Floats:
-    """Rotation vector of a rotation matrix, angle in [0, π]; (..., 3, 3) -> (..., 3)."""
-    from scipy.spatial.transform import Rotation  # slow to import
+    """Rotation vector of a rotation matrix, angle in [0, π]; (..., 3, 3) -> (..., 3).
 
-    flat = Rotation.from_matrix(r.reshape(-1, 3, 3)).as_rotvec()
-    return np.asarray(flat, dtype=float).reshape(r.shape[:-1])
+    By the unit quaternion (v, w): of 4 (v, w)(v, w)ᵀ, whose elements are sums of those of R, the
+    row with the largest diagonal element is taken, so that nothing cancels at any angle
+    (Shepperd 1978, J. Guidance and Control 1); θ = 2 atan2(|v|, w).
+    """
+    m = r.reshape(-1, 3, 3)
+    square = np.empty((len(m), 4, 4))
+    square[:, :3, :3] = m + np.swapaxes(m, 1, 2)
+    trace = np.einsum("nii->n", m)
+    square[:, 3, 3] = 1.0 + trace
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        square[:, i, i] += 1.0 - trace
+        square[:, i, 3] = square[:, 3, i] = m[:, k, j] - m[:, j, k]
+    largest = np.argmax(np.einsum("nii->ni", square), axis=1)
+    q = square[np.arange(len(m)), largest]
+    q *= (np.where(q[:, 3] < 0.0, -1.0, 1.0) / np.linalg.norm(q, axis=1))[:, None]
+    sine = np.linalg.norm(q[:, :3], axis=1)
+    turn = sine > np.finfo(float).tiny
+    length = np.where(turn, 2.0 * np.arctan2(sine, q[:, 3]) / np.where(turn, sine, 1.0), 2.0)
+    return np.asarray(length[:, None] * q[:, :3]).reshape(r.shape[:-1])
 
 
 def exp(twist: Floats) -> tuple[Floats, Floats]:

@@ -42,6 +42,17 @@ def test_rotation_and_its_vector_are_inverse(seed: int, magnitude: float) -> Non
     np.testing.assert_allclose(back, w, rtol=0, atol=2e-15 + 1e-13 * magnitude)
 
 
+@pytest.mark.parametrize("short", [0.0, 1e-15, 1e-12, 1e-8, 1e-4, 0.1])
+def test_vectors_of_rotations_by_about_half_a_turn(short: float) -> None:
+    w = np.random.default_rng(2).standard_normal((200, 3))
+    w = np.vstack([w, np.eye(3), -np.eye(3), np.eye(3)[:2] + np.eye(3)[1:]])
+    w *= (np.pi - short) / np.linalg.norm(w, axis=1, keepdims=True)
+    r = se3.rotation(w)
+    found = se3.rotation_vector(r)
+    assert np.linalg.norm(found, axis=1).max() <= np.pi + 1e-15
+    np.testing.assert_allclose(se3.rotation(found), r, rtol=0, atol=1e-14)
+
+
 @given(seeds, magnitudes)
 def test_rotation_is_orthonormal_and_keeps_its_axis(seed: int, magnitude: float) -> None:
     w = vectors(seed, magnitude)
