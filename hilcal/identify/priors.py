@@ -16,10 +16,10 @@ def prior_of(model: Model) -> tuple[Floats, Ints]:
     """
     prior, groups, used = [np.zeros(0)], [np.zeros(0, dtype=np.int64)], 0
     for e in model.effects:
-        size = len(e.parameters)
+        size = len(e.magnitudes)
         own, fixed = e.groups(), e.prior_std()
         if own is not None:
-            prior.append(FIRST_GUESS * np.array([p.scale for p in e.parameters]))
+            prior.append(FIRST_GUESS * e.magnitudes)
             groups.append(own + used)
             used += int(own.max()) + 1
         else:

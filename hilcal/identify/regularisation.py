@@ -5,13 +5,21 @@ is the variance of the residual in units of the stated noise, at least 1, that t
 weighed against. The rank counts the flat directions that the data determine against the residual.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from hilcal.regression.empirical_bayes import maximise_evidence, spent_by_groups
 from hilcal.regression.factored import Tall, keep_columns
-from hilcal.regression.normal_equations import Basis, NormalEquations, find_basis, normal_equations
+from hilcal.regression.normal_equations import (
+    Basis,
+    FlatProducts,
+    NormalEquations,
+    find_basis,
+    flat_products,
+    flat_triangle,
+    normal_equations,
+)
 from hilcal.regression.products import submatrix
 from hilcal.types import Floats, Ints
 
@@ -35,6 +43,8 @@ class LinearProblem:
         noise: variance of the rows: 1 where the scaling whitens, else that of the residual.
         whitened: whether rows are in units of the stated noise.
         rows: (R, L) A itself, one row per element of the readings.
+
+    Priors, noise factor and solution share what depends on the flat parameters alone.
     """
 
     live: Ints
@@ -46,6 +56,8 @@ class LinearProblem:
     noise: float
     whitened: bool
     rows: Tall
+    _triangles: dict[bytes, Floats] = field(default_factory=dict, repr=False)
+    _products: dict[bytes, FlatProducts] = field(default_factory=dict, repr=False)
 
     def restricted(self, prior: Floats) -> "LinearProblem":
         """Return the problem without the parameters that a prior (P,) of zero holds at zero.
@@ -59,7 +71,9 @@ class LinearProblem:
         same = self.rows is self.a
         a = keep_columns(self.a, kept)
         rows = a if same else keep_columns(self.rows, kept)
-        return replace(self, live=self.live[kept], a=a, gram=gram, rows=rows)
+        known = {key: of.restricted(kept) for key, of in self._products.items()}
+        live = self.live[kept]
+        return replace(self, live=live, a=a, gram=gram, rows=rows, _products=known)
 
     def basis(self, scale: Floats, prior: Floats, spread: float) -> Basis:
         """Return identifiable coordinates for magnitudes (P,), priors (P,), and the residual's σ.
@@ -67,11 +81,20 @@ class LinearProblem:
         Without whitening only rounding decides the rank.
         """
         threshold = spread if self.whitened else None
-        return find_basis(self.a, scale[self.live], prior[self.live], threshold)
+        scale, prior = scale[self.live], prior[self.live]
+        flat = np.flatnonzero(np.isinf(prior))
+        key = self.live[flat].tobytes() + scale[flat].tobytes()
+        if key not in self._triangles:
+            self._triangles[key] = flat_triangle(self.a, flat, scale)
+        return find_basis(self.a, scale, prior, threshold, self._triangles[key])
 
     def equations(self, basis: Basis) -> NormalEquations:
         """Return the normal equations in the coordinates of a basis."""
-        return normal_equations(self.a, self.target, basis, self.gram)
+        turned = basis.transform[basis.flat, : len(basis.singular)]
+        key = self.live[basis.flat].tobytes() + turned.tobytes()
+        if key not in self._products:
+            self._products[key] = flat_products(self.a, self.target, basis)
+        return normal_equations(self.a, self.target, basis, self.gram, self._products[key])
 
     def rss(self, equations: NormalEquations, z: Floats) -> float:
         """Return ‖y − A (θ − θ_0)‖² at the coordinates z (K,) of normal equations."""

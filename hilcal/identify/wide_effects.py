@@ -18,6 +18,8 @@ from hilcal.types import Floats, Ints
 
 WIDE = 64
 """Columns of an effect from which on they are kept by their factors; a choice."""
+PER_COLUMN = 2
+"""Numbers that an effect computes for each parameter and state; for the size of a chunk."""
 
 
 def whitened_columns(
@@ -101,7 +103,8 @@ def of_joints(columns: tuple[Columns, ...]) -> Columns | None:
 def _write(out: Floats, effect: Effect, within: Ints, prediction: Prediction) -> Ints:
     """Write the displacements (N, C) by the parameters `within` an effect; returns their joints."""
     joint = np.zeros(0, dtype=np.int64)
-    for rows in chunks(len(out), 6 * len(effect.parameters)):
+    # Naming a thousand parameters takes long.
+    for rows in chunks(len(out), PER_COLUMN * len(effect.magnitudes)):
         (c,) = effect.checked_columns(prediction[rows].situation)
         place = np.full(int(c.parameter.max()) + 1, -1)
         place[c.parameter] = np.arange(len(c.parameter))

@@ -86,6 +86,7 @@ def maximise_evidence(
     effective = 0.0
     keep = np.flatnonzero(active[groups])
     g, b = submatrix(g, keep), b[keep]
+    room = np.empty(g.size)
     for iteration in range(ITERATIONS):
         if not len(keep):
             effective = 0.0
@@ -93,7 +94,7 @@ def maximise_evidence(
             break
         group = groups[keep]
         std = np.sqrt(variance[group])
-        h = g * (std / beta)
+        h = np.multiply(g, std / beta, out=room[: g.size].reshape(g.shape))
         h *= std[:, None]
         inverse = _inverse_root(h)
         posterior = np.einsum("ij,ij->j", inverse, inverse)
@@ -173,9 +174,9 @@ def _inverse_root(h: Floats) -> Floats:
     one = h.T  # in LAPACK's order, not turned over in memory; the other triangle stays
     diagonal = np.diag(h).copy()
     one[np.diag_indices_from(one)] += 1.0
-    low, failed = sl.lapack.dpotrf(one, lower=1)
-    if not failed:
-        return np.asarray(sl.lapack.dtrtri(low, lower=1, overwrite_c=1)[0])
+    up, failed = sl.lapack.dpotrf(one, lower=0)
+    if not failed:  # the inverse of an upper triangle takes less time than that of a lower one
+        return np.asarray(sl.lapack.dtrtri(up, lower=0, overwrite_c=1)[0].T)
     one[np.diag_indices_from(one)] = diagonal
     values, vectors = np.linalg.eigh(h)
     return np.asarray((vectors / np.sqrt(1.0 + np.maximum(values, 0.0))).T)

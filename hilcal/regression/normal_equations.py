@@ -103,7 +103,13 @@ class Basis:
         return out
 
 
-def find_basis(a: Tall, scale: Floats, prior: Floats, spread: float | None = 1.0) -> Basis:
+def find_basis(
+    a: Tall,
+    scale: Floats,
+    prior: Floats,
+    spread: float | None = 1.0,
+    triangle: Floats | None = None,
+) -> Basis:
     """Rank analysis of A (R, P): the identifiable directions of the flat parameters.
 
     Args:
@@ -113,12 +119,13 @@ def find_basis(a: Tall, scale: Floats, prior: Floats, spread: float | None = 1.0
             parameters held at zero.
         spread: standard deviation of the whitened residual, at least 1; None where rows are
             not in units of noise, so that only rounding decides the rank.
+        triangle: what `flat_triangle` returns, where it is known.
     """
     flat = np.isinf(prior)
     held = np.flatnonzero(~flat & (prior > 0))
     columns = np.flatnonzero(flat)
     p = a.shape[1]
-    r = _triangle(a, columns, scale)
+    r = flat_triangle(a, columns, scale) if triangle is None else triangle
     _, s, vt = np.linalg.svd(r, full_matrices=True)
     s = np.concatenate([s, np.zeros(len(columns) - len(s))])
     floor = ROUNDING * s.max(initial=0.0)
@@ -135,8 +142,8 @@ def find_basis(a: Tall, scale: Floats, prior: Floats, spread: float | None = 1.0
     return Basis(transform, precision, null, flat, held, s[keep], structural, *conditions)
 
 
-def _triangle(a: Tall, columns: Ints, scale: Floats) -> Floats:
-    """R of the QR of some columns of A (R, P), multiplied by their magnitudes (P,)."""
+def flat_triangle(a: Tall, columns: Ints, scale: Floats) -> Floats:
+    """Return R of the QR of some columns of A (R, P), multiplied by their magnitudes (P,)."""
     if len(a) > TALL and len(columns):
         whole = Triangle(len(columns))
         whole.add(written(a) if len(columns) == a.shape[1] else a[:, columns])
@@ -188,25 +195,59 @@ class NormalEquations:
         return np.asarray(root.T @ root)
 
 
-def normal_equations(a: Tall, target: Floats, basis: Basis, gram: Floats) -> NormalEquations:
+@dataclass(frozen=True, slots=True, eq=False)
+class FlatProducts:
+    """Products of the rows by F flat coordinates, from which normal equations are put together.
+
+    Attributes:
+        own: (F, F) with each other.
+        all: (F, P) with all columns of A.
+        target: (F,) with the target.
+        columns: (P,) of all columns of A with the target.
+    """
+
+    own: Floats
+    all: Floats
+    target: Floats
+    columns: Floats
+
+    def restricted(self, kept: Bools) -> "FlatProducts":
+        """Return those over some columns (P,) of A, which the flat coordinates are made of."""
+        return replace(self, all=self.all[:, kept], columns=self.columns[kept])
+
+
+def flat_products(a: Tall, target: Floats, basis: Basis) -> FlatProducts:
+    """Form the products of the flat coordinates of a basis: the rows are orthonormal."""
+    rows = basis.flat_rows(a)
+    return FlatProducts(rows.T @ rows, rows.T @ a, rows.T @ target, a.T @ target)
+
+
+def normal_equations(
+    a: Tall, target: Floats, basis: Basis, gram: Floats, known: FlatProducts | None = None
+) -> NormalEquations:
     """Form the normal equations of A (R, P) in the coordinates of a basis.
 
     The flat directions are formed from their rows, which are orthonormal, so that squaring
     costs no accuracy; columns with a prior are taken from the gram AᵀA (P, P), for speed.
+
+    Args:
+        a: A.
+        target: (R,) right-hand side.
+        basis: the coordinates.
+        gram: AᵀA.
+        known: products of the flat coordinates, where they are known.
     """
-    flat = len(basis.singular)
-    rows = basis.flat_rows(a)
+    flat, of = len(basis.singular), flat_products(a, target, basis) if known is None else known
     held = basis.held
     sigma = basis.transform[held, flat + np.arange(len(held))]
     size = basis.transform.shape[1]
     full = np.empty((size, size))
-    full[:flat, :flat] = rows.T @ rows
+    full[:flat, :flat] = of.own
     if not len(held):
-        return NormalEquations(basis, full, rows.T @ target)
-    full[:flat, flat:] = (rows.T @ a)[:, held] * sigma
+        return NormalEquations(basis, full, of.target)
+    full[:flat, flat:] = of.all[:, held] * sigma
     full[flat:, :flat] = full[:flat, flat:].T
     inner = submatrix(gram, held)
     inner *= sigma
     np.multiply(inner, sigma[:, None], out=full[flat:, flat:])
-    rhs = np.concatenate([rows.T @ target, sigma * (a.T @ target)[held]])
-    return NormalEquations(basis, full, rhs)
+    return NormalEquations(basis, full, np.concatenate([of.target, sigma * of.columns[held]]))
