@@ -18,6 +18,7 @@ from hilcal.identify.arm_scatter import with_arm_scatter, with_prior_scatter
 from hilcal.identify.carried_evidence import carried_effects
 from hilcal.identify.fit import Fit, fit
 from hilcal.model import Model
+from hilcal.threads import later
 
 __all__ = ["Refinement", "Step", "add", "predicts_better", "refine", "remove"]
 
@@ -115,11 +116,16 @@ def refine(
     """
     say(f"fitting {' + '.join(model.names) or 'the bare arm'}")
     readings = with_prior_scatter(model, readings)
-    path = Path(fit(model, readings, mode), say, history, laws, seen)
-    changed = True
-    while changed:
-        path.extend()
-        changed = path.reconsider() or path.take_scatter()
+    first = fit(model, readings, mode)
+    with later() as ahead:
+        # Its error on poses left out decides next; it is computed beside the refits that follow.
+        path = Path(
+            first, say, history, laws, seen, lambda of: ahead(lambda: of.left_out, len(of.white))
+        )
+        changed = True
+        while changed:
+            path.extend()
+            changed = path.reconsider() or path.take_scatter()
     return Refinement(tuple(path.steps))
 
 
@@ -133,6 +139,7 @@ class Path:
         before: History = NOTHING,
         laws: LawSearch | None = None,
         seen: Callable[[Step], None] = lambda step: None,
+        likely: Callable[[Fit], None] = lambda fit: None,
     ) -> None:
         """Begin with a fit, the effects of which stay.
 
@@ -142,10 +149,11 @@ class Path:
             before: how its model was reached.
             laws: searches laws.
             seen: takes each step.
+            likely: takes a fit that is most likely to be tried next.
         """
         self.steps: list[Step] = []
         self._given, self._before, self._say = first.model.names, before, say
-        self._laws, self._seen = laws, seen
+        self._laws, self._seen, self._likely = laws, seen, likely
         self._rejected, self._removed = [*before.rejected], [*before.removed]
         self._refits, self._regressions = Refits(), Regressions()
         taken = first.readings.arm_scatter is not None
@@ -167,7 +175,9 @@ class Path:
 
     def append(self, found: Fit, added: str | None, removed: str | None = None) -> None:
         """Judge a fit and append it."""
-        self._evidence = Evidence(found, self._refits.add, self._say, self._regressions)
+        self._evidence = Evidence(
+            found, self._refits.add, self._say, self._regressions, self._likely
+        )
         diagnosis = judge(self._evidence, self._history(found))
         self.steps.append(Step(found, diagnosis, added, removed))
         self._seen(self.steps[-1])

@@ -76,11 +76,11 @@ def later() -> Iterator[Callable[[Callable[[], object], int], None]]:
     """Compute in a thread beside the block what the block asks for, one after the other.
 
     What is yielded takes a function of compiled code mostly, and the rows of the arrays that it
-    works on: where they are many, or there is one processor, it is left undone. So it serves for
-    what keeps its result, and is computed when that is needed. The block's end waits; what was
-    raised is raised again where the result is needed.
+    works on: where they are many, or there is one processor for this thread, it is left undone. So
+    it serves for what keeps its result, and is computed when that is needed. The block's end waits;
+    what was raised is raised again where the result is needed.
     """
-    if cores() < 2:
+    if cores() < 2 or getattr(_here, "busy", False):
         yield lambda function, rows: None
         return
     pool = ThreadPoolExecutor(1, "hilcal", one_thread)

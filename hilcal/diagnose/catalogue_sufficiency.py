@@ -94,6 +94,7 @@ def insufficiency(
     refit: Callable[[Fit, str], Fit],
     say: Callable[[str], None] = lambda text: None,
     regressions: Regressions | None = None,
+    likely: Callable[[Fit], None] = lambda fit: None,
 ) -> Insufficiency | None:
     """Return what the whole catalogue leaves of a misfit; None where that is noise.
 
@@ -102,6 +103,7 @@ def insufficiency(
         refit: returns a fit with one more effect.
         say: takes progress, one line each.
         regressions: those that were made.
+        likely: takes the fit with the best effect, which a refinement is most likely to try next.
     """
     regressions = Regressions() if regressions is None else regressions
     current = fit
@@ -117,6 +119,8 @@ def insufficiency(
         say(f"testing the whole catalogue: adding {found.effects[0]}")
         current = refit(current, found.effects[0])
         names.append(found.effects[0])
+        if len(names) == 1:
+            likely(current)
     regression = regressions.of(linearise(current))
     noise = judge_noise(current, pure_error(current), regression.share > PREDICTABLE)
     if noise.misjudged or not noise.off:

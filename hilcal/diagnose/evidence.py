@@ -41,6 +41,7 @@ class Evidence:
         refit: Callable[[Fit, str], Fit] = add,
         say: Callable[[str], None] = lambda text: None,
         regressions: Regressions | None = None,
+        likely: Callable[[Fit], None] = lambda fit: None,
     ) -> None:
         """Take a fit.
 
@@ -49,13 +50,14 @@ class Evidence:
             refit: returns a fit with one more effect.
             say: takes progress, one line each.
             regressions: of residuals, those that were made.
+            likely: takes a fit that is most likely to be tried next, see `insufficiency`.
 
         Raises:
             InputError: for a fit whose residual is not whitened.
         """
         if fit.scaling != "gc":
             raise InputError(f"diagnosis needs scaling gc, this fit has {fit.scaling}")
-        self.fit, self._refit, self._say = fit, refit, say
+        self.fit, self._refit, self._say, self._likely = fit, refit, say, likely
         self._regressions = Regressions() if regressions is None else regressions
         self._known: dict[tuple[str, frozenset[str]], Alternative] = {}
         self._eliminated: dict[str, FamilyScore] = {}
@@ -147,7 +149,7 @@ class Evidence:
     @cached_property
     def insufficiency(self) -> Insufficiency | None:
         """What all effects of the catalogue together leave, where it is not noise."""
-        return insufficiency(self.fit, self._refit, self._say, self._regressions)
+        return insufficiency(self.fit, self._refit, self._say, self._regressions, self._likely)
 
     def tree_share(self, beyond: float) -> float:
         """Return the share of the misfit that trees predict, where that is more than another."""

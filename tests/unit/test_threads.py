@@ -97,6 +97,19 @@ def test_what_is_asked_for_later_is_computed_beside_the_block_where_it_may_be(
     assert done == ["on 2"]
 
 
+def test_nothing_is_computed_ahead_where_many_compute(monkeypatch: pytest.MonkeyPatch) -> None:
+    processors(monkeypatch, 2)
+    done: list[int] = []
+
+    def part(number: int) -> int:
+        with threads.later() as ahead:
+            ahead(lambda: done.append(number), 1)
+        return number
+
+    assert threads.in_threads(part, range(4)) == [0, 1, 2, 3]
+    assert done == []
+
+
 @pytest.mark.parametrize("order", ["C", "F"])
 def test_columns_are_kept_in_their_own_memory(order: Literal["C", "F"]) -> None:
     a = np.array(np.random.default_rng(2).normal(size=(2 * ROWS + 7, 5)), order=order)
