@@ -107,8 +107,7 @@ def restore(
     Raises:
         InputError: readings were appended since, or the record is of another model.
     """
-    same = stored is not None and stored == record.options.get(STORED)
-    if not same and record.data_hash != content_hash(readings):
+    if not _fitted_to(record, readings, stored):
         raise InputError(
             f"revision {record.number} was fitted before readings were appended; "
             "run hilcal identify again"
@@ -121,6 +120,22 @@ def restore(
         if scatter is not None:
             readings = with_arm_scatter(model.cell, readings, ArmScatter.from_json(scatter))
     return fit(model, readings, mode, scaling, theta, prior)
+
+
+def _fitted_to(record: RevisionRecord, readings: Readings, stored: str | None) -> bool:
+    """Whether a revision was fitted to these readings.
+
+    Revisions of programs before `STORED` have the hash of computed covariances alone, whose last
+    bits are those of the machine that fitted; elsewhere their number of readings has to do. Stored
+    readings cannot be changed, only appended, and each has a checksum.
+    """
+    if stored is not None and stored == record.options.get(STORED):
+        return True
+    if record.data_hash == content_hash(readings):
+        return True
+    reported = record.result_json.get("identify")
+    told = reported.get("n_readings") if isinstance(reported, Mapping) else None
+    return STORED not in record.options and told == len(readings)
 
 
 @contextmanager

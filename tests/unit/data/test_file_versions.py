@@ -2,6 +2,7 @@
 
 import gzip
 import sqlite3
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,10 @@ from hilcal.campaign import Campaign
 from hilcal.cli import main
 from hilcal.data import schema
 from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.revision import STORED
 from hilcal.data.rows import _reading_crc
 from hilcal.errors import InputError
+from hilcal.revisions import restore
 from tests.support.paths import ROOT
 
 FILES = sorted((ROOT / "tests" / "data" / "campaigns").glob("*.hilcal.gz"))
@@ -47,6 +50,22 @@ def test_a_file_of_an_older_program(path: Path, tmp_path: Path) -> None:
         assert np.allclose(found.theta, stored, rtol=1e-6, atol=2e-7)  # m, rad, rad/(N·m)
         assert found.model.names == record.effects
     assert old.read_bytes() == before, "reading an old file must not change it"
+
+
+def test_a_revision_that_another_processor_hashed(tmp_path: Path) -> None:
+    """Its hash is of computed covariances, whose last bits differ there."""
+    (path,) = (p for p in FILES if p.name.startswith("version-5.hilcal"))
+    with Campaign.open(unpacked(path, tmp_path), read_only=True) as run:
+        (record,) = run.file.revisions()
+        assert STORED not in record.options
+        elsewhere = replace(record, data_hash="0" * 64)
+        found = restore(elsewhere, run.cell, run.readings)
+        assert found.model.names == record.effects
+        with pytest.raises(InputError, match="fitted before readings were appended"):
+            restore(elsewhere, run.cell, run.readings[:29])
+        today = replace(elsewhere, options={**record.options, STORED: "1" * 64})
+        with pytest.raises(InputError, match="fitted before readings were appended"):
+            restore(today, run.cell, run.readings, stored="2" * 64)
 
 
 def test_every_version_is_there() -> None:
