@@ -16,6 +16,9 @@ WIDER = 1.5
 """Ratio from which on the stated standard uncertainty is called too small; a choice. The standard
 deviation of 200 draws is known to 5 %, but that of few poses to much less."""
 
+CROWDED = 0.5
+"""Degrees of freedom that a fit spends, per pose, from which on draws are too wide; a choice."""
+
 
 def bootstrap_report(found: Bootstrap) -> Iterator[RenderableType]:
     """Yield all that people want to know of a bootstrap."""
@@ -68,10 +71,18 @@ def remarks(found: Bootstrap) -> Iterator[str]:
     wide = sorted(np.flatnonzero(found.ratio > WIDER), key=lambda k: -found.ratio[k])
     if wide:
         listed = numbers.few([f"{names[k]} ({found.ratio[k]:.1f} times)" for k in wide], 5)
-        yield (
-            f"Stated too small, or few poses carry it: {listed}. Take the drawn one, and measure "
-            "more poses that move these parameters."
-        )
+        spent = found.fit.solution.effective
+        if spent > CROWDED * found.poses:
+            yield (
+                f"Wider than stated: {listed}. This does not show that the stated ones are too "
+                f"small: the fit spends {spent:.0f} degrees of freedom on {found.poses} poses, and "
+                "draws, which have 63 % of the poses, scatter too much then. More poses tell."
+            )
+        else:
+            yield (
+                f"Stated too small, or few poses carry it: {listed}. Take the drawn one, and "
+                "measure more poses that move these parameters."
+            )
     elif found.fit.uncertainty.inflated:
         yield (
             "The residuals are larger than the noise. What neighbouring poses then have in common "

@@ -60,6 +60,8 @@ def test_it_notices_readings_of_a_pose_that_are_not_independent() -> None:
     ratio = np.median([b.ratio[frames] for b in found])
     assert 0.75 * np.sqrt(loads) < ratio < 1.25 * np.sqrt(loads)
     assert any("Stated too small" in line for line in remarks(found[0]))
+    crowded = replace(found[0], poses=20)  # for as many parameters
+    assert any("does not show that the stated ones" in line for line in remarks(crowded))
     independent = drawn(fitted(), 50)
     assert any("can be used" in line for line in remarks(independent))
 
