@@ -34,6 +34,7 @@ from hilcal.types import Floats
 _PROBE_S, _DASHBOARD_S, _RECEIVE_S = 2.5, 1.5, 4.0  # 8 s together
 _PAYLOAD_S = 1.5
 _ORPHAN_S = 1.6
+_PULSE_S = 0.1  # the arm is not stopped before
 POLYSCOPE_X = 10
 """Major version of the controllers without a dashboard server."""
 _MASS_KG, _COM_M = 1e-3, 1e-4  # how well a payload has to be read back
@@ -172,7 +173,9 @@ class UrArm:
         if self._motion is not None:
             raise failure(self._host, "the motion before has not ended")
         reading = self._read()
-        self._check_state(reading, 0.0)
+        self._check_state(reading)
+        if reading.runtime != states.PLAYING:
+            self._fail(cause.program_ended(reading, 0.0))
         motion = MotionInProgress(
             reading.sample.q, q, speed, acceleration, self._arrival, self._clock
         )
@@ -195,14 +198,16 @@ class UrArm:
                 self._in_control()
             return False
         control = self._in_control()
+        reading = self._read()  # first: the control process can hang once the program has ended
+        self._check_state(reading)
+        if reading.runtime != states.PLAYING:
+            self._fail(_why_ended(reading, control))
         try:
             pulse = control.alive()
         except WorkerError as error:
             self._fail(cause.not_commanded(error))
         if pulse.expired:
-            self._fail("nobody watched its motion for 0.5 s, so it was stopped")
-        reading = self._read()
-        self._check_state(reading, pulse.late)
+            self._fail(cause.UNWATCHED)
         if motion.arrived(reading):
             self._motion = None
             with contextlib.suppress(WorkerError):  # at rest; the next command tells
@@ -275,12 +280,10 @@ class UrArm:
                 self._fail("", lost=str(error))
             raise failure(self._host, f"the link is lost: {error}", CHECK_LINK) from None
 
-    def _check_state(self, reading: Reading, late: float) -> None:
+    def _check_state(self, reading: Reading) -> None:
         """Fail unless the robot is in a state to move."""
         if reading.sample.safety != states.NORMAL or reading.mode != states.RUNNING:
             self._fail("it is not ready to move")
-        if reading.runtime != states.PLAYING:
-            self._fail(cause.program_ended(reading, late))
 
     def _fail(self, noticed: str, lost: str = "") -> NoReturn:
         """Stop the arm first, then find out the cause and raise it."""
@@ -290,6 +293,15 @@ class UrArm:
         if not halt.stands:
             advice = f"{HOLD_ON}; {advice}"
         raise failure(self._host, self._fault, advice)
+
+
+def _why_ended(reading: Reading, control: Control) -> str:
+    """Return why the robot's program does not play any more, as far as both sides know it."""
+    try:
+        pulse = control.alive(_PULSE_S)
+    except WorkerError:
+        return cause.program_ended(reading, 0.0)
+    return cause.UNWATCHED if pulse.expired else cause.program_ended(reading, pulse.late)
 
 
 def _is_foreign(problem: str) -> bool:

@@ -9,6 +9,8 @@ from drivers.ur_link.lines import LinkError
 from drivers.ur_link.reading import Reading
 from drivers.ur_link.worker import WorkerError
 
+UNWATCHED = "nobody watched its motion for 0.5 s, so it was stopped"
+
 
 def find(host: str, halt: Halt, noticed: str, has_dashboard: bool) -> tuple[str, str]:
     """Return what happened and what to do about it, after the arm has been stopped.

@@ -50,9 +50,9 @@ class Control:
         """Number of the worker's process."""
         return self._worker.pid
 
-    def alive(self) -> Pulse:
-        """Watch the motion: renew its lease."""
-        answer = self._worker.call("alive", COMMAND_S)
+    def alive(self, seconds: float = COMMAND_S) -> Pulse:
+        """Watch the motion: renew its lease; the answer comes within a deadline, real s."""
+        answer = self._worker.call("alive", seconds)
         return Pulse(bool(answer["expired"]), float(answer["late"]))
 
     def move(self, q: Floats, speed: float, acceleration: float, brake: float) -> bool:

@@ -40,6 +40,16 @@ def test_fault_in_motion_stops_the_arm_and_names_its_cause(arm, sim, fault):
     cases.finish(arm)
 
 
+def test_program_that_ended_is_the_cause_though_the_process_that_commands_hangs(arm, sim):
+    cases.under_way(arm, sim)
+    os.kill(arm.workers[1], signal.SIGSTOP)
+    since = sim.admin("kill_script")["fault_ns"]
+    text = cases.error_of(arm.moving)
+    cases.check_resting(sim, since)
+    assert "its program is stopped" in text
+    assert "ended" not in text
+
+
 def test_motion_that_is_refused_is_told(arm, sim):
     sim.admin("refuse_motion", on=True)
     goal = cases.away(arm)
