@@ -248,8 +248,9 @@ def refine(
                 nonlocal first
                 number = next(numbers_to_be) if first is None else first.number
                 first = None
-                of = step.fit
+                of, suspects = step.fit, step.diagnosis.suspects
                 ahead(lambda: of.uncertainty, len(of.white))
+                ahead(lambda: [(s.holdout_share, s.least) for s in suspects], len(of.white))
                 if live is not None:
                     live.revised(chapter_of(number, step))
 

@@ -2,6 +2,7 @@
 
 import shlex
 import signal
+import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
@@ -289,8 +290,12 @@ def _sighted(rig: Rig, answer: ConnectionResult, say: Say) -> ConnectionResult:
 def _ends_as_interrupt(t: Terminal) -> Iterator[None]:
     """Let Ctrl-C, a plea to end, or a closed terminal stop the arm; once is enough.
 
-    Stopping has deadlines of its own, so whoever asks again meanwhile is told to wait.
+    Stopping has deadlines of its own, so whoever asks again meanwhile is told to wait. Signals are
+    for a process's main thread; in another one, as of a worker of many, the process's end stops it.
     """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
     asked: list[int] = []
 
     def stop(number: int, frame: FrameType | None) -> None:

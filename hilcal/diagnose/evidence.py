@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
-from functools import cached_property
 
 from hilcal import threads
 from hilcal.data.arm_scatter import ArmScatter
@@ -30,6 +29,7 @@ from hilcal.identify.fit import Fit, fit
 from hilcal.identify.linearisation import Linearisation, linearise
 from hilcal.regression.distributions import chi2
 from hilcal.regression.evidence import FamilyScore
+from hilcal.threads import once
 
 
 class Evidence:
@@ -61,66 +61,76 @@ class Evidence:
         self._regressions = Regressions() if regressions is None else regressions
         self._known: dict[tuple[str, frozenset[str]], Alternative] = {}
         self._eliminated: dict[str, FamilyScore] = {}
+        self._wanted = True
+        self._lead_likely: Callable[[], None] = lambda: None
 
-    @cached_property
+    @once
     def linearisation(self) -> Linearisation:
         """The fitted model's part of the regression."""
         return linearise(self.fit)
 
-    @cached_property
+    @once
     def effects(self) -> tuple[Effect, ...]:
         """Effects that are not in the model and can be computed."""
         return candidates(self.fit)
 
     @contextmanager
-    def beside(self, *parts: Callable[[], object]) -> Iterator[None]:
-        """Compute parts of the evidence, which are kept, beside the block."""
+    def later(self) -> Iterator[Callable[[Callable[[], object]], None]]:
+        """Compute parts of the evidence beside the block, as it asks for them; they are kept.
+
+        As soon as a suspect is likely to pass all tests, the insufficiency of the catalogue is
+        computed too. It is given up at the end of the block if it has not been needed.
+        """
         _ = self.linearisation.left_out  # all parts need it
+        try:
+            with threads.later() as ahead:
+                self._lead_likely = lambda: ahead(lambda: self.insufficiency, len(self.fit.white))
+                try:
+                    yield lambda part: ahead(part, len(self.fit.white))
+                finally:
+                    self._wanted, self._lead_likely = False, lambda: None
+        finally:
+            self._wanted = True
 
-        def compute() -> None:
-            for part in parts:
-                part()
-
-        with threads.beside(compute, len(self.fit.white)):
-            yield
-
-    @cached_property
+    @once
     def suspects(self) -> tuple[Suspect, ...]:
         """All of them scored."""
-        return rank_suspects(self.linearisation, self.effects, refit=self._refit)
+        return rank_suspects(
+            self.linearisation, self.effects, refit=self._refit, likely=self._lead_likely
+        )
 
-    @cached_property
+    @once
     def misfit_breakdown(self) -> tuple[MisfitShare, ...]:
         """Variables that the misfit follows, largest share first."""
         return misfit_breakdown(self.linearisation)
 
-    @cached_property
+    @once
     def pure_error(self) -> PureError | None:
         """The scatter of repeated readings; None without repeats."""
         return pure_error(self.fit)
 
-    @cached_property
+    @once
     def misfit(self) -> bool:
         """Whether χ² is larger than the stated noise allows."""
         return float(chi2.sf(self.fit.chi2, self.fit.dof)) < MISFIT_ALARM
 
-    @cached_property
+    @once
     def regression(self) -> ResidualRegression:
         """What smooth laws, or trees, predict of the misfit on poses left out."""
         return self._regressions.of(self.linearisation)
 
-    @cached_property
+    @once
     def arm_scatter(self) -> ArmScatter | None:
         """The arm's scatter, if it is what is left; None where the residual shows none."""
         return estimate_arm_scatter(self.fit)
 
-    @cached_property
+    @once
     def pose_alone(self) -> PoseAlone | None:
         """A misfit that is the same under every load of a pose."""
         level = FALSE_ALARM / max(len(self.effects), 1)
         return pose_alone(self.linearisation, self.effects, level, LEAST_SHARE)
 
-    @cached_property
+    @once
     def by_arrivals(self) -> "Evidence | None":
         """The evidence with the arm's estimated scatter in the covariance; None where it is this.
 
@@ -139,17 +149,24 @@ class Evidence:
         found = fit(model, scattered, mode, start=start)
         return Evidence(found, self._refit, self._say, self._regressions)
 
-    @cached_property
+    @once
     def redundant(self) -> tuple[str, ...]:
         """Effects of the model without which the readings are explained as well."""
         found = backward_elimination(self.fit, self._eliminated)
         needless = tuple(n.effect for n in found)
         return (*spoken_against(self.fit), *needless)
 
-    @cached_property
+    @once
     def insufficiency(self) -> Insufficiency | None:
         """What all effects of the catalogue together leave, where it is not noise."""
-        return insufficiency(self.fit, self._refit, self._say, self._regressions, self._likely)
+        return insufficiency(
+            self.fit,
+            self._refit,
+            self._say,
+            self._regressions,
+            self._likely,
+            lambda: self._wanted,
+        )
 
     def tree_share(self, beyond: float) -> float:
         """Return the share of the misfit that trees predict, where that is more than another."""

@@ -106,22 +106,23 @@ def judge(e: Evidence, history: History) -> Diagnosis:
 
 def _judged(e: Evidence, history: History) -> Diagnosis:
     """Judge by the evidence as it is."""
-    with e.beside(
-        lambda: e.misfit_breakdown,
-        lambda: e.alternatives(history.added, history.removed),
-        lambda: e.redundant,
-    ):
-        scored = e.suspects
-    suspects = ranked(scored, history.rejected)
-    lead = suspects[0] if suspects and suspects[0].passes else None
-    insufficiency, noise, scatter = None, None, e.fit.readings.arm_scatter
+    with e.later() as ahead:
+        ahead(lambda: e.misfit_breakdown)
+        ahead(lambda: (e.alternatives(history.added, history.removed), e.redundant))
+        suspects = ranked(e.suspects, history.rejected)
+        lead = suspects[0] if suspects and suspects[0].passes else None
+        insufficiency = None
+        if lead is not None:
+            share = lead.holdout_share
+            if e.misfit:
+                ahead(lambda: e.tree_share(share))
+            insufficiency = e.insufficiency
+    noise, scatter = None, e.fit.readings.arm_scatter
     rivals: tuple[Separability, ...] = ()
     reason: Reason
     if lead is not None:
-        beyond = lead.holdout_share
-        with e.beside(lambda: e.tree_share(beyond) if e.misfit else 0.0):
-            insufficiency = e.insufficiency
-        regression = ResidualRegression(e.tree_share(beyond) if e.misfit else 0.0, ())
+        trees = e.tree_share(lead.holdout_share) if e.misfit else 0.0
+        regression = ResidualRegression(trees, ())
         predicted = max(regression.share, lead.holdout_share) if e.misfit else 0.0
         if insufficiency is not None:
             reason = "insufficient_catalogue"

@@ -1,7 +1,6 @@
 """A fit: parameters, their uncertainties, residuals and errors."""
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -23,6 +22,7 @@ from hilcal.identify.uncertainty import Uncertainty, uncertainty
 from hilcal.identify.variance_factor import WithVarianceFactor
 from hilcal.model import Model
 from hilcal.observe import Observation
+from hilcal.threads import once
 from hilcal.types import Bools, Floats, Ints
 
 Frame = Literal["sensor", "base"]
@@ -82,17 +82,17 @@ class Fit(WithVarianceFactor):
     dof: float
     error: ErrorBlock
 
-    @cached_property
+    @once
     def left_out(self) -> Floats:
         """(D, m) residual of each measurement, predicted without its pose."""
         return leave_out(self.model, self.solution, random_folds(self.pose), self.fitted)
 
-    @cached_property
+    @once
     def holdout(self) -> ErrorBlock:
         """Error block of whole poses left out."""
         return error_block(*all_left_out(self))
 
-    @cached_property
+    @once
     def uncertainty(self) -> Uncertainty:
         """Standard uncertainties and identifiable parameters."""
         kept = self.readings[~self.outlier]
@@ -100,7 +100,7 @@ class Fit(WithVarianceFactor):
             self.model, kept, self.fitted, self.solution, self.pose, self.chi2, self.dof
         )
 
-    @cached_property
+    @once
     def conflicts(self) -> tuple[Conflict, ...]:
         """How far a carried prior and the readings disagree, worst first; empty without one."""
         return conflicts(self.model, self.solution, self.whitening)

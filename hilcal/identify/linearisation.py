@@ -6,7 +6,6 @@ both use it, so that the planner's power and the diagnosis's test are of the sam
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -31,6 +30,7 @@ from hilcal.regression.leave_out import (
 from hilcal.regression.paired_test import improves
 from hilcal.regression.projection import Projection
 from hilcal.regression.spectrum import Spectrum
+from hilcal.threads import once
 from hilcal.types import Floats, Ints
 
 LEAST_MISFIT = 3.0
@@ -69,12 +69,12 @@ class Linearisation:
         """(R, K) whitened Jacobian of the model by identifiable coordinates."""
         return self.projection.rows
 
-    @cached_property
+    @once
     def rss(self) -> float:
         """‖r‖²."""
         return float(self.residual @ self.residual)
 
-    @cached_property
+    @once
     def left_out(self) -> Floats:
         """(poses,) squared whitened residual of each pose, predicted without it.
 
@@ -84,7 +84,7 @@ class Linearisation:
         white = left_out_residual(self.folds, self.projection, self.fit.white)
         return by_pose(self.fit, white)
 
-    @cached_property
+    @once
     def folds(self) -> tuple[Fold, ...]:
         """The model without each fold of poses."""
         fit = self.fit

@@ -18,9 +18,9 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-import scipy.linalg as sl
 from scipy.special import exp1
 
+from hilcal.regression import lapack
 from hilcal.regression.distributions import chi2
 from hilcal.regression.products import submatrix
 from hilcal.regression.schur import eliminate
@@ -94,9 +94,7 @@ def maximise_evidence(
             break
         group = groups[keep]
         std = np.sqrt(variance[group])
-        h = np.multiply(g, std / beta, out=room[: g.size].reshape(g.shape))
-        h *= std[:, None]
-        inverse = _inverse_root(h)
+        inverse = _inverse_root(g, std, beta, room[: g.size].reshape(g.shape))
         posterior = np.einsum("ij,ij->j", inverse, inverse)
         z = inverse.T @ (inverse @ (std * b / beta))
         gamma = np.bincount(group, weights=1 - posterior, minlength=count)
@@ -165,18 +163,23 @@ def _mean_inverse(k: float) -> float:
     return 2.0 * density - float(chi2.sf(1.0, 1.0))
 
 
-def _inverse_root(h: Floats) -> Floats:
-    """Return T (K, K) with Tᵀ T = (1 + H)⁻¹ of a positive semidefinite H, however large.
+def _inverse_root(g: Floats, std: Floats, beta: float, room: Floats) -> Floats:
+    """Return T (K, K) with Tᵀ T = (1 + H)⁻¹, H = S G S/β of a positive semidefinite G.
 
     Where H is so large that 1 is below its rounding, by its eigenvalues, which are at least zero.
-    The diagonal of H is used up.
+
+    Args:
+        g: (K, K) G.
+        std: (K,) diagonal of S.
+        beta: β.
+        room: (K, K) memory that is used, and may be returned.
     """
-    one = h.T  # in LAPACK's order, not turned over in memory; the other triangle stays
-    diagonal = np.diag(h).copy()
-    one[np.diag_indices_from(one)] += 1.0
-    up, failed = sl.lapack.dpotrf(one, lower=0)
-    if not failed:  # the inverse of an upper triangle takes less time than that of a lower one
-        return np.asarray(sl.lapack.dtrtri(up, lower=0, overwrite_c=1)[0].T)
-    one[np.diag_indices_from(one)] = diagonal
-    values, vectors = np.linalg.eigh(h)
+    h = np.multiply(g, std / beta, out=room)
+    h *= std[:, None]
+    up = h.T  # in LAPACK's order, not turned over in memory
+    up[np.diag_indices_from(up)] += 1.0
+    if lapack.factorise(up, lower=False):
+        lapack.invert(up, lower=False)  # less time than that of a lower triangle
+        return np.asarray(up.T)
+    values, vectors = np.linalg.eigh(g * (std / beta) * std[:, None])
     return np.asarray((vectors / np.sqrt(1.0 + np.maximum(values, 0.0))).T)

@@ -12,15 +12,15 @@ give (see `empirical_bayes`),
 d the columns of the group, M the projection off the others.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 
 import numpy as np
-import scipy.linalg as sl
 
-from hilcal.regression.empirical_bayes import maximise_evidence
+from hilcal.regression import lapack
+from hilcal.regression.empirical_bayes import EmpiricalPrior, maximise_evidence
 from hilcal.regression.factored import Tall, gram, of_rows
-from hilcal.regression.schur import eliminate
+from hilcal.regression.schur import inverse_root
 from hilcal.threads import in_threads
 from hilcal.types import Bools, Floats, Ints
 
@@ -64,15 +64,13 @@ def solutions(p: FamilyProblem, fold: Ints) -> Floats:
 
     def without(f: int) -> Floats:
         own, side = parts[f]
-        g, b, yy = whole - own, rhs - side, float(square.sum() - square[f])
+        rest = _Rest.of(whole, own, rhs - side, flat, float(square.sum() - square[f]))
         count = len(fold) - int(count_of[f]) - flat
-        # Beside the unshrunk columns, which are eliminated once.
-        h, c, left = eliminate(g, b, yy, slice(0, flat))
-        h, c = h[flat:, flat:], c[flat:]
-        first = maximise_evidence(h, c, left, count, 0, p.groups, p.std, p.beta)
-        start = _with_dropped(h, c, p.groups, first.std, first.beta)
-        last = maximise_evidence(h, c, left, count, 0, p.groups, start, first.beta)
-        return _solve(g, b, flat, last.std, last.beta)[0]
+        live = np.flatnonzero(p.std > 0)
+        first = rest.maximised(live, p.groups, p.std, p.beta, count)
+        start = rest.with_dropped(p.groups, first.std, first.beta)
+        last = rest.maximised(np.flatnonzero(start), p.groups, start, first.beta, count)
+        return rest.solution(last.std, last.beta)
 
     return np.array(in_threads(without, range(len(parts)), len(fold)))
 
@@ -83,42 +81,107 @@ def _products(p: FamilyProblem, rows: Bools) -> tuple[Floats, Floats]:
     return gram(own), own.T @ p.target[rows]
 
 
-def _solve(
-    gram: Floats, rhs: Floats, flat: int, std: Floats, beta: float
-) -> tuple[Floats, Ints, Floats]:
-    """Return u (F + P), the columns that are not held at zero, and their Cholesky factor."""
-    live = np.concatenate([np.arange(flat), flat + np.flatnonzero(std > 0)])
-    h = gram[np.ix_(live, live)].copy()
-    h[np.diag_indices_from(h)] += np.concatenate([np.zeros(flat), beta / std[std > 0] ** 2])
-    low = sl.cholesky(h, lower=True, check_finite=False)
-    u = np.zeros(len(rhs))
-    u[live] = sl.cho_solve((low, True), rhs[live], check_finite=False)
-    return u, live, low
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rest:
+    """The problem of all rows but a fold's; of its products only what is needed is formed.
+
+    Attributes:
+        whole: (F + P, F + P) AᵀA of all rows.
+        own: the same of the fold.
+        rhs: (F + P,) Aᵀy of the rest.
+        flat: number F of unshrunk columns.
+        square: ‖y‖² of the rest, beside the unshrunk columns.
+        cross: (F, P) what they take off AᵀA of the shrunk columns, as crossᵀ cross.
+        beside: (P,) Aᵀy of the shrunk columns, beside the unshrunk ones.
+    """
+
+    whole: Floats
+    own: Floats
+    rhs: Floats
+    flat: int
+    square: float
+    cross: Floats
+    beside: Floats
+
+    @classmethod
+    def of(cls, whole: Floats, own: Floats, rhs: Floats, flat: int, square: float) -> "_Rest":
+        """Eliminate the unshrunk columns."""
+        rows = whole[:flat] - own[:flat]
+        solved = inverse_root(rows[:, :flat]) @ np.column_stack([rows[:, flat:], rhs[:flat]])
+        cross, along = solved[:, :-1], solved[:, -1]
+        left = square - float(along @ along)
+        return cls(whole, own, rhs, flat, left, cross, rhs[flat:] - cross.T @ along)
+
+    def gram(self, rows: Ints, columns: Ints) -> Floats:
+        """AᵀA between some shrunk columns and others, beside the unshrunk ones."""
+        at = np.ix_(self.flat + rows, self.flat + columns)
+        return np.asarray(
+            self.whole[at] - self.own[at] - self.cross[:, rows].T @ self.cross[:, columns]
+        )
+
+    def maximised(
+        self, live: Ints, groups: Ints, std: Floats, beta: float, count: int
+    ) -> EmpiricalPrior:
+        """Maximise the evidence over the strengths of some shrunk columns; the others have none."""
+        found = maximise_evidence(
+            self.gram(live, live),
+            self.beside[live],
+            self.square,
+            count,
+            0,
+            groups[live],
+            std[live],
+            beta,
+        )
+        out = np.zeros(len(groups))
+        out[live] = found.std
+        return replace(found, std=out)
+
+    def with_dropped(self, groups: Ints, std: Floats, beta: float) -> Floats:
+        """Return strengths (P,), with dropped groups where the rows speak for them."""
+        out, live = np.flatnonzero(std == 0), np.flatnonzero(std > 0)
+        if not len(out):
+            return std
+        h = lapack.column_major(self.gram(live, live))
+        h[np.diag_indices_from(h)] += beta / std[live] ** 2
+        _factorise(h)
+        x = lapack.column_major(np.column_stack([self.gram(live, out), self.beside[live]]))
+        lapack.solve_triangle(h, x)
+        at = self.flat + out
+        size = self.whole[at, at] - self.own[at, at] - np.sum(self.cross[:, out] ** 2, axis=0)
+        free = np.maximum(size - np.sum(x[:, :-1] ** 2, axis=0), 1e-300)
+        told = self.beside[out] - x[:, :-1].T @ x[:, -1]
+        group, count = groups[out], int(groups.max()) + 1
+        members = np.bincount(group, minlength=count)
+        quality = np.bincount(group, weights=told**2 / (beta * free), minlength=count)
+        excess = np.bincount(group, weights=told**2 - beta * free, minlength=count)
+        spread = np.bincount(group, weights=free**2, minlength=count)
+        enters = (quality > members) & (excess > 0)
+        variance = np.where(enters, excess / np.maximum(spread, 1e-300), 0.0)
+        start = std.copy()
+        start[out] = np.sqrt(variance[group])
+        return start
+
+    def solution(self, std: Floats, beta: float) -> Floats:
+        """Return u (F + P) for strengths (P,)."""
+        kept = std > 0
+        live = np.concatenate([np.arange(self.flat), self.flat + np.flatnonzero(kept)])
+        at = np.ix_(live, live)
+        h = lapack.column_major(self.whole[at] - self.own[at])
+        h[np.diag_indices_from(h)] += np.concatenate([np.zeros(self.flat), beta / std[kept] ** 2])
+        _factorise(h)
+        u = np.zeros(len(self.rhs))
+        found = self.rhs[live]
+        lapack.solve_factored(h, found)
+        u[live] = found
+        return u
 
 
-def _with_dropped(gram: Floats, rhs: Floats, groups: Ints, std: Floats, beta: float) -> Floats:
-    """Return the strengths (P,) with dropped groups entered again where the rows speak for them."""
-    flat = len(rhs) - len(groups)
-    out = np.flatnonzero(std == 0)
-    if not len(out):
-        return std
-    _, live, low = _solve(gram, rhs, flat, std, beta)
-    columns = flat + out
-    x = sl.solve_triangular(
-        low,
-        np.column_stack([gram[np.ix_(live, columns)], rhs[live]]),
-        lower=True,
-        check_finite=False,
-    )
-    free = np.maximum(np.diag(gram)[columns] - np.sum(x[:, :-1] ** 2, axis=0), 1e-300)
-    told = rhs[columns] - x[:, :-1].T @ x[:, -1]
-    group, count = groups[out], int(groups.max()) + 1
-    members = np.bincount(group, minlength=count)
-    quality = np.bincount(group, weights=told**2 / (beta * free), minlength=count)
-    excess = np.bincount(group, weights=told**2 - beta * free, minlength=count)
-    spread = np.bincount(group, weights=free**2, minlength=count)
-    enters = (quality > members) & (excess > 0)
-    variance = np.where(enters, excess / np.maximum(spread, 1e-300), 0.0)
-    start = std.copy()
-    start[out] = np.sqrt(variance[group])
-    return start
+def _factorise(h: Floats) -> None:
+    """Overwrite H (K, K) by its Cholesky factor.
+
+    Raises:
+        LinAlgError: H is not positive definite.
+    """
+    if not lapack.factorise(h):
+        raise np.linalg.LinAlgError("the normal equations without a fold are not positive definite")

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg as sl
 
+from hilcal.regression import lapack
 from hilcal.types import Bools, Floats, Ints
 
 DETERMINED = 1e-12
@@ -58,18 +59,22 @@ def _triangular(scaled: Floats) -> tuple[Floats, Bools]:
     """Inverse Cholesky factors of blocks (N, F, F), and which of them serve."""
     if len(scaled) == 1:
         # The transpose, in LAPACK's order, is not turned over in memory.
-        low, failed = sl.lapack.dpotrf(scaled[0].T, lower=1)
-        out = np.zeros_like(low) if failed else sl.lapack.dtrtri(low, lower=1, overwrite_c=1)[0]
-        out = np.asarray(out)[None]
+        low = lapack.column_major(scaled[0].T)
+        failed = not lapack.factorise(low)
+        if failed:
+            low[:] = 0.0
+        else:
+            lapack.invert(low)
+        out = low[None]
     else:
         try:
             out = np.linalg.inv(np.linalg.cholesky(scaled))
         except np.linalg.LinAlgError:  # one of them is singular: all by eigenvalues
             return np.zeros_like(scaled), np.zeros(len(scaled), dtype=np.bool_)
-        failed = 0
+        failed = False
     # The trace of the inverse is at least the inverse of the least eigenvalue.
     trace = np.einsum("nij,nij->n", out, out)
-    return out, np.asarray((trace < _SOUND / DETERMINED) & (failed == 0))
+    return out, np.asarray((trace < _SOUND / DETERMINED) & (not failed))
 
 
 def positive_solve(m: Floats, rhs: Floats) -> Floats:
@@ -83,12 +88,14 @@ def positive_solve(m: Floats, rhs: Floats) -> Floats:
         scaled = m / scale
         scaled /= scale[:, None]
         norm = float(np.abs(scaled).sum(axis=0).max())
-        low, failed = sl.lapack.dpotrf(scaled.T, lower=1, clean=0, overwrite_a=1)
-        if not failed:
+        low = scaled.T if scaled.flags.c_contiguous else lapack.column_major(scaled.T)
+        if lapack.factorise(low):
             condition, _ = sl.lapack.dpocon(low, norm, uplo="L")
             if condition * norm > len(m) * DETERMINED / _SOUND:
                 by = scale if rhs.ndim == 1 else scale[:, None]
-                return np.asarray(sl.lapack.dpotrs(low, rhs / by, lower=1)[0] / by)
+                out = lapack.column_major(rhs / by)
+                lapack.solve_factored(low, out)
+                return np.asarray(out / by)
     root = inverse_root(m)
     return np.asarray(root.T @ (root @ rhs))
 

@@ -9,11 +9,11 @@ Source: Golub and Van Loan, *Matrix Computations* (2013), section 8.3.
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import scipy.linalg as sl
 
+from hilcal.threads import once
 from hilcal.types import Bools, Floats
 
 VISIBLE = 1e-4
@@ -48,7 +48,7 @@ class Spectrum:
         """Number of directions that can be tested."""
         return int(np.count_nonzero(self.seen))
 
-    @cached_property
+    @once
     def vectors(self) -> Floats:
         """(P, P) U, eigenvectors in columns."""
         return self._turned(self.inner, "N")

@@ -1,6 +1,10 @@
 """Parts of a computation on several processors: the order of the items, the same bits."""
 
+import pickle
 import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -32,14 +36,135 @@ def test_results_are_in_the_order_of_the_items(monkeypatch: pytest.MonkeyPatch) 
     assert threads.in_threads(after, range(5)) == [0, 1, 4, 9, 16]
 
 
-def test_a_thread_computes_its_own_items_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+class Counted:
+    """How many threads are in a block at once, at most."""
+
+    def __init__(self) -> None:
+        self.most = self._now = 0
+        self._lock = threading.Lock()
+
+    def __enter__(self) -> None:
+        with self._lock:
+            self._now += 1
+            self.most = max(self.most, self._now)
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._now -= 1
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_few_more_threads_compute_than_there_are_processors(
+    monkeypatch: pytest.MonkeyPatch, count: int
+) -> None:
+    processors(monkeypatch, count)
+    counted = Counted()
+
+    def compute(item: int) -> int:
+        with counted:
+            time.sleep(0.001)
+        return item
+
+    def outer(item: int) -> int:
+        return sum(threads.in_threads(compute, range(item, item + 4)))
+
+    with threads.later() as ahead:
+        for _ in range(3):
+            ahead(lambda: compute(0), 1)
+        assert threads.in_threads(outer, range(6)) == [4 * k + 6 for k in range(6)]
+    # For a moment also those that go on after waiting; without a limit it would be dozens.
+    assert counted.most <= (1 if count == 1 else 2 * count)
+
+
+def test_who_waits_leaves_its_processor_to_what_it_waits_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    processors(monkeypatch, 2)
+    used: set[int] = set()
+
+    def inner(_: int) -> None:
+        used.add(threading.get_ident())
+        time.sleep(0.001)
+
+    def outer(item: int) -> None:
+        if item == 1:  # the other thread has no more to do than the first item
+            threads.in_threads(inner, range(100))
+
+    threads.in_threads(outer, range(2))
+    assert len(used) == 2
+
+
+def test_a_worker_of_many_computes_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     processors(monkeypatch, 2)
 
-    def inner(item: int) -> set[int]:
-        return set(threads.in_threads(lambda _: threading.get_ident(), range(3)))
+    def worker() -> set[int]:
+        threads.one_thread()
+        found = set(threads.in_threads(lambda _: threading.get_ident(), range(4)))
+        with threads.later() as ahead:
+            ahead(lambda: found.add(0), 1)
+        return found
 
-    for own in threads.in_threads(inner, range(4)):
-        assert len(own) == 1
+    with ThreadPoolExecutor(1) as pool:
+        assert len(pool.submit(worker).result()) == 1
+
+
+def test_the_first_of_several_errors_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
+    processors(monkeypatch, 2)
+    second = threading.Event()
+
+    def fails(item: int) -> None:
+        if item == 0:
+            assert second.wait(10)
+        second.set()
+        raise ValueError(str(item))
+
+    with pytest.raises(ValueError, match="0"):
+        threads.in_threads(fails, range(2))
+
+
+class Once:
+    """A property, and how often it was computed."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.go = threading.Event()
+
+    @threads.once
+    def value(self) -> int:
+        assert self.go.wait(10)
+        self.count += 1
+        return 7
+
+
+def test_a_property_is_computed_once_and_others_wait_for_it() -> None:
+    of, other = Once(), Once()
+    with ThreadPoolExecutor(3) as pool:
+        found = [pool.submit(lambda: of.value) for _ in range(3)]
+        other.go.set()
+        assert other.value == 7  # another instance waits for nobody
+        assert not of.count
+        of.go.set()
+        assert [f.result() for f in found] == [7, 7, 7]
+    assert of.count == 1
+    assert pickle.loads(pickle.dumps(Point(2))).square == 4
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    x: int
+
+    @threads.once
+    def square(self) -> int:
+        if self.x < 0:
+            raise ValueError("negative")
+        return self.x**2
+
+
+def test_a_property_that_fails_is_not_kept() -> None:
+    of = Point(-1)
+    for _ in range(2):
+        with pytest.raises(ValueError, match="negative"):
+            _ = of.square
 
 
 @pytest.mark.parametrize("count", [1, 2])
@@ -51,19 +176,6 @@ def test_an_error_reaches_the_caller(monkeypatch: pytest.MonkeyPatch, count: int
 
     with pytest.raises(ValueError, match="here"):
         threads.in_threads(lambda _: fails(), range(3))
-    with pytest.raises(ValueError, match="here"), threads.beside(fails):
-        pass
-
-
-@pytest.mark.parametrize("count", [1, 2])
-def test_what_is_beside_a_block_is_done_after_it(
-    monkeypatch: pytest.MonkeyPatch, count: int
-) -> None:
-    processors(monkeypatch, count)
-    done: list[str] = []
-    with threads.beside(lambda: done.append("beside")):
-        done.append("block")
-    assert sorted(done) == ["beside", "block"]
 
 
 def test_many_rows_are_worked_off_in_this_thread(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -71,10 +183,6 @@ def test_many_rows_are_worked_off_in_this_thread(monkeypatch: pytest.MonkeyPatch
     own = threading.get_ident()
     found = threads.in_threads(lambda _: threading.get_ident(), range(3), threads.MANY + 1)
     assert set(found) == {own}
-    done: list[int] = []
-    with threads.beside(lambda: done.append(threading.get_ident()), threads.MANY + 1):
-        assert not done
-    assert done == [own]
 
 
 def test_what_is_asked_for_later_is_computed_beside_the_block_where_it_may_be(
@@ -97,16 +205,26 @@ def test_what_is_asked_for_later_is_computed_beside_the_block_where_it_may_be(
     assert done == ["on 2"]
 
 
-def test_nothing_is_computed_ahead_where_many_compute(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_computed_ahead_while_no_processor_is_free(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     processors(monkeypatch, 2)
     done: list[int] = []
+    begun, ended = threading.Event(), threading.Event()
 
     def part(number: int) -> int:
+        if number == 0:  # has the other processor until the block of the other part has ended
+            begun.set()
+            assert ended.wait(10)
+            return number
+        assert begun.wait(10)
         with threads.later() as ahead:
             ahead(lambda: done.append(number), 1)
+            time.sleep(0.01)
+        ended.set()
         return number
 
-    assert threads.in_threads(part, range(4)) == [0, 1, 2, 3]
+    assert threads.in_threads(part, range(2)) == [0, 1]
     assert done == []
 
 
