@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from hilcal.calibration.calibration import Calibration
 from hilcal.cell import Cell
-from hilcal.cli.engine import Jobs, Scheduler
+from hilcal.cli.engine import OneJob, Scheduler, one_by_default
 from hilcal.cli.terminal import Json, terminal
 from hilcal.data.readings import Readings
 from hilcal.engine.engine import open_engine
@@ -64,7 +64,7 @@ def carry(
         Path | None,
         typer.Option("--without-of", metavar="F.json", help="An earlier record's errors without."),
     ] = None,
-    jobs: Jobs = 1,
+    jobs: OneJob = None,
     scheduler: Scheduler = None,
     keep_file: Keep = None,
     as_json: Json = False,
@@ -85,7 +85,7 @@ def carry(
         cases += [("C", second, n) for n in _numbers(other_poses)]
     run = partial(_drawn, prior=prior, draws=draws, without=without)
     with (
-        open_engine(None if scheduler else jobs, scheduler) as engine,
+        open_engine(*one_by_default(jobs, scheduler)) as engine,
         counting(t.progress, "numbers of poses", len(cases)) as advance,
     ):
         done = engine.map(run, cases, advance=advance)

@@ -16,10 +16,10 @@ from hilcal.config import load_config
 from hilcal.engine.engine import open_engine
 from hilcal.report import text
 from hilcal.report.numbers import length
-from hilcal.report.progress import counting, working
+from hilcal.report.progress import counting
 from hilcal.robot.catalogue import configs_dir
 from studies.change import READINGS_B, REPAIRS, Case, StudiedArm, case, studied_arm
-from studies.change_real import ZERO_RAD, RealCase, real_cases
+from studies.change_real import ZERO_RAD, RealCase, RealStudy, real_case
 from studies.records import Figure, Keep, keep
 
 ARMS: tuple[tuple[str, tuple[str, ...]], ...] = (
@@ -52,8 +52,13 @@ def change(
     """Repair a joint of simulated arms, measure a few readings, and ask what has changed."""
     t = terminal(as_json)
     if real is not None:
-        with working(t.progress) as say:
-            halves = real_cases(real, seeds, first_seed, readings, say)
+        study = RealStudy(real.absolute(), seeds, first_seed, readings)
+        with (
+            open_engine(jobs, scheduler) as engine,
+            counting(t.progress, "comparisons", 2 * seeds) as advance,
+        ):
+            compare = partial(real_case, study=study)
+            halves = engine.map(compare, range(2 * seeds), advance=advance)
         _tell(t, real_figures(halves), [asdict(c) for c in halves])
         keep(
             keep_file,

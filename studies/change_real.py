@@ -4,8 +4,8 @@ Nothing has changed between them, so nothing must be claimed. Then a joint's zer
 later readings by the fitted model, and must be found.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -47,37 +47,28 @@ class RealCase:
     z: float | None
 
 
-def real_cases(
-    path: Path, count: int, seed: int, count_b: int, say: Callable[[str], None]
-) -> list[RealCase]:
-    """Compare the halves of a series so many times without a change, and as often with one.
+@dataclass(frozen=True, slots=True)
+class RealStudy:
+    """What is compared.
 
-    Args:
+    Attributes:
         path: `measurements_joint_configurations.csv` of the IPA UR10 accuracy data.
-        count: comparisons of each kind.
+        count: comparisons of each kind, those without a change first.
         seed: of halves and draws.
         count_b: readings of the later campaign.
-        say: takes progress.
     """
-    cell = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
-    readings, rng = read_table(path, cell, "ipa-ur10"), np.random.default_rng(seed)
-    poses = rng.permutation(np.unique(readings.pose))
-    half = np.isin(readings.pose, poses[: len(poses) // 2])
-    say("fitting one half")
-    model = with_effects(cell, readings[half], "absolute", EFFECTS)
-    found, _ = completed(fit(model, readings[half], "absolute"), (), say)
-    say("predicting the poses left out")
-    earlier, others = earlier_fit(found), np.flatnonzero(~half)
-    out = []
-    for k in range(2 * count):
-        later = readings[np.sort(rng.choice(others, count_b, replace=False))]
-        joint = int(rng.integers(2 if k % 2 else 1, 7)) if k >= count else 0
-        out.append(_case(earlier, later, joint, bool(k % 2)))
-        say(f"comparison {k + 1} of {2 * count}")
-    return out
+
+    path: Path
+    count: int
+    seed: int
+    count_b: int
 
 
-def _case(earlier: Earlier, later: Readings, joint: int, anew: bool) -> RealCase:
+def real_case(k: int, study: RealStudy) -> RealCase:
+    """Compare readings of one half of a series with the other half, for the k-th time."""
+    earlier, draws = _begun(study)
+    later, joint = draws[k]
+    anew = bool(k % 2)
     if joint:
         later = _moved(earlier, later, joint - 1)
     found = find_changes(setting(earlier, later, anew=anew))
@@ -88,6 +79,27 @@ def _case(earlier: Earlier, later: Readings, joint: int, anew: bool) -> RealCase
     ]
     parts = tuple(dict.fromkeys(c.candidate.part for c in found.found))
     return RealCase(joint, anew, parts, found.explained, z[0] if z else None)
+
+
+@cache
+def _begun(study: RealStudy) -> tuple[Earlier, list[tuple[Readings, int]]]:
+    """Fit one half, and draw later readings and a joint, or 0, for each comparison.
+
+    Once in each process: what is fitted is larger than what it takes to fit it.
+    """
+    cell = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
+    readings, rng = read_table(study.path, cell, "ipa-ur10"), np.random.default_rng(study.seed)
+    poses = rng.permutation(np.unique(readings.pose))
+    half = np.isin(readings.pose, poses[: len(poses) // 2])
+    model = with_effects(cell, readings[half], "absolute", EFFECTS)
+    found, _ = completed(fit(model, readings[half], "absolute"), (), lambda words: None)
+    earlier, others = earlier_fit(found), np.flatnonzero(~half)
+    out = []
+    for k in range(2 * study.count):
+        later = readings[np.sort(rng.choice(others, study.count_b, replace=False))]
+        joint = int(rng.integers(2 if k % 2 else 1, 7)) if k >= study.count else 0
+        out.append((later, joint))
+    return earlier, out
 
 
 def _moved(earlier: Earlier, later: Readings, j: int) -> Readings:

@@ -19,7 +19,7 @@ import typer
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.poses import BAND, ToolPoses, band
 from hilcal.cell import Cell
-from hilcal.cli.engine import Jobs, Scheduler
+from hilcal.cli.engine import OneJob, Scheduler, one_by_default
 from hilcal.cli.terminal import Json, terminal
 from hilcal.data.readings import Readings
 from hilcal.engine.engine import open_engine
@@ -93,7 +93,7 @@ def compensation(
         Path | None,
         typer.Option("--calibrations", metavar="DIR", help="Keep them there; use what is there."),
     ] = None,
-    jobs: Jobs = 1,
+    jobs: OneJob = None,
     scheduler: Scheduler = None,
     keep_file: Keep = None,
     as_json: Json = False,
@@ -105,7 +105,7 @@ def compensation(
     cases = [(path, k) for path in series for k in range(splits + (share == HALF))]
     run = partial(_split, splits=splits, share=share, folder=folder)
     with (
-        open_engine(None if scheduler else jobs, scheduler) as engine,
+        open_engine(*one_by_default(jobs, scheduler)) as engine,
         counting(t.progress, "splits", len(cases)) as advance,
     ):
         done = engine.map(run, cases, advance=advance)

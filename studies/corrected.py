@@ -4,15 +4,23 @@ Simulated cells with a hidden effect each, calibrated by the steps of `hilcal ca
 real drivers, on simulated devices over their protocols. The validation poses are loaded with 60 %
 of the payload; nothing is fitted to them. Counted is the error that the tracker measures at their
 uncorrected and at their corrected joint values, in its own frame by the fitted registration.
+
+Every cell is a case of its own, on the engine: its devices are processes of the worker's machine,
+on a loopback address and in a folder of their own, and end with the case or with the worker. They
+run in real time, so that readings depend on the load of the machine, as those of real devices do:
+the draws are the same on any number of workers, the figures agree within the noise.
 """
 
+import fcntl
 import sys
 import time
 import zlib
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TextIO
 
 import numpy as np
 import typer
@@ -22,10 +30,13 @@ from drivers.simulated.rehearsal import as_told
 from hilcal.calibration.improvement import Improvement
 from hilcal.cell import cell_from_config
 from hilcal.cli.calibrating_steps import Operator
+from hilcal.cli.engine import OneJob, Scheduler, one_by_default
 from hilcal.cli.terminal import Json, Terminal, terminal
 from hilcal.config import CellConfig, load_config
 from hilcal.config.loads import Load
 from hilcal.effects.catalogue import installed
+from hilcal.engine.engine import open_engine
+from hilcal.errors import DeviceError
 from hilcal.procedure.procedure import Procedure, continued
 from hilcal.procedure.state import Settings
 from hilcal.report.numbers import length
@@ -55,6 +66,9 @@ WANTED_BAND = (0.93, 0.97)
 CLOCK = 50.0
 """How much faster than real time the simulated worlds go."""
 CANDIDATES = 120
+STARTS = 3
+"""Of the devices of a cell: a busy machine gives them no turn for seconds, and a controller whose
+program was left running wants its pendant. A choice."""
 SEED = 11
 
 
@@ -68,6 +82,7 @@ class Case:
         found: the errors before and after.
         verdict: of the refinement.
         model: its effects.
+        seconds: that it took.
     """
 
     arm: str
@@ -75,25 +90,37 @@ class Case:
     found: Improvement
     verdict: str
     model: tuple[str, ...]
+    seconds: float
 
 
 def corrected(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Campaigns; goes on with them.")],
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            metavar="DIR", help="Campaigns; goes on with them. One that all workers reach."
+        ),
+    ],
     points: Annotated[int, typer.Option("--points", help="Validation poses of a cell.")] = 50,
+    poses: Annotated[int, typer.Option("--poses", help="Of the plan that is fitted.")] = POSES,
     arms: Annotated[str, typer.Option("--arms", help="Separated by commas.")] = ",".join(ARMS),
     effects: Annotated[str, typer.Option("--effects", help="The same.")] = ",".join(HIDDEN),
+    jobs: OneJob = None,
+    scheduler: Scheduler = None,
     keep_file: Keep = None,
     as_json: Json = False,
 ) -> None:
     """Calibrate simulated cells through the drivers, and measure at corrected targets."""
     t = terminal(as_json)
     folder.mkdir(parents=True, exist_ok=True)
-    cases = []
-    for hidden in effects.split(","):
-        for arm in arms.split(","):
-            begun = time.monotonic()
-            cases.append(case(folder, arm, hidden, points))
-            t.notice(f"{words(cases[-1])} ({time.monotonic() - begun:.0f} s)")
+    asked = [(arm, hidden) for hidden in effects.split(",") for arm in arms.split(",")]
+    run = partial(case, folder=folder.absolute(), points=points, poses=poses)
+    done: dict[int, Case] = {}
+    cases: list[Case] = []
+    with open_engine(*one_by_default(jobs, scheduler)) as engine:
+        for number, found in engine.results(run, asked):
+            done[number] = found
+            cases = [done[k] for k in sorted(done)]
+            t.notice(f"{words(found)} ({found.seconds:.0f} s)")
             keep(keep_file, "Moved to corrected joint targets, measured there", figures(cases))
     for f in figures(cases):
         t.show(f"{f.what}: {f.measured}")
@@ -107,28 +134,68 @@ def corrected(
     )
 
 
-def case(folder: Path, arm: str, hidden: str, points: int) -> Case:
-    """Calibrate one cell, or go on where its files end."""
+def case(of: tuple[str, str], folder: Path, points: int, poses: int = POSES) -> Case:
+    """Calibrate one cell, or go on where its files end.
+
+    Args:
+        of: the arm and the hidden effect.
+        folder: of the campaigns.
+        points: validation poses.
+        poses: of the plan that is fitted.
+
+    Raises:
+        DeviceError: a device failed, again and again.
+    """
+    arm, hidden = of
+    begun = time.monotonic()
     seed = zlib.crc32(f"{SEED} {arm} {hidden}".encode())  # independent draws in each cell
+    settings = Settings(
+        poses=poses, validation=points, seed=seed, readings="absolute", hide=hidden,
+        under_load=True,
+    )  # fmt: skip
     config = as_told(cell_of(arm, seed), hidden)
     run = folder / f"{arm}-{hidden}.hilcal"
-    cell, catalogue = cell_from_config(config), installed()
-    if run.exists():
-        p = continued(run, cell, config, catalogue)
-    else:
-        settings = Settings(
-            poses=POSES, validation=points, seed=seed, readings="absolute", hide=hidden,
-            under_load=True,
-        )  # fmt: skip
-        p = Procedure(run, cell, config, folder, catalogue, settings)
-    with run.with_suffix(".log").open("a", encoding="utf-8") as log, ExitStack() as stack:
+    with _alone(run.with_suffix(".log")) as log:
         quiet = Console(file=log, width=100)
         t = Terminal(json=False, people=quiet, progress=quiet, out=sys.stderr)
-        Operator(t, p, stack, rehearse=True, yes=True).to_the_end()
+        p = _calibrated(t, run, config, settings)
     found = p.compare()
     record = p.record()
     verdict = str(record.result_json.get("diagnose", {}).get("verdict", ""))
-    return Case(arm, hidden, found, verdict, record.effects)
+    return Case(arm, hidden, found, verdict, record.effects, time.monotonic() - begun)
+
+
+def _calibrated(t: Terminal, run: Path, config: CellConfig, settings: Settings) -> Procedure:
+    """Do what is missing of a calibration, on devices started anew where some have failed."""
+    cell, catalogue = cell_from_config(config), installed()
+    for left in reversed(range(STARTS)):
+        if run.exists():
+            p = continued(run, cell, config, catalogue)
+        else:
+            p = Procedure(run, cell, config, run.parent, catalogue, settings)
+        with ExitStack() as stack:
+            try:
+                Operator(t, p, stack, rehearse=True, yes=True).to_the_end()
+            except DeviceError as error:
+                if not left:
+                    raise
+                t.notice(f"note: {error}")
+                t.notice("going on with devices started anew")
+            else:
+                break
+    return p
+
+
+@contextmanager
+def _alone(path: Path) -> Iterator[TextIO]:
+    """Open a log to append to, when nobody else has it open by this.
+
+    A cluster does not end what its workers compute when the study is stopped: the next one waits
+    for the case, and goes on where it ended. The kernel lets go of a file with its process.
+    """
+    with path.open("a", encoding="utf-8") as log:
+        fcntl.flock(log, fcntl.LOCK_EX)
+        yield log
 
 
 def cell_of(arm: str, seed: int) -> CellConfig:

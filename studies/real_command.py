@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from hilcal.cell import Cell
-from hilcal.cli.engine import Jobs, Scheduler
+from hilcal.cli.engine import OneJob, Scheduler, one_by_default
 from hilcal.cli.terminal import Json, terminal
 from hilcal.engine.engine import open_engine
 from hilcal.identify.baseline import baseline
@@ -46,7 +46,7 @@ def real(
         list[Path],
         typer.Argument(metavar="F.csv...", help="measurements_joint_configurations.csv."),
     ],
-    jobs: Jobs = 1,
+    jobs: OneJob = None,
     scheduler: Scheduler = None,
     keep_file: Keep = None,
     as_json: Json = False,
@@ -57,7 +57,7 @@ def real(
     """
     t = terminal(as_json)
     with (
-        open_engine(None if scheduler else jobs, scheduler) as engine,
+        open_engine(*one_by_default(jobs, scheduler)) as engine,
         counting(t.progress, "series", len(series)) as advance,
     ):
         done = engine.map(refined, series, advance=advance)

@@ -5,23 +5,32 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from hilcal.cli.engine import OneJob, Scheduler, one_by_default
 from hilcal.cli.terminal import terminal
 from hilcal.data.whitening import SCALINGS
-from hilcal.report.progress import working
-from hilcal.study.scaling import scaling_study
+from hilcal.engine.engine import open_engine
+from hilcal.report.progress import counting
+from hilcal.study.scaling import check, experiments, scaling_study
 from hilcal.study.scaling_table import table
 from studies.records import Figure, Keep, keep
 
 
 def scaling(
     runs: Annotated[int, typer.Option("--runs", help="Monte-Carlo runs.")] = 2000,
+    jobs: OneJob = None,
+    scheduler: Scheduler = None,
     keep_file: Keep = None,
 ) -> None:
     """Show what the scalings none, gu and gc do to the same data."""
     t = terminal(False)
-    with working(t.progress) as say:
-        say(f"simulating {runs} campaigns, each with every scaling")
-        study = scaling_study(np.random.default_rng(1), runs)
+    check(runs)
+    what = f"experiments of {runs} campaigns, each with every scaling"
+    with (
+        open_engine(*one_by_default(jobs, scheduler)) as engine,
+        counting(t.progress, what, experiments()) as advance,
+    ):
+        rng = np.random.default_rng(1)
+        study = scaling_study(rng, runs, engine=engine, advance=advance)
     t.show(table(study))
     figures = []
     for name in SCALINGS:

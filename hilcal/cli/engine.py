@@ -1,4 +1,8 @@
-"""Options of commands that compute on several workers."""
+"""Options of commands that compute on several workers.
+
+`Workers` and `Jobs` are one per processor where neither they nor a scheduler are given; `OneWorker`
+and `OneJob` are for what is computed in this process then, see `one_by_default`.
+"""
 
 from typing import Annotated
 
@@ -10,9 +14,14 @@ Workers = Annotated[
         "--workers", metavar="N", help="Processes of this machine; one per processor by default."
     ),
 ]
+OneWorker = Annotated[
+    int | None,
+    typer.Option("--workers", metavar="N", help="Processes of this machine; 1 by default."),
+]
 Jobs = Annotated[
     int | None, typer.Option("--jobs", help="Processes; one per processor by default.")
 ]
+OneJob = Annotated[int | None, typer.Option("--jobs", help="Processes; 1 by default.")]
 Scheduler = Annotated[
     str | None,
     typer.Option(
@@ -21,3 +30,8 @@ Scheduler = Annotated[
         help="Compute on a Dask cluster instead, as tcp://host:8786.",
     ),
 ]
+
+
+def one_by_default(workers: int | None, scheduler: str | None) -> tuple[int | None, str | None]:
+    """Return what `open_engine` takes: this process where neither of both was given."""
+    return (1 if workers is None and scheduler is None else workers), scheduler

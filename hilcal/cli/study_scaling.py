@@ -5,25 +5,34 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from hilcal.cli.engine import OneWorker, Scheduler, one_by_default
 from hilcal.cli.terminal import Json, terminal
+from hilcal.engine.engine import open_engine
 from hilcal.errors import InputError
-from hilcal.report.progress import working
+from hilcal.report.progress import counting
 
 
 def scaling(
     runs: Annotated[int, typer.Option("--runs", help="Monte-Carlo runs.")] = 2000,
     seed: Annotated[int, typer.Option("--seed", help="Of the random numbers.")] = 1,
+    workers: OneWorker = None,
+    scheduler: Scheduler = None,
     as_json: Json = False,
 ) -> None:
     """Show what the scalings none, gu and gc do to the same data."""
-    from hilcal.study.scaling import scaling_study
+    from hilcal.study.scaling import check, experiments, scaling_study
     from hilcal.study.scaling_table import table
 
     t = terminal(as_json)
     if seed < 0:
         raise InputError(f"--seed {seed}; valid: a whole number, 0 or more")
-    with working(t.progress) as say:
-        say(f"simulating {runs} campaigns, each with every scaling")
-        study = scaling_study(np.random.default_rng(seed), runs)
+    check(runs)
+    what = f"experiments of {runs} campaigns, each with every scaling"
+    with (
+        open_engine(*one_by_default(workers, scheduler)) as engine,
+        counting(t.progress, what, experiments()) as advance,
+    ):
+        rng = np.random.default_rng(seed)
+        study = scaling_study(rng, runs, engine=engine, advance=advance)
     t.show(table(study))
     t.document(study.to_json())

@@ -217,10 +217,14 @@ def _own(count: int, threads: bool) -> Iterator["Client"]:
     with (
         _quiet(),
         _ended_in_order(),
-        tempfile.TemporaryDirectory(prefix="hilcal-workers-") as scratch,
+        tempfile.TemporaryDirectory(
+            prefix="hilcal-workers-", ignore_cleanup_errors=True
+        ) as scratch,
     ):
         from distributed import Client, LocalCluster
 
+        # What a worker that is killed leaves among temporary files goes with the folder.
+        own: dict[str, Any] = {} if threads else {"env": {"TMPDIR": scratch}}
         # Ctrl-C is for this process: workers are born with it blocked, and those that replace
         # a dead one as well, because the thread that starts them inherits the mask.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -236,6 +240,7 @@ def _own(count: int, threads: bool) -> Iterator["Client"]:
                 memory_limit=0,
                 local_directory=scratch,
                 silence_logs=logging.CRITICAL,
+                **own,
             )
             client = Client(cluster, set_as_default=False)
         finally:

@@ -7,12 +7,16 @@ intervals are counted.
 """
 
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import asdict, dataclass
+from functools import partial
 
 import numpy as np
 from scipy.linalg import solve_triangular
 
+from hilcal.data.readings import Readings
 from hilcal.data.whitening import SCALINGS, Scaling, Whitening, whitening
+from hilcal.engine.engine import ALONE, Advance, Engine
 from hilcal.errors import InputError
 from hilcal.regression import distributions
 from hilcal.robot.arm import Arm
@@ -115,8 +119,13 @@ def scaling_study(
     *,
     arm: Arm | None = None,
     poses: int = 30,
+    engine: Engine = ALONE,
+    advance: Advance | None = None,
 ) -> ScalingStudy:
     """Simulate the identification of joint compliances with every scaling.
+
+    Each correlation is an experiment of its own, with unloaded readings shared or not: that is what
+    the engine computes side by side, `experiments` of them.
 
     Args:
         rng: source of poses and noise.
@@ -124,11 +133,29 @@ def scaling_study(
         correlations: shares ρ of variance that the six elements have in common, each in [0, 1).
         arm: the arm; None for the UR10e.
         poses: number of random feasible poses.
+        engine: what the experiments are computed on.
+        advance: told 1 for each experiment that is done.
 
     Raises:
         InputError: fewer than 2 runs or poses, no correlation, or one outside [0, 1).
         CannotAnswerError: the arm cannot hold the wrenches in so many poses.
     """
+    check(runs, correlations, poses)
+    design = make_design(rng, arm or load_arm("ur10e"), poses)
+    asked = _experiments(rng, design, correlations, runs)
+    done = engine.map(partial(_cells, design=design, runs=runs), asked, advance=advance)
+    return ScalingStudy(
+        arm=design.arm.name,
+        runs=runs,
+        poses=poses,
+        loads=len(design.wrenches),
+        typical_correlation=_off_diagonal(design.specified) / _off_diagonal(design.common),
+        cells=tuple(cell for cells in done for cell in cells),
+    )
+
+
+def check(runs: int, correlations: Sequence[float] = CORRELATIONS, poses: int = 30) -> None:
+    """Refuse a study that cannot be, before workers are started for it; see `scaling_study`."""
     if runs < 2:
         raise InputError(f"runs = {runs}: a Monte-Carlo study needs 2 or more")
     if poses < 2:
@@ -138,21 +165,40 @@ def scaling_study(
     for rho in correlations:
         if not 0 <= rho < 1:
             raise InputError(f"correlation {rho:g}: must be in [0, 1)")
-    design = make_design(rng, arm or load_arm("ur10e"), poses)
-    cells = [
-        cell
-        for shared in (False, True)
-        for rho in correlations
-        for cell in _experiment(rng, design, float(rho), shared, runs)
-    ]
-    return ScalingStudy(
-        arm=design.arm.name,
-        runs=runs,
-        poses=poses,
-        loads=len(design.wrenches),
-        typical_correlation=_off_diagonal(design.specified) / _off_diagonal(design.common),
-        cells=tuple(cells),
-    )
+
+
+def experiments(correlations: Sequence[float] = CORRELATIONS) -> int:
+    """Return how many experiments a study of these correlations has."""
+    return 2 * len(correlations)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Experiment:
+    """Correlation ρ, whether unloaded readings are shared, and the generator of the noise."""
+
+    rho: float
+    shared: bool
+    rng: np.random.Generator
+
+
+def _experiments(
+    rng: np.random.Generator, design: Design, correlations: Sequence[float], runs: int
+) -> list[_Experiment]:
+    """Give each experiment the generator as it is when those before have drawn their noise.
+
+    So each can be computed by itself, and the random numbers are those of all in one sequence.
+    """
+    out = []
+    for shared in (False, True):
+        for rho in correlations:
+            out.append(_Experiment(float(rho), shared, deepcopy(rng)))
+            _drawn(rng, make_readings(design, design.covariance(float(rho)), shared), runs)
+    return out
+
+
+def _drawn(rng: np.random.Generator, readings: Readings, runs: int) -> Floats:
+    """(N, 6, R) standard normal numbers: for every element of N readings in R runs."""
+    return rng.standard_normal((len(readings), 6, runs))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -164,16 +210,14 @@ class _Fit:
     variance_factor: float | None
 
 
-def _experiment(
-    rng: np.random.Generator, design: Design, rho: float, shared: bool, runs: int
-) -> list[StudyCell]:
+def _cells(of: _Experiment, design: Design, runs: int) -> list[StudyCell]:
     """All scalings and units on the same noise."""
+    rho, shared = of.rho, of.shared
     covariance = design.covariance(rho)
     limit = np.sqrt(np.diagonal(bound(design, covariance, shared)))[:, None]
     readings = make_readings(design, covariance, shared)
-    noise = np.linalg.cholesky(covariance)[readings.pose] @ rng.standard_normal(
-        (len(readings), 6, runs)
-    )
+    # A copy, so that the same experiment can be computed again, as after a worker's death.
+    noise = np.linalg.cholesky(covariance)[readings.pose] @ _drawn(deepcopy(of.rng), readings, runs)
     cells = []
     for scaling in SCALINGS:
         first: Floats | None = None

@@ -288,6 +288,8 @@ def test_study_scaling(capsys: Capsys) -> None:
     assert d["runs"] == 20
     assert set(d["summary"]) == {"none", "gu", "gc"}
     assert "2 or more" in refused(capsys, 2, "study", "scaling", "--runs", "1")
+    both = ("--workers", "2", "--scheduler", "tcp://127.0.0.1:1")
+    assert "own workers" in refused(capsys, 2, "study", "scaling", *both)
 
 
 def test_json_leaves_words_to_stderr(campaign: Path, capsys: Capsys) -> None:

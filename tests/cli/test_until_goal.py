@@ -1,5 +1,6 @@
 """Goals while a campaign is measured: what is judged, how often, and what the command does."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -9,11 +10,12 @@ import pytest
 
 import hilcal.cli.running as running
 from hilcal.acquire.connect import ConnectionResult
+from hilcal.cli.terminal import terminal
 from hilcal.config import CellConfig, Repeatability
 from hilcal.config.write import to_toml
 from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.plan import Plan, Step
-from hilcal.data.run_log import RunLog
+from hilcal.data.run_log import RunLog, create_run
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import fit
@@ -299,3 +301,15 @@ def test_a_wrong_goal_is_refused_before_anything_else(
     assert '"joint std < 2 %"' in line
     assert site.bench.world.calls == []
     assert not (site.directory / "run.hilcal").exists()
+
+
+def test_a_worker_of_many_measures_in_a_thread(site: Site) -> None:
+    """Where no signal can be handled."""
+    bench, path = site.bench, site.directory / "run.hilcal"
+
+    def measured() -> int:
+        with create_run(path, bench.config, site.directory, site.plan) as campaign:
+            return running.measure(terminal(True), bench.config, bench.cell, campaign)
+
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(measured).result() == len(site.plan.steps)

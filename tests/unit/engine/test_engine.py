@@ -1,13 +1,10 @@
 """Many computations: the same bits wherever they run, and nothing lost or left."""
 
 import os
-import re
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import psutil
@@ -15,10 +12,10 @@ import pytest
 
 from hilcal.engine.engine import ClusterError, open_engine
 from hilcal.errors import InputError
+from tests.support.cluster import HERE, WORKER, running, scheduler
 from tests.support.engine_cases import refuse, singular_value
 from tests.support.paths import ROOT
 
-HERE = {**os.environ, "PYTHONPATH": str(ROOT)}
 ITEMS = range(40)
 SEED = 11
 
@@ -26,34 +23,6 @@ SEED = 11
 def here() -> tuple[float, ...]:
     with open_engine(1) as engine:
         return engine.map(singular_value, ITEMS, SEED)
-
-
-@contextmanager
-def running(*command: str) -> "Iterator[subprocess.Popen[str]]":
-    process = subprocess.Popen(
-        [sys.executable, "-m", *command], env=HERE, cwd=ROOT, stderr=subprocess.PIPE, text=True
-    )
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
-
-
-@contextmanager
-def scheduler() -> Iterator[str]:
-    """A real scheduler on loopback; its address."""
-    command = ("dask", "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard")
-    with running(*command, "--dashboard-address", "127.0.0.1:0") as process:
-        assert process.stderr is not None
-        for line in process.stderr:
-            if found := re.search(r"Scheduler at:\s*(tcp://127\S+)", line):
-                yield found[1]
-                return
-    pytest.fail("no scheduler")
-
-
-WORKER = ("--host", "127.0.0.1", "--no-nanny", "--no-dashboard", "--nthreads", "1")
 
 
 @pytest.mark.slow

@@ -9,12 +9,13 @@ import pytest
 from rich.console import Console
 from scipy import stats
 
+from hilcal.engine.engine import Engine, open_engine
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
 from hilcal.robot.deviation import Deviation
 from hilcal.robot.se3 import rotation_vector
-from hilcal.study.scaling import CORRELATIONS, UNITS, ScalingStudy, scaling_study
+from hilcal.study.scaling import CORRELATIONS, UNITS, ScalingStudy, experiments, scaling_study
 from hilcal.study.scaling_design import JOINT_STD, TARGET, WRENCHES, Design, bound, make_design
 from hilcal.study.scaling_table import CURVES, table
 from hilcal.types import Floats
@@ -248,6 +249,29 @@ def test_same_seed_same_study() -> None:
         scaling_study(np.random.default_rng(3), runs=50, correlations=(0.5,)) for _ in range(2)
     )
     assert first == second
+
+
+@pytest.mark.parametrize("threads", [pytest.param(False, marks=pytest.mark.slow), True])
+def test_the_same_bits_on_several_workers(threads: bool) -> None:
+    correlations, done = (0.5, 0.9), []
+
+    def on(engine: Engine) -> ScalingStudy:
+        rng = np.random.default_rng(3)
+        found = scaling_study(rng, 50, correlations, engine=engine, advance=done.append)
+        assert rng.random() == after
+        return found
+
+    every = np.random.default_rng(3)
+    make_design(every, load_arm("ur10e"), 30)
+    for loaded_and_unloaded in (8, 8, 5, 5):  # as one sequence: of 30 poses, 6 elements, 50 runs
+        every.standard_normal((30 * loaded_and_unloaded, 6, 50))
+    after = every.random()
+    with open_engine(1) as engine:
+        alone = on(engine)
+    with open_engine(2, threads=threads) as engine:
+        assert on(engine) == alone
+    assert len(done) == 2 * experiments(correlations)
+    assert experiments() == 2 * len(CORRELATIONS)
 
 
 # --- what people and scripts get ------------------------------------------------------------

@@ -1,0 +1,51 @@
+"""Deflections of a simulated UR10e that hides nothing, under two weights, from seeded draws."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from drivers.simulated.injected_effects import nothing_hidden
+from drivers.simulated.rehearsal import measurement_noise, simulate
+from drivers.simulated.world import World
+from hilcal.cell import Cell, cell_from_config
+from hilcal.config import load_config
+from hilcal.data.readings import Readings
+from hilcal.robot.catalogue import configs_dir
+from hilcal.types import Ints
+from studies.random_campaigns import dead_weights, rehearsal_states
+
+
+@dataclass(frozen=True, eq=False)
+class Rehearsed:
+    """What was simulated.
+
+    Attributes:
+        cell: the cell.
+        world: its truth.
+        readings: (D,) deflections with their noise.
+        pose: (D,) number of each reading's pose.
+        cycle: (D,) number of its load cycle.
+    """
+
+    cell: Cell
+    world: World
+    readings: Readings
+    pose: Ints
+    cycle: Ints
+
+
+def rehearsed(poses: int, seed: int) -> Rehearsed:
+    """Simulate some poses, without temperatures, approach directions or times under load."""
+    config = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
+    cell = cell_from_config(config)
+    rng = np.random.default_rng(seed)
+    loads = dead_weights((4.0, 8.0), cell.gravity)
+    states, pose, load, cycle = rehearsal_states(
+        cell, poses, loads, rng, approach=False, temperatures=False
+    )
+    states = replace(states, load_time=None)
+    std = config.repeatability.per_joint(cell.arm.n)
+    world = nothing_hidden(cell, rng, noise=measurement_noise(config), joint_std=std)
+    names = ("none", *(name for name, _ in loads))
+    readings = simulate(world, states, pose, load, cycle, names, rng)
+    return Rehearsed(cell, world, readings, pose, cycle)
