@@ -22,7 +22,8 @@ from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.residual import residual
 from hilcal.types import Floats, Ints
-from studies.foreign_laws import KINDS, Foreign, scene
+from studies.foreign_laws import KINDS, Foreign
+from studies.law_scene import Scene, scene
 from studies.random_campaigns import rehearsal_states
 from studies.study_cases import with_study_loads
 
@@ -87,11 +88,12 @@ class Outcome:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Campaign:
-    """Readings with the law in them, what the law did, and what the noise did, (N, 3)."""
+    """Readings with the law in them; what law and noise did, (N, 3); where the arm rested."""
 
     readings: Readings
     moved: Floats
     noise: Floats
+    scene: Scene
 
 
 def run_case(config: CellConfig, asked: Asked) -> Outcome:
@@ -135,7 +137,7 @@ def run_case(config: CellConfig, asked: Asked) -> Outcome:
     if law is None:
         return out
     again = rehearsal_states(cell, asked.poses, loads, rng)
-    fresh = _scaled(_measured(world, again, names, rng, law), size)
+    fresh = _scaled(_measured(world, again, names, rng, law, before=first.scene), size)
     off = _error(before, fresh)
     if d.reason == "catalogue":
         return _with_catalogue(replace(out, before=off), law, before, d.catalogue, first, fresh)
@@ -195,18 +197,20 @@ def _measured(
     rng: np.random.Generator,
     law: Foreign | None,
     stated: float = 1.0,
+    before: Scene | None = None,
 ) -> _Campaign:
     states, pose, load, cycle = made
     readings = simulate(world, states, pose, load, cycle, names, rng)
-    s = scene(world, states)
+    s = scene(world, states, before)
     moved = np.zeros_like(s.seen) if law is None else law.displaced(s)
     noise = readings.value - s.seen
-    return _Campaign(replace(readings, covariance=stated**2 * readings.covariance), moved, noise)
+    stated_so = replace(readings, covariance=stated**2 * readings.covariance)
+    return _Campaign(stated_so, moved, noise, s)
 
 
 def _scaled(c: _Campaign, size: float) -> _Campaign:
     moved = size * c.moved
-    return _Campaign(replace(c.readings, value=c.readings.value + moved), moved, c.noise)
+    return replace(c, readings=replace(c.readings, value=c.readings.value + moved), moved=moved)
 
 
 def _right_site(law: Foreign, found: Law) -> bool:

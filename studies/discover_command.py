@@ -26,6 +26,8 @@ from studies.study_cases import effects_shown
 ROBOTS = ("ur3e", "ur5e", "ur10e")
 FLOOR, SAME = 1.15, 0.98
 """Error over the noise floor, and correlation of formulas, that the claims ask for."""
+PLAIN = 0.95
+"""Share that all claims ask for of laws at 10 σ with 100 poses."""
 
 
 def discover(
@@ -89,6 +91,8 @@ def discover(
     title = "Laws discovered, and none where none is hidden"
     if law:
         title = f"Laws discovered: {', '.join(law)}"
+    elif outcomes and all(_plain(o) for o in outcomes):
+        title = "Laws discovered at 10 σ with 100 poses"
     keep(keep_file, title, figures, {"cases": [_brief(o) for o in done]} if counted else None)
     t.document({"cases": [asdict(o) for o in outcomes], "figures": [asdict(f) for f in figures]})
 
@@ -159,6 +163,7 @@ def _mode(name: str) -> Mode:
 def claims(outcomes: Sequence[Outcome]) -> Iterator[Figure]:
     """Yield what is claimed of a search, with the counts."""
     laws = [o for o in outcomes if o.asked.law]
+    plain = bool(laws) and all(map(_plain, laws))
     of_law: tuple[tuple[str, float, Callable[[Outcome], bool]], ...] = (
         ("error at fresh poses at most 1.15 times the noise", 0.75, lambda o: 0 < o.after <= FLOOR),
         ("excess of the error at fresh poses halved", 0.90, _halved),
@@ -167,7 +172,7 @@ def claims(outcomes: Sequence[Outcome]) -> Iterator[Figure]:
         ("formula equivalent (correlation 0.98)", 0.70, lambda o: o.correlation >= SAME),
     )
     for what, least, holds in of_law:
-        yield _figure(what, [holds(o) for o in laws], least)
+        yield _figure(what, [holds(o) for o in laws], PLAIN if plain else least)
     silent = (
         ("no law where an effect of the catalogue is hidden", lambda o: bool(o.asked.effect)),
         ("no law where nothing is hidden", lambda o: _bare(o) and o.asked.stated == 1.0),
@@ -181,6 +186,10 @@ def claims(outcomes: Sequence[Outcome]) -> Iterator[Figure]:
         held = [not o.formula for o in outcomes if mine(o)]
         if held:
             yield _figure(words, held, least)
+
+
+def _plain(o: Outcome) -> bool:
+    return o.asked.strength >= 10.0 and o.asked.poses >= 100
 
 
 def _bare(o: Outcome) -> bool:

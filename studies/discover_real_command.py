@@ -9,7 +9,7 @@ import numpy as np
 import typer
 
 from hilcal.cell import Cell
-from hilcal.cli.engine import Jobs, Scheduler
+from hilcal.cli.engine import OneJob, Scheduler, one_by_default
 from hilcal.cli.terminal import Json, terminal
 from hilcal.diagnose.residual_regression import residual_regression
 from hilcal.discover.discovery import Discovery, discover
@@ -49,7 +49,7 @@ def discover_real(
         list[Path],
         typer.Argument(metavar="F.csv F.csv", help="measurements_joint_configurations.csv, …"),
     ],
-    jobs: Jobs = 1,
+    jobs: OneJob = None,
     scheduler: Scheduler = None,
     keep_file: Keep = None,
     as_json: Json = False,
@@ -57,7 +57,7 @@ def discover_real(
     """Search a law for what refinement leaves of the IPA UR10's series; try it on the other one."""
     t = terminal(as_json)
     with (
-        open_engine(None if scheduler else jobs, scheduler) as engine,
+        open_engine(*one_by_default(jobs, scheduler)) as engine,
         counting(t.progress, "series", len(series)) as advance,
     ):
         done = engine.map(_searched, series, advance=advance)

@@ -10,54 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.simulated.mechanics import Equilibrium
-from drivers.simulated.world import World
-from hilcal.data.readings import States
 from hilcal.types import Floats
+from studies.law_scene import Scene
 
 ABSOLUTE, DEFLECTION = "absolute", "deflection"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Scene:
-    """Where the arm rests in N states, for a law to look at.
-
-    Attributes:
-        states: the states.
-        rest: equilibrium of the simulated arm.
-        torque: (N, n) at the drives, N·m.
-        place: (N, 3) of the target, base axes, m.
-        seen: (N, 3) of the target, sensor axes, m.
-        by_joint: (N, 3, n) motion of the target by each drive, sensor axes.
-        view: (3, 3) base axes in sensor axes.
-    """
-
-    states: States
-    rest: Equilibrium
-    torque: Floats
-    place: Floats
-    seen: Floats
-    by_joint: Floats
-    view: Floats
-
-    def of_joint(self, j: int, angle: Floats) -> Floats:
-        """(N, 3) displacement by an error (N,) of joint j (from 1), rad."""
-        return np.asarray(self.by_joint[:, :, j - 1] * angle[:, None])
-
-    def in_base(self, shift: Floats) -> Floats:
-        """(N, 3) displacement in sensor axes of one in base axes."""
-        return np.asarray(shift @ self.view.T)
-
-
-def scene(world: World, states: States) -> Scene:
-    """Return where the arm rests."""
-    rest, sight = world.rest(states), world.sight(states)
-    flange = rest.flange
-    place = flange[:, :3, 3] + flange[:, :3, :3] @ world.cell.target[:3, 3]
-    return Scene(
-        states, rest, world.drive_torque(states), place, sight.position, sight.jacobian[:, :3],
-        world.registration[:3, :3],
-    )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,7 +66,7 @@ def _dead_zone(rng: np.random.Generator) -> Foreign:
 
     def displaced(s: Scene) -> Floats:
         torque = s.torque[:, j - 1]
-        preload = 0.5 * float(np.median(np.abs(torque)))
+        preload = 0.5 * float(np.median(np.abs(s.first.torque[:, j - 1])))
         return s.of_joint(j, np.sign(torque) * np.maximum(np.abs(torque) - preload, 0.0))
 
     words = f"dq_{j} = c (tau_{j} beyond a preload)"
@@ -197,7 +153,7 @@ def _stick_slip(rng: np.random.Generator) -> Foreign:
 
     def displaced(s: Scene) -> Floats:
         torque = np.abs(s.torque[:, j - 1])
-        grip = 1.0 - np.exp(-torque / np.median(torque))
+        grip = 1.0 - np.exp(-torque / np.median(np.abs(s.first.torque[:, j - 1])))
         return s.of_joint(j, _given(s.states.approach)[:, j - 1] * grip)
 
     names = frozenset({_torque(j), f"joint {j} approach"})
@@ -294,7 +250,8 @@ def _settling(rng: np.random.Generator) -> Foreign:
 
     def displaced(s: Scene) -> Floats:
         time = _given(s.states.time)
-        return s.of_joint(j, s.torque[:, j - 1] * np.sqrt(time - time.min()))
+        past = np.maximum(time - _given(s.first.states.time).min(), 0.0)
+        return s.of_joint(j, s.torque[:, j - 1] * np.sqrt(past))
 
     return Foreign(
         f"dq_{j} = c tau_{j} sqrt(t)", displaced, (f"joint {j}",), frozenset({_torque(j), "time"})
@@ -322,7 +279,8 @@ def _soft_play(rng: np.random.Generator) -> Foreign:
 
     def displaced(s: Scene) -> Floats:
         torque = s.torque[:, j - 1]
-        return s.of_joint(j, np.arctan(torque / (share * np.median(np.abs(torque)))))
+        whole = np.median(np.abs(s.first.torque[:, j - 1]))
+        return s.of_joint(j, np.arctan(torque / (share * whole)))
 
     words = f"dq_{j} = c atan(tau_{j}/tau0)"
     return Foreign(words, displaced, (f"joint {j}",), frozenset({_torque(j)}))
@@ -332,10 +290,12 @@ def _taut_hose(rng: np.random.Generator) -> Foreign:
     """A hose from forearm to flange that pulls joint 4 once the wrist has stretched it."""
     lever = float(rng.uniform(0.5, 0.9))
 
-    def displaced(s: Scene) -> Floats:
+    def length(s: Scene) -> Floats:
         bend = np.cos(s.states.q[:, 4]) * np.cos(s.states.q[:, 5])
-        length = np.sqrt(1.0 + lever**2 - 2.0 * lever * bend)
-        return s.of_joint(4, np.maximum(length - np.quantile(length, 0.3), 0.0))
+        return np.sqrt(1.0 + lever**2 - 2.0 * lever * bend)
+
+    def displaced(s: Scene) -> Floats:
+        return s.of_joint(4, np.maximum(length(s) - np.quantile(length(s.first), 0.3), 0.0))
 
     names = frozenset({_angle(5), _angle(6)})
     words = f"dq_4 = c (a hose over joints 5 and 6, lever {lever:.1f}, taut beyond its length)"
@@ -349,7 +309,8 @@ def _warming_up(rng: np.random.Generator) -> Foreign:
 
     def displaced(s: Scene) -> Floats:
         time = _given(s.states.time)
-        warm = 1.0 - np.exp(-time / (share * time.max()))
+        last = _given(s.first.states.time).max()
+        warm = 1.0 - np.exp(-time / (share * last))
         return s.of_joint(j, warm * np.cos(s.states.q[:, j - 1]))
 
     names = frozenset({_angle(j), "time"})

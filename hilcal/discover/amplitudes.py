@@ -4,6 +4,7 @@ A function of one quantity has the complexity of its shape, a sum of two joints 
 has the sum of its factors'.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -26,7 +27,7 @@ class Factor:
     @property
     def cost(self) -> int:
         """Complexity."""
-        return self.shape.cost + (self.variable.kind == "sum")
+        return self.shape.cost + self.variable.cost
 
     def values(self, s: Situation) -> Floats:
         """(N,) of the states."""
@@ -36,6 +37,22 @@ class Factor:
     def power(self) -> float:
         """Power of the variable's unit that the factor has."""
         return self.shape.power(self.numbers)
+
+    def text(self) -> str:
+        """Return it as text."""
+        return self.shape.text(self.variable.symbol, [f"{x:g}" for x in self.numbers])
+
+    def latex(self) -> str:
+        """Return it in LaTeX."""
+        return self.shape.latex(self.variable.latex, [f"{x:g}" for x in self.numbers])
+
+    def code(self) -> str:
+        """Return it as Python, of a situation s."""
+        return self.shape.code(self.variable.code, [repr(x) for x in self.numbers])
+
+    def slope_code(self) -> str:
+        """Return its derivative by the variable likewise."""
+        return self.shape.slope_code(self.variable.code, [repr(x) for x in self.numbers])
 
 
 @dataclass(frozen=True)
@@ -67,7 +84,7 @@ class Amplitude:
     @property
     def needs(self) -> tuple[str, ...]:
         """Columns of the readings that it needs."""
-        return tuple(dict.fromkeys(f.variable.need for f in self.factors if f.variable.need))
+        return tuple(dict.fromkeys(n for f in self.factors for n in f.variable.needs))
 
     def values(self, s: Situation) -> Floats:
         """(N,) of the states."""
@@ -84,6 +101,28 @@ class Amplitude:
             if f.power and f.variable.unit != "1":
                 powers[f.variable.unit] = powers.get(f.variable.unit, 0.0) + f.power
         return powers
+
+    def text(self) -> str:
+        """Return the product as text."""
+        return "·".join(f.text() for f in self.factors)
+
+    def latex(self) -> str:
+        """Return the product in LaTeX."""
+        return r"\,".join(f.latex() for f in self.factors)
+
+    def code(self) -> str:
+        """Return the product as Python, of a situation s."""
+        parts = [f.code() for f in self.factors] or ["np.ones(len(s.angle))"]
+        return parts[0] if len(parts) == 1 else " * ".join(f"({part})" for part in parts)
+
+    def slopes(self) -> Iterator[tuple[tuple[int, int], str]]:
+        """Yield slots and components of transmitted wrenches, and its derivative by each."""
+        for i, f in enumerate(self.factors):
+            others = Amplitude((*self.factors[:i], *self.factors[i + 1 :]))
+            for slot, inner in f.variable.slopes():
+                parts = [f.slope_code(), *([inner] if inner else [])]
+                parts += [others.code()] if others.factors else []
+                yield slot, " * ".join(f"({part})" for part in parts)
 
     def unit(self) -> str:
         """Unit of the product; "1" where it has none."""

@@ -3,8 +3,9 @@
 1. Where the stated noise explains the residual, there is nothing to explain.
 2. All candidates are screened, and laws of one, two and three terms chosen (`search`).
 3. The catalogue is given the same chance: its effects are added by algebra as long as they are
-   significant. Where they explain the readings as well as the law, at odds of 20 : 1, the answer is
-   the catalogue, and no law is proposed; nor is one that an effect of it describes.
+   significant, and refitted in the exact model. Where they explain the readings as well as the law
+   in either, at odds of 20 : 1, the answer is the catalogue, and no law is proposed; nor is one
+   that an effect of it describes (`known_effects`).
 4. The search is repeated without each fold of poses. A law is proposed only where the laws so found
    predict the poses left out.
 5. Free numbers are refined, and the law is refitted as an effect in the exact model.
@@ -17,31 +18,27 @@ from typing import Literal
 
 import numpy as np
 
-from hilcal.diagnose.effect_ranking import FALSE_ALARM, catalogue_columns
 from hilcal.diagnose.noise_verdict import MISFIT_ALARM, PREDICTABLE
 from hilcal.diagnose.residual_regression import residual_regression
 from hilcal.discover.curve import Curve, curves
 from hilcal.discover.folds import FoldSearch, found_again, search_by_folds, stability
+from hilcal.discover.known_effects import KnownEffects, instead_of_law, known_effects, resembling
 from hilcal.discover.law import (
     Coefficient,
     Form,
     Law,
-    Resemblance,
     form_of,
 )
 from hilcal.discover.problem import Problem
 from hilcal.discover.refit import at_linearisation, exact, refine
 from hilcal.discover.screen import Screen, screen
-from hilcal.discover.search import LEAST, MOST_TERMS, SAME, Selection, alternatives, search
+from hilcal.discover.search import MOST_TERMS, Selection, alternatives, search
 from hilcal.discover.write_effect import source_of_form
 from hilcal.errors import HilcalError, InputError
 from hilcal.identify.fit import Fit
 from hilcal.identify.linearisation import left_out_by_pose, linearise
-from hilcal.regression import forward_selection as selection
 from hilcal.regression.distributions import chi2
 from hilcal.regression.evidence import score_family
-from hilcal.regression.forward_selection import families_beside
-from hilcal.regression.leave_out import left_out_residuals
 from hilcal.types import Floats
 
 Reason = Literal["law", "adequate", "catalogue", "no_law", "unpredictable"]
@@ -53,7 +50,6 @@ Reason = Literal["law", "adequate", "catalogue", "no_law", "unpredictable"]
 - no_law: something predicts it, but no law of this complexity does;
 - unpredictable: nothing recorded predicts it.
 """
-MOST_TOGETHER = 6
 LEAST_SHARE = 0.1
 """Share of the misfit on poses left out that a law must explain, searched for without them."""
 NEAR = 0.7
@@ -126,19 +122,15 @@ def discover(
         return _silent(fit, found, say, 0.0)
     best = max(selections, key=lambda s: s.total)
     say("comparing with the catalogue")
-    chain, total, columns = _catalogue(fit)
-    near = _resembling(problem, best, columns)
-    same = (
-        near and near[0].cosine >= SAME and not _tells_more(problem, best, columns, near[0].effect)
-    )
-    if total > best.total - LEAST or same:
-        names = tuple(chain) or (near[0].effect,)
+    known = known_effects(fit)
+    names = instead_of_law(fit, problem, best, known)
+    if names:
         return Discovery(fit, "catalogue", catalogue=names, candidates=found.candidates)
     say("repeating the search without each fold of poses")
     folds = search_by_folds(found, MOST_TERMS)
     if not folds.sure or folds.share < LEAST_SHARE:
         return _silent(fit, found, say, folds.share)
-    return _laws(fit, problem, selections, folds, columns, say, name)
+    return _laws(fit, problem, selections, folds, known, say, name)
 
 
 def rival_sources(d: Discovery) -> dict[str, str]:
@@ -162,25 +154,6 @@ def _silent(fit: Fit, found: Screen, say: Callable[[str], None], searched: float
     )
 
 
-_Columns = tuple[Floats, dict[str, slice]]
-
-
-def _catalogue(fit: Fit) -> tuple[list[str], float, _Columns]:
-    """Effects that explain the misfit together, their evidence less the choice, and columns."""
-    linear = linearise(fit)
-    x, columns, most = catalogue_columns(fit)
-    families = families_beside(linear.information(x), linear.residual, fit.dof, x, columns, most)
-    tested = max(len(families.columns), 1)
-    names: list[str] = []
-    total = 0.0
-    for step in selection.forward_selection(families, MOST_TOGETHER):
-        if step.score.log_evidence <= 0 or step.score.p_value * tested >= FALSE_ALARM:
-            break
-        names.append(step.name)
-        total += step.score.log_evidence - float(np.log(tested))
-    return names, total, (x, columns)
-
-
 def curve(problem: Problem, s: Selection) -> Floats:
     """(R,) what a law explains of the residual, the model projected out."""
     x = np.hstack([problem.columns(t) for t in s.terms])
@@ -189,54 +162,12 @@ def curve(problem: Problem, s: Selection) -> Floats:
     return np.asarray(free @ step)
 
 
-def _resembling(problem: Problem, s: Selection, catalogue: _Columns) -> tuple[Resemblance, ...]:
-    """Effects that describe what a law does, the nearest first.
-
-    An effect is fitted to the law without each fold of poses, and predicts it there: an effect of
-    many parameters describes anything else in few poses.
-    """
-    x, columns = catalogue
-    linear = problem.screen.linear
-    law = np.hstack([problem.columns(t) for t in s.terms])
-    free = problem.model.project_out(law)
-    y = (law @ np.linalg.lstsq(free, problem.residual, rcond=1e-8)[0])[:, None]
-    folds = linear.folds
-    whole = float(np.sum(left_out_residuals(folds, linear.projection, y) ** 2))
-    out = []
-    for effect, part in columns.items():
-        left = left_out_residuals(folds, linear.projection, y, x[:, part])
-        share = 1.0 - float(np.sum(left**2)) / max(whole, 1e-300)
-        out.append(Resemblance(effect, float(np.sqrt(max(share, 0.0)))))
-    return tuple(sorted(out, key=lambda r: -r.cosine))
-
-
-def _tells_more(problem: Problem, s: Selection, catalogue: _Columns, effect: str) -> bool:
-    """Whether odds of 20 : 1, the search paid for, ask for a law beside an effect that is near it.
-
-    An effect of the catalogue is preferred to a law that describes the same; a law that readings
-    tell from it, as a power of 2.3 from a cube, is not the same.
-    """
-    x, columns = catalogue
-    law = np.hstack([problem.columns(t) for t in s.terms])
-    both = np.hstack([x[:, columns[effect]], law])
-    count = both.shape[1] - law.shape[1]
-    places = {"effect": slice(0, count), "law": slice(count, both.shape[1])}
-    families = families_beside(
-        problem.model.information(both), problem.residual, problem.dof, both, places, {}
-    )
-    score = families.scores()["effect"]
-    if not score.rank:
-        return True
-    beside = families.with_family("effect", score).scores()["law"]
-    return bool(beside.log_evidence - sum(t.price for t in s.terms) > LEAST)
-
-
 def _laws(
     fit: Fit,
     problem: Problem,
     selections: list[Selection],
     folds: FoldSearch,
-    catalogue: _Columns,
+    known: KnownEffects,
     say: Callable[[str], None],
     name: str,
 ) -> Discovery:
@@ -255,7 +186,7 @@ def _laws(
             continue
         left = left_out_by_pose(after)
         share = float(np.clip((before.sum() - left.sum()) / misfit, -1.0, 1.0))
-        law = _law(problem, s, form, name, coefficients, share, after, folds, catalogue)
+        law = _law(problem, s, form, name, coefficients, share, after, folds, known)
         evidence = (
             f"It explains {100 * share:.0f} % of the misfit on poses left out; p-value "
             f"{law.p_value:.1g}, the search\npaid for."
@@ -301,18 +232,19 @@ def _law(
     share: float,
     after: Fit,
     folds: FoldSearch,
-    catalogue: _Columns,
+    known: KnownEffects,
 ) -> Law:
     linear = problem.screen.linear
     x = np.hstack([problem.columns(t) for t in s.terms])
     score = score_family(linear.information(x), x.T @ linear.residual, linear.rss, linear.fit.dof)
     price = sum(t.price for t in s.terms)
     p_value = float(np.exp(min(np.log(max(score.p_value, 1e-300)) + price, 0.0)))
-    near = tuple(r for r in _resembling(problem, s, catalogue) if r.cosine >= NEAR)
+    near = tuple(r for r in resembling(problem, s, known) if r.cosine >= NEAR)
     situation = linear.fit.solution.prediction.situation
-    known = {f.variable.symbol: f.variable for p in form.parts for f in p.amplitude.factors}
+    factors = (f for p in form.parts for f in p.amplitude.factors)
+    read = {v.symbol: v for f in factors for v in f.variable.recorded}
     ranges = []
-    for symbol, v in known.items():
+    for symbol, v in read.items():
         values = v.read(situation)
         ranges.append((symbol, float(values.min()), float(values.max()), v.unit))
     others: dict[str, Form] = {}

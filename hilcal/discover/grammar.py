@@ -15,6 +15,7 @@ import numpy as np
 
 from hilcal.discover import shapes
 from hilcal.discover.amplitudes import Amplitude, Factor, different
+from hilcal.discover.composed import Composed
 from hilcal.discover.functions import FINEST, fine_waves, functions
 from hilcal.discover.shapes import Numbers
 from hilcal.discover.variables import Variable
@@ -27,6 +28,16 @@ MOST_FACTORS = 2
 """Factors of a product; a choice, likewise."""
 SOME = 2000
 """Products that are formed at a time; a choice, for memory."""
+ARGUMENT = 2
+"""Complexity of a product in a composed quantity; a choice, by the number of them."""
+COMPOSED_OF = {
+    "angle", "torque", "load", "gravity", "temperature", "time", "hanging", "place",
+}  # fmt: skip
+"""Quantities of which others are composed; a choice: components in joint axes are too many."""
+WAVES_OF_ARGUMENT = 2
+"""Multiples of an angle in a composed quantity; a choice."""
+SHAPES = 5
+"""Functions of a composed quantity: bends to both sides, the same with an exponent, steps."""
 FLAT = 0.1
 """Factors whose spread is a smaller share of their size are in no product: it would be the other
 factor's law to within that share. A choice."""
@@ -43,6 +54,8 @@ class Grammar:
         size: (F,) what they were divided by.
         cost: (F,) complexities.
         partner: (F,) the amplitude with sine for cosine in its first periodic factor; −1 for none.
+        less: (2, F) the amplitude without the first and without the second factor of a product of
+            two; −1 for no product.
         situation: of the readings.
         singles: the functions of one quantity from which products are made.
     """
@@ -53,6 +66,7 @@ class Grammar:
     size: Floats
     cost: Ints
     partner: Ints
+    less: Ints
     situation: Situation
     singles: tuple[Factor, ...]
     _more: list[tuple[Amplitude, Floats, float]] = field(default_factory=list)
@@ -114,6 +128,15 @@ class Grammar:
     def _places(self) -> dict[frozenset[tuple[str, str, Numbers]], int]:
         return {_key(a): k for k, a in enumerate(self.amplitudes)}
 
+    def tuned(self, a: Amplitude) -> int:
+        """Return how many factors have numbers that are not of the grid."""
+        return sum(k not in self._grid for k in _key(a))
+
+    @cached_property
+    def _grid(self) -> frozenset[tuple[str, str, Numbers]]:
+        alone = (a for a in self.amplitudes if len(a.factors) == 1)
+        return frozenset(k for a in alone for k in _key(a))
+
     def inner(self, k: int) -> list[int]:
         """Return the amplitudes with one factor less."""
         factors = self.at(k).factors
@@ -127,6 +150,10 @@ class Grammar:
 
     def price_of(self, a: Amplitude, sites: int) -> float:
         """Return the same of any product: as if all of its complexity had been tried."""
+        if len(a.factors) == 1 and isinstance(u := a.factors[0].variable, Composed):
+            # Further products of a sum are paid for where they are added.
+            argument = float(self.price_of_argument(np.array(u.terms[0][1].cost)))
+            return argument + log(SHAPES * sites) + log(2.0) * a.factors[0].shape.cost
         kind = a.cost, len(a.factors)
         count = self._counts.get(kind, self._counts.get((a.cost, 0), 1))
         return log(max(count, 1) * sites) + log(2.0) * a.cost
@@ -143,10 +170,45 @@ class Grammar:
             **{(cost, 0): count for cost, count in enumerate(own)},
         }
 
+    def price_of_argument(self, cost: Ints) -> Floats:
+        """Log of the number of arguments of complexities (…), and of 2 per unit of them."""
+        return np.asarray(self._of_argument[cost])
+
+    @cached_property
+    def _of_argument(self) -> Floats:
+        """(C,) log of the number of products in arguments, and of 2 per unit, by complexity."""
+        count = np.bincount(self.cost[self.smooth], minlength=ARGUMENT + 1)
+        return np.asarray(np.log(np.maximum(count, 1)) + log(2.0) * np.arange(len(count)))
+
+    @cached_property
+    def smooth(self) -> Ints:
+        """(F',) products of which composed quantities are made: without a bend, and simple."""
+        found = [k for k, a in enumerate(self.amplitudes) if _smooth(a)]
+        return np.array(sorted(found, key=lambda k: self.cost[k]), dtype=np.int_)
+
+    @cached_property
+    def unit_of_smooth(self) -> dict[int, str]:
+        """Unit of each of these."""
+        return {k: self.at(k).unit() for k in self.smooth.tolist()}
+
     @cached_property
     def depends(self) -> tuple[frozenset[str], ...]:
         """Names of the quantities that each amplitude depends on."""
         return tuple(frozenset(a.names) for a in self.amplitudes)
+
+
+def _smooth(a: Amplitude) -> bool:
+    kinds = {f.variable.kind for f in a.factors}
+    if not 0 < a.cost <= ARGUMENT or not kinds <= COMPOSED_OF | {"sum"}:
+        return False
+    if len(a.factors) > 1 and "sum" in kinds:
+        return False
+    return all(
+        f.shape.name == "linear"
+        or (f.shape.name in ("cos", "sin") and f.numbers[0] <= WAVES_OF_ARGUMENT)
+        or (f.shape.name == "even" and f.numbers[0] == 2)
+        for f in a.factors
+    )
 
 
 def _key(a: Amplitude) -> frozenset[tuple[str, str, Numbers]]:
@@ -182,6 +244,9 @@ def grammar(known: list[Variable], s: Situation, poses: int = 0) -> Grammar:
     place = {pairs[k]: at for at, k in enumerate(kept.tolist())}
     turned = _turned(singles)
     partner = np.array([_partner(pairs[k], turned, place) for k in kept.tolist()])
+    alone = np.array([place.get((i, -1), -1) for i in range(-1, len(singles))])
+    first, second = np.array(pairs)[kept].T
+    less = np.where(second >= 0, [alone[second + 1], alone[first + 1]], -1)
     return Grammar(
         known,
         amplitudes,
@@ -189,6 +254,7 @@ def grammar(known: list[Variable], s: Situation, poses: int = 0) -> Grammar:
         size,
         np.array([a.cost for a in amplitudes]),
         partner,
+        less,
         s,
         tuple(
             f

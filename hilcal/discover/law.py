@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilcal.discover.amplitudes import Amplitude, unit_of
+from hilcal.discover.amplitudes import Amplitude, Factor, unit_of
 from hilcal.discover.screen import Screen
 from hilcal.discover.sites import ORDINARY, Site
 from hilcal.discover.terms import Term
@@ -117,20 +117,12 @@ class Form:
         return w.whiten_readings(raw)
 
 
-def _numbers(numbers: tuple[float, ...]) -> list[str]:
-    return [f"{x:g}" for x in numbers]
-
-
 def _amplitude_text(letter: str, a: Amplitude) -> str:
-    pieces = [letter]
-    pieces += [f.shape.text(f.variable.symbol, _numbers(f.numbers)) for f in a.factors]
-    return "·".join(pieces)
+    return f"{letter}·{a.text()}" if a.factors else letter
 
 
 def _amplitude_latex(letter: str, a: Amplitude) -> str:
-    pieces = [letter]
-    pieces += [f.shape.latex(f.variable.latex, _numbers(f.numbers)) for f in a.factors]
-    return r"\,".join(pieces)
+    return rf"{letter}\,{a.latex()}" if a.factors else letter
 
 
 def form_of(screen: Screen, terms: tuple[Term, ...]) -> Form:
@@ -145,15 +137,12 @@ def form_of(screen: Screen, terms: tuple[Term, ...]) -> Form:
     return Form(tuple(parts))
 
 
-def with_numbers(form: Form, numbers: dict[tuple[int, int], tuple[float, ...]]) -> Form:
-    """Return a law with other numbers in its functions, by part and factor."""
+def with_factors(form: Form, factors: dict[tuple[int, int], Factor]) -> Form:
+    """Return a law with other factors, by part and place in its product."""
     parts = []
     for k, p in enumerate(form.parts):
-        factors = tuple(
-            replace(f, numbers=numbers.get((k, i), f.numbers))
-            for i, f in enumerate(p.amplitude.factors)
-        )
-        parts.append(replace(p, amplitude=Amplitude(factors)))
+        own = tuple(factors.get((k, i), f) for i, f in enumerate(p.amplitude.factors))
+        parts.append(replace(p, amplitude=Amplitude(own)))
     return Form(tuple(parts))
 
 

@@ -11,17 +11,15 @@ from functools import cached_property
 
 import numpy as np
 
+from hilcal.discover.compose import composed_terms
+from hilcal.discover.gains import keep_largest, orthonormal, together
 from hilcal.discover.grow import grown
 from hilcal.discover.screen import LEAST_MOTION, SEEN, Screen
 from hilcal.discover.terms import Found, Scored, Screened, Term
 from hilcal.regression.evidence import FamilyScore, score_family
 from hilcal.regression.projection import Projection, projection
-from hilcal.types import Bools, Floats, Ints
+from hilcal.types import Bools, Floats
 
-SHORT_LIST = 200
-"""Candidates that are scored in full at each step; a choice."""
-OF_SITE = 60
-"""Of each site at most; a choice."""
 EXTENDED = 40
 """Of these, those that are extended to other axes and joints; a choice."""
 
@@ -29,10 +27,10 @@ EXTENDED = 40
 LEFT = 1e-3
 """Share of a column's square that chosen terms must leave for it to count as another; a choice."""
 LOG2 = float(np.log(2.0))
+LOG_ZERO = 2 * LOG2
+"""Price of a free zero of one of two factors: for having one, and for which."""
 LEAST_RIDGE = 1e-6
 """Least ridge of the model's directions, not all of which some rows determine; a choice."""
-SPANNED = 1e-9
-"""Directions of chosen columns below this share of the largest are rounding."""
 
 
 class Problem:
@@ -139,6 +137,11 @@ class Beside:
     def _shadows(self) -> tuple[list[Floats], Floats, list[Floats]]:
         return self.problem.shadows(self._x) if self.chosen else ([], np.zeros(0), [])
 
+    def taken(self) -> Iterator[tuple[float, Floats]]:
+        """Yield uᵀ r and u (R',), in the rows of the screening, of what chosen terms take."""
+        _, told, units = self._shadows
+        yield from zip(told.tolist(), units, strict=True)
+
     @cached_property
     def screened(self) -> "Screened":
         """All candidates beside the model and the chosen terms."""
@@ -204,13 +207,15 @@ class Beside:
         """Return the candidates with the best odds, by what is free beside the coefficient.
 
         Keys: "" for nothing; "p" for the phase: with the partner; "c" for a constant at the site,
-        and "pc" for both.
+        and "pc" for both; "1" and "2" for the zero of the first and of the second factor of a
+        product: with the other factor alone.
         """
         p, all_ = self.problem, self.screened
-        partner = p.screen.grammar.partner
+        words, one = p.screen.grammar, p.screen.one
+        partner = words.partner
         has = np.flatnonzero(partner >= 0)
-        one = p.screen.one
-        found: dict[str, list[Found]] = {"": [], "p": [], "c": [], "pc": []}
+        products = np.flatnonzero((words.less >= 0).all(axis=0))
+        found: dict[str, list[Found]] = {k: [] for k in ("", "p", "c", "pc", "1", "2")}
         for s in range(len(p.screen.sites)):
             price = self._prices(s).astype(np.float32)
             a, g, h = all_.square[s], all_.slope[s], all_.across[s]
@@ -229,19 +234,23 @@ class Beside:
                     seen = seen & (a > LEFT * all_.square[s])
                 safe = np.where(seen, a, 1.0)
                 gain = np.where(seen, g * g / safe, 0.0)
-                odds = self._evidence(gain + gain0, 1 + constant) - price - LOG2 * constant
-                found[own] += _largest(np.where(seen, odds, -np.inf), s)
-                b, k = safe[partner[has]], g[partner[has]]
-                ah, gh, hh = safe[has], g[has], h[has]
-                det = ah * b - hh * hh
-                ok = seen[has] & seen[partner[has]] & (det > 1e-3 * ah * b)
-                both = (b * gh * gh - 2 * hh * gh * k + ah * k * k) / np.where(ok, det, 1.0)
-                odds = self._evidence(np.where(ok, both, 0.0) + gain0, 2 + constant)
+                odds = self.evidence(gain + gain0, 1 + constant) - price - LOG2 * constant
+                keep_largest(found[own], np.where(seen, odds, -np.inf), s)
+                both = together(safe, g, h, seen, has, partner)
+                odds = self.evidence(both + gain0, 2 + constant)
                 odds = odds - price[has] - LOG2 * (1 + constant)
-                found["p" + own] += _largest(np.where(ok, odds, -np.inf), s, has)
-        return {k: sorted(v, key=lambda x: -x.odds)[:SHORT_LIST] for k, v in found.items()}
+                keep_largest(found["p" + own], np.where(both > 0, odds, -np.inf), s, has)
+            a, g = all_.square[s], all_.slope[s]
+            for key, less, h in zip("12", words.less, p.screen.across_less[:, s], strict=True):
+                h = np.float32(p.share) * h
+                for told in (shadow[s] for shadow in self._shadows[0]):
+                    h = h - told * told[less]
+                both = together(np.where(a > 0, a, 1.0), g, h, a > 0, products, less)
+                odds = self.evidence(both, 2) - price[products] - LOG_ZERO
+                keep_largest(found[key], np.where(both > 0, odds, -np.inf), s, products)
+        return found
 
-    def _evidence(self, gain: Floats, count: int) -> Floats:
+    def evidence(self, gain: Floats, count: int) -> Floats:
         """Log evidence of columns at the best strength, by Laplace: for the short list only."""
         share = np.clip(gain / np.float32(self.problem.seen * self.rss), 0.0, 0.99999)
         share = share.astype(np.float32)
@@ -259,13 +268,13 @@ class Beside:
         slope = values @ (form.T @ thin)
         lifted = values @ screen.free[s]
         square = np.float32(self.problem.share) * np.einsum("ck,ck->c", lifted, values)
-        for told, unit in zip(*self._shadows[1:], strict=True):
+        for told, unit in self.taken():
             own = values @ (form.T @ unit)
-            slope, square = slope - told * own, square - own**2
+            slope, square = slope - np.float32(told) * own, square - own**2
         moved = values**2 @ np.sum(form**2, axis=0)
         seen = square > SEEN * moved + LEAST_MOTION
         gain = np.where(seen, slope**2 / np.where(seen, square, 1.0), 0.0)
-        return np.where(seen, self._evidence(gain, 1), -np.inf)
+        return np.where(seen, self.evidence(gain, 1), -np.inf)
 
     def score(self, terms: Sequence[Term]) -> list[Scored]:
         """Score terms exactly beside the chosen ones."""
@@ -312,11 +321,18 @@ class Beside:
                 if other is not None:
                     parts = ((x.s, x.f), (x.s, other), *((x.s, k) for k in more))
                     add(self.term(parts, LOG2 * (1 + len(more))))
+        for key, without in (("1", 0), ("2", 1)):
+            for x in found[key][:EXTENDED]:
+                less = self.problem.screen.grammar.less[:, x.f].tolist()
+                add(self.term(((x.s, x.f), (x.s, less[without])), LOG_ZERO))
+                parts = tuple((x.s, k) for k in (x.f, *less) if self.problem.screen.visible(x.s, k))
+                add(self.term(parts, LOG_ZERO + LOG2))
         firsts = found[""][:EXTENDED]
         for x in firsts:
             for t in self._extended(x.s, x.f):
                 add(t)
-        for t in grown(self, sorted(firsts + found["c"][:EXTENDED], key=lambda x: -x.odds)):
+        best = sorted(firsts + found["c"][:EXTENDED], key=lambda x: -x.odds)
+        for t in (*grown(self, best), *composed_terms(self)):
             add(t)
         return list(out.values())
 
@@ -335,7 +351,7 @@ class Beside:
         for inner in grammar.inner(f):
             # The zero of one factor is free, as that of a temperature.
             if screen.visible(s, inner):
-                yield self.term(((s, f), (s, inner)), LOG2)
+                yield self.term(((s, f), (s, inner)), LOG_ZERO)
         if any(x.variable.vector for x in amplitude.factors):
             # A vector's components along all axes of the site.
             by_axis = []
@@ -361,23 +377,3 @@ class Beside:
         if len(parts) > 1:
             yield self.term(parts, LOG2)
             yield self.term(parts, LOG2, common=True)
-
-
-def orthonormal(model: Projection, x: Floats) -> Floats:
-    """(R, K) M X T of columns X (R, P) with Tᵀ Xᵀ M X T = 1, without what X does not span."""
-    free = model.project_out(x)
-    gram = x.T @ free
-    values, vectors = np.linalg.eigh((gram + gram.T) / 2)
-    kept = values > SPANNED * values[-1]
-    return np.asarray(free @ (vectors[:, kept] / np.sqrt(values[kept])))
-
-
-def _largest(odds: Floats, s: int, which: Ints | None = None) -> list[Found]:
-    """Return the best candidates of a site."""
-    count = min(OF_SITE, len(odds))
-    top = np.argpartition(-odds, count - 1)[:count]
-    top = top[np.isfinite(odds[top])]
-    return [
-        Found(s, int(f if which is None else which[f]), float(x))
-        for f, x in zip(top.tolist(), odds[top].tolist(), strict=True)
-    ]

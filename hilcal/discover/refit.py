@@ -6,12 +6,12 @@ and the model's projected out. A refined number is kept where it gains more evid
 costs, else the one of the grid, which is simpler.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from hilcal.discover.law import LETTERS, Coefficient, Form, ordinary, with_numbers
+from hilcal.discover.free_numbers import free_numbers, with_values
+from hilcal.discover.law import LETTERS, Coefficient, Form, ordinary
 from hilcal.discover.screen import Screen
 from hilcal.discover.write_effect import effect_class, source_of_form
 from hilcal.effects.protocol import Situation
@@ -24,8 +24,6 @@ WORTH = 3.0
 DIGITS = 3
 SPANNED = 1e-10
 """Directions of a law's columns below this share of the largest are rounding."""
-RANGE = 30.0
-"""Factor by which a refined number may differ from that of the grid; a choice."""
 
 
 def refine(screen: Screen, form: Form) -> Form:
@@ -34,67 +32,35 @@ def refine(screen: Screen, form: Form) -> Form:
 
     linear = screen.linear
     s = linear.fit.solution.prediction.situation
-    free = _free(form)
+    free = free_numbers(form, s)
     if not free:
         return form
-    begin = np.array([value for _, _, value in free])
     best = left_by(screen, form, s)
 
-    def at(x: Floats) -> Form:
-        return _with(form, free, begin * np.exp(x))
+    def at(x: Floats) -> list[float]:
+        return [number.at(v) for number, v in zip(free, x.tolist(), strict=True)]
 
     def objective(x: Floats) -> float:
-        if np.any(np.abs(x) > np.log(RANGE)):
+        values = at(x)
+        if not np.isfinite(values).all():
             return np.inf
-        return left_by(screen, at(x), s)
+        return left_by(screen, with_values(form, free, values), s)
 
     found = minimize(
-        objective, np.zeros(len(begin)), method="Nelder-Mead",
-        options={"maxfev": 60 * len(begin), "xatol": 1e-3, "fatol": 1e-3,
-                 "initial_simplex": _simplex(len(begin))},
+        objective, np.zeros(len(free)), method="Nelder-Mead",
+        options={"maxfev": 60 * len(free), "xatol": 1e-3, "fatol": 1e-3,
+                 "initial_simplex": _simplex(len(free))},
     )  # fmt: skip
-    refined = _with(form, free, [float(f"{v:.{DIGITS}g}") for v in begin * np.exp(found.x)])
+    values = [float(f"{v:.{DIGITS}g}") for v in at(found.x)]
+    refined = with_values(form, free, values)
     after = left_by(screen, refined, s)
     dof = linear.fit.dof
     gain = 0.5 * dof * np.log(best / max(after, 1e-300))
-    return refined if gain > len(begin) * (0.5 * np.log(dof)) + WORTH else form
+    return refined if gain > len(free) * (0.5 * np.log(dof)) + WORTH else form
 
 
 def _simplex(count: int) -> Floats:
     return np.vstack([np.zeros(count), 0.3 * np.eye(count)])
-
-
-def _free(form: Form) -> list["_Free"]:
-    """Places (part, factor) of each free number, its index there, and its value.
-
-    The same function of the same quantity in several products has one number.
-    """
-    groups: dict[tuple[str, str, tuple[float, ...]], list[tuple[int, int]]] = {}
-    for k, p in enumerate(form.parts):
-        for i, f in enumerate(p.amplitude.factors):
-            if f.shape.free:
-                key = f.variable.symbol, f.shape.name, f.numbers
-                groups.setdefault(key, []).append((k, i))
-    out = []
-    for (_, _, numbers), places in groups.items():
-        k, i = places[0]
-        for number in form.parts[k].amplitude.factors[i].shape.free:
-            if numbers[number] > 0:
-                out.append((places, number, numbers[number]))
-    return out
-
-
-_Free = tuple[list[tuple[int, int]], int, float]
-"""Places (part, factor) of a free number, its index there, its value."""
-
-
-def _with(form: Form, free: list[_Free], values: Sequence[float] | Floats) -> Form:
-    numbers: dict[tuple[int, int], tuple[float, ...]] = {}
-    for (places, number, _), value in zip(free, values, strict=True):
-        for k, i in places:
-            old = numbers.get((k, i), form.parts[k].amplitude.factors[i].numbers)
-            numbers[k, i] = (*old[:number], float(value), *old[number + 1 :])
-    return with_numbers(form, numbers)
 
 
 def left_by(screen: Screen, form: Form, s: Situation) -> float:

@@ -15,6 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from hilcal.discover.amplitudes import Amplitude
+from hilcal.discover.bends import Bends, bends
 from hilcal.discover.grammar import Grammar, grammar
 from hilcal.discover.sites import Site, site_motions
 from hilcal.discover.variables import variables
@@ -51,6 +52,7 @@ class Screen:
         square: (S, F) xᵀ M x; zero where the model explains a column.
         across: (S, F) xᵀ M x' with the partner of each amplitude.
         across_one: (S, F) xᵀ M x' with a constant at the site.
+        across_less: (2, S, F) xᵀ M x' of a product with what is left without either factor.
     """
 
     linear: Linearisation
@@ -64,6 +66,7 @@ class Screen:
     square: Floats
     across: Floats
     across_one: Floats
+    across_less: Floats
 
     @cached_property
     def price(self) -> Floats:
@@ -101,6 +104,13 @@ class Screen:
         if amplitude < len(self.price):
             return float(self.price[amplitude])
         return self.grammar.price_of(self.grammar.at(amplitude), len(self.sites))
+
+    @cached_property
+    def bends(self) -> Bends:
+        """Bends and steps of composed quantities."""
+        return bends(
+            self.grammar, self.sites, self.readings, self.form, self.free, (SEEN, LEAST_MOTION)
+        )
 
     @cached_property
     def values(self) -> Floats:
@@ -141,6 +151,7 @@ def screen(linear: Linearisation) -> Screen:
     square: Floats = np.empty((len(places), len(words.size)), dtype=np.float32)
     across: Floats = np.zeros_like(square)
     across_one: Floats = np.zeros_like(square)
+    across_less: Floats = np.zeros((2, *square.shape), dtype=np.float32)
     every: Floats = np.empty((len(places), len(readings), len(readings)), dtype=np.float32)
     a = words.values[:, readings]
     squares = a**2
@@ -155,6 +166,7 @@ def screen(linear: Linearisation) -> Screen:
         every[k] = free = own.information(t).astype(np.float32)
         lifted = a @ free
         across_one[k] = lifted.sum(axis=1)  # a constant has the value 1
+        across_less[:, k] = _across_factors(words, a, lifted)
         square[k] = np.einsum("fn,fn->f", lifted, a)
         across[k, has] = np.einsum("fn,fn->f", lifted[has], a[words.partner[has]])
         seen = SEEN * (squares @ np.sum(t**2, axis=0).astype(np.float32)) + LEAST_MOTION
@@ -164,7 +176,33 @@ def screen(linear: Linearisation) -> Screen:
                 square[k, (kinds == kind).all(axis=1)] = 0.0
     return Screen(
         linear, words, places, motion, rows, readings, form, every, square, across, across_one,
+        across_less,
     )  # fmt: skip
+
+
+def _across_factors(words: Grammar, values: Floats, lifted: Floats) -> Floats:
+    """(2, F) xᵀ Q x' of products with what is left without the first, and the second factor.
+
+    With a product f g and Q symmetric, (f g)ᵀ Q g = fᵀ (g ∘ Q g): no product is formed.
+
+    Args:
+        words: the amplitudes.
+        values: (F, K) these, each with root mean square 1.
+        lifted: (F, K) Q of them.
+    """
+    out: Floats = np.zeros((2, len(words.size)), dtype=np.float32)
+    products = np.flatnonzero((words.less >= 0).all(axis=0))
+    if not len(products):
+        return out
+    second, first = words.less[:, products]
+    alone, place = np.unique(words.less[:, products], return_inverse=True)
+    g, f = place.reshape(2, -1)
+    v = values[alone]
+    both = v @ (v * lifted[alone]).T
+    scale = words.size[second] * words.size[first] / words.size[products]
+    out[0, products] = both[f, g] * scale
+    out[1, products] = both[g, f] * scale
+    return out
 
 
 def _thinned(fit: Fit) -> tuple[Bools, Ints]:

@@ -10,7 +10,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from hilcal.discover.problem import SHORT_LIST, Beside, Problem
+from hilcal.discover.gains import SHORT_LIST
+from hilcal.discover.problem import Beside, Problem
 from hilcal.discover.screen import Screen
 from hilcal.discover.terms import Scored, Term
 from hilcal.regression.forward_selection import families_beside
@@ -117,25 +118,36 @@ def _ordered(beside: Beside) -> list[Scored]:
     if not found:
         return []
     as_good = [c for c in found if c.odds > found[0].odds - LEAST]
-    first = min(as_good, key=lambda c: (_simplicity(beside.problem.screen, c.term), -c.odds))
+    first = min(as_good, key=lambda c: _preference(beside.problem.screen, c))
     return [first, *(c for c in found if c is not first)]
 
 
-def _simplicity(screen: Screen, t: Term) -> tuple[float, ...]:
-    """Coefficients, complexity, rank of sites and functions, joints apart; smaller is simpler.
+def _preference(screen: Screen, c: Scored) -> tuple[float, ...]:
+    """Which of terms as good is taken: the simplest, and of equally simple ones the likeliest.
 
-    Of causes that the readings do not tell apart, as joints that warm alike, the one of the joint
-    itself is simpler than that of another.
+    The rank of functions decides only where the odds are the same to within one.
+    """
+    *simple, functions = _simplicity(screen, c.term)
+    return (*simple, -round(c.odds), functions, -c.odds)
+
+
+def _simplicity(screen: Screen, t: Term) -> tuple[float, ...]:
+    """Numbers and complexity, rank of sites, joints apart, rank of functions; smaller is simpler.
+
+    A coefficient, and a number that is not of the grid, count as much as a unit of complexity: the
+    free zero of a factor is no less simple than an exponent of 4. Of causes that the readings do
+    not tell apart, as joints that warm alike, the one of the joint itself is simpler than that of
+    another.
     """
     amplitudes = [screen.grammar.at(a) for _, a in t.parts]
-    cost = max(a.cost for a in amplitudes)
+    cost = max(a.cost + screen.grammar.tuned(a) for a in amplitudes)
     sites = max(screen.sites[s].rank for s, _ in t.parts)
     functions = max(sum(f.shape.rank for f in a.factors) for a in amplitudes)
     apart = max(
         sum(_far(f.variable.joint, screen.sites[s].joint) for f in amplitudes[k].factors)
         for k, (s, _) in enumerate(t.parts)
     )
-    return t.count, cost, sites, functions, apart
+    return t.count + cost, sites, apart, functions
 
 
 def _far(quantity: int, site: int) -> int:

@@ -4,8 +4,8 @@ linear      x
 cos, sin    cos k x, sin k x
 odd, even   sign(x) |x|^p, |x|^p, rounded off at zero where p < 1
 plus, minus max(x, 0), max(−x, 0)
-above       max(x − x0, 0)
-below       max(x0 − x, 0)
+above       max(x − x0, 0), and a power of it
+below       max(x0 − x, 0), likewise
 saturation  tanh(x/x0), which for a small x0 is the sign of x
 log         log10(1 + x/unit)
 approach    1 − exp(−x/T)
@@ -55,7 +55,23 @@ class Shape:
     @property
     def rank(self) -> int:
         """Order in which equally good functions are shown: smaller is simpler."""
-        return {"linear": 0, "minus": 3, "above": 3, "below": 3, "even": 2}.get(self.name, 1)
+        return {
+            "linear": 0,
+            "minus": 3,
+            "above": 3,
+            "below": 3,
+            "even": 2,
+            "above_power": 3,
+            "below_power": 3,
+        }.get(self.name, 1)
+
+
+def _past(x: Floats) -> Floats:
+    return np.maximum(x, 1e-12)
+
+
+def _past_slope(x: str, power: str) -> str:
+    return f"{power} * np.maximum({x}, 1e-12) ** ({power} - 1) * ({x} > 0)"
 
 
 def _times(k: str, x: str) -> str:
@@ -210,6 +226,28 @@ BELOW = Shape(
     lambda x, p: rf"\max({p[0]} - {x}, 0)",
     lambda p: 1.0,
     (0,), (0,),
+)  # fmt: skip
+ABOVE_POWER = Shape(
+    "above_power", 3,
+    lambda x, p: np.maximum(x - p[0], 0.0) ** p[1],
+    lambda x, p: p[1] * _past(x - p[0]) ** (p[1] - 1) * (x > p[0]),
+    lambda x, p: f"np.maximum({x} - {_bracketed(p[0])}, 0.0) ** {p[1]}",
+    lambda x, p: _past_slope(f"({x} - {_bracketed(p[0])})", p[1]),
+    lambda x, p: f"max({x} - {_bracketed(p[0])}, 0)^{p[1]}",
+    lambda x, p: rf"\max({x} - {_bracketed(p[0])}, 0)^{{{p[1]}}}",
+    lambda p: p[1],
+    (0, 1), (0,),
+)  # fmt: skip
+BELOW_POWER = Shape(
+    "below_power", 3,
+    lambda x, p: np.maximum(p[0] - x, 0.0) ** p[1],
+    lambda x, p: -p[1] * _past(p[0] - x) ** (p[1] - 1) * (x < p[0]),
+    lambda x, p: f"np.maximum({p[0]} - {x}, 0.0) ** {p[1]}",
+    lambda x, p: f"-{_past_slope(f'({p[0]} - {x})', p[1])}",
+    lambda x, p: f"max({p[0]} - {x}, 0)^{p[1]}",
+    lambda x, p: rf"\max({p[0]} - {x}, 0)^{{{p[1]}}}",
+    lambda p: p[1],
+    (0, 1), (0,),
 )  # fmt: skip
 SATURATION = Shape(
     "saturation", 2,

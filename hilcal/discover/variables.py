@@ -13,7 +13,7 @@ from hilcal.types import Floats
 
 Kind = Literal[
     "angle", "sum", "torque", "force", "load", "gravity", "temperature", "time", "hanging", "side",
-    "place", "sight", "sensor",
+    "place", "sight", "sensor", "composed",
 ]  # fmt: skip
 VARIES = 1e-6
 """Least spread, as a share of the largest value, of a quantity that counts as varying."""
@@ -51,6 +51,25 @@ class Variable:
     joint: int = -1
     vector: str = ""
     axis: int = -1
+
+    @property
+    def cost(self) -> int:
+        """Complexity that it adds to a function of it."""
+        return int(self.kind == "sum")
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Columns of the readings that it needs."""
+        return (self.need,) if self.need else ()
+
+    @property
+    def recorded(self) -> tuple["Variable", ...]:
+        """The recorded quantities that it is made of: itself."""
+        return (self,)
+
+    def slopes(self) -> tuple[tuple[tuple[int, int], str], ...]:
+        """Slots and components of the transmitted wrenches, and ∂x by each as Python."""
+        return () if self.slot is None else ((self.slot, ""),)
 
 
 def variables(s: Situation) -> list[Variable]:

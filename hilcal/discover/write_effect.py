@@ -2,12 +2,11 @@
 
 import hashlib
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from types import ModuleType
 
 import numpy as np
 
-from hilcal.discover.amplitudes import Factor
 from hilcal.discover.law import LETTERS, Coefficient, Form, Part
 from hilcal.effects.protocol import Effect
 
@@ -150,24 +149,13 @@ def _parameters(form: Form, found: tuple[Coefficient, ...]) -> Iterator[str]:
         yield f'            Parameter("{letter}", "{form.unit(k)}", {scale!r}, "{where}"),'
 
 
-def _product(factors: Sequence[Factor]) -> str:
-    if not factors:
-        return "np.ones(len(s.angle))"
-    parts = [f.shape.code(f.variable.code, _numbers(f)) for f in factors]
-    return parts[0] if len(parts) == 1 else " * ".join(f"({part})" for part in parts)
-
-
-def _numbers(f: Factor) -> list[str]:
-    return [repr(x) for x in f.numbers]
-
-
 def _moving(form: Form) -> Iterator[str]:
     """Yield the lines of what moves parts of the arm, or the frames."""
     parts = [(k, p) for k, p in enumerate(form.parts) if p.site.field != "sensor"]
     if not parts:
         yield "        return ()"
         return
-    yield from (f"        by_{k} = {_product(p.amplitude.factors)}" for k, p in parts)
+    yield from (f"        by_{k} = {p.amplitude.code()}" for k, p in parts)
     yield "        return ("
     yield from (f"            {_columns(k, p)}," for k, p in parts)
     yield "        )"
@@ -177,7 +165,7 @@ def _misread(form: Form) -> Iterator[str]:
     """Yield the lines of what the force sensor reads beside the true wrench."""
     for p in form.parts:
         if p.site.field == "sensor":
-            yield f"        by = {_product(p.amplitude.factors)}"
+            yield f"        by = {p.amplitude.code()}"
             yield f"        out[:, {p.coefficient}, {p.site.axis}] += by"
 
 
@@ -192,14 +180,7 @@ def _columns(k: int, p: Part) -> str:
 def _responses(form: Form) -> Iterator[str]:
     """Yield the lines that add what each wrench component does to each part."""
     for p in form.parts:
-        factors = p.amplitude.factors
-        for i, f in enumerate(factors):
-            if f.variable.slot is None:
-                continue
-            slope = f"({f.shape.slope_code(f.variable.code, _numbers(f))})"
-            if len(factors) > 1:
-                slope += f" * ({_product([*factors[:i], *factors[i + 1 :]])})"
-            slot, component = f.variable.slot
+        for (slot, component), slope in p.amplitude.slopes():
             to = f"dq[:, :, {p.site.element}]"
             if p.site.field != "dq":
                 to = f"twist[:, :, {p.site.element}, {p.site.axis}]"

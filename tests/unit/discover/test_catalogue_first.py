@@ -1,17 +1,22 @@
 """When an effect of the catalogue is named, and when a law that is near one."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
-from hilcal.discover.discovery import _catalogue, _tells_more
+from hilcal.discover.known_effects import instead_of_law, known_effects, tells_more
 from hilcal.discover.problem import Problem
 from hilcal.discover.screen import screen
 from hilcal.discover.search import Selection
 from hilcal.discover.terms import Term
+from hilcal.effects.spec import EffectSpec
+from hilcal.identify.fit import Fit, fit
 from hilcal.identify.linearisation import linearise
-from tests.unit.discover.test_discover import campaign
+from tests.unit.discover.test_discover import campaign, short_products
+
+__all__ = ["short_products"]
 
 
 @cache
@@ -41,9 +46,35 @@ def test_a_law_is_told_beside_an_effect_only_where_it_is_another(
     column = p.model.project_out(p.columns(own))[:, 0]
     noise = p.residual.copy()
     p.residual = noise + size * column / np.linalg.norm(column)
-    _, _, columns = _catalogue(campaign())
+    known = known_effects(campaign())
     chosen = Selection((own,), (size**2 / 2,))
     try:
-        assert _tells_more(p, chosen, columns, "joint_stiffening") is more
+        assert tells_more(p, chosen, known, "joint_stiffening") is more
     finally:
         p.residual = noise
+
+
+@pytest.mark.parametrize(("shift", "named"), [(0.5, ("load_point",)), (0.2, ())])
+def test_a_large_effect_is_named_by_its_exact_refit(shift: float, named: tuple[str, ...]) -> None:
+    """What a load half a metre off does beyond the linearisation is no law of its own.
+
+    By algebra the law is likelier by 20 in the logarithm of the odds, in either case.
+    """
+    fitted = _with_load_off(shift)
+    p = Problem(screen(linearise(fitted)))
+    known = known_effects(fitted)
+    assert known.names[0] == "load_point"
+    law = Selection((term(p, 0.5),), (known.total + 20.0,))
+    assert instead_of_law(fitted, p, law, known) == named
+
+
+def _with_load_off(shift: float) -> Fit:
+    """Deflections as the model would read them with the load off by so much along z, and noise."""
+    before = campaign()
+    model = before.model + EffectSpec("load_point")
+    states = before.readings.states
+    theta = np.concatenate([before.theta, [0.0, 0.0, shift]])
+    clean = model.predict(states, theta).observation.position
+    noise = before.readings.value - before.model.predict(states, before.theta).observation.position
+    readings = replace(before.readings, value=clean + noise)
+    return fit(before.model, readings, before.mode)

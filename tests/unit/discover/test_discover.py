@@ -10,11 +10,6 @@ import numpy as np
 import pytest
 
 import hilcal as hc
-from drivers.simulated.injected_effects import nothing_hidden
-from drivers.simulated.rehearsal import measurement_noise, simulate
-from hilcal.cell import cell_from_config
-from hilcal.config import load_config
-from hilcal.data.readings import Readings
 from hilcal.discover import grammar as products
 from hilcal.discover import grow, shapes
 from hilcal.discover.amplitudes import Amplitude, Factor
@@ -45,9 +40,8 @@ from hilcal.report.text_discover import (
     silence,
     to_json,
 )
-from hilcal.robot.catalogue import configs_dir
-from studies.random_campaigns import dead_weights, rehearsal_states
 from studies.unmodelled_laws import law_named, shift
+from tests.support.rehearsed import rehearsed
 
 LAW = "compliance by another joint"
 
@@ -64,21 +58,13 @@ def short_products() -> Iterator[None]:
 @cache
 def campaign(law: str = "", stated: float = 1.0, seed: int = 4) -> Fit:
     """Deflections of 14 poses under two weights, with a law that no effect describes."""
-    config = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
-    cell = cell_from_config(config)
-    rng = np.random.default_rng(seed)
-    loads = dead_weights((4.0, 8.0), cell.gravity)
-    states, pose, load, cycle = rehearsal_states(
-        cell, 14, loads, rng, approach=False, temperatures=False
-    )
-    states = replace(states, load_time=None)
-    std = config.repeatability.per_joint(cell.arm.n)
-    world = nothing_hidden(cell, rng, noise=measurement_noise(config), joint_std=std)
-    names = ("none", *(name for name, _ in loads))
-    readings: Readings = simulate(world, states, pose, load, cycle, names, rng)
-    value = readings.value
+    of = rehearsed(14, seed)
+    cell, readings, value = of.cell, of.readings, of.readings.value
     if law:
-        value = value + shift(law_named(law), world, states, 6.0, "deflection", pose, cycle)
+        drawn = law_named(law)
+        value = value + shift(
+            drawn, of.world, readings.states, 6.0, "deflection", of.pose, of.cycle
+        )
     readings = replace(readings, value=value, covariance=stated**2 * readings.covariance)
     return fit(baseline(cell, readings, "deflection"), readings, "deflection")
 

@@ -1,10 +1,13 @@
 """The study of `discover`: its laws displace the target, and its claims count what they say."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from studies.discover import Asked, Outcome
 from studies.discover_command import claims
-from studies.foreign_laws import KINDS, scene
+from studies.foreign_laws import KINDS
+from studies.law_scene import scene
 from tests.unit.studies.test_study_cases import case
 
 GOOD = Asked("ur5e", "absolute", law="wear")
@@ -38,3 +41,12 @@ def test_claims_count_what_they_say() -> None:
     assert found["no law where nothing is hidden"].met is True
     assert found["no law where the noise is misjudged by two"].met is False
     assert "no law where an effect of the catalogue is hidden" not in found  # none was
+
+
+def test_more_is_claimed_of_laws_that_are_plain() -> None:
+    plain = replace(GOOD, strength=10.0, poses=100)
+    nine = [Outcome(plain, "law", "dq_2 = a", "wear", True, True, 0.99, 2.0, 1.1)] * 9
+    wrong = Outcome(plain, "law", "dq_3 = a", "wear", False, True, 0.99, 2.0, 1.1)
+    found = {f.what: f for f in claims([*nine, wrong])}
+    assert found["site right"].met is False  # nine of ten are enough elsewhere
+    assert found["variables right"].required == "95 %"

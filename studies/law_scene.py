@@ -1,0 +1,65 @@
+"""Where the simulated arm comes to rest, for a hidden law to look at."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivers.simulated.mechanics import Equilibrium
+from drivers.simulated.world import World
+from hilcal.data.readings import States
+from hilcal.types import Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """Where the arm rests in N states, for a law to look at.
+
+    Attributes:
+        states: the states.
+        rest: equilibrium of the simulated arm.
+        torque: (N, n) at the drives, N·m.
+        place: (N, 3) of the target, base axes, m.
+        seen: (N, 3) of the target, sensor axes, m.
+        by_joint: (N, 3, n) motion of the target by each drive, sensor axes.
+        view: (3, 3) base axes in sensor axes.
+        before: the states in which the law was first seen; None where these are they.
+    """
+
+    states: States
+    rest: Equilibrium
+    torque: Floats
+    place: Floats
+    seen: Floats
+    by_joint: Floats
+    view: Floats
+    before: "Scene | None" = None
+
+    @property
+    def first(self) -> "Scene":
+        """The states from which a law takes its levels: it is the same law at fresh poses."""
+        return self.before or self
+
+    def of_joint(self, j: int, angle: Floats) -> Floats:
+        """(N, 3) displacement by an error (N,) of joint j (from 1), rad."""
+        return np.asarray(self.by_joint[:, :, j - 1] * angle[:, None])
+
+    def in_base(self, shift: Floats) -> Floats:
+        """(N, 3) displacement in sensor axes of one in base axes."""
+        return np.asarray(shift @ self.view.T)
+
+
+def scene(world: World, states: States, before: Scene | None = None) -> Scene:
+    """Return where the arm rests.
+
+    Args:
+        world: the simulated arm.
+        states: the states.
+        before: those in which a law was first seen, if others.
+    """
+    rest, sight = world.rest(states), world.sight(states)
+    flange = rest.flange
+    place = flange[:, :3, 3] + flange[:, :3, :3] @ world.cell.target[:3, 3]
+    return Scene(
+        states, rest, world.drive_torque(states), place, sight.position, sight.jacobian[:, :3],
+        world.registration[:3, :3], before,
+    )  # fmt: skip
