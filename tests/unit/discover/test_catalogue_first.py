@@ -14,9 +14,7 @@ from hilcal.discover.terms import Term
 from hilcal.effects.spec import EffectSpec
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.linearisation import linearise
-from tests.unit.discover.test_discover import campaign, short_products
-
-__all__ = ["short_products"]
+from tests.unit.discover.test_discover import campaign
 
 
 @cache

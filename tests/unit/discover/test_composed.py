@@ -1,6 +1,5 @@
 """Functions of composed quantities: written with their derivative, found, refined, and paid for."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
 
@@ -8,8 +7,7 @@ import numpy as np
 import pytest
 
 from hilcal.data.whitening import whitening
-from hilcal.discover import grammar as products
-from hilcal.discover import grow, shapes
+from hilcal.discover import shapes
 from hilcal.discover.agreement import agreement
 from hilcal.discover.amplitudes import Amplitude, Factor
 from hilcal.discover.composed import Composed, composed
@@ -34,15 +32,6 @@ from studies.law_scene import scene
 from tests.support.rehearsed import rehearsed
 
 SIGMA = 6.0
-
-
-@pytest.fixture(autouse=True, scope="module")
-def short_products() -> Iterator[None]:
-    """Products of two simple functions at most, for speed; studies search all."""
-    most, grown = products.MOST, grow.MOST
-    products.MOST = grow.MOST = 2
-    yield
-    products.MOST, grow.MOST = most, grown
 
 
 def example() -> Situation:

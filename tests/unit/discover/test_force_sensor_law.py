@@ -24,6 +24,11 @@ SHARE = 0.3
 """Share of what the sensor reads along +z that is not there; it reads the other way rightly."""
 
 
+@pytest.fixture(autouse=True, scope="module")
+def short_products() -> None:
+    """All products, other than in the other files of this folder: the law is one of the longer."""
+
+
 @cache
 def misread() -> Fit:
     """The same arm with nothing hidden, read by a force sensor that is wrong on one side."""

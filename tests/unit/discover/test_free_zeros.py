@@ -11,9 +11,7 @@ from hilcal.discover.screen import Screen
 from hilcal.discover.search import _preference, _simplicity, search
 from hilcal.discover.terms import Scored, Term
 from hilcal.regression.evidence import FamilyScore
-from tests.unit.discover.test_discover import screened, short_products
-
-__all__ = ["short_products"]
+from tests.unit.discover.test_discover import screened
 
 
 def products(s: Screen, count: int) -> list[tuple[int, int]]:
