@@ -19,7 +19,7 @@ from typing import Literal
 import numpy as np
 
 from hilcal.diagnose.noise_verdict import MISFIT_ALARM, PREDICTABLE
-from hilcal.diagnose.residual_regression import residual_regression
+from hilcal.diagnose.residual_regression import Dependence, residual_regression
 from hilcal.discover.curve import Curve, curves
 from hilcal.discover.folds import FoldSearch, found_again, search_by_folds, stability
 from hilcal.discover.known_effects import KnownEffects, instead_of_law, known_effects, resembling
@@ -75,6 +75,7 @@ class Discovery:
         after: the fit with the first law.
         source: of the first law's effect, as a Python file.
         curves: the first law over what it depends on, with the readings.
+        carried: where no law is found, recorded variables that the misfit depends on.
     """
 
     fit: Fit
@@ -87,6 +88,7 @@ class Discovery:
     after: Fit | None = None
     source: str = ""
     curves: tuple[Curve, ...] = ()
+    carried: tuple[Dependence, ...] = ()
 
 
 def discover(
@@ -147,10 +149,15 @@ def rival_sources(d: Discovery) -> dict[str, str]:
 
 def _silent(fit: Fit, found: Screen, say: Callable[[str], None], searched: float) -> Discovery:
     say("asking what is predictable at all")
-    share = residual_regression(found.linear).share
-    reason: Reason = "no_law" if share > PREDICTABLE else "unpredictable"
+    known = residual_regression(found.linear)
+    predictable = known.share > PREDICTABLE
     return Discovery(
-        fit, reason, attainable=share, searched_share=searched, candidates=found.candidates
+        fit,
+        "no_law" if predictable else "unpredictable",
+        attainable=known.share,
+        searched_share=searched,
+        candidates=found.candidates,
+        carried=known.dependences if predictable else (),
     )
 
 

@@ -6,12 +6,12 @@ import numpy as np
 from rich.console import RenderableType
 from rich.text import Text
 
+from hilcal.diagnose.misfit_breakdown import ROW_ORDER
 from hilcal.discover.curve import Curve
 from hilcal.discover.discovery import Discovery
 from hilcal.discover.law import Coefficient, Law
 from hilcal.discover.proposal import LawSearch
-from hilcal.report import numbers, text
-from hilcal.report.text_unknown import sparkline
+from hilcal.report import numbers, text, text_unknown
 
 FEW = 3
 LEAST_BINS = 3
@@ -23,6 +23,7 @@ def discovery_report(d: Discovery) -> Iterator[RenderableType]:
     yield text.heading(f"Laws for what {text.model_name(d.fit.model.names)} leaves unexplained")
     if not d.laws:
         yield numbers.sentence(silence(d))
+        yield from text_unknown.curves(d.carried)
         return
     yield (
         f"{d.candidates} candidates were tried. Searched for without them, laws explain "
@@ -51,10 +52,18 @@ def silence(d: Discovery) -> str:
     if d.reason == "no_law":
         return (
             f"no law: {numbers.percent(d.attainable)} of the misfit is predictable on poses left "
-            f"out, but {tried}, and no law of this size predicts it; measure more poses, or record "
-            "what else may matter"
+            f"out, but {tried}, and no law of this size predicts it; {_what_helps(d)}"
         )
     return f"no law: {tried}, and nothing recorded predicts the misfit on poses left out"
+
+
+def _what_helps(d: Discovery) -> str:
+    if any(c.variable == ROW_ORDER for c in d.carried[:1]):
+        return (
+            "the order of the readings carries most of it, and they have no times, which a law "
+            "of time needs: give them"
+        )
+    return "measure more poses, or record what else may matter"
 
 
 def _law(law: Law, d: Discovery, first: bool) -> Iterator[RenderableType]:
@@ -95,7 +104,7 @@ def curve_tables(curves: Sequence[Curve]) -> Iterator[RenderableType]:
         unit, factor = numbers.unit_for(c.unit, list(y))
         head = c.quantity if c.quantity_unit == "1" else f"{c.quantity} [{c.quantity_unit}]"
         law = np.interp(x, *c.line)
-        out = text.table(head, f"{c.of} [{unit}] {sparkline(list(y))}", "±", "law")
+        out = text.table(head, f"{c.of} [{unit}] {text_unknown.sparkline(list(y))}", "±", "law")
         for at, seen, error, told in zip(x, y, std, law, strict=True):
             value, spread = numbers.with_std(factor * float(seen), factor * float(error))
             places = len(value.partition(".")[2])
@@ -170,6 +179,9 @@ def to_json(d: Discovery) -> dict[str, object]:
         "searched_share": d.searched_share,
         "candidates": d.candidates,
         "catalogue": list(d.catalogue),
+        "carried_by": [
+            {"variable": c.variable, "share": c.share, "moves": c.moves} for c in d.carried
+        ],
         "laws": [law_json(law) for law in d.laws],
         "curves": [curve_json(c) for c in d.curves],
     }

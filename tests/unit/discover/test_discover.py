@@ -170,6 +170,23 @@ def test_noise_that_is_misjudged_is_no_law(stated: float) -> None:
     assert silence(d).startswith("no law")
 
 
+def test_a_drift_of_readings_without_times_is_said_to_need_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    of = campaign()
+    timeless = replace(of.readings.states, time=None, load_time=None)
+    value = of.readings.value.copy()
+    value[:, 0] += 400e-6 * np.maximum(np.linspace(-1.0, 1.0, len(value)), 0.0)
+    readings = replace(of.readings, states=timeless, value=value)
+    before = fit(baseline(of.model.cell, readings, "absolute"), readings, "absolute")
+    monkeypatch.setattr(sys.modules[Discovery.__module__], "search", lambda problem: [])
+    d = discover(before)
+    assert (d.reason, d.carried[0].variable) == ("no_law", "row order")
+    assert "they have no times, which a law of time needs" in silence(d)
+    assert "row order carries" in "".join(map(str, discovery_report(d)))
+    assert to_json(d)["carried_by"][0]["variable"] == "row order"  # type: ignore[index]
+
+
 def test_nothing_is_searched_where_the_noise_explains_the_residual() -> None:
     d = discover(campaign())
     assert (d.reason, d.candidates) == ("adequate", 0)
