@@ -5,6 +5,7 @@ terms are taken out again where the others make them needless. Of terms that odd
 tell apart the simplest is taken.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -52,6 +53,8 @@ class Selection:
 def search(problem: Problem, most: int = MOST_TERMS, beam: int = BEAM) -> list[Selection]:
     """Return the best selection of each number of terms, from one on; none where chance would do.
 
+    A longer one is returned only where odds of 20 : 1 ask for it beside every shorter one.
+
     Args:
         problem: the rows to search on.
         most: terms at most.
@@ -81,7 +84,16 @@ def search(problem: Problem, most: int = MOST_TERMS, beam: int = BEAM) -> list[S
             # What was added last is the best beside the others already.
             s = _exchanged(problem, grown, last=len(grown.terms) - 1)
             _keep(problem, best, s)
-    return [_plainly(problem.screen, best[k]) for k in sorted(best)]
+    return [_plainly(problem.screen, s) for s in worth_their_length(best[k] for k in sorted(best))]
+
+
+def worth_their_length(selections: Iterable[Selection]) -> list[Selection]:
+    """Return those that odds of 20 : 1 ask for beside every one before, which is shorter."""
+    out: list[Selection] = []
+    for s in selections:
+        if all(s.total >= shorter.total + LEAST for shorter in out):
+            out.append(s)
+    return out
 
 
 def alternatives(problem: Problem, s: Selection) -> list[tuple[Term, ...]]:
@@ -137,16 +149,19 @@ def _simplicity(screen: Screen, t: Term) -> tuple[float, ...]:
     A coefficient, and a number that is not of the grid, count as much as a unit of complexity: the
     free zero of a factor is no less simple than an exponent of 4. Of causes that the readings do
     not tell apart, as joints that warm alike, the one of the joint itself is simpler than that of
-    another.
+    another. A joint's temperature seldom moves anything but this joint and stands for whatever
+    else changes with time: elsewhere it counts a unit more.
     """
     amplitudes = [screen.grammar.at(a) for _, a in t.parts]
     cost = max(a.cost + screen.grammar.tuned(a) for a in amplitudes)
     sites = max(screen.sites[s].rank for s, _ in t.parts)
     functions = max(sum(f.shape.rank for f in a.factors) for a in amplitudes)
-    apart = max(
-        sum(_far(f.variable.joint, screen.sites[s].joint) for f in amplitudes[k].factors)
-        for k, (s, _) in enumerate(t.parts)
-    )
+    far = [
+        [(_far(f.variable.joint, screen.sites[s].joint), f.variable.kind) for f in a.factors]
+        for a, (s, _) in zip(amplitudes, t.parts, strict=True)
+    ]
+    apart = max(sum(distance for distance, _ in each) for each in far)
+    cost += any((2, "temperature") in each for each in far)
     return t.count + cost, sites, apart, functions
 
 

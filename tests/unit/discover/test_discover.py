@@ -18,7 +18,13 @@ from hilcal.discover.problem import Problem
 from hilcal.discover.proposal import LawSearch
 from hilcal.discover.refit import exact
 from hilcal.discover.screen import Screen, screen
-from hilcal.discover.search import Selection, _plainly, _simplicity, search
+from hilcal.discover.search import (
+    Selection,
+    _plainly,
+    _simplicity,
+    search,
+    worth_their_length,
+)
 from hilcal.discover.sites import ORDINARY
 from hilcal.discover.terms import Term
 from hilcal.discover.variables import variables
@@ -303,6 +309,28 @@ def test_of_equals_the_cause_in_the_joint_itself_is_simpler() -> None:
         _simplicity(s, Term(((2, by[name,]),), 0.0)) for name in ("joint 3 angle", "joint 4 angle")
     )
     assert own < other
+
+
+def test_another_joints_temperature_stands_in_for_time_and_is_no_simpler() -> None:
+    s = screened()
+    by = {a.names: k for k, a in enumerate(s.grammar.amplitudes) if a.names and a.cost == 1}
+    places = {site.symbol: k for k, site in enumerate(s.sites)}
+
+    def cost(name: str, site: str = "dq_3") -> float:
+        return _simplicity(s, Term(((places[site], by[name,]),), 0.0))[0]
+
+    assert cost("joint 4 temperature") == cost("joint 3 temperature") + 1
+    assert cost("joint 4 temperature") == cost("joint 4 temperature", "base_x")
+    assert cost("joint 3 temperature") == cost("joint 4 torque") == cost("time")
+
+
+def test_a_longer_law_has_to_be_more_likely_than_every_shorter_one() -> None:
+    one, two, three = (
+        Selection((Term(((0, 0),), 0.0),) * k, odds)
+        for k, odds in ((1, (182.3,)), (2, (171.9, 9.0)), (3, (171.9, 9.0, 5.0)))
+    )
+    assert worth_their_length([one, two, three]) == [one, three]
+    assert worth_their_length([one, two]) == [one]
 
 
 def test_products_that_were_added_later_are_tried_again_and_extended(
