@@ -13,6 +13,7 @@ from hilcal.discover import grow, shapes
 from hilcal.discover.amplitudes import Amplitude, Factor
 from hilcal.discover.curve import curves
 from hilcal.discover.discovery import Discovery, discover
+from hilcal.discover.grammar import grammar
 from hilcal.discover.law import Form, Part
 from hilcal.discover.problem import Problem
 from hilcal.discover.proposal import LawSearch
@@ -25,12 +26,13 @@ from hilcal.discover.search import (
     search,
     worth_their_length,
 )
-from hilcal.discover.sites import ORDINARY
+from hilcal.discover.sites import ORDINARY, sites
 from hilcal.discover.terms import Term
 from hilcal.discover.variables import variables
 from hilcal.discover.write_effect import effect_class, source_of_form
 from hilcal.effects.catalogue import installed
 from hilcal.effects.check import check_effect
+from hilcal.effects.example import example_cell, example_situation, example_states
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.effect_columns import effect_columns
@@ -312,12 +314,15 @@ def test_of_equals_the_cause_in_the_joint_itself_is_simpler() -> None:
 
 
 def test_another_joints_temperature_stands_in_for_time_and_is_no_simpler() -> None:
-    s = screened()
-    by = {a.names: k for k, a in enumerate(s.grammar.amplitudes) if a.names and a.cost == 1}
-    places = {site.symbol: k for k, site in enumerate(s.sites)}
+    cell = example_cell()
+    s = example_situation(cell, example_states(cell))
+    made = grammar([v for v in variables(s) if v.kind in ("temperature", "time", "torque")], s, 14)
+    by = {a.names: k for k, a in enumerate(made.amplitudes) if a.names and a.cost == 1}
+    some = replace(screened(), grammar=made, sites=sites(6))
+    places = {site.symbol: k for k, site in enumerate(some.sites)}
 
     def cost(name: str, site: str = "dq_3") -> float:
-        return _simplicity(s, Term(((places[site], by[name,]),), 0.0))[0]
+        return _simplicity(some, Term(((places[site], by[name,]),), 0.0))[0]
 
     assert cost("joint 4 temperature") == cost("joint 3 temperature") + 1
     assert cost("joint 4 temperature") == cost("joint 4 temperature", "base_x")
