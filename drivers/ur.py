@@ -34,7 +34,8 @@ from hilcal.types import Floats
 _PROBE_S, _DASHBOARD_S, _RECEIVE_S = 2.5, 1.5, 4.0  # 8 s together
 _PAYLOAD_S = 1.5
 _ORPHAN_S = 1.6
-_PULSE_S = 0.1  # the arm is not stopped before
+_PULSE_S = 0.1
+"""Deadline for asking the control process why the program ended, real s; the stop waits for it."""
 POLYSCOPE_X = 10
 """Major version of the controllers without a dashboard server."""
 _MASS_KG, _COM_M = 1e-3, 1e-4  # how well a payload has to be read back

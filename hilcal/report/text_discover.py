@@ -60,8 +60,8 @@ def silence(d: Discovery) -> str:
 def _what_helps(d: Discovery) -> str:
     if any(c.variable == ROW_ORDER for c in d.carried[:1]):
         return (
-            "the order of the readings carries most of it, and they have no times, which a law "
-            "of time needs: give them"
+            "it depends mostly on the order of the readings, whose times are missing: without "
+            "them no law of time can be searched, so add them"
         )
     return "measure more poses, or record what else may matter"
 

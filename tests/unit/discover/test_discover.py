@@ -190,7 +190,7 @@ def test_a_drift_of_readings_without_times_is_said_to_need_them(
     monkeypatch.setattr(sys.modules[Discovery.__module__], "search", lambda problem: [])
     d = discover(before)
     assert (d.reason, d.carried[0].variable) == ("no_law", "row order")
-    assert "they have no times, which a law of time needs" in silence(d)
+    assert "whose times are missing" in silence(d)
     assert "row order carries" in "".join(map(str, discovery_report(d)))
     assert to_json(d)["carried_by"][0]["variable"] == "row order"  # type: ignore[index]
 
