@@ -16,6 +16,7 @@ from hilcal.acquire.tool_load import (
 from hilcal.cell import Cell
 from hilcal.config import ForceSensor as Settings
 from hilcal.config import Load, Operator
+from hilcal.errors import DeviceError
 from hilcal.robot import chain as chains
 from hilcal.robot import se3
 from hilcal.types import Floats
@@ -65,6 +66,11 @@ class ForceMeter:
     hook, less the tool of the configuration. Wrenches of sessions are comparable after it,
     whatever the sensor's own zero did while it was off; how the real tool differs from the
     configured one stays in them, the same in all sessions.
+
+    Attributes:
+        zero: (6,) what the sensor reads with nothing on it, N and N·m, sensor axes.
+        tool: what it carries.
+        identified: whether the tool has been weighed, else it is that of the configuration.
     """
 
     def __init__(
@@ -84,7 +90,7 @@ class ForceMeter:
         self._origin = np.array(settings.origin_m)
         self._axes = se3.rotation(np.array(settings.rotvec_rad))
         self._com = self._axes.T @ (cell.tool_com - self._origin)
-        self._identified = False
+        self.identified = False
         nothing = np.zeros((PARAMETERS, PARAMETERS))
         moment = cell.tool_mass * self._com
         self.tool = ToolLoad(np.zeros(6), cell.tool_mass, moment, nothing, cell.gravity, 0.0, 0, 0)
@@ -101,12 +107,17 @@ class ForceMeter:
         """Return a mean of at least `MIN_FRAMES` frames, as the sensor gives it.
 
         Raises:
-            DeviceError: the stream is dead, or gives too few frames.
+            DeviceError: the stream is dead, gives too few frames, or stands still.
         """
         sample = self.sensor.average(self._seconds)
         if sample.frames < MIN_FRAMES:  # a fast clock's window is too short for the real line
             self._seconds *= 1.2 * MIN_FRAMES / max(sample.frames, 1)
             sample = self.sensor.average(self._seconds)
+        if sample.frames >= MIN_FRAMES and not np.diagonal(sample.covariance).any():
+            raise DeviceError(
+                f"force sensor: {sample.frames} frames are the same to the last digit: it sends "
+                "old values. Switch it off and on"
+            )
         return sample
 
     def tared(self, sample: WrenchSample, q: Floats) -> TaredWrench:
@@ -130,7 +141,7 @@ class ForceMeter:
         covariance = sample.covariance / max(sample.frames, 1) + _FLOOR
         zero = tare(sample.wrench, covariance, rotation, cell.gravity, cell.tool_mass, self._com)
         self.zero = zero.bias
-        if not self._identified:
+        if not self.identified:
             self.tool = replace(zero, bias=np.zeros(6))
 
     def identify(self, unloaded: list[TaredWrench]) -> ToolLoad | None:
@@ -147,7 +158,7 @@ class ForceMeter:
             np.array([self.frame(f.q).rotation for f in unloaded]),
             self._cell.gravity,
         )
-        self._identified = True
+        self.identified = True
         return self.tool
 
     def load_wrench(self, tared: TaredWrench) -> Floats:

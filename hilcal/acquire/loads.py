@@ -1,17 +1,25 @@
 """Changing the load: the operator, the payload of the controller, and the force sensor's check."""
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
 from hilcal.acquire.clock import Clock
-from hilcal.acquire.devices import ArmDevice, OperatorDevice, TerminalPerson, WrongLoadError
+from hilcal.acquire.devices import (
+    ArmDevice,
+    ConfirmingOperator,
+    OperatorDevice,
+    TerminalPerson,
+    WrongLoadError,
+)
 from hilcal.acquire.force import ForceMeter
 from hilcal.acquire.motion import Mover
 from hilcal.acquire.progress import Answered, Phase, Question, Remark, Watcher
 from hilcal.cell import Cell
 from hilcal.config import CellConfig, Load
 from hilcal.data.plan import UNLOADED
+from hilcal.errors import DeviceError
 from hilcal.types import Floats
 
 Wrong = Callable[[], str]
@@ -64,7 +72,7 @@ class Hook:
 
         The force sensor confirms it where its zero is known from an earlier session.
         """
-        self._ask(None, self._still_hangs)
+        self._ask(None, self._still_hangs, (UNLOADED,))
         self.hanging, self.since = UNLOADED, self._clock.now()
 
     def change(self, name: str) -> None:
@@ -81,24 +89,79 @@ class Hook:
         heavier = payload(self._cell, new)[0] > payload(self._cell, old)[0]
         if heavier:
             self._arm.set_payload(*payload(self._cell, new))
-        self._ask(new, lambda: self._differs(new))
+        self._suspend()
+        self._ask(new, lambda: self._differs(new), (self.hanging, name))
         if not heavier:
             self._arm.set_payload(*payload(self._cell, new))
-        self.hanging, self.since = name, self._clock.now()
+        self._hangs(name)
 
-    def _ask(self, load: Load | None, wrong: Wrong) -> None:
-        """Ask until nothing is wrong, `TRIES` times."""
+    def restore(self, why: str) -> None:
+        """Have what should hang put right, where the arm stands, after it was found wrong.
+
+        The controller is told at once if nothing hangs any more.
+
+        Raises:
+            DeviceError: the person gives up.
+            WrongLoadError: what hangs is wrong three times.
+        """
+        name, load = self.hanging, self.load(self.hanging)
+        self._suspend()
+        if load is not None and not self._differs(None):
+            self._arm.set_payload(*payload(self._cell, None))
+        self._ask(load, lambda: self._still_wrong(load), (UNLOADED, name), why)
+        self._hangs(name)
+
+    def confirm(self, question: str) -> None:
+        """Ask whether the arm may go on.
+
+        Raises:
+            DeviceError: the person gives up, or the operator's driver cannot ask that.
+        """
+        operator = self._operator
+        if not isinstance(operator, ConfirmingOperator):
+            raise DeviceError(f"arm: {question}: look at it, and start again")
+        if not (isinstance(operator, TerminalPerson) and operator.at_terminal):
+            self._watcher.notify(Remark(question))
+        self._watcher.notify(Phase("waiting for the operator to look at the arm"))
+        self._asked(partial(operator.confirm, question))
+
+    def _suspend(self) -> None:
+        if self._mover.watch is not None:
+            self._mover.watch.suspend()
+
+    def _hangs(self, name: str) -> None:
+        """Take note that a load hangs, and watch it from now on."""
+        self.hanging, self.since = name, self._clock.now()
+        if self._mover.watch is not None:
+            self._mover.watch.expect(self.load(name))
+
+    def _asked(self, ask: Callable[[], None]) -> None:
+        """Ask a person; one at the terminal gets it from the display."""
+        person = isinstance(self._operator, TerminalPerson) and self._operator.at_terminal
+        if person:
+            self._watcher.notify(Question())
+        ask()
+        if person:
+            self._watcher.notify(Answered())
+
+    def _ask(
+        self, load: Load | None, wrong: Wrong, hanging: tuple[str, ...], why: str = ""
+    ) -> None:
+        """Ask until nothing is wrong, `TRIES` times; an arm moved meanwhile is put back.
+
+        Args:
+            load: what to hang.
+            wrong: what is wrong after the answer.
+            hanging: names of the loads of which one hangs meanwhile.
+            why: why it is asked for, empty at the first time.
+        """
         what = "take everything off" if load is None else f"hang {load.name}"
         person = isinstance(self._operator, TerminalPerson) and self._operator.at_terminal
-        why = ""
         for _ in range(TRIES):
             self._watcher.notify(Phase(f"waiting for the operator to {what}"))
-            if person:
-                self._watcher.notify(Question())
-            self._operator.hang(load, why)
-            if person:
-                self._watcher.notify(Answered())
+            self._asked(partial(self._operator.hang, load, why))
             self._watcher.notify(Phase("checking what hangs"))
+            self._mover.put_back(hanging, self.confirm)
             self._mover.look()
             why = wrong()
             if not why:
@@ -120,6 +183,17 @@ class Hook:
             if good:
                 return ""
         return text
+
+    def _still_wrong(self, load: Load | None) -> str:
+        """Why the load is wrong still; the person is believed while the tool is not weighed."""
+        watch = self._mover.watch
+        wrong = self._differs(load)
+        if wrong and watch is not None and watch.believe():
+            self._watcher.notify(
+                Remark(f"{wrong}; the person is believed until the tool has been weighed")
+            )
+            return ""
+        return wrong
 
     def _still_hangs(self) -> str:
         """What seems to hang still: a load that fits better than nothing does.
