@@ -16,7 +16,7 @@ SWING = 0.3
 """Share of the load that it exerts to the side while it swings in motion: 17°."""
 PULL = 0.5
 """Share by which a pull may differ: its rope turns with the arm, its weight is on a pulley."""
-UNKNOWN_KG = 0.5
+UNKNOWN_KG = 1.0
 """A tool that has not been weighed yet may differ from [tool] by so much, or by half of it, kg."""
 HOLD_S = 0.2
 """In motion and between readings a difference has to last for so long, real seconds."""
@@ -32,32 +32,25 @@ class LoadWatch:
     `MOMENT_LEVER_M`. The limit is `ALLOWED` times the one of `[operator]` when a load is hung, and
     more for a pull (`PULL`), for a tool that is not weighed yet (`UNKNOWN_KG`), and in motion for
     what swings (`SWING`) and is accelerated.
+
+    Attributes:
+        watching: whether anything is compared now.
     """
 
     def __init__(self, meter: ForceMeter, cell: Cell, config: CellConfig) -> None:
         """Nothing is compared before `expect`."""
         self._meter, self._cell, self._config = meter, cell, config
         self._load: Load | None = None
-        self._suspended, self._believed = True, False
+        self.watching = False
         self._since: tuple[int, int] | None = None
-
-    @property
-    def watching(self) -> bool:
-        """Whether anything is compared now."""
-        return not self._suspended and (self._meter.identified or not self._believed)
 
     def expect(self, load: Load | None) -> None:
         """Compare with this load from now on; None: nothing hangs."""
-        self._load, self._suspended, self._since = load, False, None
+        self._load, self.watching, self._since = load, True, None
 
     def suspend(self) -> None:
         """Compare nothing: what hangs is being changed."""
-        self._suspended = True
-
-    def believe(self) -> bool:
-        """Believe a person that all is well until the tool has been weighed: whether it has not."""
-        self._believed = True
-        return not self._meter.identified
+        self.watching = False
 
     def look(self, sample: ArmSample, felt: Floats, *, moving: bool) -> None:
         """Compare one frame of the sensor.

@@ -108,7 +108,7 @@ class Hook:
         self._suspend()
         if load is not None and not self._differs(None):
             self._arm.set_payload(*payload(self._cell, None))
-        self._ask(load, lambda: self._still_wrong(load), (UNLOADED, name), why)
+        self._ask(load, lambda: self._differs(load), (UNLOADED, name), why)
         self._hangs(name)
 
     def confirm(self, question: str) -> None:
@@ -183,17 +183,6 @@ class Hook:
             if good:
                 return ""
         return text
-
-    def _still_wrong(self, load: Load | None) -> str:
-        """Why the load is wrong still; the person is believed while the tool is not weighed."""
-        watch = self._mover.watch
-        wrong = self._differs(load)
-        if wrong and watch is not None and watch.believe():
-            self._watcher.notify(
-                Remark(f"{wrong}; the person is believed until the tool has been weighed")
-            )
-            return ""
-        return wrong
 
     def _still_hangs(self) -> str:
         """What seems to hang still: a load that fits better than nothing does.

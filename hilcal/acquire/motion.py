@@ -30,6 +30,8 @@ move it by less. A choice, no study set it: 7 mm at the end of an arm of 1.3 m."
 OFF_WAY_RAD = 0.05
 """A joint so far from the straight line of its motion has left it, rad; an arm follows its command
 to about 0.01. A choice."""
+FOLLOW_S = 0.05
+"""So long after its command a joint is where it was commanded to, at most, s. A choice."""
 FROZEN_S = 0.6
 """Joint angles or a clock that stand still for so long where they have to change, real seconds."""
 FROZEN_RAD = 1e-5
@@ -267,6 +269,14 @@ class Mover:
                 f"arm: {joint} has left the straight way to {name} by {off[k]:.3g} rad; does "
                 "another program command the arm, or does somebody push it?"
             )
+        behind = np.abs(sample.q_target - sample.q)
+        k = int(np.argmax(behind))
+        joint = self._guard.cell.arm.joint_names[k]
+        if not behind[k] <= OFF_WAY_RAD + FOLLOW_S * self._motion.speed_rad_s:
+            raise DeviceError(
+                f"arm: {joint} is told to be {behind[k]:.3g} rad from where it is, on the way to "
+                f"{name}: its angle is old, or something holds the joint"
+            )
         if last is None or np.abs(sample.q - last.q).max() > FROZEN_RAD:
             return sample
         near = np.abs(sample.q - goal).max() <= MOVED_RAD
@@ -275,7 +285,7 @@ class Mover:
         if sample.host_ns - last.host_ns > FROZEN_S * 1e9:
             raise DeviceError(
                 f"arm: its joint angles have stood still for {FROZEN_S:g} s on the way to {name}: "
-                "they are not read anew, or something holds it"
+                "they are old, or something holds it"
             )
         return last
 

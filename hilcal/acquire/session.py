@@ -229,13 +229,22 @@ class Session:
         if self._meter is None:
             return
         self._identified = len(self._state.tared_wrenches)
+        tolerance = self._config.operator.tolerance_N
         try:
-            tool = self._meter.identify(self._state.tared_wrenches)
+            left_out = self._meter.identify(self._state.tared_wrenches, tolerance)
         except HilcalError as error:
             self._watcher.notify(Remark(f"the tool is not identified: {error}"))
             return
-        if tool is None:
+        if left_out is None:
             return
+        tool = self._meter.tool
+        if left_out:
+            self._watcher.notify(
+                Remark(
+                    f"{len(left_out)} of {self._identified} unloaded readings differ by more than "
+                    f"{tolerance:g} N from the tool that the others weigh: was the tool touched?"
+                )
+            )
         self._event(
             "tool",
             {
@@ -244,9 +253,10 @@ class Session:
                 "bias": tool.bias.tolist(),
                 "variance_factor": tool.chi2 / max(tool.dof, 1),
                 "readings": self._identified,
+                "left_out": list(left_out),
             },
         )
-        differs = self._meter.tool_differs(self._config.operator.tolerance_N)
+        differs = self._meter.tool_differs(tolerance)
         if differs is not None:
             self._watcher.notify(Remark(differs))
 
