@@ -94,8 +94,8 @@ def loaded(run: Run) -> str:
     def under_load() -> bool:
         name = run.site.ask("world", "state")["load"]
         found[:] = [] if name is None else [name]
-        last = run.words.splitlines()[-1]
-        return bool(found) and "measuring" in last and found[0] in last
+        now = run.words.rstrip().rpartition("\n")[2]
+        return bool(found) and "measuring" in now and found[0] in now
 
     run.wait_until(under_load, "a reading under a load")
     return found[0]
