@@ -49,14 +49,14 @@ def reached(cell: Cell, parts: tuple[Capsule, ...], q: Floats) -> tuple[Floats, 
     """
     turns = np.zeros((25, cell.arm.n))
     turns[:, 0] = np.linspace(-np.pi, np.pi, 25)
-    low, high = _extent([p for p in parts if p.body > 2], cell, q)
-    upper = _extent([p for p in parts if p.body == 2], cell, q)
-    stands, rises = _extent([p for p in parts if p.body < 2], cell, turns)
+    low, high = extent([p for p in parts if p.body > 2], cell, q)
+    upper = extent([p for p in parts if p.body == 2], cell, q)
+    stands, rises = extent([p for p in parts if p.body < 2], cell, turns)
     low = np.where(stands > low, np.minimum(low, upper[0]), low)
     return low, np.where(rises < high, np.maximum(high, upper[1]), high)
 
 
-def _extent(parts: list[Capsule], cell: Cell, q: Floats) -> tuple[Floats, Floats]:
+def extent(parts: list[Capsule], cell: Cell, q: Floats) -> tuple[Floats, Floats]:
     """(3,) lowest and highest of capsules in states (N, n) along each axis, m."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for state in q:
