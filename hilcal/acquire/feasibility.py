@@ -290,9 +290,8 @@ class Feasibility:
             far, limit = over - margin, self._box[0 if below else 1][axis]
             if below and self._floor:
                 text = (
-                    f"{name} is {far:.3g} m below the mounting plane z = 0, which is the floor "
-                    "where no workspace is given; where the arm may go below it, say so by "
-                    "[limits] workspace_min_m, e.g. [-2.0, -2.0, -1.0]"
+                    f"{name} is {far:.3g} m below the mounting plane z = 0; where the arm may go "
+                    "there, [limits] workspace_min_m says how far, e.g. [-2.0, -2.0, -1.0]"
                 )
             else:
                 text = (
@@ -376,7 +375,7 @@ class Feasibility:
         names = [self._names[k] for k in np.flatnonzero(mount)]
         fixed = self._inside(names, ends, self._radius[mount], everywhere, self._rates[mount])
         outside = fixed.over.reshape(-1, len(_SIDES)) - self.margins.inside
-        kept = np.all(outside <= 0.0, axis=0)
+        kept = mount.any() & np.all(outside <= 0.0, axis=0)
         self._held |= (~moving & ~mount)[:, None] & kept
         hook = on_flange(arm, self.cell.load_point)[None]
         self._at_hook = np.array([from_axis(arm, arm.n, hook, i + 1) for i in range(arm.n)])

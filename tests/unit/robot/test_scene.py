@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from hilcal.config import Obstacle
 from hilcal.robot.body import capsules, is_known
 from hilcal.robot.catalogue import load_arm, robot_names
+from hilcal.robot.chain import evaluate
 from hilcal.robot.scene import Scene, Segment
 from hilcal.robot.segments import segment_distance
 from tests.support.arm_cases import ODD, arm_of
@@ -133,6 +134,27 @@ def test_whatever_is_free_is_free_by_another_way_to_count(
         assert far >= 0.02 - 1e-9 or around[k]
         assert own <= 0.01 + coarse or not itself[k]
         assert far <= 0.02 + coarse or not around[k]
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.sampled_from(["ur3e", "ur10e", ODD]), things, st.integers(0, 999))
+def test_no_gap_closes_faster_than_its_rate(name: str, thing: Obstacle, seed: int) -> None:
+    """What touches after turns of the joints is seen before with the bound as margin."""
+    arm, rng = arm_of(name), np.random.default_rng(seed)
+    scene, point = Scene(arm, obstacles=(thing,)), rng.normal(0.0, 0.1, 3)
+    towards = scene.towards(point)
+    q = rng.uniform(-2.0, 2.0, (30, arm.n))
+    turns = rng.uniform(-0.3, 0.3, q.shape) * (rng.random(q.shape) < 0.4)
+    places = [evaluate(arm, states).point(point) for states in (q, q + turns)]
+    before, after = (Segment("hung", at, at - [0.0, 0.0, 0.2], 0.02) for at in places)
+    for k, turn in enumerate(np.abs(turns)):
+        old, new = q[k : k + 1], (q + turns)[k : k + 1]
+        for pairs in (scene.itself, scene.around):
+            if pairs.touching(new).all():
+                assert pairs.touching(old, pairs.rates @ turn + 1e-6).all()
+        hung = [replace(x, start=x.start[k], end=x.end[k]) for x in (before, after)]
+        if scene.free.touching(new, 0.0, hung[1]).all():
+            assert scene.free.touching(old, towards @ turn + 1e-6, hung[0]).all()
 
 
 def test_an_arm_of_unknown_shape_gets_links_and_can_move() -> None:
