@@ -72,7 +72,7 @@ class Hook:
 
         The force sensor confirms it where its zero is known from an earlier session.
         """
-        self._ask(None, self._still_hangs, (UNLOADED,))
+        self._ask(None, self._still_hangs)
         self.hanging, self.since = UNLOADED, self._clock.now()
 
     def change(self, name: str) -> None:
@@ -89,8 +89,8 @@ class Hook:
         heavier = payload(self._cell, new)[0] > payload(self._cell, old)[0]
         if heavier:
             self._arm.set_payload(*payload(self._cell, new))
-        self._suspend()
-        self._ask(new, lambda: self._differs(new), (self.hanging, name))
+        self._suspend(self.hanging, name)
+        self._ask(new, lambda: self._differs(new))
         if not heavier:
             self._arm.set_payload(*payload(self._cell, new))
         self._hangs(name)
@@ -105,10 +105,10 @@ class Hook:
             WrongLoadError: what hangs is wrong three times.
         """
         name, load = self.hanging, self.load(self.hanging)
-        self._suspend()
+        self._suspend(UNLOADED, name)
         if load is not None and not self._differs(None):
             self._arm.set_payload(*payload(self._cell, None))
-        self._ask(load, lambda: self._differs(load), (UNLOADED, name), why)
+        self._ask(load, lambda: self._differs(load), why)
         self._hangs(name)
 
     def confirm(self, question: str) -> None:
@@ -125,13 +125,16 @@ class Hook:
         self._watcher.notify(Phase("waiting for the operator to look at the arm"))
         self._asked(partial(operator.confirm, question))
 
-    def _suspend(self) -> None:
+    def _suspend(self, *hanging: str) -> None:
+        """Take note that one of some loads hangs, and do not watch it."""
+        self._mover.hanging = hanging
         if self._mover.watch is not None:
             self._mover.watch.suspend()
 
     def _hangs(self, name: str) -> None:
         """Take note that a load hangs, and watch it from now on."""
         self.hanging, self.since = name, self._clock.now()
+        self._mover.hanging = (name,)
         if self._mover.watch is not None:
             self._mover.watch.expect(self.load(name))
 
@@ -144,15 +147,12 @@ class Hook:
         if person:
             self._watcher.notify(Answered())
 
-    def _ask(
-        self, load: Load | None, wrong: Wrong, hanging: tuple[str, ...], why: str = ""
-    ) -> None:
+    def _ask(self, load: Load | None, wrong: Wrong, why: str = "") -> None:
         """Ask until nothing is wrong, `TRIES` times; an arm moved meanwhile is put back.
 
         Args:
             load: what to hang.
             wrong: what is wrong after the answer.
-            hanging: names of the loads of which one hangs meanwhile.
             why: why it is asked for, empty at the first time.
         """
         what = "take everything off" if load is None else f"hang {load.name}"
@@ -161,7 +161,7 @@ class Hook:
             self._watcher.notify(Phase(f"waiting for the operator to {what}"))
             self._asked(partial(self._operator.hang, load, why))
             self._watcher.notify(Phase("checking what hangs"))
-            self._mover.put_back(hanging, self.confirm)
+            self._mover.put_back(self.confirm)
             self._mover.look()
             why = wrong()
             if not why:

@@ -13,6 +13,7 @@ from hilcal.acquire.guard import NORMAL, Guard
 from hilcal.acquire.load_watch import LoadWatch
 from hilcal.acquire.route import Stop, duration
 from hilcal.config import CellConfig
+from hilcal.data.plan import UNLOADED
 from hilcal.errors import DeviceError
 from hilcal.types import Floats
 
@@ -46,6 +47,7 @@ class Mover:
 
     Attributes:
         goal: (n,) joint angles where the arm has been left, or goes; None while that is unknown.
+        hanging: names of the loads of which one hangs.
         side: (n,) from which each joint arrived, -1 or +1; 0 before its first motion.
         watch: compares what the force sensor feels with what should hang; None without a sensor.
     """
@@ -61,6 +63,7 @@ class Mover:
     ) -> None:
         """Use an open arm; `passed` is told where it is (n,) while it moves, and must not wait."""
         self.goal: Floats | None = None
+        self.hanging: tuple[str, ...] = (UNLOADED,)
         self.side = np.zeros(guard.cell.arm.n)
         self.watch = None if meter is None else LoadWatch(meter, guard.cell, config)
         self._arm, self._meter, self._guard, self._config = arm, meter, guard, config
@@ -78,7 +81,8 @@ class Mover:
         """
         sample = self._arm.sample()
         felt = None if self._meter is None else self._meter.felt()
-        reason = self._guard.check(sample, felt) or self._clock_stands(sample)
+        checked = (self._guard.check(sample, felt, load) for load in self.hanging)
+        reason = next(filter(None, checked), None) or self._clock_stands(sample)
         if reason is not None:
             if sample.safety != NORMAL:
                 self._arm.moving()  # in motion the driver raises the cause and what to do
@@ -117,20 +121,14 @@ class Mover:
         """Whether the last motion went to just these joint angles (n,)."""
         return self.goal is not None and np.array_equal(q, self.goal)
 
-    def agreed(
-        self,
-        to: tuple[Floats, str],
-        hanging: tuple[str, ...],
-        left: Floats,
-        ask: Callable[[str], None],
-    ) -> Floats:
+    def agreed(self, goal: Floats, name: str, left: Floats, ask: Callable[[str], None]) -> Floats:
         """Return where the arm stands, once its way to a goal is free and people have agreed.
 
         Where it does not stand where it was left, that is asked first, and checked anew after.
 
         Args:
-            to: joint angles (n,) of the goal, rad, and its name.
-            hanging: names of the loads of which one hangs.
+            goal: (n,) where it goes next, rad.
+            name: of the goal.
             left: (n,) where it was left, rad.
             ask: asks a person to confirm a sentence; raises DeviceError where that is refused.
 
@@ -140,14 +138,13 @@ class Mover:
         Raises:
             DeviceError: the way is not free, or the person gave up.
         """
-        goal, name = to
         while True:
             sample = self._arm.sample()
             unfit = self._guard.state(sample)
             if unfit is not None:
                 raise DeviceError(unfit)
             q = sample.q
-            self.check_way(q, goal, name, *hanging)
+            self.check_way(q, goal, name)
             off = np.abs(q - left)
             k = int(np.argmax(off))
             if off[k] <= MOVED_RAD:
@@ -159,26 +156,26 @@ class Mover:
             )
             left = q
 
-    def put_back(self, hanging: tuple[str, ...], ask: Callable[[str], None]) -> None:
+    def put_back(self, ask: Callable[[str], None]) -> None:
         """Have an arm that was moved during a question go back; see `agreed`."""
         if self.goal is None or self.moved(self._arm.sample()) is None:
             return
         goal, name = self.goal, "where it was left"
-        self.goal = self.agreed((goal, name), hanging, goal, ask)
-        self.move(goal, name, *hanging)
+        self.goal = self.agreed(goal, name, goal, ask)
+        self.move(goal, name)
 
     def left_here(self) -> None:
         """Take note of where the arm stands after it was stopped on its way."""
         if self.goal is None:
             self.goal = self._arm.sample().q
 
-    def check_way(self, start: Floats, goal: Floats, name: str, *hanging: str) -> None:
-        """Check the straight line in joint space between two states (n,), rad, under loads by name.
+    def check_way(self, start: Floats, goal: Floats, name: str) -> None:
+        """Check the straight line in joint space between two states (n,), rad.
 
         Raises:
             DeviceError: it is not free.
         """
-        for load in hanging:
+        for load in self.hanging:
             stops = Stop("where the arm stands", start, load), Stop(name, goal, load)
             problems = route_problems(self._guard.cell, self._config, stops)
             if problems:
@@ -187,13 +184,12 @@ class Mover:
                     "hand to a free place in the middle of its workspace"
                 )
 
-    def move(self, q: Floats, name: str, *hanging: str) -> None:
+    def move(self, q: Floats, name: str) -> None:
         """Move in a straight line in joint space, which is checked from where the arm stands.
 
         Args:
             q: (n,) rad.
             name: of the goal.
-            hanging: names of the loads of which one hangs.
 
         Raises:
             LoadChangedError: the load is not what should hang any more.
@@ -204,7 +200,7 @@ class Mover:
         start = sample.q
         if self.goal is not None and np.abs(start - self.goal).max() <= self._motion.arrival_rad:
             start = self.goal
-        self.check_way(start, q, name, *hanging)
+        self.check_way(start, q, name)
         self.goal = None  # wherever it ends, if it does not arrive
         self._under_way = True
         try:

@@ -174,11 +174,10 @@ class Session:
         if self._temperatures is None:
             self._temperatures = bool(np.isfinite(sample.joint_temperature).all())
         first, last = start[0], self._state.last_q
-        self._mover.check_way(sample.q, first.q, first.name, UNLOADED)
+        self._mover.check_way(sample.q, first.q, first.name)
         self._hook.begin()
         left = sample.q if last is None else last
-        to = first.q, first.name
-        self._mover.goal = self._mover.agreed(to, (UNLOADED,), left, self._hook.confirm)
+        self._mover.goal = self._mover.agreed(first.q, first.name, left, self._hook.confirm)
         self.in_control = True
         self._rig.arm.take_control(*payload(self._cell, None))
         seen = []
@@ -201,7 +200,7 @@ class Session:
     def _move(self, stop: Stop) -> None:
         if not self._mover.is_at(stop.q):
             self._watcher.notify(Phase(f"moving to {stop.name}"))
-            self._mover.move(stop.q, stop.name, self._hook.hanging)
+            self._mover.move(stop.q, stop.name)
 
     def _tare(self) -> None:
         """Set the force sensor's zero at the present pose, with nothing on the hook."""
