@@ -179,5 +179,31 @@ def test_a_motion_that_is_planned_passes_and_touches_nothing(
             assert not is_known(c.arm) or space.shapes.scene.itself.distance(between) > 0.0
 
 
+@settings(max_examples=8, deadline=None)
+@given(st.sampled_from(["ur3e", "ur10e", URDF]), SEED, st.floats(0.05, 0.95), LOAD)
+def test_nothing_small_is_passed_between_two_samples(
+    name: str, seed: int, share: float, load: str
+) -> None:
+    """A cube of 4 mm where hook, elbow or what hangs comes by, and a side that they just pass."""
+    free = cell(limits={"workspace_min_m": [-9.0, -9.0, -9.0], "joint_margin_rad": 0.0})
+    c = replace(cell_from_config(free), arm=arm(name))
+    space, q = Space(c, free), states(c, seed, 30)
+    start, *ends = q[space.allowed(q, load, STATE)]
+    clear = np.array(ends)[space.passable(start, np.array(ends), load)]
+    for end in clear[:2]:
+        between = start + share * (end - start)
+        at, parts = frames(c.arm, between), space.shapes.scene.parts
+        for point in (placed(parts[-1], at)[-1], at[4][:3, 3]):
+            cube = {"name": "cube", "center_m": point.tolist(), "size_m": [0.004] * 3}
+            found = cell(limits=free.limits.model_dump(), obstacles=[cube])
+            assert not Space(c, found).passable(start, end[None], load).any()
+            assert any(
+                "cube collide" in x for x in route_problems(c, found, _way(start, end, load))
+            )
+        low, _ = extent([p for p in parts if p.body > 2], c, between[None])
+        box = free.limits.model_dump() | {"workspace_min_m": [-9.0, -9.0, low[2] + 0.002]}
+        assert route_problems(c, cell(limits=box), _way(start, end, load))
+
+
 def _way(start: Floats, end: Floats, load: str) -> tuple[Stop, Stop]:
     return Stop("a", start, load), Stop("b", end, load)
