@@ -68,12 +68,8 @@ class CampaignFile:
         meta = dict(
             zip(_META, (config_json, base_dir, source, utc_now(), __version__), strict=True)
         )
-        try:
-            kept = robot_file_of(config_json, base_dir)
-            meta |= {**typed_now(), **kept, **(more or {})}
-            write_new(path, meta, overwrite)
-        except OSError as e:
-            raise InputError(f"{path}: cannot be written ({e.strerror})") from e
+        meta |= {**typed_now(), **robot_file_of(config_json, base_dir), **(more or {})}
+        write_new(path, meta, overwrite)
         return cls.open(path)
 
     @classmethod
