@@ -1,4 +1,4 @@
-"""`info` and `accept`: what a campaign holds, and which revision of it is used."""
+"""`info`, `accept` and `repair`: what a campaign holds, and which revisions of it are used."""
 
 from typing import Annotated
 
@@ -8,6 +8,7 @@ from hilcal.cli.terminal import Json, Run, terminal
 from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.covariance import COVERS
 from hilcal.data.overview import overview
+from hilcal.data.repair import repair as repaired
 from hilcal.data.revision import RevisionRecord
 from hilcal.errors import InputError
 from hilcal.identify.full_covariance import covariance_parts
@@ -61,6 +62,23 @@ def accept(
             "latest": records[-1].number,
         }
     )
+
+
+def repair(run: Run, as_json: Json = False) -> None:
+    """Open a campaign again that a bad revision closes: it is set aside, no reading is."""
+    t = terminal(as_json)
+    done = repaired(run)
+    if done is None:
+        t.show(f"{run}: no revision is bad; nothing was changed.")
+        t.document({"set_aside": [], "original": None})
+        return
+    numbers = ", ".join(map(str, done.revisions))
+    t.show(
+        f"{run}: {done.why}. Set aside: revision{'s' * (len(done.revisions) > 1)} {numbers}. All "
+        f"readings are there; the file as it was is {done.original}. Fit again with:"
+    )
+    t.command(f"hilcal identify {run}")
+    t.document({"set_aside": list(done.revisions), "original": str(done.original)})
 
 
 def _named(record: RevisionRecord) -> str:

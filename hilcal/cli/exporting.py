@@ -17,6 +17,7 @@ from hilcal.campaign import Campaign
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.terminal import Json, Revision, Run, Terminal, terminal
 from hilcal.data.covariance import INSTRUMENT
+from hilcal.data.records import content_hash
 from hilcal.data.revision_table import revision_table
 from hilcal.data.robot_file import ROBOT_FILE
 from hilcal.data.table import with_what_rounding_does, write_table
@@ -178,7 +179,7 @@ def _write_data(
     if readings is not None:
         stored = run.file.readings()
         covers = run.stored_covers
-        about["readings_sha256"] = run.file.data_hash()
+        about["readings_sha256"] = content_hash(stored)
         write_table(stored, readings, with_what_rounding_does(covers, stored), about)
         with_arm = "" if covers == INSTRUMENT else ", the arm's scatter in their covariance"
         t.show(f"{readings}: {len(stored)} readings as stored{with_arm}")

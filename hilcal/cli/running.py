@@ -98,7 +98,7 @@ def run(
                 raise InputError("--append begins a further plan, --resume goes on; give one")
             if plan is not None:
                 raise InputError("--plan with --resume: the plan is in the campaign; leave it out")
-            campaign = stack.enter_context(CampaignFile.open(output))
+            campaign = stack.enter_context(CampaignFile.open(output, check_revisions=False))
             check_same_cell(campaign, config, base_dir)
             made = RunLog(campaign).plans[0]
         elif append:
@@ -219,7 +219,7 @@ def _append(
     """
     if plan is None:
         raise InputError("--append needs the further plan: give it with --plan PLAN")
-    campaign = stack.enter_context(CampaignFile.open(output))
+    campaign = stack.enter_context(CampaignFile.open(output, check_revisions=False))
     check_same_cell(campaign, config, base_dir)
     further = RunLog(campaign).with_new_names(load_plan(plan))
     refuse(dry_checked(t, cell, config, further), str(plan))
