@@ -16,7 +16,7 @@ from hilcal.data.purpose import refuse_fitting
 from hilcal.data.readings import Readings
 from hilcal.data.records import content_hash
 from hilcal.data.revision import STORED, RevisionRecord
-from hilcal.data.robot_file import ROBOT_FILE
+from hilcal.data.robot_file import ROBOT_FILE, check_robot
 from hilcal.data.whitening import Mode, usual_mode
 from hilcal.diagnose.diagnosis import Diagnosis, History
 from hilcal.diagnose.verdict import diagnose
@@ -90,6 +90,7 @@ class Campaign:
         file = CampaignFile.open(path, read_only=read_only)
         try:
             config = CellConfig.from_json(file.config_json)
+            check_robot(file.path, file.config_json, file.about(ROBOT_FILE))
             cell = cell_from_config(config, Path(file.base_dir), file.about(ROBOT_FILE))
             readings = campaign_readings(file, cell, config)
         except BaseException:

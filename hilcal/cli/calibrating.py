@@ -28,7 +28,14 @@ from hilcal.data.quantities import parse_duration, parse_length
 from hilcal.data.run_log import RunLog
 from hilcal.data.whitening import Mode
 from hilcal.effects.catalogue import Catalogue
-from hilcal.errors import CannotAnswerError, HilcalError, InputError, LimitError, StoppedError
+from hilcal.errors import (
+    CannotAnswerError,
+    HilcalError,
+    InputError,
+    LimitError,
+    MovedFileError,
+    StoppedError,
+)
 from hilcal.plan.nominal_model import check_effects
 from hilcal.procedure.procedure import Procedure, continued
 from hilcal.procedure.state import DECIDED, REFINED, VALIDATED, Settings, Step
@@ -193,7 +200,7 @@ class _Told:
 
         def safe() -> str:
             if not p.run.exists():
-                return f"nothing has been measured; begin again with: {self.again}"
+                return f"{p.run} is not there; begin again with: {self.again}"
             return f"everything measured so far is safe; go on with: {self.on}"
 
         try:
@@ -204,7 +211,8 @@ class _Told:
             raise
         except HilcalError as error:
             words = str(error).removesuffix(HOW_ON).rstrip(". ")
-            raise type(error)(f"{words}; {safe()}") from error
+            how = f"then go on with: {self.on}" if isinstance(error, MovedFileError) else safe()
+            raise type(error)(f"{words}; {how}") from error
 
 
 def _procedure(

@@ -2,7 +2,8 @@
 
 import json
 import sqlite3
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -13,13 +14,14 @@ import numpy as np
 from hilcal import __version__
 from hilcal.data import rows, schema
 from hilcal.data.command_line import typed_now
+from hilcal.data.in_place import identity, moved_to, rescued
 from hilcal.data.new_campaign import write_new
 from hilcal.data.readings import Readings
 from hilcal.data.records import Layout, content_hash, layout_of, read_layout
 from hilcal.data.revision import RevisionRecord, fitted_to, from_text, to_text, utc_now
 from hilcal.data.robot_file import robot_file_of
 from hilcal.data.stored_priors import join, split
-from hilcal.errors import InputError
+from hilcal.errors import HilcalError, InputError, MovedFileError
 
 _TARGETS = "targets"
 ACCEPTED = "accepted {}"
@@ -40,6 +42,9 @@ class CampaignFile:
         """Take over an open connection; use `create` or `open`."""
         self.path = path
         self._connection = connection
+        self._identity = identity(path)
+        self._now: Path | None = None
+        self._written = False
         self._meta = self._read_meta()
 
     @classmethod
@@ -126,8 +131,12 @@ class CampaignFile:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Close the file."""
-        self.close()
+        """Close the file; what was written is not left in one that is not in its place."""
+        try:
+            if self._written and self._now is None:
+                self.check_place()
+        finally:
+            self.close()
 
     @property
     def n_readings(self) -> int:
@@ -165,6 +174,38 @@ class CampaignFile:
         """The open file, for the other modules of this package."""
         return self._connection
 
+    @contextmanager
+    def transaction(self) -> Iterator[sqlite3.Connection]:
+        """Store everything of a block, or nothing.
+
+        Raises:
+            InputError: it cannot be stored.
+            DeviceError: the disk is full or failed, or see `check_place`.
+        """
+        self._written = True
+        try:
+            with schema.sqlite_errors(self.path), schema.transaction(self._connection) as found:
+                yield found
+        except HilcalError:
+            self.check_place()  # which is why
+            raise
+        self.check_place()
+
+    def check_place(self) -> None:
+        """Refuse to go on where the open file is not the one of its name any more.
+
+        Raises:
+            MovedFileError: it was deleted, replaced or moved; says where its readings are.
+        """
+        if identity(self.path) == self._identity:
+            return
+        if self._now is None:
+            self._now = moved_to(self._identity) or rescued(self._connection, self.path)
+        raise MovedFileError(
+            f"{self.path}: deleted, replaced or moved while it was open; all {self.n_readings} "
+            f"readings stored so far are in {self._now}: move that back to {self.path} first"
+        )
+
     def append_readings(self, readings: Readings) -> int:
         """Append readings in one transaction; names already known keep their numbers.
 
@@ -175,7 +216,7 @@ class CampaignFile:
             InputError: other quantities, joints or elements than the readings before; a known
                 pose with other commanded joints; not finite; the file cannot be written.
         """
-        with schema.sqlite_errors(self.path), schema.transaction(self._connection):
+        with self.transaction():
             return self.insert(readings)
 
     def insert(self, readings: Readings) -> int:
@@ -218,7 +259,7 @@ class CampaignFile:
             InputError: the file cannot be written.
             ValueError: a number in it is not finite.
         """
-        with schema.sqlite_errors(self.path), schema.transaction(self._connection):
+        with self.transaction():
             return self.insert_revision(record)
 
     def insert_revision(self, record: RevisionRecord) -> int:
@@ -236,7 +277,7 @@ class CampaignFile:
                 rows.insert_meta(self._connection, key, posterior)
             schema.require(self._connection, schema.CARRIED_PRIOR)
         row = (number, text, rows.text_crc(str(number), text))
-        self._connection.execute("INSERT INTO revisions VALUES (?, ?, ?)", row)
+        rows.insert(self._connection, "revisions", [row])
         return number
 
     def accepted(self) -> int | None:
@@ -252,7 +293,7 @@ class CampaignFile:
         """
         if number is not None:
             self.revision(number)
-        with schema.sqlite_errors(self.path), schema.transaction(self._connection):
+        with self.transaction():
             key = ACCEPTED.format(len(self.acceptances()) + 1)
             rows.insert_meta(self._connection, key, json.dumps(number))
             schema.require(self._connection, schema.CHOSEN_REVISION)

@@ -1,12 +1,17 @@
-"""A campaign that a bad revision closes is opened again: it is set aside, no reading is."""
+"""What opens a campaign again: a bad revision is set aside, a robot's file is put in."""
 
 import sqlite3
 from dataclasses import dataclass
 from pathlib import Path
 
+from hilcal.config import CellConfig
 from hilcal.data import schema
 from hilcal.data.campaign_file import ACCEPTED, CampaignFile
 from hilcal.data.procedure_log import ENTRY, ProcedureLog
+from hilcal.data.robot_file import ROBOT_FILE, text_of
+from hilcal.data.rows import insert_meta
+from hilcal.errors import InputError
+from hilcal.robot.catalogue import load_arm
 from hilcal.whole_file import replace_file
 
 
@@ -43,7 +48,7 @@ def repair(path: Path) -> Repaired | None:
         if bad is None:
             return None
         first, why = bad
-        with schema.sqlite_errors(path), schema.transaction(file.connection) as connection:
+        with file.transaction() as connection:
             original = _free(path)
             replace_file(original, connection.serialize(), must_be_new=True)
             found = connection.execute("SELECT id FROM revisions WHERE id >= ?", (first,))
@@ -51,6 +56,28 @@ def repair(path: Path) -> Repaired | None:
             _delete(connection, "revisions", "id", numbers)
             _delete(connection, "meta", "key", _naming(file, first))
     return Repaired(why, numbers, original)
+
+
+def put_robot(path: Path, file: Path) -> None:
+    """Put the file of its robot into a campaign that does not hold it.
+
+    Raises:
+        InputError: it holds one, needs none, or that file is not one of such an arm.
+    """
+    with CampaignFile.open(path) as campaign:
+        robot = CellConfig.from_json(campaign.config_json).robot
+        if campaign.about(ROBOT_FILE) is not None or not Path(robot.model).suffix:
+            raise InputError(f"{path}: its robot is in it already; leave out --robot")
+        kept = text_of(file)
+        if not kept:
+            raise InputError(f"--robot {file}: cannot be read as text")
+        links = {"base_link": robot.base_link, "tip_link": robot.tip_link}
+        arm = load_arm(robot.model, text=kept[ROBOT_FILE], **links)
+        n = campaign.readings().states.q.shape[1] if campaign.n_readings else arm.n
+        if arm.n != n:
+            raise InputError(f"--robot {file}: {arm.n} joints, the readings have {n}")
+        with campaign.transaction() as connection:
+            insert_meta(connection, ROBOT_FILE, kept[ROBOT_FILE])
 
 
 def _naming(file: CampaignFile, first: int) -> tuple[str, ...]:

@@ -19,6 +19,7 @@ from hilcal.data.revision import STORED, fitted_to, from_text, to_text
 from hilcal.errors import InputError
 from tests.support.appending import again, appending
 from tests.support.cli_cases import CELL, ok, refused, rehearsal
+from tests.support.unguarded import unguarded
 
 Capsys = pytest.CaptureFixture[str]
 
@@ -170,15 +171,10 @@ def _bad(path: Path, how: str) -> None:
         o.accept(3)
         wrong = replace(o.file.revision(2), parent=None)
     wrong = replace(wrong, options={**wrong.options, STORED: "0" * 64})
-    with closing(sqlite3.connect(path, isolation_level=None)) as db:
-        (trigger,) = db.execute(
-            "SELECT sql FROM sqlite_master WHERE name = 'revisions_no_update'"
-        ).fetchone()
-        db.execute("DROP TRIGGER revisions_no_update")
+    with closing(sqlite3.connect(path, isolation_level=None)) as db, unguarded(db):
         text = to_text(wrong) if how == "hash" else "{"
         crc = rows.text_crc("2", text) if how == "hash" else 0
         db.execute("UPDATE revisions SET content = ?, crc = ? WHERE id = 2", (text, crc))
-        db.execute(trigger)
 
 
 @pytest.mark.parametrize("how", ["hash", "damage"])
