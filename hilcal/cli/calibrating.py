@@ -120,10 +120,18 @@ def calibrate(
         asked["prior"] = str(prior.absolute())
     on = ["hilcal", "calibrate", str(cell), "-o", str(output)]
     more = ["--rehearse"] * rehearse + ["--yes"] * yes + ["--view"] * view
+    if prior is not None:
+        more += ["--prior", str(prior)]
     for path in effects_from or ():
         more += ["--effects-from", str(path)]
     told = _Told(t, shlex.join([*on, "--resume", *more]), shlex.join([*on, *more]))
     p = _procedure(cell, output, resume, rehearse, config, numbers, catalogue, asked, told)
+    kept = p.settings.prior
+    if kept is not None and prior is None and Path(kept).parent != output.absolute().parent:
+        raise InputError(
+            f"{output}: its prior is {kept!r}, and no file elsewhere is read because a campaign "
+            f"names it; give it yourself: --prior {kept}"
+        )
     if p.settings.prior is not None and p.next().kind in FITTED_LATER:
         known = PriorOptions(Path(p.settings.prior), "arm", None).load(catalogue)
         p = replace(p, known=known)

@@ -71,13 +71,13 @@ def put_robot(path: Path, file: Path) -> None:
         kept = text_of(file)
         if not kept:
             raise InputError(f"--robot {file}: cannot be read as text")
-        links = {"base_link": robot.base_link, "tip_link": robot.tip_link}
-        arm = load_arm(robot.model, text=kept[ROBOT_FILE], **links)
+        text, base, tip = kept[ROBOT_FILE], robot.base_link, robot.tip_link
+        arm = load_arm(robot.model, base_link=base, tip_link=tip, text=text)
         n = campaign.readings().states.q.shape[1] if campaign.n_readings else arm.n
         if arm.n != n:
             raise InputError(f"--robot {file}: {arm.n} joints, the readings have {n}")
         with campaign.transaction() as connection:
-            insert_meta(connection, ROBOT_FILE, kept[ROBOT_FILE])
+            insert_meta(connection, ROBOT_FILE, text)
 
 
 def _naming(file: CampaignFile, first: int) -> tuple[str, ...]:

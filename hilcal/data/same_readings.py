@@ -85,12 +85,14 @@ def shared(campaigns: Sequence[Floats]) -> tuple[int, int] | None:
         rows = np.concatenate([rows for _, rows in own])
         if len(rows) < 2:
             continue
-        distance, nearest = cKDTree(rows).query(
-            rows, k=[2], p=np.inf, distance_upper_bound=1.0 + 1e-9
-        )
+        tree = cKDTree(rows)
+        told = tree.query(rows, k=2, p=np.inf, distance_upper_bound=1.0 + 1e-9)
+        here, (distance, nearest) = np.arange(len(rows)), map(np.asarray, told)
+        second = (nearest[:, 0] == here).astype(int)  # one of the two is the reading itself
+        distance, nearest = distance[here, second], nearest[here, second]
+        found = np.isfinite(distance)
         other = np.full(len(rows), -1)
-        found = np.isfinite(distance[:, 0])
-        other[found] = of[nearest[found, 0]]
+        other[found] = of[nearest[found]]
         for k, unique in own:
             others = other[of == k]
             others = others[(others >= 0) & (others != k)]

@@ -56,9 +56,9 @@ def fleet(directory: Path, engine: Engine, counting: Counting = _unseen) -> Flee
     """
     listed = entries(directory)
     if same := shared(engine.map(prints_of, listed)):
-        first, second = sorted(listed[k].name for k in same)
+        one, other = sorted(listed[k].name for k in same)
         raise InputError(
-            f"{directory}: {first} and {second} have readings in common: one measurement counts "
+            f"{directory}: {one} and {other} have readings in common: one measurement counts "
             "once; leave one of them out"
         )
     with counting("campaigns", len(listed)) as advance:
