@@ -95,6 +95,8 @@ class CampaignFile:
             InputError: no such file, another format, a newer version, damaged or truncated.
         """
         path = Path(path)
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise InputError(f"{path}: a device or a pipe; valid: a campaign file")
         try:
             with path.open("rb") as stream:
                 head = stream.read(len(schema.HEADER))

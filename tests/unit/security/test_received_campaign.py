@@ -18,6 +18,7 @@ from hilcal.data.covariance import COVERS, WHOLE
 from hilcal.errors import InputError
 from hilcal.robot.catalogue import load_arm
 from tests.support.cli_cases import CELL, ok, refused, rehearsal
+from tests.support.cli_cases import run as run_of
 from tests.unit.data.test_campaign import REVISION
 
 Capsys = pytest.CaptureFixture[str]
@@ -118,6 +119,14 @@ def test_nothing_is_said_to_be_stored_that_is_not(what: str, run: Path) -> None:
         with pytest.raises(InputError, match="not stored"):
             store()
         assert file.n_readings == count
+
+
+def test_a_pipe_in_the_place_of_a_campaign_is_not_waited_for(
+    tmp_path: Path, capsys: Capsys
+) -> None:
+    os.mkfifo(tmp_path / "x.hilcal")
+    assert "a pipe" in refused(capsys, 2, "info", tmp_path / "x.hilcal")
+    assert run_of(capsys, "fleet", tmp_path, "-o", tmp_path / "p.json", "--workers", "1").code == 4
 
 
 # the robot
