@@ -184,7 +184,9 @@ def test_a_bad_revision_is_set_aside_and_no_reading(run: Path, capsys: Capsys, h
     for command in ("info", "identify", "compare", "export"):
         words = ["--readings", str(run.with_suffix(".csv"))] if command == "export" else []
         assert f"hilcal repair {run}" in refused(capsys, 2, command, run, *words)
-    with CampaignFile.open(run, check_revisions=False) as file:  # as `run --resume` does
+    told = refused(capsys, 2, "run", CELL, "-o", run, "--resume")  # it looks at no revision
+    assert "was not measured with `hilcal run`" in told
+    with CampaignFile.open(run, check_revisions=False) as file:
         readings = file.readings()
         more_hash = content_hash(readings)
     told = ok(capsys, "repair", run, "--json").document
