@@ -31,6 +31,7 @@ from hilcal.model import Model
 from hilcal.robot.arm import Arm
 from hilcal.toml import parse_json
 from hilcal.types import Floats
+from hilcal.whole_file import replace_file
 
 FORMAT, VERSION = "hilcal-calibration", 2
 BY_FACTOR = 1
@@ -49,10 +50,7 @@ def write(c: Calibration, path: Path) -> None:
         InputError: it cannot be written.
     """
     content = json.dumps(to_json(c), indent=1, allow_nan=False)
-    try:
-        path.write_text(content + "\n", encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+    replace_file(path, content + "\n")
 
 
 def read(path: Path, catalogue: Catalogue | None = None) -> Calibration:

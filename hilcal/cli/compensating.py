@@ -26,6 +26,7 @@ from hilcal.report import text_compensate
 from hilcal.report.progress import working
 from hilcal.robot import se3
 from hilcal.types import Floats
+from hilcal.whole_file import replace_file
 
 PROGRAMS = (".script", ".urscript")
 WRITTEN = (".csv", ".json", *PROGRAMS)
@@ -264,10 +265,7 @@ def _write(path: Path, task: _Task, found: Compensation, document: dict[str, obj
         content = movej_program(names, found.q)
     else:
         content = task.rewrite(found.q)
-    try:
-        path.write_text(content, encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+    replace_file(path, content)
 
 
 def _csv(names: tuple[str, ...], found: Compensation) -> str:

@@ -21,7 +21,6 @@ _NAMES = {
     "poses": "SELECT name FROM poses ORDER BY id",
     "loads": "SELECT name FROM loads ORDER BY id",
 }
-_NEW_NAME = {"poses": "INSERT INTO poses VALUES (?, ?)", "loads": "INSERT INTO loads VALUES (?, ?)"}
 
 
 def text_crc(key: str, text: str) -> int:
@@ -33,9 +32,23 @@ def _reading_crc(number: int, where: Sequence[int], record: bytes) -> int:
     return zlib.crc32(record, zlib.crc32(np.array([number, *where], dtype="<i8").tobytes()))
 
 
+def insert(connection: sqlite3.Connection, table: str, rows: Sequence[Sequence[object]]) -> None:
+    """Append rows to a table.
+
+    Raises:
+        sqlite3.DatabaseError: not all of them are in it.
+    """
+    if not rows:
+        return
+    marks = ", ".join("?" * len(rows[0]))
+    done = connection.executemany(f"INSERT INTO {table} VALUES ({marks})", rows)  # noqa: S608
+    if done.rowcount != len(rows):
+        raise sqlite3.DatabaseError(f"{len(rows) - done.rowcount} rows of {table} were not stored")
+
+
 def insert_meta(connection: sqlite3.Connection, key: str, value: str) -> None:
     """Store a text about the campaign; it cannot be changed later."""
-    connection.execute("INSERT INTO meta VALUES (?, ?, ?)", (key, value, text_crc(key, value)))
+    insert(connection, "meta", [(key, value, text_crc(key, value))])
 
 
 def fetch_meta(connection: sqlite3.Connection, path: Path) -> dict[str, str]:
@@ -67,7 +80,7 @@ def insert_names(connection: sqlite3.Connection, table: str, names: Sequence[str
     known = {name: k for k, name in enumerate(fetch_names(connection, table))}
     for name in names:
         if name not in known:
-            connection.execute(_NEW_NAME[table], (len(known), name))
+            insert(connection, table, [(len(known), name)])
             known[name] = len(known)
     return np.array([known[name] for name in names], dtype=np.int64)
 
@@ -79,15 +92,13 @@ def insert_readings(connection: sqlite3.Connection, readings: Readings) -> int:
     load = insert_names(connection, "loads", readings.load_names)[readings.load]
     (last,) = connection.execute("SELECT ifnull(max(id), 0) FROM readings").fetchone()
     index = np.stack([pose, load, readings.cycle], axis=1).tolist()
-    connection.executemany(
-        "INSERT INTO readings VALUES (?, ?, ?, ?, ?, ?)",
-        (
-            (number, *where, record, _reading_crc(number, where, record))
-            for number, (where, record) in enumerate(
-                zip(index, map(bytes, records), strict=True), start=int(last) + 1
-            )
-        ),
-    )
+    stored = [
+        (number, *where, record, _reading_crc(number, where, record))
+        for number, (where, record) in enumerate(
+            zip(index, map(bytes, records), strict=True), start=int(last) + 1
+        )
+    ]
+    insert(connection, "readings", stored)
     return int(last) + len(readings)
 
 

@@ -7,7 +7,6 @@ metadata, and what the table is about is in the schema's, as JSON under the key 
 
 import csv
 import json
-import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ import numpy as np
 from hilcal.data.csvfile import CsvTable
 from hilcal.errors import InputError
 from hilcal.types import Floats
+from hilcal.whole_file import replacing
 
 UNITS = ("m2", "rad2", "m", "rad", "N", "Nm", "s", "degC")
 """Ends of names that are units."""
@@ -54,17 +54,14 @@ def write_columns(path: Path, columns: Mapping[str, Column], about: Mapping[str,
     if path.suffix.lower() == ".parquet":
         table = _arrow(path, plain, about)
         parquet = pyarrow_module(path, "pyarrow.parquet")
-        _replaced(path, lambda new: parquet.write_table(table, new))
+        with replacing(path) as new:
+            parquet.write_table(table, new)
         return
-
-    def write(new: Path) -> None:
-        with new.open("w", encoding="utf-8", newline="") as stream:
-            out = csv.writer(stream, lineterminator="\n")
-            out.writerow(plain)
-            cells = [[_cell(v) for v in values] for values in plain.values()]
-            out.writerows(zip(*cells, strict=True))
-
-    _replaced(path, write)
+    with replacing(path) as new, new.open("w", encoding="utf-8", newline="") as stream:
+        out = csv.writer(stream, lineterminator="\n")
+        out.writerow(plain)
+        cells = [[_cell(v) for v in values] for values in plain.values()]
+        out.writerows(zip(*cells, strict=True))
 
 
 def read_parquet(
@@ -144,17 +141,6 @@ def _numbers(path: Path, name: str, column: Any) -> Floats:
         if not number or not np.isfinite(value):
             raise InputError(f"{path}: row {k}, column '{name}': {value!r} is not a finite number")
     return np.array(values, dtype=float)
-
-
-def _replaced(path: Path, write: Callable[[Path], object]) -> None:
-    """Write a file beside its place, and put it there when it is complete."""
-    new = path.with_name(f".{path.name}.new")
-    try:
-        write(new)
-        os.replace(new, path)
-    except (OSError, UnicodeEncodeError) as e:
-        new.unlink(missing_ok=True)
-        raise InputError(f"{path}: cannot be written ({e})") from e
 
 
 def pyarrow_module(path: Path, module: str) -> Any:

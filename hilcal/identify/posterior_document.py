@@ -17,6 +17,7 @@ from hilcal.errors import InputError
 from hilcal.identify.posterior import LearntEffect, Posterior, Source
 from hilcal.toml import parse_json
 from hilcal.types import Floats
+from hilcal.whole_file import replace_file
 
 FORMAT, VERSION = "hilcal-posterior", 1
 
@@ -85,10 +86,7 @@ def write(p: Posterior, path: Path) -> None:
     Raises:
         InputError: it cannot be written.
     """
-    try:
-        path.write_text(json.dumps(to_json(p), allow_nan=False) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+    replace_file(path, json.dumps(to_json(p), allow_nan=False) + "\n")
 
 
 def _read(content: Mapping[str, Any]) -> Posterior:
