@@ -25,6 +25,7 @@ from hilcal.data.tabular import check_suffix, write_columns
 from hilcal.errors import InputError
 from hilcal.identify import parameters_document
 from hilcal.identify.residual_table import residual_table
+from hilcal.names import csv_text
 from hilcal.report.numbers import length
 from hilcal.report.progress import Say, working
 
@@ -358,7 +359,8 @@ def _write_parameters(path: Path, rows: Sequence[dict[str, object]]) -> None:
             out = csv.writer(stream, lineterminator="\n")
             out.writerow(names)
             for row in rows:
-                out.writerow("" if row[k] is None else row[k] for k in names)
+                cells = ("" if row[k] is None else row[k] for k in names)
+                out.writerow(csv_text(c) if isinstance(c, str) else c for c in cells)
     except OSError as e:
         raise InputError(f"{path}: cannot be written ({e.strerror})") from e
 

@@ -279,6 +279,8 @@ class CampaignFile:
                     if number != expected or rows.text_crc(str(number), text) != crc:
                         raise ValueError
                     records.append(join(from_text(text, number), meta))
+                except InputError as e:
+                    raise InputError(f"{self.path}: {e}") from None
                 except ValueError as e:
                     where = f"damaged at revision {expected}"
                     raise InputError(f"{self.path}: the campaign is {where}") from e

@@ -344,7 +344,7 @@ class Writer:
         return "\n".join(self.lines) + "\n"
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=300, deadline=None)
 @given(st.integers(0, 2**40))
 def test_every_target_of_a_random_program_is_corrected_or_left(seed: int) -> None:
     with contextlib.suppress(InputError):  # how many, see the next test
