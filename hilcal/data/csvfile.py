@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from hilcal.errors import InputError
-from hilcal.names import check_name, from_csv
+from hilcal.names import check_name, check_names, from_csv
 from hilcal.types import Bools, Floats, Ints
 
 _BLOCK = 4096
@@ -104,7 +104,8 @@ def read_columns(
     try:
         with Path(path).open(encoding="utf-8-sig", newline="") as stream:
             reader = csv.reader(stream, delimiter=dialect.delimiter, strict=True)
-            header = [check_name(cell.strip(), f"{name}: row 1") for cell in next(reader, [])]
+            header = [cell.strip() for cell in next(reader, [])]
+            check_names(header, f"{name}: row 1, column")
             text, number = choose(header)
             return _parse(name, reader, header, text, number, dialect)
     except UnicodeDecodeError as e:

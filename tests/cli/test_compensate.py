@@ -138,6 +138,24 @@ def test_waypoints_are_corrected_left_or_refused_and_that_is_said(capsys, fitted
     )
 
 
+def test_a_name_is_neither_a_line_of_a_program_nor_a_formula(capsys, fitted, tmp_path) -> None:
+    points, out = table(tmp_path, fitted), tmp_path / "o.script"
+    plain = points.read_text()
+    evil = '"P1\n movej([0,0,0,0,0,0], a=10, v=3)\n #"'
+    points.write_text(plain.replace("w1", evil))
+    said = refused(capsys, 2, "compensate", fitted, points, "-o", out)
+    assert "row 3, column 'pose': 'P1\\u000a movej(" in said
+    assert "valid: " in said
+    assert not out.exists()
+    points.write_text(plain.replace("w1", "=1+1"))
+    ok(capsys, "compensate", fitted, points, "-o", tmp_path / "a.csv")
+    assert "\n'=1+1," in (tmp_path / "a.csv").read_text()
+    kept = [line.rsplit(",", 3)[0] for line in (tmp_path / "a.csv").read_text().splitlines()]
+    points.write_text("\n".join(kept) + "\n")
+    told = ok(capsys, "compensate", fitted, points, "--json").document
+    assert [point["name"] for point in told["points"]] == ["w0", "=1+1", "w2"]
+
+
 def test_the_corrected_geometry_is_handed_over(capsys, fitted, tmp_path) -> None:
     paths = [tmp_path / name for name in ("a.urdf", "a.yaml", "f.json")]
     options = zip(("--urdf", "--ur-kinematics", "--frames"), paths, strict=True)
