@@ -45,8 +45,11 @@ _HARMLESS = re.compile(
     r"|pose_(add|sub|dist|inv|trans)|point_dist|interpolate_pose|wrench_trans"
     r"|to_(num|str)|str_(at|cat|empty|find|len|sub)|sleep|sync|textmsg|popup|time|powerdown"
     r"|(get|set)_(standard_|configurable_|tool_)?(digital|analog)_(in|out)|set_tool_voltage"
+    r"|set_(standard_|configurable_|tool_)?(digital|analog)_(in|out)put_?(action|domain|mode|range)"
+    r"|set_(runstate|input_actions)_\w+|set_tool_(communication|output_mode)"
+    r"|set_safety_mode_transition_hardness"
     r"|(read|write)_(input|output)_(boolean|integer|float)_register|read_port_(bit|register)"
-    r"|write_port_(bit|register)|modbus_(get|set)_(output_)?signal(_status)?"
+    r"|write_port_(bit|register)|modbus_\w+"
     r"|socket_(open|close|get_var|set_var|(read|send)_\w+)|request_\w+_from_primary_client"
     r"|is_steady|get_steptime|get_tcp_force|force|get_joint_temp|get_controller_temp"
     r"|get_tool_(temp|current)",

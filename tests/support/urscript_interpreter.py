@@ -179,8 +179,10 @@ class Machine:
                 return ("inverse", *given, *named.values())
             case "pose_trans":
                 return Pose([a + b for a, b in zip(*given, strict=True)])
-            case "sleep" | "textmsg" | "set_payload":
+            case "sleep" | "textmsg":
                 return None
+        if name.startswith("set_"):
+            return None
         function = self._read(name, scopes)
         if not isinstance(function, tuple) or len(function[0]) != len(given):
             raise Stopped

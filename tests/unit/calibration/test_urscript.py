@@ -84,9 +84,33 @@ def check_understood(program: str, seeds: int = 4) -> int:
     return seen
 
 
+POLYSCOPE = f"""def Program():
+  set_standard_analog_input_domain(0, 1)
+  set_tool_voltage(24)
+  set_standard_digital_input_action(0, "default")
+  set_gravity([0.0, 0.0, 9.82])
+  set_tcp(p[0.0,0.0,0.1,0.0,0.0,0.0])
+  set_payload(2.0, [0.0, 0.0, 0.05])
+  global Waypoint_1_p={POSE}
+  global Waypoint_1_q={SIX}
+  global Waypoint_2_p=p[0.4, 0.2, 0.25, 0, 3, 0]
+  $ 1 "Robot Program"
+  while (get_standard_digital_in(7)):
+    $ 2 "MoveJ"
+    $ 3 "Waypoint_1" "breakAfter"
+    movej(get_inverse_kin(Waypoint_1_p, qnear=Waypoint_1_q), a=1.3962634015954636, v=1.04)
+    $ 4 "MoveL"
+    $ 5 "Waypoint_2" "breakAfter"
+    movel(Waypoint_2_p, a=1.2, v=0.25, r=0.01)
+  end
+end
+"""
+
+
 @pytest.mark.parametrize(
     "program",
     [
+        POLYSCOPE,
         f"movej({SIX})\n",
         f"movej( q = {SIX} , a=1.4)\nmovel(pose={SIX}, a=1, v=1, t=0, r=0.01)\n",
         f"def prog():\n\tglobal A={SIX}\n  movej(A, v=1)\r\n  movel({POSE})\nend",
