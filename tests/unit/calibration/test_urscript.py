@@ -368,23 +368,31 @@ class Writer:
         return "\n".join(self.lines) + "\n"
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(st.integers(0, 2**40))
 def test_every_target_of_a_random_program_is_corrected_or_left(seed: int) -> None:
     with contextlib.suppress(InputError):  # how many, see the next test
         check_understood(Writer(seed).program(), seeds=2)
 
 
-def test_random_programs_are_not_all_refused() -> None:
-    """What the property is worth: corrected, left and refused ones are all met often."""
+def met(seeds: range) -> list[int]:
+    """How many programs have motions that were seen corrected, waypoints left, or are refused."""
     seen = left = refused = 0
-    for seed in range(150):
+    for seed in seeds:
         program = Writer(seed).program()
         try:
             seen += check_understood(program, seeds=1) > 0
             left += bool(corrected(program)[2])
         except InputError:
             refused += 1
-    assert seen > 40
-    assert left > 40
-    assert refused > 5
+    return [seen, left, refused]
+
+
+def test_random_programs_are_not_all_refused() -> None:
+    """What the property is worth: corrected, left and refused ones are all met often."""
+    assert min(np.array(met(range(60))) / [10, 20, 3]) >= 1
+
+
+@pytest.mark.slow
+def test_many_random_programs() -> None:
+    assert min(met(range(10**6, 10**6 + 10_000))) > 100
