@@ -46,15 +46,18 @@ def check_names(value: object, where: str) -> None:
     Raises:
         InputError: see `check_name`.
     """
-    if isinstance(value, str):
-        check_name(value, where)
-    elif isinstance(value, dict):
-        for key, inner in value.items():
-            check_name(str(key), where)
-            check_names(inner, f"{where}: {key}")
-    elif isinstance(value, list | tuple):
-        for k, inner in enumerate(value, start=1):
-            check_names(inner, f"{where} {k}")
+    pending = [(value, where)]  # documents of others are nested deeper than Python calls itself
+    while pending:
+        inner, at = pending.pop()
+        if isinstance(inner, str):
+            check_name(inner, at)
+        elif isinstance(inner, dict):
+            for key in inner:
+                check_name(str(key), at)
+            pending += [(one, f"{at}: {key}") for key, one in inner.items()]
+        elif isinstance(inner, list | tuple):
+            texts = ((k, x) for k, x in enumerate(inner, start=1) if not isinstance(x, float | int))
+            pending += [(one, f"{at} {k}") for k, one in texts]
 
 
 def csv_text(text: str) -> str:

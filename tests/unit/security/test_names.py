@@ -59,7 +59,7 @@ from hilcal.data.tabular import read_parquet, write_columns
 from hilcal.discover.write_effect import source_of_form
 from hilcal.errors import InputError
 from hilcal.identify import posterior_document
-from hilcal.names import csv_text, escaped, from_csv
+from hilcal.names import check_name, check_names, csv_text, escaped, from_csv
 from hilcal.report.charts import style as chart_style
 from hilcal.report.charts.readings_drawn import escaped as in_chart
 from hilcal.report.html import page
@@ -96,8 +96,6 @@ def harmless(text: str) -> bool:
 
 @pytest.mark.parametrize("sign", EVIL)
 def test_each_such_character_is_refused_in_one_line_and_escaped(sign: str) -> None:
-    from hilcal.names import check_name
-
     with pytest.raises(InputError) as error:
         check_name(f"P1{sign}x", "t.csv: row 2, column 'pose'")
     said = str(error.value)
@@ -107,6 +105,18 @@ def test_each_such_character_is_refused_in_one_line_and_escaped(sign: str) -> No
     assert harmless(said)
     assert "\n" not in said
     assert escaped(sign) == code
+
+
+def test_documents_are_checked_however_deep_they_are() -> None:
+    deep: object = "a\nb"
+    for _ in range(5000):
+        deep = [deep]
+    with pytest.raises(InputError, match="holds the character"):
+        check_names({"a": deep}, "f")
+    with pytest.raises(InputError, match=r"f: a: b 2: .* holds the character"):
+        check_names({"a": {"b": [1, "\x1b"]}}, "f")
+    with pytest.raises(InputError, match="holds the character"):
+        check_names({"a": {"b\u2028": 1}}, "f")
 
 
 @few
