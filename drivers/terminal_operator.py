@@ -10,6 +10,7 @@ from rich.console import Console
 from hilcal.acquire.devices import Report
 from hilcal.config import CellConfig, Load
 from hilcal.errors import DeviceError, InputError
+from hilcal.names import escaped
 
 _NO_TERMINAL = (
     "operator: standard input is not a terminal, so nobody can be asked to hang a load; "
@@ -101,6 +102,7 @@ class TerminalOperator:
     def _say(self, words: str = "", *, style: str | None = None, end: str = "\n") -> None:
         """Print above nothing: the live display is gone. A terminal's lines break between words."""
         whole = not self._console.is_terminal
+        words = "\n".join(map(escaped, words.split("\n")))
         self._console.print(words, style=style, end=end, markup=False, soft_wrap=whole)
 
     def close(self) -> None:

@@ -28,6 +28,7 @@ from hilcal.data.whitening import MODES
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError
 from hilcal.model import Model
+from hilcal.names import check_names
 from hilcal.robot.arm import Arm
 from hilcal.toml import parse_json
 from hilcal.types import Floats
@@ -119,6 +120,7 @@ def from_json(content: Mapping[str, Any], catalogue: Catalogue | None = None) ->
             f"a calibration of version {content['version']}, written by hilcal "
             f"{content['hilcal']}; this program reads versions {BY_FACTOR} and {VERSION}"
         )
+    check_names({k: v for k, v in content.items() if k != "source"}, "calibration")
     known = catalogue or installed()
     arm = _arm(content["arm"])
     check_arm(arm)

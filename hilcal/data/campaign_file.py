@@ -334,6 +334,8 @@ class CampaignFile:
                     if number != expected or rows.text_crc(str(number), text) != crc:
                         raise ValueError
                     records.append(join(from_text(text, number), meta))
+                except InputError as error:
+                    return tuple(records), (expected, str(error))
                 except (ValueError, TypeError, AttributeError):
                     what = f"the campaign is damaged at revision {expected}"
                     return tuple(records), (expected, what)

@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from hilcal.errors import InputError
+from hilcal.names import check_names
 from hilcal.toml import parse_json
 
 STORED = "stored_sha256"
@@ -115,6 +116,7 @@ def from_text(text: str, number: int) -> RevisionRecord:
 
     Raises:
         ValueError: not such a text.
+        InputError: a name in it is none.
     """
     try:
         content = parse_json(text)
@@ -135,6 +137,7 @@ def _check(record: RevisionRecord) -> None:
     named = (t for t in (record.added, record.removed) if t is not None)
     if not all(isinstance(text, str) for text in (*texts, *named)):
         raise TypeError("a name is no text")
+    check_names([*texts, *named], f"revision {record.number}, name")
     if record.parent is not None and not isinstance(record.parent, int):
         raise TypeError("parent is no number")
 

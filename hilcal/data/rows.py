@@ -12,6 +12,7 @@ from hilcal.data.checks import SAME_POSE, is_covariance
 from hilcal.data.readings import Readings
 from hilcal.data.records import Layout, pack, unpack
 from hilcal.errors import InputError
+from hilcal.names import check_name, check_names
 from hilcal.toml import parse_json
 from hilcal.types import Ints
 
@@ -73,13 +74,14 @@ def insert_names(connection: sqlite3.Connection, table: str, names: Sequence[str
     """Numbers of names; new ones are appended in order.
 
     Raises:
-        InputError: a name stands for two of them.
+        InputError: a name stands for two of them, or is none.
     """
     if len(set(names)) != len(names):
         raise InputError(f"readings: two {table} have the same name")
     known = {name: k for k, name in enumerate(fetch_names(connection, table))}
     for name in names:
         if name not in known:
+            check_name(name, table)
             insert(connection, table, [(len(known), name)])
             known[name] = len(known)
     return np.array([known[name] for name in names], dtype=np.int64)
@@ -108,12 +110,13 @@ def fetch_readings(
     """All readings, in order.
 
     Raises:
-        InputError: one is missing or damaged.
+        InputError: one is missing or damaged, or a name of a pose, load or target is none.
     """
     rows = connection.execute(
         "SELECT id, pose, load, cycle, record, crc FROM readings ORDER BY id"
     ).fetchall()
     names = [fetch_names(connection, table) for table in ("poses", "loads")]
+    check_names([*names, target_names], f"{path}: name")
     size = 8 * sum(width for _, width in layout)
     for number, (key, *where, record, crc) in enumerate(rows, start=1):
         try:

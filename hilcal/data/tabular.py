@@ -15,6 +15,7 @@ import numpy as np
 
 from hilcal.data.csvfile import CsvTable
 from hilcal.errors import InputError
+from hilcal.names import check_name, check_names, csv_text, escaped
 from hilcal.types import Floats
 from hilcal.whole_file import replacing
 
@@ -50,7 +51,9 @@ def write_columns(path: Path, columns: Mapping[str, Column], about: Mapping[str,
         InputError: another ending, no pyarrow for Parquet, or the file cannot be written.
     """
     check_suffix(path)
-    plain = {k: v.tolist() if isinstance(v, np.ndarray) else list(v) for k, v in columns.items()}
+    plain = {
+        escaped(k): v.tolist() if isinstance(v, np.ndarray) else list(v) for k, v in columns.items()
+    }
     if path.suffix.lower() == ".parquet":
         table = _arrow(path, plain, about)
         parquet = pyarrow_module(path, "pyarrow.parquet")
@@ -59,7 +62,7 @@ def write_columns(path: Path, columns: Mapping[str, Column], about: Mapping[str,
         return
     with replacing(path) as new, new.open("w", encoding="utf-8", newline="") as stream:
         out = csv.writer(stream, lineterminator="\n")
-        out.writerow(plain)
+        out.writerow(map(csv_text, plain))
         cells = [[_cell(v) for v in values] for values in plain.values()]
         out.writerows(zip(*cells, strict=True))
 
@@ -83,6 +86,7 @@ def read_parquet(
         words = " ".join(str(e).split())[:80]
         raise InputError(f"{path}: damaged, or not a Parquet file ({words})") from e
     header = list(found.column_names)
+    check_names(header, f"{path}: column")
     text, number = choose(header)
     rows = np.arange(1, found.num_rows + 1)
     if not found.num_rows:
@@ -112,12 +116,15 @@ def unit_of(name: str) -> str | None:
 
 def _cell(value: object) -> object:
     """Return a cell as CSV writes it."""
+    if isinstance(value, str):
+        return csv_text(value)
     return "" if value is None else repr(value) if isinstance(value, float) else value
 
 
 def _arrow(path: Path, columns: Mapping[str, list[Any]], about: Mapping[str, object]) -> Any:
     arrow = pyarrow_module(path, "pyarrow")
-    arrays = [arrow.array(values) for values in columns.values()]
+    texts = ([escaped(v) if isinstance(v, str) else v for v in c] for c in columns.values())
+    arrays = [arrow.array(values) for values in texts]
     fields = []
     for name, array in zip(columns, arrays, strict=True):
         unit = unit_of(name)
@@ -130,7 +137,7 @@ def _texts(path: Path, name: str, values: list[object]) -> list[str]:
     for k, value in enumerate(values, start=1):
         if not isinstance(value, str):
             raise InputError(f"{path}: row {k}, column '{name}': {value!r} is no text")
-    return [str(value).strip() for value in values]
+    return [check_name(str(v).strip(), f"{path}: column '{name}'") for v in values]
 
 
 def _numbers(path: Path, name: str, column: Any) -> Floats:

@@ -20,6 +20,7 @@ from hilcal.identify.baseline import baseline, with_effects
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.learnt import of_arm
 from hilcal.identify.posterior import Posterior, Source
+from hilcal.names import check_names
 from hilcal.refine import refine
 from hilcal.types import Floats
 
@@ -114,6 +115,7 @@ def _listed(path: Path) -> Mapping[str, tuple[str, str]]:
             if not {"campaign", "arm"} <= set(rows.fieldnames or ()):
                 raise InputError(f"{path}: valid: columns campaign, arm and, where known, date")
             for k, row in enumerate(rows, start=2):
+                check_names(dict(row), f"{path}: row {k}")
                 date = (row.get("date") or "").strip()
                 if date:
                     seconds_of(date, f"{path}: row {k}, column 'date'")

@@ -15,6 +15,7 @@ from hilcal.data.ranges import Range
 from hilcal.data.whitening import MODES
 from hilcal.errors import InputError
 from hilcal.identify.posterior import LearntEffect, Posterior, Source
+from hilcal.names import check_names
 from hilcal.toml import parse_json
 from hilcal.types import Floats
 from hilcal.whole_file import replace_file
@@ -58,6 +59,7 @@ def from_json(content: Mapping[str, Any]) -> Posterior:
             f"a prior of version {content.get('version')}, written by hilcal "
             f"{content.get('hilcal')}; this program reads version {VERSION}"
         )
+    check_names({k: v for k, v in content.items() if k != "source"}, "prior")
     try:
         return _read(content)
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
