@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from hilcal import __version__
+from hilcal import __version__, limits
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.check_stored import check_arm, check_cell, check_numbers, check_spread
 from hilcal.calibration.learnt import Learnt
@@ -62,7 +62,7 @@ def read(path: Path, catalogue: Catalogue | None = None) -> Calibration:
         InputError: see `from_json`; or the file cannot be read.
     """
     try:
-        content = parse_json(path.read_text(encoding="utf-8"))
+        content = parse_json(limits.read_text(path, limits.DOCUMENT))
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: no calibration: {error}") from None
     try:

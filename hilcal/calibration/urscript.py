@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from hilcal.calibration.points import Points
+from hilcal import limits
 from hilcal.errors import InputError
 from hilcal.robot import se3
 from hilcal.types import Floats
@@ -83,7 +84,7 @@ def program_points(path: Path) -> tuple[str, tuple[Waypoint, ...], Points, Float
         InputError: see `waypoints`; or more than one tool centre point.
     """
     try:
-        program = path.read_text(encoding="utf-8")
+        program = limits.read_text(path, limits.PROGRAM)
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read as a program: {error}") from None
     try:

@@ -280,7 +280,7 @@ class CampaignFile:
                         raise ValueError
                     records.append(join(from_text(text, number), meta))
                 except ValueError as e:
-                    where = f"damaged at revision {expected}"
+                    where = f"damaged at revision {expected}" + (f" ({e})" if str(e) else "")
                     raise InputError(f"{self.path}: the campaign is {where}") from e
         return tuple(records)
 

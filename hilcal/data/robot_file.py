@@ -6,12 +6,10 @@ A campaign that was sent is read by that, on any machine, and reads no file outs
 import json
 from pathlib import Path
 
-from hilcal.errors import InputError
+from hilcal import limits
 
 ROBOT_FILE = "robot_file"
 """Its key in the campaign."""
-MOST_BYTES = 16 << 20
-"""Larger ones are refused; a choice: a URDF without its meshes is far smaller."""
 
 
 def robot_file_of(config_json: str, base_dir: str) -> dict[str, str]:
@@ -31,10 +29,6 @@ def robot_file_of(config_json: str, base_dir: str) -> dict[str, str]:
     if not path.suffix:
         return {}
     try:
-        if path.stat().st_size > MOST_BYTES:
-            raise InputError(
-                f"{path}: {path.stat().st_size >> 20} MB; a robot's file has 16 at most"
-            )
-        return {ROBOT_FILE: path.read_text(encoding="utf-8")}
+        return {ROBOT_FILE: limits.read_text(path, limits.PROGRAM)}
     except (OSError, UnicodeDecodeError):
         return {}

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from hilcal import __version__
+from hilcal import __version__, limits
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit
 from hilcal.toml import parse_json
@@ -133,7 +133,7 @@ def read(path: str | Path) -> Parameters:
         InputError: no such file, or another kind of document.
     """
     try:
-        return from_json(parse_json(Path(path).read_text(encoding="utf-8")))
+        return from_json(parse_json(limits.read_text(Path(path), limits.DOCUMENT)))
     except (OSError, LookupError, TypeError, ValueError) as error:
         raise InputError(f"{path}: no parameters: {error!r}") from None
     except InputError as error:

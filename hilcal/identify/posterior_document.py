@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hilcal import __version__
+from hilcal import __version__, limits
 from hilcal.data.arm_scatter import ArmScatter
 from hilcal.data.ranges import Range
 from hilcal.data.whitening import MODES
@@ -70,7 +70,7 @@ def read(path: Path) -> Posterior:
         InputError: see `from_json`; or the file cannot be read.
     """
     try:
-        content = parse_json(path.read_text(encoding="utf-8"))
+        content = parse_json(limits.read_text(path, limits.DOCUMENT))
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: no prior: {error}") from None
     try:
