@@ -37,6 +37,10 @@ MOVING = 100
 """Of them those that are not fixed."""
 JOINTS = 32
 """Joints of an arm."""
+PARAMETERS = 4000
+"""Parameters of a model that a file holds."""
+NUMBERS = 1 << 26
+"""Numbers of an array that a file makes."""
 MEMORY = 3 << 28
 """Bytes that reading one file may take beyond what the process has."""
 STREAM = "a longer series is fitted as a stream (docs/how-to/fit-a-stream.md)"
@@ -100,6 +104,18 @@ class Lines:
         self._rows += 1
         check_rows(self._what, self._rows)
         check_cells(self._what, self._rows, columns)
+
+
+def check_parameters(count: int) -> None:
+    """Refuse so many parameters; raises as `check_size` does."""
+    if count > PARAMETERS:
+        raise InputError(f"{count} parameters; valid: at most {PARAMETERS}")
+
+
+def check_numbers(what: str, count: int) -> None:
+    """Refuse an array of so many numbers; raises as `check_size` does."""
+    if count > NUMBERS:
+        raise InputError(f"{what}: {count:.2g} numbers; valid: at most {NUMBERS:.2g}")
 
 
 def read_bytes(path: Path, most: int) -> bytes:

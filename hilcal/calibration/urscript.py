@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hilcal.calibration.points import Points
 from hilcal import limits
+from hilcal.calibration.points import Points
 from hilcal.errors import InputError
 from hilcal.robot import se3
 from hilcal.types import Floats

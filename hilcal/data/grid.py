@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hilcal.data.mapping_sections import FileFormat
 from hilcal import limits
+from hilcal.data.mapping_sections import FileFormat
 from hilcal.errors import InputError
 from hilcal.types import Bools, Floats, Ints
 

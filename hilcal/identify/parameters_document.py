@@ -111,6 +111,7 @@ def from_json(content: Mapping[str, Any]) -> Parameters:
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise InputError(f'no parameters; valid: a JSON document with "format": "{FORMAT}"')
     rows = content["parameters"]
+    limits.check_parameters(len(rows))
     names = tuple(row["name"] for row in rows)
     at = [names.index(name) for name in content["covariance_of"]]
     covariance = np.full((len(rows), len(rows)), np.nan)

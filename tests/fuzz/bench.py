@@ -25,7 +25,7 @@ EVENTS: dict[str, dict[str, Any]] = {
     "start": {"missing": 4},
     "devices": {
         "answers": [
-            {"device": "arm", "driver": "x", "name": "UR10e, serial number 7", "facts": [["a", "b"]]}
+            {"device": "arm", "driver": "x", "name": "UR10e, serial number 7", "facts": {"a": "b"}}
         ]
     },
     "tare": {"force": {"wrench": [0.1] * 6}, "q": [0.0] * 6},

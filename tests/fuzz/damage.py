@@ -118,7 +118,9 @@ def toml_damaged(document: str, rng: Random) -> bytes:
     if kind < 0.51:
         return rng.choice((b"a = " + b"[" * 5000, b"a." * 5000 + b"b = 1"))
     root = tree_damaged(tomllib.loads(document), rng)
-    lines = (f"{json.dumps(k)} = {_toml(v)}" for k, v in root.items()) if root else ()
+    lines = (
+        (f"{json.dumps(k)} = {_toml(v)}" for k, v in root.items()) if isinstance(root, dict) else ()
+    )
     return "\n".join(lines).encode("utf-8", "replace")
 
 

@@ -32,7 +32,7 @@ from hilcal.procedure.state import next_step, settings_of
 from hilcal.report import text_info
 from hilcal.robot.catalogue import configs_dir, load_arm
 from hilcal.workbench.snapshot import row_of
-from tests.fuzz.bench import Bench
+from tests.fuzz.bench import CELL, Bench
 from tests.fuzz.damage import (
     NUMBERS,
     bytes_damaged,
@@ -165,7 +165,7 @@ def _text(
         use(bench.path(f"{name}{suffix}", data))
         return True
 
-    return Parser(name, make, parse)
+    return Parser(name, make, parse, limit_s=10.0)
 
 
 def _damaged_text(text: str, by: Random) -> bytes:
@@ -301,13 +301,13 @@ def parsers(bench: Bench) -> list[Parser]:
         _text(bench, "program", lambda: PROGRAM, _damaged_text, _program, ".script"),
         _text(bench, "fleet", lambda: listed, _damaged_text, _fleet, ".csv"),
         _text(
-            bench, "discovered", lambda: effect, _damaged_text,
+            bench, "discovered", lambda: effect, lambda s, by: bytes_damaged(s.encode(), by),
             lambda p: installed().with_file(p), ".py",
         ),
         _text(bench, "revision", stored_revision, document_damaged, _revision, ".json"),
         _text(bench, "compensation", of_run("calibration"), document_damaged, _compensated, ".json"),
         _text(bench, "prior", of_run("posterior"), document_damaged, _carried(bench), ".json"),
-        _text(bench, "cells", lambda: cells, toml_damaged, hc.Cell.load, ".toml"),
+        _text(bench, "cells", CELL.read_text, toml_damaged, hc.Cell.load, ".toml"),
         _mapped(bench),
         _preview(bench),
         _stream(bench),
