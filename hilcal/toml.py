@@ -11,6 +11,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError
 from pydantic.fields import FieldInfo
 
+from hilcal import limits
 from hilcal.errors import InputError
 from hilcal.names import check_names
 
@@ -48,7 +49,7 @@ def read_toml(path: Path) -> dict[str, Any]:
         InputError: unreadable file, not UTF-8, or a syntax error (names the line).
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = limits.read_text(path, limits.SETTINGS)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; expected a TOML file") from None
     except OSError as error:

@@ -19,6 +19,8 @@ from typing import Any
 
 import numpy as np
 
+from hilcal import limits
+from hilcal.calibration.check_stored import check_numbers
 from hilcal.data.readings import Readings, States
 from hilcal.data.whitening import Mode, whitening
 from hilcal.identify.gauss_newton import whitened_jacobian
@@ -57,6 +59,36 @@ class Learnt:
         values, vectors = np.linalg.eigh(a.T @ a)
         spread = self.factor * self.noise / (np.maximum(values, 0.0) + self.noise)
         return np.asarray(self.prior[:, None] * vectors * np.sqrt(spread))
+
+    def check(self, model: Model) -> None:
+        """Refuse what does not go with a model.
+
+        Raises:
+            InputError: too large.
+            ValueError: says why.
+        """
+        r, n = self.readings, model.cell.arm.n
+        count = len(r.states)
+        limits.check_numbers("what its covariance follows from", count * r.m * max(model.size, 1))
+        check_numbers("prior", self.prior, (model.size,), least=0.0)
+        check_numbers("noise", self.noise, least=0.0)
+        check_numbers("factor", self.factor, least=0.0)
+        widths = {"q": n, "wrench": 6, "joint_temperature": n, "approach": n, "q_actual": n}
+        for f in fields(States):
+            values = getattr(r.states, f.name)
+            if values is not None:
+                wide = (widths[f.name],) if f.name in widths else ()
+                check_numbers(f.name, values, (count, *wide))
+        check_numbers("covariance", r.covariance, (count, r.m, r.m))
+        if r.common is not None:
+            check_numbers("common", r.common, (count, r.m, r.common.shape[-1]))
+        for index, names in ((r.pose, r.pose_names), (r.load, r.load_names)):
+            if index.shape != (count,) or np.any((index < 0) | (index >= len(names))):
+                raise ValueError("readings without a pose or load")
+        if r.states.target is not None and np.any(
+            (r.states.target < 0) | (r.states.target >= max(len(r.target_names), 1))
+        ):
+            raise ValueError("readings without a target")
 
     def to_json(self) -> dict[str, object]:
         """Return it as JSON; numbers of the readings with 7 digits."""
@@ -97,7 +129,7 @@ class Learnt:
             value=np.zeros((len(states), m)),
             covariance=covariance,
             load_names=tuple(content["load_names"]),
-            pose_names=tuple(f"p{k + 1}" for k in range(int(content["poses"]))),
+            pose_names=tuple(f"p{k + 1}" for k in range(min(int(content["poses"]), len(states)))),
             target_names=tuple(content["target_names"]),
             common=None if common is None else _unpacked(common),
         )
@@ -117,6 +149,7 @@ def _unpacked(content: Mapping[str, Any]) -> Any:
     shape = [int(k) for k in content["shape"]]
     if content["type"] not in ("<i4", "<f4") or not shape or min(shape) < 0:
         raise ValueError(f"numbers of type {content['type']!r} and shape {shape}")
+    limits.check_numbers("an array", math.prod(shape))
     size = 4 * math.prod(shape)
     try:
         data = zlib.decompressobj().decompress(base64.b85decode(content["zlib_base85"]), size + 1)

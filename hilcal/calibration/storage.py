@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from hilcal import __version__
+from hilcal import __version__, limits
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.check_stored import check_arm, check_cell, check_numbers, check_spread
 from hilcal.calibration.learnt import Learnt
@@ -61,7 +61,7 @@ def read(path: Path, catalogue: Catalogue | None = None) -> Calibration:
         InputError: see `from_json`; or the file cannot be read.
     """
     try:
-        content = parse_json(path.read_text(encoding="utf-8"))
+        content = parse_json(limits.read_text(path, limits.DOCUMENT))
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: no calibration: {error}") from None
     try:
@@ -136,6 +136,7 @@ def from_json(content: Mapping[str, Any], catalogue: Catalogue | None = None) ->
         effects.append(known.make(e["name"], cell, one_of_each(cell), e["options"]))
     model = Model(cell, tuple(effects), known)
     names = [f"{e.name}.{p.name}" for e in effects for p in e.parameters]
+    limits.check_parameters(len(names))
     if names != content["parameters"]:
         raise InputError(
             f"written by hilcal {content['hilcal']}, whose effects have other parameters"
@@ -146,6 +147,7 @@ def from_json(content: Mapping[str, Any], catalogue: Catalogue | None = None) ->
     root = learnt = None
     if "learnt" in content:
         learnt = Learnt.from_json(content["learnt"])
+        learnt.check(model)
     else:
         flat = np.frombuffer(base64.b64decode(content["covariance_root"]), dtype="<f4")
         root = flat.reshape(len(std), -1).astype(float) * std[:, None]

@@ -23,6 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hilcal import limits
 from hilcal.calibration.points import Points
 from hilcal.calibration.urscript_statements import Statement, statements
 from hilcal.errors import InputError
@@ -130,7 +131,8 @@ def program_points(
         InputError: see `waypoints`; or a waypoint that is not understood.
     """
     try:
-        program = path.read_bytes().decode("utf-8-sig")  # ends of lines stay as they are
+        # ends of lines stay as they are
+        program = limits.read_bytes(path, limits.PROGRAM).decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read as a program: {error}") from None
     try:

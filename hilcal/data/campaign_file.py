@@ -336,9 +336,10 @@ class CampaignFile:
                     records.append(join(from_text(text, number), meta))
                 except InputError as error:
                     return tuple(records), (expected, str(error))
-                except (ValueError, TypeError, AttributeError):
+                except (ValueError, TypeError, AttributeError) as error:
                     what = f"the campaign is damaged at revision {expected}"
-                    return tuple(records), (expected, what)
+                    why = f" ({error})" if str(error) else ""
+                    return tuple(records), (expected, what + why)
         return tuple(records), None
 
     def revision(self, number: int) -> RevisionRecord:

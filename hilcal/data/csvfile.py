@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hilcal import limits
 from hilcal.errors import InputError
 from hilcal.names import check_name, check_names, from_csv
 from hilcal.types import Bools, Floats, Ints
@@ -103,11 +104,13 @@ def read_columns(
     _refuse_binary(name)
     try:
         with Path(path).open(encoding="utf-8-sig", newline="") as stream:
-            reader = csv.reader(stream, delimiter=dialect.delimiter, strict=True)
+            lines = limits.Lines(name, stream)
+            reader = csv.reader(lines, delimiter=dialect.delimiter, strict=True)
             header = [cell.strip() for cell in next(reader, [])]
             check_names(header, f"{name}: row 1, column")
+            lines.row(len(header))
             text, number = choose(header)
-            return _parse(name, reader, header, text, number, dialect)
+            return _parse(name, _records(reader, lines), header, text, number, dialect)
     except UnicodeDecodeError as e:
         raise InputError(
             f"{name}: not UTF-8 text; expected a CSV file; --preview proposes a mapping for others"
@@ -135,14 +138,17 @@ def _refuse_binary(name: str) -> None:
         raise InputError(f"{name}: not a CSV file (binary data)")
 
 
-def _records(reader: Iterator[list[str]]) -> Iterator[tuple[int, list[str]]]:
+def _records(reader: Iterator[list[str]], lines: limits.Lines) -> Iterator[tuple[int, list[str]]]:
     """Records that are not blank lines, with their rows as a spreadsheet counts."""
-    return ((row, cells) for row, cells in enumerate(reader, start=2) if cells)
+    for row, cells in enumerate(reader, start=2):
+        lines.row(len(cells))
+        if cells:
+            yield row, cells
 
 
 def _parse(
     name: str,
-    reader: Iterator[list[str]],
+    records: Iterator[tuple[int, list[str]]],
     header: list[str],
     text: Sequence[str],
     number: Sequence[str],
@@ -152,7 +158,6 @@ def _parse(
     rows: list[int] = []
     texts: dict[str, list[str]] = {column: [] for column in text}
     numbers: dict[str, list[Floats]] = {column: [np.empty(0)] for column in number}
-    records = _records(reader)
     while block := list(islice(records, _BLOCK)):
         here = [row for row, _ in block]
         for row, cells in block:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hilcal import limits
 from hilcal.data.mapping_sections import FileFormat
 from hilcal.errors import InputError
 from hilcal.names import check_name, check_names, from_csv
@@ -239,12 +240,13 @@ def records(path: str, text: str, how: FileFormat) -> Iterator[tuple[int, list[s
         text = text.replace("\t", " ")
     if how.comment is not None and how.header_row:
         text = _header_uncommented(text, how.header_row, how.comment)
-    lines = io.StringIO(text, newline=None)
+    lines = limits.Lines(path, io.StringIO(text, newline=None))
     reader = csv.reader(
         lines, delimiter=separator, skipinitialspace=how.separator == "blanks", strict=True
     )
     try:
         for cells in reader:
+            lines.row(len(cells))
             stripped = [c.strip() for c in cells]
             while how.separator == "blanks" and stripped and not stripped[-1]:
                 stripped.pop()
@@ -294,6 +296,7 @@ def table(path: str, found: Sequence[tuple[int, Sequence[Cell]]], how: FileForma
                 f"{'the header' if header else 'others'} {width}; rows that are no readings are "
                 f"listed in [file] skip_rows, or begin with [file] comment"
             )
+    limits.check_cells(path, len(body), width)
     names = unique(header or [str(k + 1) for k in range(width)])
     padded = [[*cells[:width], *[None] * (width - len(cells))] for _, cells in body]
     columns = tuple(list(column) for column in zip(*padded, strict=True))
@@ -385,7 +388,7 @@ def content_of(path: str | Path) -> bytes:
         InputError: no such file, or it cannot be read.
     """
     try:
-        return Path(path).read_bytes()
+        return limits.read_bytes(Path(path), limits.TABLE)
     except FileNotFoundError as e:
         raise InputError(f"{path}: no such file") from e
     except OSError as e:

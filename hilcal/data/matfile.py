@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from hilcal import limits
 from hilcal.errors import InputError
 
 LIMIT_S = 60
@@ -45,7 +46,10 @@ def read(path: str) -> tuple[list[str], list[Block]]:
         raise InputError(f"{path}: damaged: not read within {LIMIT_S} s") from None
     if done.returncode == 0:
         return unpacked(done.stdout)
-    words = done.stderr.decode(errors="replace").strip().rpartition("\n")[2][:80]
+    words = done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
+    if done.returncode == InputError.exit_code:
+        raise InputError(words)
+    words = words[:80]
     why = "its reader crashed" if done.returncode < 0 or not words else words
     raise InputError(f"{path}: damaged, or not what its first bytes say ({why})")
 
@@ -57,6 +61,11 @@ def packed(path: str) -> bytes:
     found = loadmat(path, appendmat=False, squeeze_me=False, struct_as_record=True)
     variables = [name for name in found if not name.startswith("__")]
     blocks = [(v, *b) for v in variables for b in _blocks(v, np.asarray(found[v]))]
+    limits.check_cells(path, sum(block.size for _, _, block in blocks))
+    for _, name, block in blocks:
+        if block.dtype.kind == "O":
+            size = 4 * block.size * max(map(len, block.flat))
+            limits.check_size(f"{path}: {name}", size, limits.UNPACKED)
     names = {"variables": variables, "blocks": [[v, name] for v, name, _ in blocks]}
     values = {
         f"b{k}": np.array(block, dtype=str) if block.dtype.kind == "O" else block
@@ -95,11 +104,16 @@ def _blocks(name: str, value: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
 
 def main() -> None:
     """Read the file that the argument names, within the limits, to standard output."""
-    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     resource.setrlimit(resource.RLIMIT_CPU, (LIMIT_S, LIMIT_S))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     try:
-        data = packed(sys.argv[1])
+        import scipy.io  # noqa: F401 - what it takes itself does not count
+
+        with limits.memory(sys.argv[1]):
+            data = packed(sys.argv[1])
+    except InputError as error:
+        print(error, file=sys.stderr)
+        raise SystemExit(InputError.exit_code) from None
     except BaseException as error:  # what a reader makes of a damaged file is not documented
         print(" ".join(str(error).split()) or type(error).__name__, file=sys.stderr)
         raise SystemExit(1) from None

@@ -12,13 +12,14 @@ from typing import Any
 
 import numpy as np
 
+from hilcal import limits
 from hilcal.data import checks, columns
 from hilcal.data.covariance import INSTRUMENT, ROUNDING, WHOLE, TrackerNoise
 from hilcal.data.csvfile import CsvTable
 from hilcal.data.readings import Readings
 from hilcal.data.stated_noise import floored, rounding_variance, with_rounding
 from hilcal.data.table import instrument_covariance, stated_covariance, states_of
-from hilcal.data.tabular import pyarrow_module
+from hilcal.data.tabular import is_plain, pyarrow_module
 from hilcal.errors import InputError
 from hilcal.robot.arm import Arm
 from hilcal.robot.batch import CHUNK
@@ -130,6 +131,9 @@ def open_stream(
     if not sum(rows):
         raise InputError(f"{path}: columns but no readings")
     names = tuple(name for name in header if name in known)
+    for name in names:
+        if not is_plain(kind := file.schema_arrow.field(name).type) or "string" in str(kind):
+            raise InputError(f"{path}: column '{name}' is no column of numbers")
     stream = ReadingStream(path, arm, noise, station, names, rows)
     first = next(k for k, count in enumerate(rows) if count)
     covers = _covers(path, first) if columns.COVERS in header else INSTRUMENT
@@ -154,11 +158,14 @@ def _opened(path: Path) -> Any:
         ) from e
 
 
-def _tables(path: Path, group: int, names: tuple[str, ...]) -> Iterator[Any]:
-    batches = _opened(path).iter_batches(CHUNK, row_groups=[group], columns=list(names))
+def _tables(path: Path, group: int, names: tuple[str, ...], count: int = CHUNK) -> Iterator[Any]:
+    batches = _opened(path).iter_batches(count, row_groups=[group], columns=list(names))
     while True:
         try:
-            batch = next(batches, None)
+            with limits.memory(str(path)):
+                batch = next(batches, None)
+        except InputError:
+            raise
         except Exception as e:  # as above
             raise InputError(f"{path}: damaged in row group {group + 1} ({_words(e)})") from e
         if batch is None:
@@ -172,7 +179,7 @@ def _words(error: Exception) -> str:
 
 def _covers(path: Path, group: int) -> str:
     """What the covariances cover, as the first row says it."""
-    word = str(next(_tables(path, group, (columns.COVERS,))).column(0)[0].as_py())
+    word = str(next(_tables(path, group, (columns.COVERS,), 1)).column(0)[0].as_py())
     if word.removesuffix(ROUNDING) not in (INSTRUMENT, WHOLE):
         raise InputError(
             f"{path}: row 1, column '{columns.COVERS}': {word!r} is unknown; valid: {INSTRUMENT}, "

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from hilcal import limits
 from hilcal.errors import InputError
 from hilcal.names import check_names
 from hilcal.toml import read_json, suggest
@@ -87,7 +88,7 @@ def load_plan(path: Path) -> Plan:
         InputError: unreadable, not a plan, or something in it that cannot be.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = limits.read_text(path, limits.DOCUMENT)
     except FileNotFoundError:
         raise InputError(f"{path}: no such plan file; make one with: hilcal plan") from None
     except (OSError, UnicodeDecodeError) as error:

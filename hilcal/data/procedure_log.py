@@ -13,6 +13,7 @@ from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.plan import Plan
 from hilcal.data.revision import RevisionRecord, utc_now
 from hilcal.data.run_log import PLAN, RunLog
+from hilcal.data.stored_schema import check_entry
 
 ENTRY = "calibrate {}"
 """Keys of the entries, numbered from 1."""
@@ -35,7 +36,7 @@ class ProcedureLog:
             meta = rows.fetch_meta(self._campaign.connection, self._campaign.path)
         found: list[dict[str, Any]] = []
         while (text := meta.get(ENTRY.format(len(found) + 1))) is not None:
-            found.append(rows.stored_json(self._campaign.path, text))
+            found.append(rows.stored_json(self._campaign.path, text, check_entry))
         return tuple(found)
 
     def last(self, kind: str) -> dict[str, Any] | None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
 from typing import Any
 
+from hilcal.data.stored_schema import Options, Result, check
 from hilcal.errors import InputError
 from hilcal.names import check_names
 from hilcal.toml import parse_json
@@ -130,9 +131,10 @@ def from_text(text: str, number: int) -> RevisionRecord:
 
 def _check(record: RevisionRecord) -> None:
     """Refuse a record whose entries are of other kinds."""
-    for name in ("options", "parameters_json", "result_json"):
-        if not isinstance(getattr(record, name), dict):
-            raise TypeError(f"{name} is no document")
+    if not isinstance(record.parameters_json, dict):
+        raise TypeError("parameters_json is no document")
+    check(Options, record.options)
+    check(Result, record.result_json)
     texts = (*record.effects, record.data_hash, record.program_version, record.created)
     named = (t for t in (record.added, record.removed) if t is not None)
     if not all(isinstance(text, str) for text in (*texts, *named)):

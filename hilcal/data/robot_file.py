@@ -6,13 +6,12 @@ A campaign that was sent is read by that, on any machine, and reads no file outs
 import json
 from pathlib import Path
 
+from hilcal import limits
 from hilcal.errors import InputError
 
 ROBOT_FILE = "robot_file"
 """Its key in the campaign."""
 _KINDS = (".urdf", ".toml")
-MOST_BYTES = 16 << 20
-"""Larger ones are refused; a choice: a URDF without its meshes is far smaller."""
 
 
 def robot_file_of(config_json: str, base_dir: str) -> dict[str, str]:
@@ -57,11 +56,7 @@ def text_of(path: Path) -> dict[str, str]:
     try:
         if not path.is_file():
             return {}
-        if path.stat().st_size > MOST_BYTES:
-            raise InputError(
-                f"{path}: {path.stat().st_size >> 20} MB; a robot's file has 16 at most"
-            )
-        return {ROBOT_FILE: path.read_text(encoding="utf-8")}
+        return {ROBOT_FILE: limits.read_text(path, limits.PROGRAM)}
     except (OSError, UnicodeDecodeError):
         return {}
 

@@ -2,7 +2,7 @@
 
 import sqlite3
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -115,6 +115,8 @@ def fetch_readings(
     rows = connection.execute(
         "SELECT id, pose, load, cycle, record, crc FROM readings ORDER BY id"
     ).fetchall()
+    if not rows:
+        raise InputError(f"{path}: the campaign file is damaged (its readings are gone)")
     names = [fetch_names(connection, table) for table in ("poses", "loads")]
     check_names([*names, target_names], f"{path}: name")
     size = 8 * sum(width for _, width in layout)
@@ -144,14 +146,17 @@ def fetch_readings(
     return readings
 
 
-def stored_json(path: Path, text: str) -> Any:
-    """Return what a stored JSON text holds.
+def stored_json(path: Path, text: str, check: Callable[[object], None] | None = None) -> Any:
+    """Return what a stored JSON text holds, which `check` may refuse by a ValueError.
 
     Raises:
         InputError: it is none.
     """
     try:
-        return parse_json(text)
+        content = parse_json(text)
+        if check is not None:
+            check(content)
+        return content
     except ValueError as error:
         raise InputError(f"{path}: the campaign file is damaged ({error})") from error
 

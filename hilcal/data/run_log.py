@@ -3,6 +3,7 @@
 import json
 import sqlite3
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from hilcal.data.plan import Plan, Step, read_plan
 from hilcal.data.readings import Readings
 from hilcal.data.revision import utc_now
 from hilcal.data.robot_file import ROBOT_FILE, robot_file_of
+from hilcal.data.stored_schema import Detail, check, check_event
 from hilcal.errors import InputError
 
 PLAN = "plan"
@@ -224,9 +226,8 @@ class RunLog:
                     f"reading {number}"
                 )
             pose, load, cycle = self._step(key)
-            out.append(
-                {**self._document(text), "step": {"pose": pose, "load": load, "cycle": cycle}}
-            )
+            found = rows.stored_json(self._campaign.path, text, partial(check, Detail))
+            out.append({**found, "step": {"pose": pose, "load": load, "cycle": cycle}})
         return out
 
     def events(self) -> list[dict[str, Any]]:
@@ -241,7 +242,7 @@ class RunLog:
                 raise InputError(
                     f"{self._campaign.path}: the campaign is damaged at event {number}"
                 )
-            out.append(self._document(text))
+            out.append(rows.stored_json(self._campaign.path, text, check_event))
         return out
 
     def readings(self) -> Readings | None:
@@ -253,12 +254,6 @@ class RunLog:
         if not isinstance(found, list) or [type(x) for x in found[:3]] != [str, str, int]:
             raise InputError(f"{self._campaign.path}: the campaign is damaged (step {key})")
         return found[0], found[1], found[2]
-
-    def _document(self, text: str) -> dict[str, Any]:
-        found = rows.stored_json(self._campaign.path, text)
-        if not isinstance(found, dict):
-            raise InputError(f"{self._campaign.path}: the campaign is damaged (its log)")
-        return found
 
     def _select(self, statement: str) -> list[Any]:
         with schema.sqlite_errors(self._campaign.path):

@@ -15,6 +15,7 @@ from contextlib import closing, contextmanager
 from functools import cache
 from pathlib import Path
 
+from hilcal import limits
 from hilcal.errors import DeviceError, InputError
 
 APPLICATION_ID = 0x68696C63  # "hilc"
@@ -109,6 +110,11 @@ def sqlite_errors(path: Path) -> Iterator[None]:
                 f"{path}: cannot be written ({text}); nothing that was stored is lost: "
                 "make room on the disk"
             ) from e
+        if "too big" in text:
+            most = limits.DOCUMENT / 1e6
+            raise InputError(
+                f"{path}: a record is larger than {most:.0f} MB, which no campaign has"
+            ) from e
         if "locked" in text or "busy" in text:
             raise InputError(f"{path}: another program is writing to the campaign") from e
         if "readonly" in text or "unable to open" in text:
@@ -133,6 +139,7 @@ def connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
     connection = sqlite3.connect(
         f"{path.absolute().as_uri()}?mode={mode}", uri=True, isolation_level=None, timeout=5.0
     )
+    connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, limits.DOCUMENT)
     for pragma in ("synchronous = EXTRA", "foreign_keys = ON", "trusted_schema = OFF"):
         connection.execute(f"PRAGMA {pragma}")
     connection.execute("PRAGMA cell_size_check = ON")

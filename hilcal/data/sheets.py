@@ -7,21 +7,21 @@ the value that is stored with them, macros, links and pickles are not read.
 import io
 import zipfile
 from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import date, datetime, time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from hilcal import limits
 from hilcal.data import matfile
 from hilcal.data.grid import Cell, Grid, content_of, joined, read_text, table, unique
 from hilcal.data.mapping import Mapping
 from hilcal.data.mapping_sections import FileFormat
+from hilcal.data.tabular import is_plain, limited_parquet
 from hilcal.errors import InputError
 from hilcal.toml import suggest
-
-LARGEST = 2**30
-"""Bytes that a packed file may unpack to; a choice: far beyond any table of readings."""
 
 REFUSED = {
     b"SQLite format 3\x00": "an SQLite file (a campaign is opened, not imported)",
@@ -79,21 +79,28 @@ def open_grid(path: str | Path, how: FileFormat) -> Grid:
     for magic, what in REFUSED.items():
         if content.startswith(magic):
             raise InputError(f"{name}: {what}; expected text, XLSX, MAT or Parquet")
-    try:
+    with _undamaged(name, "what its first bytes say"):
         if content.startswith(b"PK\x03\x04"):
             return _xlsx(name, content, how)
         if content.startswith(b"PAR1"):
             return _parquet(name, content, how)
         if content.startswith(b"MATLAB"):
             return _mat(name, how)
-    except InputError:
-        raise
-    except Exception as e:  # what a reader makes of a damaged file is not documented
-        raise InputError(f"{name}: damaged, or not what its first bytes say ({_short(e)})") from e
     if how.sheet or how.variable:
         key = "sheet" if how.sheet else "variable"
         raise InputError(f"{name}: text has no {key}; remove [file] {key}")
     return read_text(name, content, how)
+
+
+@contextmanager
+def _undamaged(path: str, what: str) -> Iterator[None]:
+    """Say in one line what a reader makes of a damaged file, which is not documented."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as e:
+        raise InputError(f"{path}: damaged, or not {what} ({_short(e)})") from e
 
 
 def _short(error: Exception) -> str:
@@ -131,8 +138,7 @@ def _book(path: str, content: bytes) -> Any:
         members = archive.infolist()
         if "xl/workbook.xml" not in [m.filename for m in members]:
             raise InputError(f"{path}: a zip archive that is no XLSX; unpack it, or save as XLSX")
-        if sum(m.file_size for m in members) > LARGEST:
-            raise InputError(f"{path}: unpacks to over 1 GB; save the table as CSV")
+        limits.check_size(f"{path}: unpacked", sum(m.file_size for m in members), limits.UNPACKED)
     openpyxl = _package(path, "openpyxl", "XLSX")
     return openpyxl.load_workbook(
         io.BytesIO(content), read_only=True, data_only=True, keep_links=False
@@ -145,24 +151,33 @@ def sheet_names(path: str, content: bytes) -> list[str]:
     Raises:
         InputError: no XLSX file, or openpyxl is not installed.
     """
-    try:
+    with _undamaged(path, "an XLSX file"):
         return list(_book(path, content).sheetnames)
-    except InputError:
-        raise
-    except Exception as e:  # as in open_grid
-        raise InputError(f"{path}: damaged, or not an XLSX file ({_short(e)})") from e
 
 
 def sheet_rows(
     path: str, content: bytes, sheet: str, comment: str | None
 ) -> list[tuple[int, list[Cell]]]:
-    """Rows of a sheet that are neither empty nor comments, with their numbers from 1."""
-    found = []
-    for row, cells in enumerate(_book(path, content)[sheet].iter_rows(values_only=True), start=1):
-        plain = [_cell(c) for c in cells]
-        remark = comment is not None and str(plain[0] if plain else "").startswith(comment)
-        if any(c is not None for c in plain) and not remark:
-            found.append((row, plain))
+    """Rows of a sheet that are neither empty nor comments, with their numbers from 1.
+
+    Raises:
+        InputError: damaged, or more rows or cells than a table may have.
+    """
+    found: list[tuple[int, list[Cell]]] = []
+    cells = 0
+    with _undamaged(path, "an XLSX file"):
+        read = _book(path, content)[sheet]
+        read.reset_dimensions()  # what the file says of its size would pad every row
+        for row, given in enumerate(read.iter_rows(values_only=True), start=1):
+            limits.check_rows(f"{path}: sheet '{sheet}'", row)
+            plain = [_cell(c) for c in given]
+            while plain and plain[-1] is None:
+                plain.pop()
+            remark = comment is not None and str(plain[0] if plain else "").startswith(comment)
+            if plain and not remark:
+                cells += len(plain)
+                limits.check_cells(f"{path}: sheet '{sheet}'", cells)
+                found.append((row, plain))
     return found
 
 
@@ -193,7 +208,11 @@ def _columns(path: str, named: list[tuple[str, list[Cell]]], how: FileFormat) ->
 
 def _parquet(path: str, content: bytes, how: FileFormat) -> Grid:
     parquet = _package(path, "pyarrow.parquet", "Parquet")
-    found = parquet.read_table(io.BytesIO(content))
+    _, found = limited_parquet(
+        path,
+        lambda **options: parquet.ParquetFile(io.BytesIO(content), **options),
+        lambda schema: [f.name for f in schema if is_plain(f.type)],
+    )
     named = []
     for name in found.column_names:
         values = found[name].to_pylist()

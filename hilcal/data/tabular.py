@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from hilcal import limits
 from hilcal.data.csvfile import CsvTable
 from hilcal.errors import InputError
 from hilcal.names import check_name, check_names, csv_text, escaped
@@ -80,20 +81,83 @@ def read_parquet(
         InputError: no pyarrow, a damaged file, a cell without a value or of another kind.
     """
     parquet = pyarrow_module(path, "pyarrow.parquet")
+    chosen: list[Sequence[str]] = []
+
+    def choose_columns(schema: Any) -> list[str]:
+        chosen.extend(choose(list(schema.names)))
+        return [*chosen[0], *chosen[1]]
+
     try:
-        found = parquet.read_table(path)
+        header, found = limited_parquet(
+            path, lambda **kw: parquet.ParquetFile(path, **kw), choose_columns
+        )
+    except InputError:
+        raise
     except Exception as e:  # what a reader makes of a damaged file is not documented
         words = " ".join(str(e).split())[:80]
         raise InputError(f"{path}: damaged, or not a Parquet file ({words})") from e
-    header = list(found.column_names)
     check_names(header, f"{path}: column")
-    text, number = choose(header)
+    text, number = chosen
     rows = np.arange(1, found.num_rows + 1)
     if not found.num_rows:
         raise InputError(f"{path}: columns but no readings")
     texts = {name: _texts(path, name, found[name].to_pylist()) for name in text}
     numbers = {name: _numbers(path, name, found[name]) for name in number}
     return CsvTable(str(path), tuple(header), rows, texts, numbers)
+
+
+def limited_parquet(
+    path: str | Path, opened: Callable[..., Any], choose: Callable[[Any], list[str]]
+) -> tuple[list[str], Any]:
+    """Return the names of all columns of a Parquet file, and the chosen ones as pyarrow's table.
+
+    The metadata tell how large they become. Texts stay as numbers of a dictionary until it is known
+    how long all of them are together: a file of 0.3 MB may hold one of 1 MB in each of 5,000 rows.
+
+    Args:
+        path: for messages.
+        opened: opens the file, with pyarrow's options.
+        choose: names of the columns to read, by the schema.
+
+    Raises:
+        InputError: too large, or a chosen column is neither of numbers nor of texts.
+    """
+    from pyarrow import compute, types
+
+    what = str(path)
+    with limits.memory(what):
+        schema = opened().schema_arrow
+        names = choose(schema)
+        for name in names:
+            if not is_plain(schema.field(name).type):
+                raise InputError(f"{what}: column '{name}' holds neither numbers nor texts")
+        texts = [
+            name
+            for name in names
+            if types.is_large_string(t := schema.field(name).type) or types.is_string(t)
+        ]
+        file = opened(read_dictionary=texts)
+        meta = file.metadata
+        limits.check_cells(what, meta.num_rows, max(len(names), 1))
+        groups = [meta.row_group(k) for k in range(meta.num_row_groups)]
+        sizes = (g.column(k).total_uncompressed_size for g in groups for k in range(g.num_columns))
+        limits.check_size(f"{what}: unpacked", sum(sizes), limits.UNPACKED)
+        found = file.read(columns=names)
+        for name in texts:
+            for part in found[name].chunks:
+                each = compute.binary_length(part.dictionary).take(part.indices)
+                size = compute.sum(each).as_py() or 0
+                limits.check_size(f"{what}: column '{name}'", size, limits.UNPACKED // 4)
+    return list(schema.names), found
+
+
+def is_plain(kind: Any) -> bool:
+    """Whether a column of this type of pyarrow holds a number, a text or a time in each row."""
+    from pyarrow import types
+
+    texts = types.is_string(kind) or types.is_large_string(kind)
+    numbers = types.is_primitive(kind) or types.is_decimal(kind) or types.is_null(kind)
+    return bool(texts or numbers)
 
 
 def is_parquet(path: Path) -> bool:

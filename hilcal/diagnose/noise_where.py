@@ -22,6 +22,8 @@ from hilcal.types import Floats
 
 Kind = Literal["axis", "joint", "load"]
 DRAWS = 600
+MOST = 1 << 22
+"""Numbers that are drawn at a time, 32 MB; a choice."""
 CERTAIN = 0.003
 """Chance of naming any direction where the factor is the same in all of them."""
 FEWEST = 8.0
@@ -57,13 +59,20 @@ def every_direction(fit: Fit, c: Contrasts) -> tuple[NoiseWhere, ...]:
     """Judge all directions; p-values count all of them."""
     directions = _directions(fit, c)
     rng = np.random.default_rng(20250301)
-    drawn = c.free(rng.standard_normal((len(c.y), DRAWS)))
-    slopes = c.slopes(np.column_stack([c.y, drawn]))
-    square = np.concatenate([[float(c.y @ c.y)], np.sum(drawn**2, axis=0)])
+    rows = [np.flatnonzero(np.any(d != 0, axis=(1, 2))) for _, _, d in directions]
+    square, size = np.zeros(1 + DRAWS), np.zeros((len(directions), 1 + DRAWS))
+    at_once = max(MOST // len(c.y), 1)
+    for start in range(0, 1 + DRAWS, at_once):
+        some = slice(start, min(start + at_once, 1 + DRAWS))
+        drawn = c.free(rng.standard_normal((len(c.y), some.stop - some.start)))
+        if start == 0:
+            drawn[:, 0] = c.y
+        square[some], slopes = np.sum(drawn**2, axis=0), c.slopes(drawn)
+        for k, (_, _, d) in enumerate(directions):
+            along = np.einsum("kir,kis->krs", d[rows[k]], slopes[rows[k]])
+            size[k, some] = np.sum(along**2, axis=(0, 1))
     out: list[tuple[Kind, str, float, float, float]] = []
-    for kind, name, d in directions:
-        rows = np.flatnonzero(np.any(d != 0, axis=(1, 2)))
-        t = np.sum(np.einsum("kir,kis->krs", d[rows], slopes[rows]) ** 2, axis=(0, 1))
+    for (kind, name, _), t in zip(directions, size, strict=True):
         mean, spread = float(t[1:].mean()), float(t[1:].std())
         if mean <= 0 or 2 * (mean / spread) ** 2 < FEWEST:
             continue

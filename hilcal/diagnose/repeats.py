@@ -4,7 +4,7 @@ Readings of one pose under one load are repeats. Whatever the model misses is eq
 so with W the whitening of the measurements (loaded readings share their unloaded one) and C
 the columns that say which class of repeats a measurement is of,
 
-    y = Nᵀ W r,   Nᵀ W C = 0,   Nᵀ N = I     ⇒     y ~ N(0, f I)
+    y = N Nᵀ W r,   Nᵀ W C = 0,   Nᵀ N = I     ⇒     Nᵀ y ~ N(0, f I)
 
 with f the factor by which the stated covariance is wrong. What differs between repeats, the
 side of approach, time, temperatures and small differences of the load, moves joints and target
@@ -31,31 +31,28 @@ ROUNDING = 1e-9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Block:
-    """Repeats that share something: the readings behind them and their contrasts.
+    """Repeats that share something.
 
     Attributes:
-        reading: (k,) rows of the fitted readings.
-        pull: (c, k·m) change of the contrasts by a change of each element of those readings.
-        contrast: (c, r) contrasts of whitened rows.
         rows: (r,) whitened rows.
+        explained: (r, k) orthonormal columns of what their classes explain; their contrasts are
+            what is orthogonal to these, and of no basis, which would have r numbers for each.
     """
 
-    reading: Ints
-    pull: Floats
-    contrast: Floats
     rows: Ints
+    explained: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contrasts:
-    """All contrasts of a fit's repeats.
+    """All contrasts of a fit's repeats, each as its whitened rows.
 
     Attributes:
         readings: the fitted readings, repeats with their mean covariance.
         whitening: of those.
         blocks: by shared class.
-        y: (c,) contrasts of the residual, free of nuisance.
-        nuisance: (c, k) orthonormal contrasts of what differed between repeats.
+        y: (r,) the part of the residual in the contrasts, free of nuisance, of all blocks' rows.
+        nuisance: (r, k) orthonormal, the part in them of what differed between repeats.
         bias: factor by which estimated covariances make ‖y‖² too large.
         moves: (N, m, n) motion of each reading by each joint, sensor axes.
     """
@@ -71,21 +68,29 @@ class Contrasts:
     @property
     def dof(self) -> int:
         """Degrees of freedom."""
-        return int(len(self.y) - self.nuisance.shape[1])
+        explained = sum(b.explained.shape[1] for b in self.blocks)
+        return int(len(self.y) - explained - self.nuisance.shape[1])
 
     def free(self, x: Floats) -> Floats:
-        """Take the nuisance out of contrasts (c, ...)."""
+        """Return the part of rows (r, ...) in the contrasts, free of nuisance."""
+        x = _unexplained(self.blocks, x)
         return np.asarray(x - self.nuisance @ (self.nuisance.T @ x))
 
     def slopes(self, x: Floats) -> Floats:
-        """(N, m, S) derivative of ½‖y‖² by a change of each reading, contrasts x (c, S)."""
-        m = self.whitening.m
-        out = np.zeros((len(self.readings), m, x.shape[1]))
-        at = 0
-        for b in self.blocks:
-            stop = at + len(b.contrast)
-            out[b.reading] = (b.pull.T @ x[at:stop]).reshape(len(b.reading), m, -1)
-            at = stop
+        """(N, m, S) derivative of ½‖y‖² by a change of each reading, rows x (r, S)."""
+        w, m, width = self.whitening, self.whitening.m, x.shape[1]
+        white = np.zeros((len(w) * m, width))
+        white[np.concatenate([b.rows for b in self.blocks])] = x
+        out = np.zeros((len(self.readings), m, width))
+        start = 0
+        for b in w.buckets:
+            stop = start + b.loaded.size * m
+            own = white[start:stop].reshape(len(b.loaded), -1, width)
+            back = (np.swapaxes(b.factor, 1, 2) @ own).reshape(*b.loaded.shape, m, width)
+            out[b.loaded] = back
+            if b.reference.shape[1]:
+                out[b.reference] = -np.einsum("lu,glms->gums", b.weights, back)
+            start = stop
         return out
 
 
@@ -124,9 +129,10 @@ def contrasts(fit: Fit) -> Contrasts | None:
         solution.prediction.deviation,
         w.m,
     ).drives
-    y = _apply(blocks, w.whiten(fit.raw).reshape(-1, 1))[:, 0]
-    other = w.whiten(w.raw(_differences(fit, readings, kind, moves)))
-    nuisance = _orthonormal(_apply(blocks, other))
+    rows = np.concatenate([b.rows for b in blocks])
+    y = _unexplained(blocks, w.whiten(fit.raw).reshape(-1)[rows])
+    other = w.whiten(w.raw(_differences(fit, readings, kind, moves)))[rows]
+    nuisance = _orthonormal(_unexplained(blocks, other))
     return Contrasts(readings, w, blocks, y - nuisance @ (nuisance.T @ y), nuisance, bias, moves)
 
 
@@ -198,35 +204,30 @@ def _block(groups: list[Group], number: Ints, m: int) -> Block | None:
     column = np.unique(number[measured], return_inverse=True)[1].reshape(-1)
     if column.max() + 1 == len(measured):
         return None
-    readings = np.concatenate([np.concatenate([b.loaded[g], b.reference[g]]) for _, b, g in groups])
-    size = len(measured) * m
-    factor, pick = np.zeros((size, size)), np.zeros((size, len(readings) * m))
-    at, first = 0, 0
+    # What each class explains: the whitened columns of its measurements, added.
+    member = np.zeros((len(measured) * m, int(column.max()) + 1, m))
+    at = 0
     for rows, b, g in groups:
-        count, refs = len(rows), b.reference.shape[1]
-        span = slice(at, at + count * m)
-        factor[span, span] = b.factor[g]
-        pick[span, first : first + count * m] = np.eye(count * m)
-        for k in range(refs):
-            start = first + (count + k) * m
-            pick[span, start : start + m] = -np.kron(b.weights[:, [k]], np.eye(m))
-        at += count * m
-        first += (count + refs) * m
-    member = np.kron(np.eye(int(column.max()) + 1)[column], np.eye(m))
-    seen = np.any(factor != 0, axis=1)
-    u, s, _ = np.linalg.svd((factor @ member)[seen], full_matrices=True)
-    rank = int(np.sum(s > ROUNDING * s.max(initial=0.0)))
-    if rank == u.shape[1]:
-        return None
-    contrast = np.zeros((u.shape[1] - rank, size))
-    contrast[:, seen] = u[:, rank:].T
+        span = slice(at * m, (at + len(rows)) * m)
+        for k, each in enumerate(np.split(b.factor[g], len(rows), axis=1)):
+            member[span, column[at + k]] += each
+        at += len(rows)
+    member = member.reshape(len(member), -1)
     rows = (measured[:, None] * m + np.arange(m)).reshape(-1)
-    return Block(readings, contrast @ factor @ pick, contrast, rows)
+    seen = np.concatenate([np.any(b.factor[g] != 0, axis=1) for _, b, g in groups])
+    u, s, _ = np.linalg.svd(member[seen], full_matrices=False)
+    rank = int(np.sum(s > ROUNDING * s.max(initial=0.0)))
+    return None if rank == len(u) else Block(rows[seen], u[:, :rank])
 
 
-def _apply(blocks: tuple[Block, ...], white: Floats) -> Floats:
-    """Contrasts (c, P) of whitened rows (R, P)."""
-    return np.concatenate([b.contrast @ white[b.rows] for b in blocks])
+def _unexplained(blocks: tuple[Block, ...], x: Floats) -> Floats:
+    """Return rows (r, ...) of all blocks less what the classes explain."""
+    out, at = x.copy(), 0
+    for b in blocks:
+        own = out[at : at + len(b.rows)]
+        own -= b.explained @ (b.explained.T @ own)
+        at += len(b.rows)
+    return out
 
 
 def _differences(fit: Fit, readings: Readings, kind: Ints, moves: Floats) -> Floats:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import CodeType, ModuleType
 
+from hilcal import limits
 from hilcal.effects.failure import line_in
 from hilcal.effects.protocol import Effect
 from hilcal.errors import InputError
@@ -73,7 +74,7 @@ def effects_of(content: bytes, path: Path) -> EffectFile:
 
 def _content(path: Path) -> bytes:
     try:
-        return path.read_bytes()
+        return limits.read_bytes(path, limits.PROGRAM)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; expected a Python file of effects") from None
     except OSError as error:
@@ -83,7 +84,7 @@ def _content(path: Path) -> bytes:
 def _compiled(content: bytes, where: str) -> CodeType:
     try:
         return compile(content, where, "exec", dont_inherit=True)
-    except (SyntaxError, ValueError) as error:
+    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         line = getattr(error, "lineno", None)
         place = where if line is None else f"{where}, line {line}"
         what = getattr(error, "msg", None) or str(error)

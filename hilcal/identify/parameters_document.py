@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from hilcal import __version__
+from hilcal import __version__, limits
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit
 from hilcal.names import check_names
@@ -113,6 +113,7 @@ def from_json(content: Mapping[str, Any]) -> Parameters:
         raise InputError(f'no parameters; valid: a JSON document with "format": "{FORMAT}"')
     check_names({k: v for k, v in content.items() if k != "source"}, "parameters")
     rows = content["parameters"]
+    limits.check_parameters(len(rows))
     names = tuple(row["name"] for row in rows)
     at = [names.index(name) for name in content["covariance_of"]]
     covariance = np.full((len(rows), len(rows)), np.nan)
@@ -135,7 +136,7 @@ def read(path: str | Path) -> Parameters:
         InputError: no such file, or another kind of document.
     """
     try:
-        return from_json(parse_json(Path(path).read_text(encoding="utf-8")))
+        return from_json(parse_json(limits.read_text(Path(path), limits.DOCUMENT)))
     except (OSError, LookupError, TypeError, ValueError) as error:
         raise InputError(f"{path}: no parameters: {error!r}") from None
     except InputError as error:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hilcal import __version__
+from hilcal import __version__, limits
 from hilcal.data.arm_scatter import ArmScatter
 from hilcal.data.ranges import Range
 from hilcal.data.whitening import MODES
@@ -73,7 +73,7 @@ def read(path: Path) -> Posterior:
         InputError: see `from_json`; or the file cannot be read.
     """
     try:
-        content = parse_json(path.read_text(encoding="utf-8"))
+        content = parse_json(limits.read_text(path, limits.DOCUMENT))
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: no prior: {error}") from None
     try:
@@ -93,28 +93,62 @@ def write(p: Posterior, path: Path) -> None:
 
 def _read(content: Mapping[str, Any]) -> Posterior:
     scatter, kept = content["arm_scatter"], content["prints"]
-    mean = np.array(content["mean"], dtype=float)
-    information = np.zeros((len(mean), len(mean)))
-    information[np.tril_indices(len(mean))] = _unpack(content["information"])
+    names, units = _texts(content["parameters"]), _texts(content["units"])
+    count, columns = len(names), int(kept["columns"])
+    limits.check_parameters(count)
+    mean, scale, own = (_numbers(content[k], count) for k in ("mean", "scale", "own_precision"))
+    information = np.zeros((count, count))
+    information[np.tril_indices(count)] = _unpack(content["information"])
     information += np.tril(information, -1).T
-    if len(content["parameters"]) != len(mean) or not np.isfinite(information).all():
+    links = np.array(content["links"], dtype=float)
+    prints = _unpack(kept["values"]).reshape(-1, columns)
+    if len(units) != count or len(set(names)) != count or columns < 5:
         raise ValueError("its arrays do not fit its parameters")
+    if links.shape != (columns - 3, 4, 4) or not all(
+        np.isfinite(a).all() for a in (information, links, prints)
+    ):
+        raise ValueError("its arrays do not fit its arm")
+    if np.any(scale <= 0) or np.any(own < 0):
+        raise ValueError("a magnitude or precision that cannot be")
     return Posterior(
         arm=str(content["arm"]),
-        links=np.array(content["links"], dtype=float),
+        links=links,
         mode=MODES[MODES.index(content["readings"])],
         effects=tuple(LearntEffect(str(e["name"]), dict(e["options"])) for e in content["effects"]),
-        names=tuple(content["parameters"]),
-        units=tuple(content["units"]),
-        scale=np.array(content["scale"], dtype=float),
+        names=names,
+        units=units,
+        scale=scale,
         mean=mean,
         information=information,
-        own_precision=np.array(content["own_precision"], dtype=float),
+        own_precision=own,
         scatter=None if scatter is None else ArmScatter.from_json(scatter),
         ranges=tuple(Range(**r) for r in content["ranges"]),
-        prints=_unpack(kept["values"]).reshape(-1, int(kept["columns"])),
+        prints=prints,
         source=Source(**content["source"]),
     )
+
+
+def _texts(values: object) -> tuple[str, ...]:
+    """Return a list of texts.
+
+    Raises:
+        ValueError: it is none.
+    """
+    if not isinstance(values, list) or not all(isinstance(v, str) for v in values):
+        raise ValueError("names that are none")
+    return tuple(values)
+
+
+def _numbers(values: object, count: int) -> Floats:
+    """Return a list of finite numbers (count,).
+
+    Raises:
+        ValueError: it is none.
+    """
+    found = np.array(values, dtype=float)
+    if found.shape != (count,) or not np.isfinite(found).all():
+        raise ValueError(f"numbers that are not {count} finite ones")
+    return found
 
 
 def _pack(values: Floats) -> str:

@@ -7,6 +7,8 @@ from hilcal.types import Floats, Ints
 _MOST = 2_000_000
 """Pairs that are compared one by one; a choice. More are sought in a tree, which takes as long to
 load as a thousand poses to group."""
+_DENSE = 20_000_000
+"""Near pairs from which on not all of them are listed, a third of a gigabyte; a choice."""
 
 
 def connected(a: Ints, b: Ints, count: int) -> Ints:
@@ -25,6 +27,37 @@ def connected(a: Ints, b: Ints, count: int) -> Ints:
         if np.array_equal(new, label):
             return np.asarray(np.unique(label, return_inverse=True)[1])
         label = new
+
+
+def _by_cells(points: Floats, distance: float) -> tuple[Ints, Ints]:
+    """Return pairs (K,) and (K,) that join what all near pairs would join, of which there are many.
+
+    Points of one cell of half the distance are joined in a row; of two cells that are not yet
+    joined one near pair is sought.
+    """
+    from scipy.spatial import cKDTree
+
+    place = np.floor(points / (distance / 2)) if distance else points
+    cells, of = np.unique(place, axis=0, return_inverse=True)
+    order = np.argsort(of.reshape(-1), kind="stable")
+    breaks = np.flatnonzero(np.diff(of.reshape(-1)[order])) + 1
+    members = np.split(order, breaks)
+    inside = np.ones(max(len(order) - 1, 0), dtype=bool)
+    inside[breaks - 1] = False
+    joined = [np.stack([order[:-1][inside], order[1:][inside]], axis=1)]
+    group = np.arange(len(cells))
+    for i, j in cKDTree(cells).query_pairs(3.0 if distance else 0.0, p=np.inf):
+        if group[i] == group[j]:
+            continue
+        few, many = sorted((members[i], members[j]), key=len)
+        bound = float(np.nextafter(distance, np.inf))
+        far, at = cKDTree(points[many]).query(points[few], p=np.inf, distance_upper_bound=bound)
+        k = int(np.argmin(far))
+        if far[k] <= distance:
+            joined.append(np.array([[few[k], many[at[k]]]]))
+            group[group == group[j]] = group[i]
+    pairs = np.concatenate(joined)
+    return pairs[:, 0], pairs[:, 1]
 
 
 def groups_within(points: Floats, distance: float) -> Ints:
@@ -47,7 +80,10 @@ def _near(points: Floats, distance: float) -> tuple[Ints, Ints]:
     if follow.sum() > _MOST:
         from scipy.spatial import cKDTree  # slow to import
 
-        pairs = cKDTree(points).query_pairs(distance, p=np.inf, output_type="ndarray")
+        tree = cKDTree(points)
+        if tree.count_neighbors(tree, distance, p=np.inf) > _DENSE:
+            return _by_cells(points, distance)
+        pairs = tree.query_pairs(distance, p=np.inf, output_type="ndarray")
         return pairs[:, 0], pairs[:, 1]
     first = np.repeat(np.arange(len(points)), follow)
     second = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(follow) - follow, follow)

@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hilcal import limits
+from hilcal.errors import InputError
 from hilcal.types import Bools, Floats
 
 
@@ -103,6 +105,15 @@ class Arm:
             return q
         given = np.where(self.own, q, 0.0)
         return np.asarray(given @ self.mimic[:, :-1].T + self.mimic[:, -1])
+
+    def __post_init__(self) -> None:
+        """Refuse an arm of more joints than any has.
+
+        Raises:
+            InputError: says how many it may have.
+        """
+        if self.n > limits.JOINTS:
+            raise InputError(f"{self.name}: {self.n} joints; valid: at most {limits.JOINTS}")
 
     @property
     def n(self) -> int:

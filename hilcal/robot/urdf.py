@@ -14,6 +14,7 @@ from xml.parsers import expat
 import numpy as np
 import pinocchio as pin
 
+from hilcal import limits
 from hilcal.errors import InputError
 from hilcal.names import check_name
 from hilcal.robot.arm import Arm
@@ -72,7 +73,7 @@ def arm_from_urdf(path: Path, base_link: str | None = None, tip_link: str | None
 def _arm(model: pin.Model, base: pin.SE3, tip: pin.SE3, path: Path) -> Arm:
     """Turn the frames of a model whose joints are just the chain so that z is the axis."""
     joints = range(1, model.njoints)
-    turns = [_z_to(_axis(model, joint)[3:]) for joint in joints]
+    turns = [_z_to(axis[3:]) for axis in _axes(model)]
     coms = [
         turn[:3, :3].T @ model.inertias[joint].lever
         for turn, joint in zip(turns, joints, strict=True)
@@ -134,12 +135,15 @@ def _limits(model: pin.Model, joint: int) -> tuple[float, float, float]:
     return float(lower), float(upper), effort
 
 
-def _axis(model: pin.Model, joint: int) -> Floats:
-    """(6,) unit twist of a joint of one degree of freedom, in its own frame."""
+def _axes(model: pin.Model) -> list[Floats]:
+    """(6,) unit twist of each joint in its own frame, of the first degree of freedom."""
     data = model.createData()
     pin.computeJointJacobians(model, data, pin.neutral(model))
-    jacobian = pin.getJointJacobian(model, data, joint, pin.ReferenceFrame.LOCAL)
-    return np.asarray(jacobian[:, model.joints[joint].idx_v], dtype=np.float64)
+    frame = pin.ReferenceFrame.LOCAL
+    return [
+        pin.getJointJacobian(model, data, joint, frame)[:, model.joints[joint].idx_v].copy()
+        for joint in range(1, model.njoints)
+    ]
 
 
 def _z_to(axis: Floats) -> Floats:
@@ -161,8 +165,9 @@ def _chain(model: pin.Model, base: str, tip: str, path: Path) -> list[int]:
             f'{path.name}: no moving joint leads from link "{base}" to link "{tip}"; '
             "set base_link and tip_link to the two ends of the arm"
         )
+    axes = _axes(model)
     for joint in chain:
-        if model.joints[joint].nv != 1 or np.any(_axis(model, joint)[:3]):
+        if model.joints[joint].nv != 1 or np.any(axes[joint - 1][:3]):
             name = model.names[joint]
             raise InputError(
                 f'{path.name}: joint "{name}" is not revolute; every moving joint of the arm must '
@@ -195,8 +200,23 @@ def _only_leaf(model: pin.Model, path: Path) -> str:
 
 
 def _read(path: Path) -> pin.Model:
+    joints = moving = 0
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal joints, moving
+        joints += tag == "joint"
+        moving += tag == "joint" and attributes.get("type") != "fixed"
+        # Pinocchio calls itself for each joint, and needs memory by the third power of the moving.
+        if joints > limits.DESCRIBED or moving > limits.MOVING:
+            raise InputError(
+                f"{path.name}: too many joints; valid: at most {limits.DESCRIBED}, "
+                f"{limits.MOVING} of them not fixed"
+            )
+
+    parser = expat.ParserCreate()
+    parser.StartElementHandler = start
     try:
-        expat.ParserCreate().Parse(path.read_bytes(), True)
+        parser.Parse(limits.read_bytes(path, limits.PROGRAM), True)
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}; expected a URDF file") from None
     except expat.ExpatError as error:

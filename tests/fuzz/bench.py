@@ -6,17 +6,40 @@ import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import hilcal as hc
 from hilcal.campaign import Campaign
 from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.covariance import INSTRUMENT
 from hilcal.data.plan import Plan, Step
+from hilcal.data.procedure_log import ProcedureLog
+from hilcal.data.run_log import RunLog, create_run
 from hilcal.data.table import write_table
 from hilcal.identify import parameters_document
+from hilcal.procedure.state import Settings
 from hilcal.robot.catalogue import configs_dir
 from tests.support.campaigns import campaign, configuration
 
+EVENTS: dict[str, dict[str, Any]] = {
+    "start": {"missing": 4},
+    "devices": {
+        "answers": [
+            {"device": "arm", "driver": "x", "name": "UR10e, serial number 7", "facts": {"a": "b"}}
+        ]
+    },
+    "tare": {"force": {"wrench": [0.1] * 6}, "q": [0.0] * 6},
+    "load": {"hanging": "5kg"},
+    "tool": {"mass_kg": 1.2, "com_m": [0.0, 0.0, 0.1]},
+    "drift": {"cycle": 0, "shift_m": [1e-5, 0.0, 0.0], "sigma": 1.0, "over": True},
+    "repeatability": {
+        "dof": 6, "poses": 2, "scatter": 1e-5, "instrument": 1e-5, "joint_std": 1e-5
+    },
+    "goal": {"goal": "0.1 mm", "met": True},
+    "stopped": {"reason": "a person"},
+    "finished": {"readings": 4},
+}  # fmt: skip
+"""What happens in a session, as the campaign keeps it."""
 CELL = configs_dir() / "cells" / "demo_ur10e.toml"
 
 
@@ -54,6 +77,33 @@ class Bench:
             run.calibration().save(self.calibration)
             self.posterior = json.dumps(run.posterior().to_json())
             self.parameters = json.dumps(parameters_document.to_json(found, {"x": 1}))
+        return path.read_bytes()
+
+    @cached_property
+    def measured(self) -> bytes:
+        """A campaign with a plan, details, events and entries of a calibration."""
+        path, readings = self.folder / "measured.hilcal", self.readings[:4]
+        names = ("p1", "p1", "p1", "p1")
+        steps = [
+            Step(p, readings.load_names[k], 0) for p, k in zip(names, readings.load, strict=True)
+        ]
+        plan = Plan(("p1",), readings.states.q[:1], tuple(steps))
+        with create_run(path, configuration(), self.folder, plan, overwrite=True) as file:
+            log = RunLog(file)
+            for kind, content in EVENTS.items():
+                log.event(kind, content)
+            for k, step in enumerate(steps):
+                detail = {
+                    "epoch_wall_s": 1.7e9,
+                    "q_actual": readings.states.q[k].tolist(),
+                    "tracker_covariance": readings.covariance[k].tolist(),
+                    "felt": {"zero": [0.0] * 6},
+                }
+                log.record(readings[[k]], step, detail)
+            procedure = ProcedureLog(file)
+            procedure.append("begun", {"settings": Settings().to_json()})
+            procedure.append("refined", {"readings_sha256": file.data_hash(), "revisions": [1]})
+            procedure.append("decided", {"action": "stop"})
         return path.read_bytes()
 
     @cached_property

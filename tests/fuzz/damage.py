@@ -1,6 +1,7 @@
 """Ways to damage bytes, texts and documents; every one returns what a parser is then given."""
 
 import json
+import tomllib
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from random import Random
@@ -101,7 +102,40 @@ def document_damaged(document: str, rng: Random) -> bytes:
     if kind < 0.12:
         deep = rng.choice((50, 2000, 100_000))
         return ("[" * deep + "]" * deep).encode()
-    root = [json.loads(document)]
+    text = json.dumps(tree_damaged(json.loads(document), rng))
+    if rng.random() < 0.05 and text.startswith("{") and len(text) > 2:  # duplicate keys
+        text = text[:-1] + "," + text[1:]
+    return text.encode()
+
+
+def toml_damaged(document: str, rng: Random) -> bytes:
+    """A TOML document with values, types, lengths and keys changed, or its text damaged."""
+    kind = rng.random()
+    if kind < 0.2:
+        return bytes_damaged(document.encode(), rng)
+    if kind < 0.5:
+        return words_damaged(document, rng).encode("utf-8", "replace")
+    if kind < 0.51:
+        return rng.choice((b"a = " + b"[" * 5000, b"a." * 5000 + b"b = 1"))
+    root = tree_damaged(tomllib.loads(document), rng)
+    lines = (
+        (f"{json.dumps(k)} = {_toml(v)}" for k, v in root.items()) if isinstance(root, dict) else ()
+    )
+    return "\n".join(lines).encode("utf-8", "replace")
+
+
+def _toml(value: Any) -> str:
+    """A value as TOML writes it within a line; it has no null."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{json.dumps(k)} = {_toml(v)}" for k, v in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_toml, value)) + "]"
+    return repr(value) if isinstance(value, float) else json.dumps(value or "")
+
+
+def tree_damaged(document: Any, rng: Random) -> Any:
+    """A document with values, types, lengths and keys changed; None where all of it went."""
+    root = [document]
     for _ in range(1 if rng.random() < 0.6 else rng.randint(2, 5)):
         places = _places(root)
         holder, key = rng.choice(places)
@@ -127,10 +161,7 @@ def document_damaged(document: str, rng: Random) -> bytes:
                 holder[key] = deepcopy(rng.choice(ODD))
         if not isinstance(root, list) or not root:
             break
-    text = json.dumps(root[0] if root else None)
-    if rng.random() < 0.05 and text.startswith("{") and len(text) > 2:  # duplicate keys
-        text = text[:-1] + "," + text[1:]
-    return text.encode()
+    return root[0] if root else None
 
 
 def _all_to(values: list[Any], to: object) -> None:

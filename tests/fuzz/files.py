@@ -3,7 +3,6 @@
 import csv
 import io
 import shutil
-import sqlite3
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -20,17 +19,16 @@ from hilcal.config import CellConfig, load_config
 from hilcal.data.importing import import_readings
 from hilcal.data.mapping import load_mapping
 from hilcal.data.plan import load_plan
-from hilcal.data.rows import _reading_crc, text_crc
 from hilcal.identify import parameters_document, posterior_document
 from hilcal.robot.catalogue import configs_dir, load_arm
 from hilcal.robot.dh import arm_from_dh
 from hilcal.robot.urdf import arm_from_urdf
+from tests.fuzz import stored
 from tests.fuzz.bench import CELL, Bench
 from tests.fuzz.damage import NUMBERS, bytes_damaged, document_damaged, words_damaged
 from tests.fuzz.harness import MEMORY_DISK, Accepted, Parser
 from tests.fuzz.packed import packed
 from tests.support.campaigns import configuration
-from tests.support.unguarded import unguarded
 
 
 def _plain(readings: hc.Readings) -> None:
@@ -247,67 +245,23 @@ def _urdf(bench: Bench) -> Parser:
     return Parser("urdf", make, parse)
 
 
-def _campaign(bench: Bench) -> Parser:
-    """Bytes of the file, and rows changed with their checksums mended."""
+def _campaign_fit(bench: Bench) -> Parser:
+    """A damaged campaign, and its fit."""
     work = bench.folder / "mended.hilcal"
 
-    def mended(by: Random) -> bytes:
-        work.write_bytes(bench.run)
-        with sqlite3.connect(work) as db, unguarded(db):
-            match by.randrange(6):
-                case 0 | 1:
-                    number = by.randint(1, 5)
-                    row = db.execute("SELECT * FROM readings WHERE id=?", (number,)).fetchone()
-                    key, *where, record, _ = row
-                    values = np.frombuffer(record, "<f8").copy()
-                    values[by.randrange(len(values))] = float(by.choice(NUMBERS))
-                    if by.random() < 0.3:
-                        where[by.randrange(3)] = by.choice((-1, 0, 7, 2**40, -(2**40)))
-                    data = values.tobytes()[: len(record) - by.choice((0, 0, 0, 1, 8))]
-                    row = (*where, data, _reading_crc(key, where, data), key)
-                    db.execute(
-                        "UPDATE readings SET pose=?,load=?,cycle=?,record=?,crc=? WHERE id=?", row
-                    )
-                case 2:
-                    key, value = by.choice(db.execute("SELECT key, value FROM meta").fetchall())
-                    text = (
-                        document_damaged(value, by).decode("utf-8", "replace")
-                        if value[:1] in "[{"
-                        else by.choice(("", "x", "/nonexistent", "..", "\x00"))
-                    )
-                    row = (text, text_crc(key, text), key)
-                    db.execute("UPDATE meta SET value=?, crc=? WHERE key=?", row)
-                case 3:
-                    number, content = db.execute("SELECT id, content FROM revisions").fetchone()
-                    text = document_damaged(content, by).decode("utf-8", "replace")
-                    row = (text, text_crc(str(number), text), number)
-                    db.execute("UPDATE revisions SET content=?, crc=? WHERE id=?", row)
-                case 4:
-                    table = by.choice(("meta", "poses", "loads", "readings", "revisions"))
-                    key = "key" if table == "meta" else "id"
-                    order = f"SELECT {key} FROM {table} ORDER BY random() LIMIT 1"
-                    db.execute(f"DELETE FROM {table} WHERE {key} = ({order})")
-                case _:
-                    table = by.choice(("poses", "loads"))
-                    name = by.choice(("", "a" * 10_000, "x\ny", b"\xff\xfe", 3.5))
-                    db.execute(f"UPDATE {table} SET name=? WHERE id=0", (name,))
-        db.close()
-        return work.read_bytes()
-
     def make(by: Random) -> bytes:
-        return mended(by) if by.random() < 0.5 else bytes_damaged(bench.run, by)
+        return stored.mended(bench.run, work, by)
 
     def parse(data: bytes) -> bool:
         path = bench.path("c.hilcal", data)
         path.with_name("c.hilcal-journal").unlink(missing_ok=True)
         with Campaign.open(path) as run:
             _plain(run.readings)
-            run.file.revisions()
             if run.latest() is not None:
-                run.fit()
+                run.calibration()
         return True
 
-    return Parser("campaign", make, parse, limit_s=20.0)
+    return Parser("campaign_fit", make, parse, limit_s=20.0)
 
 
 def parsers() -> list[Parser]:
@@ -327,7 +281,7 @@ def parsers() -> list[Parser]:
 
         return text
 
-    campaigns = _campaign(bench)
+    campaigns = _campaign_fit(bench)
     return [
         _table(bench),
         _points(bench),
@@ -347,6 +301,7 @@ def parsers() -> list[Parser]:
         _document(bench, "parameters", of_run("parameters"), parameters_document.read),
         _urdf(bench),
         campaigns,
+        *stored.parsers(bench),
         _chain(bench),
         _cell_chain(bench),
         _campaign_chain(bench, campaigns),

@@ -28,14 +28,23 @@ per_example_file = settings(
     deadline=None, max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 
+ERRORS = {"mean_m": 1e-4, "rms_m": 1e-4, "max_m": 1e-4, "rms_sigma": 1.0}
 REVISION = RevisionRecord(
     effects=("base_frame", "joint_compliance"),
     added="joint_compliance",
-    options={"scaling": "gc", "harmonics": None},
+    options={"readings": "absolute", "scaling": "gc", "effects": {}, "harmonics": None},
     data_hash="abc",
     program_version="0.1.0",
     parameters_json={"joint_compliance": [1.0 / 3.0, 2e-300]},
-    result_json={"error": {"rms_m": 1e-4}, "text": "µrad/(N·m)"},
+    result_json={
+        "identify": {
+            "n_readings": 3,
+            "variance_factor": 1.0,
+            "error": {"fit": ERRORS, "holdout": ERRORS},
+            "parameters": [],
+        },
+        "text": "µrad/(N·m)",
+    },
 )
 
 

@@ -1,0 +1,163 @@
+"""How large a file may be that is read: checked before memory is taken for it.
+
+What a file says of its own size (a zip archive's directory, the metadata of Parquet) is checked
+first, what it turns out to hold is counted while it is read, and `memory` ends what is left. All of
+them are choices, far beyond the largest measured series; docs/reference/limits.md states them.
+"""
+
+import resource
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Self, TextIO
+
+from hilcal.errors import InputError
+
+SETTINGS = 1 << 19
+"""Bytes of a TOML file."""
+PROGRAM = 1 << 24
+"""Bytes of a robot's description, a program of the robot, a file of effects."""
+DOCUMENT = 1 << 25
+"""Bytes of a JSON document: plan, calibration, prior."""
+TABLE = 1 << 27
+"""Bytes of a table, as text or packed."""
+UNPACKED = 1 << 28
+"""Bytes that a packed table unpacks to."""
+LINE = 1 << 20
+"""Characters of a row of a table."""
+ROWS = 1 << 20
+"""Rows of a table, empty ones included."""
+COLUMNS = 2000
+"""Columns of a table."""
+CELLS = 5_000_000
+"""Cells of a table."""
+DESCRIBED = 500
+"""Joints of a robot's description, fixed ones and those of grippers included."""
+MOVING = 100
+"""Of them those that are not fixed."""
+JOINTS = 32
+"""Joints of an arm."""
+PARAMETERS = 4000
+"""Parameters of a model that a file holds."""
+NUMBERS = 1 << 26
+"""Numbers of an array that a file makes."""
+MEMORY = 3 << 28
+"""Bytes that reading one file may take beyond what the process has."""
+STREAM = "a longer series is fitted as a stream (docs/how-to/fit-a-stream.md)"
+
+
+def check_size(what: str, size: int, most: int) -> None:
+    """Refuse so many bytes.
+
+    Raises:
+        InputError: names them and the limit.
+    """
+    if size > most:
+        raise InputError(f"{what}: {size / 1e6:.1f} MB; valid: at most {most / 1e6:.1f} MB")
+
+
+def check_rows(what: str, rows: int) -> None:
+    """Refuse so many rows; raises as `check_size` does."""
+    if rows > ROWS:
+        raise InputError(f"{what}: more than {ROWS} rows; {STREAM}")
+
+
+def check_cells(what: str, rows: int, columns: int = 1) -> None:
+    """Refuse so many columns or cells; raises as `check_size` does."""
+    if columns > COLUMNS:
+        raise InputError(f"{what}: {columns} columns; valid: at most {COLUMNS}")
+    if rows * columns > CELLS:
+        raise InputError(f"{what}: more than {CELLS / 1e6:.0f} million cells; {STREAM}")
+
+
+class Lines:
+    """The lines of a table's text, no row of which is longer than `LINE`."""
+
+    def __init__(self, what: str, stream: TextIO) -> None:
+        """Read from a stream; `what` names it in messages."""
+        self._what, self._stream, self._taken, self._rows = what, stream, 0, 0
+
+    def __iter__(self) -> Self:
+        """Return the lines."""
+        return self
+
+    def __next__(self) -> str:
+        """Return the next line; a row in quotes may have several.
+
+        Raises:
+            InputError: the row is too long.
+        """
+        line = self._stream.readline(LINE + 1)
+        self._taken += len(line)
+        if self._taken > LINE:
+            raise InputError(
+                f"{self._what}: row {self._rows + 1} is longer than {LINE} characters; valid: "
+                "a line for each reading"
+            )
+        if not line:
+            raise StopIteration
+        return line
+
+    def row(self, columns: int) -> None:
+        """Take note that a row is complete; raises as `check_rows` and `check_cells` do."""
+        self._taken = 0
+        self._rows += 1
+        check_rows(self._what, self._rows)
+        check_cells(self._what, self._rows, columns)
+
+
+def check_parameters(count: int) -> None:
+    """Refuse so many parameters; raises as `check_size` does."""
+    if count > PARAMETERS:
+        raise InputError(f"{count} parameters; valid: at most {PARAMETERS}")
+
+
+def check_numbers(what: str, count: int) -> None:
+    """Refuse an array of so many numbers; raises as `check_size` does."""
+    if count > NUMBERS:
+        raise InputError(f"{what}: {count:.2g} numbers; valid: at most {NUMBERS:.2g}")
+
+
+def read_bytes(path: Path, most: int) -> bytes:
+    """Read a file of at most so many bytes.
+
+    Raises:
+        InputError: it is larger.
+        OSError: it cannot be read.
+    """
+    with path.open("rb") as stream:
+        data = stream.read(most + 1)
+        if len(data) > most:
+            check_size(str(path), max(path.stat().st_size, len(data)), most)
+        return data
+
+
+def read_text(path: Path, most: int) -> str:
+    """Read a UTF-8 text of at most so many bytes; raises as `read_bytes`, or UnicodeDecodeError."""
+    return read_bytes(path, most).decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
+
+
+@contextmanager
+def memory(what: str) -> Iterator[None]:
+    """End what takes more than `MEMORY` beyond what the process has.
+
+    Raises:
+        InputError: it did.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    try:
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+    except OSError:  # no Linux
+        yield
+        return
+    most = pages * resource.getpagesize() + MEMORY
+    least = [limit for limit in (soft, hard, most) if limit != resource.RLIM_INFINITY]
+    resource.setrlimit(resource.RLIMIT_AS, (min(least), hard))
+    try:
+        yield
+    except MemoryError:
+        raise InputError(
+            f"{what}: reading it takes more than {MEMORY / 1e6:.0f} MB of memory; {STREAM}"
+        ) from None
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))

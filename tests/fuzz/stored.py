@@ -1,0 +1,307 @@
+"""What a campaign file keeps, and files beside it, given damaged ones and then used."""
+
+import io
+import sqlite3
+import zlib
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+import hilcal as hc
+from hilcal.calibration.calibration import Calibration
+from hilcal.calibration.urscript import program_points, with_joints
+from hilcal.data import revision, run_log
+from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.mapping import load_mapping
+from hilcal.data.overview import overview
+from hilcal.data.parquet_stream import open_stream
+from hilcal.data.propose import propose
+from hilcal.data.revision_table import revision_table
+from hilcal.data.rows import _reading_crc, text_crc
+from hilcal.effects import template
+from hilcal.effects.catalogue import installed
+from hilcal.fleet.members import LIST, entries
+from hilcal.identify import posterior_document
+from hilcal.identify.carried import carried_prior, check_arm
+from hilcal.procedure.state import next_step, settings_of
+from hilcal.report import text_info
+from hilcal.robot.catalogue import configs_dir, load_arm
+from hilcal.workbench.snapshot import row_of
+from tests.fuzz.bench import CELL, Bench
+from tests.fuzz.damage import (
+    NUMBERS,
+    bytes_damaged,
+    document_damaged,
+    toml_damaged,
+    words_damaged,
+)
+from tests.fuzz.harness import Accepted, Parser
+from tests.support.unguarded import unguarded
+
+PROGRAM = """def part():
+  set_tcp(p[0, 0, 0.1, 0, 0, 0])
+  home = [0.1, -1.5, 1.0, 0, 0.3, 0]
+  movej(home, a=1.4, v=1.05)
+  movel(p[0.4, -0.2, 0.3, 0, 3.14, 0], a=1.2, v=0.25)
+  movej([0.2, -1.4, 1.1, 0.1, 0.3, 0.2])  # a comment
+  if digital_in(1):
+    movep(p[0.5, 0.1, 0.3, 0, 3.1, 0], r=0.05)
+  end
+end
+"""
+
+
+def _told(file: CampaignFile) -> None:
+    """Ask for everything that a campaign file says of itself."""
+    found = overview(file)
+    console = Console(file=io.StringIO(), width=100)
+    for part in text_info.info_report(found, "x", "instrument"):
+        console.print(part)
+    text_info.to_json(found, "x", "instrument")
+    revision_table(found.revisions, found.in_use)
+    for record in found.revisions:
+        row_of(record)
+    if file.about(run_log.PLAN) is not None:
+        log = run_log.RunLog(file)
+        log.details()
+        log.with_new_names(log.plans[-1])
+        settings_of(file)
+
+
+def mended(data: bytes, work: Path, by: Random) -> bytes:
+    """A campaign with one row changed, its checksum right and its triggers as they were."""
+    work.write_bytes(data)
+    with closing(sqlite3.connect(work)) as db, db, unguarded(db):
+        _change(db, by)
+    return work.read_bytes()
+
+
+def _change(db: sqlite3.Connection, by: Random) -> None:
+    match by.randrange(8):
+        case 0 | 1:
+            row = db.execute("SELECT * FROM readings ORDER BY random() LIMIT 1").fetchone()
+            key, *where, record, _ = row
+            values = np.frombuffer(record, "<f8").copy()
+            values[by.randrange(len(values))] = float(by.choice(NUMBERS))  # type: ignore[arg-type]
+            if by.random() < 0.3:
+                where[by.randrange(3)] = by.choice((-1, 0, 7, 2**40, -(2**40)))
+            changed = values.tobytes()[: len(record) - by.choice((0, 0, 0, 1, 8))]
+            done = (*where, changed, _reading_crc(key, where, changed), key)
+            db.execute("UPDATE readings SET pose=?,load=?,cycle=?,record=?,crc=? WHERE id=?", done)
+        case 2 | 3:
+            key, value = by.choice(db.execute("SELECT key, value FROM meta").fetchall())
+            text = (
+                document_damaged(value, by).decode("utf-8", "replace")
+                if value[:1] in "[{"
+                else by.choice(("", "x", "/nonexistent", "..", "\x00"))
+            )
+            db.execute(
+                "UPDATE meta SET value=?, crc=? WHERE key=?", (text, text_crc(key, text), key)
+            )
+        case 4 | 5:
+            table = by.choice(("revisions", "events", "details"))
+            keyed = "id || step" if table == "details" else "id"
+            chosen = f"SELECT id, {keyed}, content FROM {table} ORDER BY random() LIMIT 1"
+            for number, key, content in db.execute(chosen).fetchall():
+                text = document_damaged(content, by).decode("utf-8", "replace")
+                done = (text, text_crc(str(key), text), number)
+                db.execute(f"UPDATE {table} SET content=?, crc=? WHERE id=?", done)
+        case 6:
+            table = by.choice(("meta", "poses", "loads", "readings", "revisions", "events"))
+            key = "key" if table == "meta" else "id"
+            order = f"SELECT {key} FROM {table} ORDER BY random() LIMIT {by.choice((1, 1, 1000))}"
+            db.execute(f"DELETE FROM {table} WHERE {key} IN ({order})")
+        case _:
+            table = by.choice(("poses", "loads"))
+            name = by.choice(("", "a" * 10_000, "x\ny", b"\xff\xfe", 3.5))
+            db.execute(f"UPDATE {table} SET name=? WHERE id=0", (name,))
+
+
+def _campaigns(bench: Bench, name: str, sound: Callable[[], bytes]) -> Parser:
+    """Bytes of the file, and rows changed with their checksums mended."""
+    work = bench.folder / f"{name}-mended.hilcal"
+
+    def make(by: Random) -> bytes:
+        data = sound()
+        return mended(data, work, by) if by.random() < 0.7 else bytes_damaged(data, by)
+
+    def parse(data: bytes) -> bool:
+        path = bench.path(f"{name}.hilcal", data)
+        path.with_name(f"{path.name}-journal").unlink(missing_ok=True)
+        with CampaignFile.open(path) as file:
+            _told(file)
+        if name == "measured":
+            next_step(path)
+        return True
+
+    return Parser(name, make, parse, limit_s=20.0)
+
+
+def _text(
+    bench: Bench,
+    name: str,
+    sound: Callable[[], str],
+    damaged: Callable[[str, Random], bytes],
+    use: Callable[[Path], object],
+    suffix: str,
+) -> Parser:
+    kept: list[str] = []
+
+    def make(by: Random) -> bytes:
+        if not kept:
+            kept.append(sound())
+        return damaged(kept[0], by)
+
+    def parse(data: bytes) -> bool:
+        use(bench.path(f"{name}{suffix}", data))
+        return True
+
+    return Parser(name, make, parse, limit_s=10.0)
+
+
+def _damaged_text(text: str, by: Random) -> bytes:
+    """Bytes, or numbers and words of a text changed."""
+    if by.random() < 0.4:
+        return bytes_damaged(text.encode(), by)
+    return words_damaged(text, by).encode("utf-8", "replace")
+
+
+def _program(path: Path) -> None:
+    program, _, points, _ = program_points(path)
+    if not np.all(np.isfinite(points.q[~np.isnan(points.q).all(axis=1)])):
+        raise Accepted("a program: joints that are not finite")
+    _, found, _, _ = program_points(path)
+    with_joints(program, found, np.zeros((len(found), 6)))
+
+
+def _fleet(path: Path) -> None:
+    folder = path.parent / "fleet"
+    folder.mkdir(exist_ok=True)
+    (folder / "a.hilcal").touch()
+    path.replace(folder / LIST)
+    entries(folder)
+
+
+def _revision(path: Path) -> None:
+    """As `CampaignFile.revisions` reads the text of a row."""
+    try:
+        record = revision.from_text(path.read_text("utf-8", "replace"), 1)
+    except ValueError as error:
+        raise hc.InputError(str(error)) from error
+    revision.fitted_to(record)
+    row_of(record)
+    revision_table([record], 1)
+
+
+def _compensated(path: Path) -> None:
+    """Read a calibration, predict, and compensate with uncertainty."""
+    found = Calibration.load(path)
+    q, wrench = np.full((2, found.model.cell.arm.n), 0.3), np.zeros((2, 6))
+    found.predict(q, wrench)
+    if zlib.crc32(path.read_bytes()) % 20 == 0:
+        with np.errstate(all="ignore"):
+            found.compensate(q, wrench)
+
+
+def _carried(bench: Bench) -> Callable[[Path], None]:
+    arm = load_arm("ur10e")
+
+    def use(path: Path) -> None:
+        prior = carried_prior(posterior_document.read(path))
+        check_arm(prior, arm)
+        found = prior.posterior
+        prior.index_in(found.names)
+        if prior.unit.shape != found.mean.shape or prior.group.shape != found.mean.shape:
+            raise Accepted("prior: arrays of other lengths")
+        if not all(np.all(np.isfinite(a)) for a in (found.mean, found.scale, found.prints)):
+            raise Accepted("prior: numbers that are not finite")
+
+    return use
+
+
+def _mapped(bench: Bench) -> Parser:
+    texts = [p.read_text() for p in sorted((configs_dir() / "mappings").glob("*.toml"))]
+
+    def make(by: Random) -> bytes:
+        return toml_damaged(by.choice(texts), by)
+
+    def parse(data: bytes) -> bool:
+        load_mapping(bench.path("m.toml", data))
+        return True
+
+    return Parser("mappings", make, parse)
+
+
+def _preview(bench: Bench) -> Parser:
+    def make(by: Random) -> bytes:
+        return _damaged_text(bench.table.decode(), by)
+
+    def parse(data: bytes) -> bool:
+        return len(propose(bench.path("p.csv", data)).grid.rows) > 0
+
+    return Parser("preview", make, parse, limit_s=10.0)
+
+
+def _stream(bench: Bench) -> Parser:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    arm = load_arm("ur10e")
+    head, *body = bench.rows
+    wanted = [k for k, name in enumerate(head) if name not in ("pose", "load", "cycle")]
+    columns: dict[str, Any] = {head[k]: [float(row[k]) for row in body] for k in wanted}
+    out = io.BytesIO()
+    pq.write_table(pa.table(columns), out)
+    sound = out.getvalue()
+
+    def parse(data: bytes) -> bool:
+        found = open_stream(bench.path("s.parquet", data), arm, None, None)
+        for group in range(len(found.rows)):
+            for readings in found.chunks(group):
+                if not np.all(np.isfinite(readings.value)):
+                    raise Accepted("stream: readings that are not finite")
+        return True
+
+    return Parser("stream", lambda by: bytes_damaged(sound, by), parse)
+
+
+def parsers(bench: Bench) -> list[Parser]:
+    """All of them."""
+
+    def of_run(name: str) -> Callable[[], str]:
+        def text() -> str:
+            assert bench.run
+            found = getattr(bench, name)
+            return found.read_text() if isinstance(found, Path) else str(found)
+
+        return text
+
+    def stored_revision() -> str:
+        path = bench.path("of.hilcal", bench.run)
+        with closing(sqlite3.connect(path)) as db:
+            return str(db.execute("SELECT content FROM revisions").fetchone()[0])
+
+    effect = Path(str(template.__file__)).read_text()
+    listed = "campaign,arm,date\na.hilcal,one,2026-03-31\n"
+    return [
+        _campaigns(bench, "campaign", lambda: bench.run),
+        _campaigns(bench, "measured", lambda: bench.measured),
+        _text(bench, "program", lambda: PROGRAM, _damaged_text, _program, ".script"),
+        _text(bench, "fleet", lambda: listed, _damaged_text, _fleet, ".csv"),
+        _text(
+            bench, "discovered", lambda: effect, lambda s, by: bytes_damaged(s.encode(), by),
+            lambda p: installed().with_file(p), ".py",
+        ),
+        _text(bench, "revision", stored_revision, document_damaged, _revision, ".json"),
+        _text(bench, "compensation", of_run("calibration"), document_damaged, _compensated, ".json"),
+        _text(bench, "prior", of_run("posterior"), document_damaged, _carried(bench), ".json"),
+        _text(bench, "cells", CELL.read_text, toml_damaged, hc.Cell.load, ".toml"),
+        _mapped(bench),
+        _preview(bench),
+        _stream(bench),
+    ]  # fmt: skip
