@@ -91,7 +91,7 @@ few = settings(max_examples=40, deadline=None)
 
 def harmless(text: str) -> bool:
     """Whether a text has no character that no name may hold, but for ends of lines."""
-    return all(escaped(line) == line for line in text.split("\n"))
+    return not set(text) & {*EVIL} - {"\n"}
 
 
 @pytest.mark.parametrize("sign", EVIL)
