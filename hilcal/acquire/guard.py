@@ -13,6 +13,7 @@ from hilcal.types import Floats
 
 NORMAL = "normal"
 """The safety state of an arm where all is well."""
+HOW_ON = "drive it by hand to a free place in the middle of its workspace"
 SLACK_M = 0.005
 """An arm that sags at the edge of its workspace is not stopped for it, m."""
 SLACK = Margins(joint=-0.01, inside=-SLACK_M, clear=0.0, itself=0.0, bear=1.02)
@@ -74,7 +75,8 @@ class Guard:
         return f"arm: {name} moves at {speed[k]:.3g} rad/s; joint_speed_rad_s is {limit:g}"
 
     def _place(self, q: Floats, hanging: str) -> str | None:
-        return next((x.at("arm") for x in self._limits.findings(q[None], hanging)), None)
+        found = next(self._limits.findings(q[None], hanging), None)
+        return found and f"{found.at('arm')}; {HOW_ON}"
 
     def _pull(self, felt: Floats | None) -> str | None:
         sensor = self.config.force_sensor

@@ -9,7 +9,7 @@ from hilcal.acquire.clock import Clock
 from hilcal.acquire.devices import ArmDevice, ArmSample
 from hilcal.acquire.dry_run import route_problems
 from hilcal.acquire.force import ForceMeter
-from hilcal.acquire.guard import NORMAL, Guard
+from hilcal.acquire.guard import HOW_ON, NORMAL, Guard
 from hilcal.acquire.load_watch import LoadWatch
 from hilcal.acquire.route import Stop, duration
 from hilcal.config import CellConfig
@@ -180,8 +180,7 @@ class Mover:
             problems = route_problems(self._guard.cell, self._config, stops)
             if problems:
                 raise DeviceError(
-                    f"arm: it cannot go to {name} from where it stands: {problems[0]}. Drive it by "
-                    "hand to a free place in the middle of its workspace"
+                    f"arm: it cannot go to {name} from where it stands: {problems[0]}; {HOW_ON}"
                 )
 
     def move(self, q: Floats, name: str) -> None:

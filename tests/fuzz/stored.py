@@ -176,7 +176,8 @@ def _program(path: Path) -> None:
     if not np.all(np.isfinite(points.q[~np.isnan(points.q).all(axis=1)])):
         raise Accepted("a program: joints that are not finite")
     _, found, _, _ = program_points(path)
-    with_joints(program, found, np.zeros((len(found), 6)))
+    kept = [w for w in found if not w.left]
+    with_joints(program, kept, np.zeros((len(kept), 6)))
 
 
 def _fleet(path: Path) -> None:

@@ -88,7 +88,7 @@ def test_an_arm_that_stands_outside_its_workspace_is_not_moved() -> None:
     b = Bench(limits=Limits(workspace_min_m=(-1.2, -0.5, 0.05), workspace_max_m=(1.2, 1.2, 1.5)))
     b.world.q = np.array([1.5, -1.3, 1.6, -1.4, -1.4, 0.1])  # beyond y = -0.5
     plan = plan_of(("reference", "none", 0), poses={"reference": POSES["reference"]})
-    with pytest.raises(DeviceError, match=r"outside the workspace.*Drive it by hand"):
+    with pytest.raises(DeviceError, match=r"outside the workspace.*drive it by hand"):
         measure(b, plan)
     assert "arm.start_move" not in b.world.calls
     assert "arm.take_control" not in b.world.calls

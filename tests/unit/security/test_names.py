@@ -71,6 +71,7 @@ from hilcal.robot.catalogue import load_arm
 from hilcal.workbench.elements import plain
 from tests.support.paths import ROOT
 from tests.support.readings_cases import make_arm, simple
+from tests.support.unguarded import unguarded
 from tests.unit.calibration.test_calibration import calibrated
 
 ARM = load_arm("ur10e")
@@ -441,8 +442,8 @@ def test_a_name_in_a_campaign_of_others_is_refused(table_: str, tmp_path: Path) 
             text = json.dumps(document)
             db.execute("INSERT INTO revisions VALUES (1, ?, ?)", (text, text_crc("1", text)))
         else:
-            db.execute(f"DROP TRIGGER {table_}_no_update")
-            db.execute(f"UPDATE {table_} SET name = ? WHERE id = 0", ("P1\n movej(x)",))
+            with unguarded(db):
+                db.execute(f"UPDATE {table_} SET name = ? WHERE id = 0", ("P1\n movej(x)",))
     db.close()
     with (
         pytest.raises(InputError, match=r"holds the character \\u00") as error,
