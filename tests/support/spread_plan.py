@@ -8,6 +8,7 @@ from hilcal.data.plan import Plan
 from hilcal.plan.draw import draw
 from hilcal.plan.feasible import Space
 from hilcal.plan.run_order import Chosen, Ordering, order_plan
+from hilcal.types import Bools, Floats
 
 
 def spread_plan(
@@ -17,11 +18,16 @@ def spread_plan(
     space = Space(cell, config)
     drawn = draw(space, 30 * (count + 1), rng, least=count + 1)
     q = drawn.q[drawn.allowed.all(axis=1)]
+
+    def reaches(start: Floats, ends: Floats) -> Bools:
+        """To which of `ends` a motion is clear under every load."""
+        return np.all([space.passable(start, ends, load) for load in space.loads], axis=0)
+
     central = np.argsort(np.linalg.norm(q - np.median(q, axis=0), axis=1))[:8]
-    reached = [(int(space.passable(q[k], q).sum()), int(k)) for k in central]
+    reached = [(int(reaches(q[k], q).sum()), int(k)) for k in central]
     home = max(reached)[1]
     poses = np.delete(q, home, axis=0)
-    poses = poses[space.passable(q[home], poses)][:count]
+    poses = poses[reaches(q[home], poses)][:count]
     assert len(poses) == count
     names = [f"p{k + 1}" for k in range(count)]
     chosen = [Chosen(name, space.loads) for name in names]
