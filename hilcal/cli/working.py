@@ -43,7 +43,8 @@ def workbench(
         sys.stdout.flush()
         t.notice(f"It lets one browser in, within {UNUSED_S / 60:g} minutes. Serving until Ctrl-C.")
 
-    serve(Session(run, catalogue), port, told, browser=not no_browser)
+    if not serve(Session(run, catalogue), port, told, browser=not no_browser):
+        t.notice("Nobody opened it: its address is no longer valid. Start it again.")
     # A fit that is being made in a thread would hold the process up; what is stored is durable.
     guard = threading.Timer(ENDING, os._exit, (0,))
     guard.daemon = True

@@ -44,20 +44,17 @@ cookie along with a redirection."""
 class Guard:
     """An ASGI application that passes on only what the operator's browser asks for."""
 
-    def __init__(
-        self, app: App, port: int, token: str, clock: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, app: App, port: int, token: str) -> None:
         """Guard an application.
 
         Args:
             app: it.
             port: of the server.
             token: the secret of its address.
-            clock: in seconds.
         """
-        self.app, self._token, self._clock = app, token, clock
+        self.app, self._token = app, token
         self._secret = secrets.token_urlsafe(32)
-        self._until = clock() + UNUSED_S
+        self._until = time.monotonic() + UNUSED_S
         self.entered = False
         self._hosts = tuple(f"{name}:{port}" for name in ("127.0.0.1", "localhost"))
         self.origins = tuple(f"http://{host}" for host in self._hosts)
@@ -111,7 +108,7 @@ class Guard:
     @property
     def abandoned(self) -> bool:
         """Whether nobody has used the token in its time, and so nobody ever will."""
-        return not self.entered and self._clock() > self._until
+        return not self.entered and time.monotonic() > self._until
 
     def _stranger(self, scope: Scope, heads: "_Heads") -> str | None:
         """Say why a request is not of this server's own page on this machine; None where it is."""

@@ -8,6 +8,7 @@ import re
 import signal
 import socket
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -22,10 +23,11 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from hilcal.campaign import Campaign
-from hilcal.workbench.guard import UNUSED_S, Guard, Message, Receive, Scope, Send
+from hilcal.workbench.guard import Guard, Message, Receive, Scope, Send
 from tests.support.bench_cases import BASE, TILT, stored
 from tests.support.browser import CHROMIUM, DESKTOP, PHONE, needs_chromium, open_browser
 from tests.support.cli_cases import refused, start
+from tests.support.paths import ROOT
 
 WAIT = 120_000
 """Nothing here takes longer, ms; far above what it takes."""
@@ -174,20 +176,31 @@ def test_the_token_is_good_for_one_exchange(served: Served) -> None:
     assert [asked(guard, "/?token=secret") for _ in range(3)] == [200, 403, 403]
 
 
-def test_the_token_that_nobody_uses_dies_and_the_session_with_it() -> None:
-    now = [0.0]
-    guard = Guard(nothing, 8787, "secret", lambda: now[0])
-    now[0] = UNUSED_S - 1
-    assert not guard.abandoned
-    now[0] = UNUSED_S + 1
-    assert guard.abandoned
-    assert asked(guard, "/?token=secret") == 403
+def test_the_token_that_nobody_uses_dies(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hilcal.workbench.guard.UNUSED_S", 0.1)
+    unused, used = (Guard(nothing, 8787, "secret") for _ in range(2))
+    assert asked(used, "/?token=secret") == 200
+    assert not unused.abandoned
+    time.sleep(0.2)
+    assert unused.abandoned
+    assert asked(unused, "/?token=secret") == 403
+    assert not used.abandoned
 
-    now[0] = 0.0
-    guard = Guard(nothing, 8787, "secret", lambda: now[0])
-    assert asked(guard, "/?token=secret") == 200
-    now[0] = 100 * UNUSED_S
-    assert not guard.abandoned
+
+def test_the_session_ends_with_the_token_that_nobody_uses(tmp_path: Path) -> None:
+    run = stored(tmp_path / "run.hilcal")
+    code = f"""
+from hilcal.workbench import guard
+guard.UNUSED_S = 0.5
+from hilcal.cli import main
+main(["workbench", {str(run)!r}, "--no-browser", "--port", "0", "--json"])
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0
+    assert "Nobody opened it" in done.stderr
+    assert "token=" in json.loads(done.stdout)["url"]
 
 
 async def nothing(scope: Scope, receive: Receive, send: Send) -> None:
