@@ -1,6 +1,8 @@
 # Needs Python 3.11 or later, pip and make; every target sets up what it needs, once.
-PYTHON ?= $(firstword $(foreach p,python3 python3.11 python3.12 python3.13 python3.14,\
-  $(shell $(p) -c 'import sys; sys.version_info >= (3, 11) and print("$(p)")' 2>/dev/null)))
+# 3.11 and 3.12 have all packages; later ones lack ur-rtde, the link to UR arms, and come last.
+having = $(foreach p,$(2),$(shell $(p) -c 'import sys; $(1) and print("$(p)")' 2>/dev/null))
+PYTHON ?= $(firstword $(call having,10 < sys.version_info.minor < 13,python3 python3.11 python3.12) \
+  $(call having,12 < sys.version_info.minor,python3.14 python3.13 python3))
 BIN := .venv/bin
 STAMP := .venv/.installed
 

@@ -8,6 +8,8 @@ controller's watchdog stops it 0.1 s after the control process has ended.
 """
 
 import contextlib
+import importlib.util
+import sys
 import time
 from dataclasses import replace
 from typing import NoReturn
@@ -40,6 +42,9 @@ POLYSCOPE_X = 10
 """Major version of the controllers without a dashboard server."""
 _MASS_KG, _COM_M = 1e-3, 1e-4  # how well a payload has to be read back
 _MAX_Q, _MAX_SPEED, _MAX_ACCELERATION = 6.34, 3.2, 40.0
+
+NO_WHEEL = (3, 13)
+"""First Python that ur-rtde 1.6.5 has no wheel for; pyproject.toml asks for it below this one."""
 
 
 class UrArm:
@@ -309,11 +314,20 @@ def _is_foreign(problem: str) -> bool:
     return problem.startswith("a program runs")
 
 
+def _lacking(python: tuple[int, ...]) -> str:
+    """Say what to do where ur-rtde is not installed."""
+    why, mend = "is not installed", "pip install ur-rtde"
+    if python >= NO_WHEEL:
+        why = f"has no wheel for Python {python[0]}.{python[1]}"
+        mend = "use Python 3.11 or 3.12 for the cell's computer"
+    return f"arm: driver ur needs ur-rtde, which {why}; {mend}"
+
+
 def open_arm(config: CellConfig) -> UrArm:
     """Connect to the controller of [robot] host; moves nothing and uploads nothing.
 
     Raises:
-        InputError: [robot] host is missing, or [robot.options] is wrong.
+        InputError: [robot] host is missing, [robot.options] is wrong, or ur-rtde not installed.
         DeviceError: no controller answers there.
     """
     host = config.robot.host
@@ -323,6 +337,8 @@ def open_arm(config: CellConfig) -> UrArm:
             'e.g. host = "192.168.56.101"'
         )
     options = check_section(dict(config.robot.options), UrOptions, "[robot.options]")
+    if importlib.util.find_spec("rtde_control") is None:
+        raise InputError(_lacking(sys.version_info[:2]))
     receiver = None
     try:
         controller = probe.controller(host, OUTPUTS, _PROBE_S)

@@ -22,12 +22,23 @@ Jobs = Annotated[
     int | None, typer.Option("--jobs", help="Processes; one per processor by default.")
 ]
 OneJob = Annotated[int | None, typer.Option("--jobs", help="Processes; 1 by default.")]
+
+
+def _open_to_others(context: typer.Context, address: str | None) -> str | None:
+    """Say what an address without TLS means."""
+    if address and not address.startswith(("tls://", "wss://")) and not context.resilient_parsing:
+        words = f"--scheduler {address}: without TLS, whoever reaches it runs code there and here"
+        typer.echo(f"{words}, as you; tls://host:8786 keeps others out", err=True)
+    return address
+
+
 Scheduler = Annotated[
     str | None,
     typer.Option(
         "--scheduler",
         metavar="ADDRESS",
-        help="Compute on a Dask cluster instead, as tcp://host:8786.",
+        callback=_open_to_others,
+        help="Compute on a Dask cluster instead, as tls://host:8786, or tcp:// without protection.",
     ),
 ]
 

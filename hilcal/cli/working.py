@@ -10,6 +10,7 @@ import typer
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.terminal import Json, Run, terminal
 from hilcal.data.campaign_file import CampaignFile
+from hilcal.workbench.guard import UNUSED_S
 from hilcal.workbench.server import require_nicegui, serve
 from hilcal.workbench.session import Session
 
@@ -40,9 +41,10 @@ def workbench(
         t.command(url)
         t.document({"url": url, "run": str(run)})
         sys.stdout.flush()
-        t.notice("Serving until Ctrl-C.")
+        t.notice(f"It lets one browser in, within {UNUSED_S / 60:g} minutes. Serving until Ctrl-C.")
 
-    serve(Session(run, catalogue), port, told, browser=not no_browser)
+    if not serve(Session(run, catalogue), port, told, browser=not no_browser):
+        t.notice("Nobody opened it: its address is no longer valid. Start it again.")
     # A fit that is being made in a thread would hold the process up; what is stored is durable.
     guard = threading.Timer(ENDING, os._exit, (0,))
     guard.daemon = True

@@ -21,6 +21,7 @@ GROUPS = {
     "hilcal.operators": "operators",
 }
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+_BELOW = re.compile(r"""python_version\s*<\s*["'](\d+)\.(\d+)["']""")
 _EXTRA = re.compile(r"""extra\s*==\s*["']([^"']+)["']""")
 
 
@@ -50,11 +51,13 @@ def packages(requirements: Iterable[str]) -> tuple[Finding, ...]:
 
     Args:
         requirements: as its metadata list them, e.g. 'pyarrow>=17; extra == "tables"'.
+            One for earlier Pythons alone has no wheel for this one.
     """
     there, out = [], []
     lacking: dict[str, list[str]] = {}
     for requirement in requirements:
         match, extra = _NAME.match(requirement), _EXTRA.search(requirement)
+        below = _BELOW.search(requirement)
         if match is None or (extra is not None and extra[1] == "dev"):
             continue
         name = match[0]
@@ -63,6 +66,11 @@ def packages(requirements: Iterable[str]) -> tuple[Finding, ...]:
         except metadata.PackageNotFoundError:
             if extra is not None:
                 lacking.setdefault(extra[1], []).append(name)
+            elif below is not None and sys.version_info[:2] >= tuple(map(int, below.groups())):
+                version = ".".join(map(str, sys.version_info[:2]))
+                said = f"has no wheel for Python {version}; the driver that needs it says so"
+                mend = "use Python 3.11 or 3.12 for the computer of a cell with such a device"
+                out.append(Finding(PROGRAM, name, "warning", said, mend))
             else:
                 mend = f"install it: pip install '{requirement}'"
                 out.append(Finding(PROGRAM, name, "problem", "is not installed", mend))

@@ -13,10 +13,27 @@ import scipy.linalg  # its BLAS is another library than numpy's, and must be loa
 from threadpoolctl import threadpool_limits
 
 from hilcal import __version__
-from hilcal.errors import InputError
+from hilcal.errors import HilcalError, InputError
 from hilcal.threads import one_thread
 
 Versions = tuple[tuple[str, str], ...]
+
+DEATHS = 3
+"""Workers that one item may take with it before it is given up; Dask's own, a choice."""
+
+
+class ClusterError(HilcalError):
+    """A cluster does not answer, or an item kills its workers; exit code as of a device."""
+
+    exit_code = 3
+
+
+def deadly(where: str) -> ClusterError:
+    """Return the error of an item that ended every worker that computed it."""
+    return ClusterError(
+        f"{where}: one computation ended {DEATHS + 1} workers, each time without a word (out of "
+        "memory?); start fewer workers, or larger ones"
+    )
 
 
 def versions() -> Versions:

@@ -8,15 +8,16 @@ which the operator's own browser opens:
 - a page of another site, or of another port of this machine, sends its Origin with a WebSocket
   handshake and with every request that changes something, and Sec-Fetch-Site with all: they are
   refused unless they are of this server; a WebSocket must say its Origin;
-- another user or program of this machine does not know the random token. The address that the
-  command prints holds it; it becomes a cookie that scripts cannot read and other sites do not send,
-  and every request but that first one needs it.
+- another user or program of this machine has not the cookie, a random secret that scripts cannot
+  read and other sites do not send. It is given once, for the random token of the address that the
+  command prints; every other request needs it. A token that nobody uses dies after a while.
 
 A policy in every answer forbids the browser to load anything from elsewhere, or to show the page in
 a frame of another site.
 """
 
 import secrets
+import time
 from collections.abc import Awaitable, Callable, MutableMapping
 from http.cookies import CookieError, SimpleCookie
 from typing import Any
@@ -32,6 +33,12 @@ PATHS = ("/_nicegui/", "/_nicegui_ws/", "/viewer/")
 """What is served beside the page; the rest does not exist."""
 LOOPBACK = ("127.0.0.1", "::1")
 TOKEN = "token"  # noqa: S105 (its name)
+UNUSED_S = 600.0
+"""How long a token waits for its use, s; a choice."""
+_ENTERED = b"""<!doctype html><title>hilcal</title><link rel="icon" href="data:,">
+<meta http-equiv="refresh" content="0; url=/">"""
+"""The page itself leads on: a browser that another page or a file sent here would not send a strict
+cookie along with a redirection."""
 
 
 class Guard:
@@ -46,6 +53,9 @@ class Guard:
             token: the secret of its address.
         """
         self.app, self._token = app, token
+        self._secret = secrets.token_urlsafe(32)
+        self._until = time.monotonic() + UNUSED_S
+        self.entered = False
         self._hosts = tuple(f"{name}:{port}" for name in ("127.0.0.1", "localhost"))
         self.origins = tuple(f"http://{host}" for host in self._hosts)
         self._cookie = f"hilcal_workbench_{port}"
@@ -81,13 +91,24 @@ class Guard:
             if scope["path"] != "/" and not scope["path"].startswith(PATHS):
                 await _refuse(scope, send, 404, "nothing here")
             elif scope["path"] == "/" and scope["query_string"]:
-                await self._enter(send)
+                await self._answer(send, 303, (b"location", b"/"))
             else:
                 await self.app(scope, receive, self._marked(send))
-        elif scope["type"] == "http" and scope["path"] == "/" and self._knows(scope):
-            await self._enter(send)
-        else:
+        elif not self._knows(scope):
             await _refuse(scope, send, 403, "open the address that hilcal workbench printed")
+        elif self.entered or self.abandoned:
+            why = "has been opened" if self.entered else "was left unused for too long"
+            await _refuse(scope, send, 403, f"this address {why}; start hilcal workbench again")
+        else:
+            self.entered = True
+            cookie = f"{self._cookie}={self._secret}; HttpOnly; SameSite=Strict; Path=/"
+            kind = (b"content-type", b"text/html; charset=utf-8")
+            await self._answer(send, 200, (b"set-cookie", cookie.encode()), kind, body=_ENTERED)
+
+    @property
+    def abandoned(self) -> bool:
+        """Whether nobody has used the token in its time, and so nobody ever will."""
+        return not self.entered and time.monotonic() > self._until
 
     def _stranger(self, scope: Scope, heads: "_Heads") -> str | None:
         """Say why a request is not of this server's own page on this machine; None where it is."""
@@ -113,18 +134,21 @@ class Guard:
         except CookieError:
             return False
         found = jar.get(self._cookie)
-        return found is not None and _same(found.value, self._token)
+        return found is not None and _same(found.value, self._secret)
 
     def _knows(self, scope: Scope) -> bool:
+        """Whether a visit of the page brings the token."""
+        if scope["type"] != "http" or (scope["method"], scope["path"]) != ("GET", "/"):
+            return False
         given = parse_qs(scope["query_string"].decode("latin-1")).get(TOKEN, [""])
         return _same(given[0], self._token)
 
-    async def _enter(self, send: Send) -> None:
-        """Change the token of the address for a cookie: it shall not stay in the address."""
-        cookie = f"{self._cookie}={self._token}; HttpOnly; SameSite=Strict; Path=/"
-        heads = [(b"location", b"/"), (b"set-cookie", cookie.encode()), *self._headers]
-        await send({"type": "http.response.start", "status": 303, "headers": heads})
-        await send({"type": "http.response.body", "body": b""})
+    async def _answer(
+        self, send: Send, status: int, *heads: tuple[bytes, bytes], body: bytes = b""
+    ) -> None:
+        head = {"type": "http.response.start", "status": status}
+        await send({**head, "headers": [*heads, *self._headers]})
+        await send({"type": "http.response.body", "body": body})
 
     def _marked(self, send: Send) -> Send:
         async def marked(message: Message) -> None:

@@ -68,10 +68,29 @@ def quiet_environment() -> None:
         os.environ.pop(name, None)
 
 
+@contextlib.contextmanager
+def leading_to(url: str) -> Iterator[Path]:
+    """Yield a file that leads a browser to an address, and that its user alone can read.
+
+    Every user of the machine reads the arguments of every process: a browser that is started with
+    the address itself would tell its token to all.
+    """
+    runtime = Path(os.environ.get("XDG_RUNTIME_DIR", ""))
+    place = runtime if runtime.is_absolute() and os.access(runtime, os.W_OK) else None
+    with tempfile.TemporaryDirectory(prefix="hilcal-workbench-", dir=place) as folder:  # mode 0700
+        file = Path(folder) / "open.html"
+        file.touch(mode=0o600)
+        lead = f'<!doctype html><meta http-equiv="refresh" content="0; url={url}">'
+        file.write_text(lead, encoding="ascii")
+        yield file
+
+
 def serve(
     session: Session, port: int | None, told: Callable[[str], None], *, browser: bool
-) -> None:
-    """Serve the workbench of a campaign until Ctrl-C.
+) -> bool:
+    """Serve the workbench of a campaign until Ctrl-C; whether somebody opened it.
+
+    It ends by itself where nobody has in the time of its token: nobody could any more.
 
     Args:
         session: of the campaign.
@@ -117,7 +136,7 @@ def serve(
                 def end(number: int, frame: FrameType | None) -> None:
                     self.should_exit = True
 
-                kinds = (signal.SIGINT, signal.SIGTERM)
+                kinds = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
                 before = [signal.signal(kind, end) for kind in kinds]
                 try:
                     yield
@@ -129,7 +148,13 @@ def serve(
                 await super().startup(sockets)
                 told(url)
                 if browser:
-                    threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
+                    lead = opening.enter_context(leading_to(url)).as_uri()
+                    threading.Thread(target=webbrowser.open, args=(lead,), daemon=True).start()
+
+            async def on_tick(self, counter: int) -> bool:
+                if guard.entered:
+                    opening.close()
+                return await super().on_tick(counter) or guard.abandoned
 
         config = uvicorn.Config(
             guard,
@@ -140,4 +165,6 @@ def serve(
             timeout_graceful_shutdown=GRACE,
             lifespan="on",
         )
-        Server(config).run(sockets=[sock])
+        with contextlib.ExitStack() as opening:
+            Server(config).run(sockets=[sock])
+        return not guard.abandoned

@@ -288,8 +288,15 @@ def test_study_scaling(capsys: Capsys) -> None:
     assert d["runs"] == 20
     assert set(d["summary"]) == {"none", "gu", "gc"}
     assert "2 or more" in refused(capsys, 2, "study", "scaling", "--runs", "1")
-    both = ("--workers", "2", "--scheduler", "tcp://127.0.0.1:1")
+    both = ("--workers", "2", "--scheduler", "tls://127.0.0.1:1")
     assert "own workers" in refused(capsys, 2, "study", "scaling", *both)
+
+
+def test_a_scheduler_that_anybody_can_reach_is_said(capsys: Capsys) -> None:
+    given = ("study", "scaling", "--workers", "2", "--scheduler", "tcp://127.0.0.1:1")
+    said, error = run(capsys, *given).err.splitlines()
+    assert said.startswith("--scheduler tcp://127.0.0.1:1: without TLS")
+    assert error.startswith("error: ")
 
 
 def test_json_leaves_words_to_stderr(campaign: Path, capsys: Capsys) -> None:

@@ -285,3 +285,25 @@ def test_a_kill_leaves_every_committed_revision(campaign: Path, capsys: Capsys) 
 def test_a_program_without_a_place_to_write(good: Path, tmp_path: Path, capsys: Capsys) -> None:
     line = refused(capsys, 2, "import", good, "--config", CELL, "-o", tmp_path / "no" / "x.hilcal")
     assert "written" in line
+
+
+@pytest.mark.parametrize(
+    ("no_wheel", "said"),
+    [
+        ((3, 0), "has no wheel for Python 3.{}; use Python 3.11 or 3.12 for the cell's computer"),
+        ((4, 0), "is not installed; pip install ur-rtde"),
+    ],
+)
+def test_a_ur_arm_without_ur_rtde(
+    no_wheel: tuple[int, int], said: str, tmp_path: Path, capsys: Capsys,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    text = CELL.read_text(encoding="utf-8")
+    text = text.replace("[robot]", '[robot]\ndriver = "ur"\nhost = "127.0.0.1"')
+    text = text.replace("[tracker]", '[tracker]\ndriver = "geocom"\nport = "/dev/none"')
+    cell = tmp_path / "cell.toml"
+    cell.write_text(text + '[operator]\ndriver = "terminal"\n', encoding="utf-8")
+    monkeypatch.setitem(sys.modules, "rtde_control", None)
+    monkeypatch.setattr("drivers.ur.NO_WHEEL", no_wheel)
+    line = refused(capsys, 2, "check", cell)
+    assert line == f"error: arm: driver ur needs ur-rtde, which {said}".format(sys.version_info[1])

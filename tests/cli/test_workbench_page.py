@@ -1,15 +1,21 @@
 """`hilcal workbench` as a process: who may talk to it, what the operator clicks, how it looks."""
 
+import asyncio
+import glob
 import json
 import os
 import re
 import signal
 import socket
 import subprocess
+import sys
+import threading
+import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
-from email.message import Message
+from email.message import Message as Headers
+from functools import cached_property
 from http.client import HTTPConnection
 from pathlib import Path
 
@@ -17,9 +23,11 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from hilcal.campaign import Campaign
+from hilcal.workbench.guard import Guard, Message, Receive, Scope, Send
 from tests.support.bench_cases import BASE, TILT, stored
-from tests.support.browser import DESKTOP, PHONE, needs_chromium, open_browser
+from tests.support.browser import CHROMIUM, DESKTOP, PHONE, needs_chromium, open_browser
 from tests.support.cli_cases import refused, start
+from tests.support.paths import ROOT
 
 WAIT = 120_000
 """Nothing here takes longer, ms; far above what it takes."""
@@ -29,11 +37,11 @@ SOCKET = "/_nicegui_ws/socket.io/?EIO=4&transport=websocket"
 @dataclass(frozen=True)
 class Answer:
     status: int
-    headers: Message
+    headers: Headers
     text: str
 
 
-@dataclass(frozen=True)
+@dataclass
 class Served:
     run: Path
     url: str
@@ -55,13 +63,14 @@ class Served:
             found = line.getresponse()
             return Answer(found.status, found.headers, found.read().decode("utf-8", "replace"))
 
-    @property
+    @cached_property
     def cookie(self) -> str:
-        """What the address with the token gives to a browser."""
+        """What the address with the token gives to a browser, once."""
         answer = self.ask(f"/?token={self.token}")
-        assert answer.status == 303
-        assert answer.headers["Location"] == "/"
-        return str(answer.headers["Set-Cookie"]).split(";")[0]
+        assert answer.status == 200
+        given = str(answer.headers["Set-Cookie"])
+        assert given.split("; ")[1:] == ["HttpOnly", "SameSite=Strict", "Path=/"]
+        return given.split(";")[0]
 
     def handshake(self, **heads: str) -> int:
         """Ask for a WebSocket; returns the status."""
@@ -80,9 +89,10 @@ class Served:
 
 
 @contextmanager
-def workbench(folder: Path) -> Iterator[Served]:
+def workbench(folder: Path, browser: bool = False) -> Iterator[Served]:
     run = stored(folder / "run.hilcal")
-    process = start("workbench", run, "--no-browser", "--port", "0", "--json", cwd=folder)
+    options = () if browser else ("--no-browser",)
+    process = start("workbench", run, *options, "--port", "0", "--json", cwd=folder)
     try:
         assert process.stdout is not None
         told = "".join(iter(process.stdout.readline, "}\n")) + "}"
@@ -124,9 +134,11 @@ def test_only_the_browser_with_the_address_is_let_in(served: Served) -> None:
     )
     assert served.ask(Cookie=cookie, Host=f"localhost:{served.port}").status == 200
 
+    name = cookie.partition("=")[0]
     strangers: tuple[dict[str, str], ...] = (
         {"Cookie": ""},
         {"Cookie": cookie[:-1]},
+        {"Cookie": f"{name}={served.token}"},
         {**here, "Host": "evil.example"},  # a name made to resolve to this machine
         {**here, "Host": f"evil.example:{served.port}"},
         {**here, "Host": f"127.0.0.1:{served.port + 1}"},
@@ -140,18 +152,167 @@ def test_only_the_browser_with_the_address_is_let_in(served: Served) -> None:
         answer = served.ask(**heads)
         assert (answer.status, answer.headers["Set-Cookie"]) == (403, None), heads
         assert len(answer.text.splitlines()) == 1
-    assert served.ask("/?token=wrong").status == 403
-    assert served.ask(f"/?token={served.token}", Host="evil.example").status == 403
-    given = str(served.ask(f"/?token={served.token}").headers["Set-Cookie"])
-    assert "HttpOnly" in given
-    assert "SameSite=Strict" in given
+    again = served.ask(f"/?token={served.token}", **here)  # as the terminal's address clicked again
+    assert (again.status, again.headers["Set-Cookie"]) == (303, None)
+
+
+def test_the_token_is_good_for_one_exchange(served: Served) -> None:
+    assert served.token not in served.cookie
+    again = served.ask(f"/?token={served.token}")
+    assert (again.status, again.headers["Set-Cookie"]) == (403, None)
+    assert "has been opened" in again.text
+
+    guard = Guard(nothing, 8787, "secret")
+    for path, heads in (
+        ("/?token=wrong", {}),
+        ("/?token=", {}),
+        ("/viewer/?token=secret", {}),
+        ("/?token=secret", {"method": "HEAD"}),
+        ("/?token=secret", {"method": "POST"}),
+        ("/?token=secret", {"host": "evil.example"}),
+        ("/?token=secret", {"origin": "http://evil.example"}),
+    ):
+        assert asked(guard, path, **heads) == 403, (path, heads)
+    assert [asked(guard, "/?token=secret") for _ in range(3)] == [200, 403, 403]
+
+
+def test_the_token_that_nobody_uses_dies(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hilcal.workbench.guard.UNUSED_S", 0.1)
+    unused, used = (Guard(nothing, 8787, "secret") for _ in range(2))
+    assert asked(used, "/?token=secret") == 200
+    assert not unused.abandoned
+    time.sleep(0.2)
+    assert unused.abandoned
+    assert asked(unused, "/?token=secret") == 403
+    assert not used.abandoned
+
+
+def test_the_session_ends_with_the_token_that_nobody_uses(tmp_path: Path) -> None:
+    run = stored(tmp_path / "run.hilcal")
+    code = f"""
+from hilcal.workbench import guard
+guard.UNUSED_S = 0.5
+from hilcal.cli import main
+main(["workbench", {str(run)!r}, "--no-browser", "--port", "0", "--json"])
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0
+    assert "Nobody opened it" in done.stderr
+    assert "token=" in json.loads(done.stdout)["url"]
+
+
+async def nothing(scope: Scope, receive: Receive, send: Send) -> None:
+    """An application that answers nothing."""
+
+
+def asked(guard: Guard, path: str, method: str = "GET", **heads: str) -> int:
+    """The status of an answer."""
+    told: list[Message] = []
+
+    async def send(message: Message) -> None:
+        told.append(message)
+
+    async def receive() -> Message:
+        raise AssertionError
+
+    where, _, query = path.partition("?")
+    given = {"host": "127.0.0.1:8787", **heads}
+    scope = {
+        "type": "http", "method": method, "path": where, "query_string": query.encode(),
+        "headers": [(name.encode(), value.encode()) for name, value in given.items()],
+    }  # fmt: skip
+    asyncio.run(guard(scope, receive, send))
+    return int(told[0]["status"])
+
+
+@needs_chromium
+@pytest.mark.slow
+def test_no_other_user_sees_the_token(
+    tmp_path: Path, browser: Browser, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The command opens a real browser; meanwhile the arguments of all processes are read."""
+    opener = tmp_path / "opener"
+    opener.write_text(
+        f"#!/bin/sh\nexec {CHROMIUM} --headless --no-sandbox --disable-background-networking "
+        f'--user-data-dir={tmp_path}/profile --remote-debugging-port=0 "$@" >{tmp_path}/told 2>&1\n'
+    )
+    opener.chmod(0o700)
+    runtime = tmp_path / "runtime"
+    runtime.mkdir()
+    monkeypatch.setenv("BROWSER", f"{opener} %s &")
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
+    with every_command_line() as seen, workbench(tmp_path, browser=True) as served:
+        debug = waited_for(tmp_path / "profile" / "DevToolsActivePort").split()[0]
+        there = browser.browser_type.connect_over_cdp(f"http://127.0.0.1:{debug}", timeout=WAIT)
+        page = there.contexts[0].pages[0]
+        expect(page.locator("[data-part=verdict]")).to_contain_text("Ambiguous", timeout=WAIT)
+        assert served.ask(f"/?token={served.token}").status == 403
+        assert list(runtime.glob("hilcal-*")) == []  # what opened it is gone
+        there.new_browser_cdp_session().send("Browser.close")
+    assert any(f"{tmp_path}/profile".encode() in line for line in seen)
+    assert not any(served.token.encode() in line for line in seen)
+
+
+def test_what_opens_the_page_is_of_its_user_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opener = tmp_path / "opener"
+    opener.write_text(f'#!/bin/sh\nprintf %s "$1" > {tmp_path}/given\n')
+    opener.chmod(0o700)
+    monkeypatch.setenv("BROWSER", f"{opener} %s &")
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    with workbench(tmp_path, browser=True) as served:
+        given = waited_for(tmp_path / "given")
+        assert served.token not in given
+        file = Path(given.removeprefix("file://"))
+        assert served.token in file.read_text()
+        assert file.stat().st_mode & 0o777 == 0o600
+        assert file.parent.stat().st_mode & 0o777 == 0o700
+        served.process.send_signal(signal.SIGHUP)  # the terminal is closed
+        served.process.communicate(timeout=60)
+        assert not file.parent.exists()
+
+
+def waited_for(file: Path) -> str:
+    """What another process writes into a file."""
+    end = time.monotonic() + WAIT / 1000
+    while not (file.exists() and file.read_text()):
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    return file.read_text()
+
+
+@contextmanager
+def every_command_line() -> Iterator[set[bytes]]:
+    """Collect the arguments of all processes of the machine, as any user can read them."""
+    seen: set[bytes] = set()
+    ended = threading.Event()
+
+    def look() -> None:
+        while not ended.wait(0.01):
+            for path in glob.glob("/proc/[0-9]*/cmdline"):
+                with suppress(OSError):
+                    seen.add(Path(path).read_bytes())
+
+    thread = threading.Thread(target=look)
+    thread.start()
+    try:
+        yield seen
+    finally:
+        ended.set()
+        thread.join()
 
 
 def test_a_socket_is_opened_by_its_own_page_alone(served: Served) -> None:
     own = {"Cookie": served.cookie, "Origin": f"http://127.0.0.1:{served.port}"}
     assert served.handshake(**own) == 101
+    name = served.cookie.partition("=")[0]
     for heads in (
         {**own, "Cookie": ""},
+        {**own, "Cookie": f"{name}=another"},
+        {**own, "Cookie": f"{name}={served.token}"},
         {**own, "Origin": ""},
         {**own, "Origin": "http://evil.example"},
         {**own, "Origin": f"http://127.0.0.1:{served.port + 1}"},
@@ -198,12 +359,22 @@ def test_what_is_wrong_is_one_line(
 
 def opened(browser: Browser, served: Served, told: list[str], **options: object) -> Page:
     """Open the page, and collect what its console says."""
-    page = browser.new_context(**options).new_page()  # type: ignore[arg-type]
+    context = browser.new_context(**options)  # type: ignore[arg-type]
+    page = context.new_page()
     page.set_default_timeout(WAIT)
     page.on("console", lambda m: told.append(m.text) if m.type == "error" else None)
     page.on("pageerror", lambda e: told.append(str(e)))
     page.on("requestfailed", lambda r: told.append(r.url))
-    page.goto(served.url)
+    here = f"http://127.0.0.1:{served.port}/"
+    if "cookie" in vars(served):
+        name, _, value = served.cookie.partition("=")
+        context.add_cookies([{"name": name, "value": value, "url": here}])
+        page.goto(here)
+    else:
+        page.goto(served.url)
+        page.wait_for_url(here)  # the token is in it no more
+        (cookie,) = context.cookies()
+        served.cookie = f"{cookie['name']}={cookie['value']}"
     page.locator("[data-part=fell] .main-svg").first.wait_for()
     return page
 
@@ -218,7 +389,6 @@ def test_an_operator_sees_adds_removes_and_goes_back(browser: Browser, served: S
     told: list[str] = []
     before = served.run.read_bytes()
     page = opened(browser, served, told, viewport=DESKTOP)
-    assert page.url == f"http://127.0.0.1:{served.port}/"  # the token is in it no more
     expect(page.locator("[data-part=verdict]")).to_contain_text("Ambiguous")
     at_first = number(page, "error on poses left out")
     assert served.run.read_bytes() == before  # opening it wrote nothing

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 
@@ -18,8 +19,9 @@ WORKER = ("--host", "127.0.0.1", "--no-nanny", "--no-dashboard", "--nthreads", "
 
 @contextmanager
 def running(*command: str) -> "Iterator[subprocess.Popen[str]]":
+    here = {**os.environ, "PYTHONPATH": str(ROOT)}
     process = subprocess.Popen(
-        [sys.executable, "-m", *command], env=HERE, cwd=ROOT, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-m", *command], env=here, cwd=ROOT, stderr=subprocess.PIPE, text=True
     )
     try:
         yield process
@@ -29,13 +31,45 @@ def running(*command: str) -> "Iterator[subprocess.Popen[str]]":
 
 
 @contextmanager
-def scheduler() -> Iterator[str]:
+def scheduler(protocol: str = "tcp") -> Iterator[str]:
     """A real scheduler on loopback; its address."""
-    command = ("dask", "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard")
+    host = ("--host", "127.0.0.1", "--protocol", protocol)
+    command = ("dask", "scheduler", *host, "--port", "0", "--no-dashboard")
     with running(*command, "--dashboard-address", "127.0.0.1:0") as process:
         assert process.stderr is not None
         for line in process.stderr:
-            if found := re.search(r"Scheduler at:\s*(tcp://127\S+)", line):
+            if found := re.search(r"Scheduler at:\s*(\w+://127\S+)", line):
                 yield found[1]
                 return
     pytest.fail("no scheduler")
+
+
+def certificates(folder: Path, names: tuple[str, ...]) -> None:
+    """Make an authority of each name, and a certificate `NAME-own` of it."""
+    for name in names:
+        key = ("-newkey", "rsa:2048", "-nodes", "-keyout")
+        openssl(folder, "req", "-x509", *key, f"{name}.key", "-out", f"{name}.pem",
+                "-subj", f"/CN={name}")  # fmt: skip
+        openssl(folder, "req", *key, f"{name}-own.key", "-out", f"{name}.csr",
+                "-subj", "/CN=localhost")  # fmt: skip
+        openssl(folder, "x509", "-req", "-in", f"{name}.csr", "-CA", f"{name}.pem",
+                "-CAkey", f"{name}.key", "-CAcreateserial", "-out", f"{name}-own.pem")  # fmt: skip
+
+
+def openssl(folder: Path, *arguments: str) -> None:
+    subprocess.run(["openssl", *arguments], cwd=folder, check=True, capture_output=True)
+
+
+def tls(folder: Path, name: str) -> dict[str, str]:
+    """Dask's configuration of an authority's certificate, for scheduler, worker and client."""
+    at = "distributed.comm.tls"
+    own = {"cert": f"{folder}/{name}-own.pem", "key": f"{folder}/{name}-own.key"}
+    roles = {f"{at}.{role}.{k}": v for role in ("scheduler", "worker", "client")
+             for k, v in own.items()}  # fmt: skip
+    return {f"{at}.ca-file": f"{folder}/{name}.pem", **roles}
+
+
+def in_environment(settings: dict[str, str]) -> dict[str, str]:
+    """Dask's configuration as environment variables."""
+    return {f"DASK_{k}".replace(".", "__").replace("-", "_").upper(): v
+            for k, v in settings.items()}  # fmt: skip

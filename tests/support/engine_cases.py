@@ -1,11 +1,18 @@
 """Computations for the tests of the engine; workers find them by the name of this module."""
 
+import os
+import signal
 import sys
 import time
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hilcal.engine.engine import open_engine
+
+Ints = NDArray[np.integer[Any]]
 
 
 def singular_value(item: int, rng: np.random.Generator) -> float:
@@ -16,7 +23,27 @@ def singular_value(item: int, rng: np.random.Generator) -> float:
 
 
 def wait(item: int) -> int:
-    time.sleep(60)
+    """The first is done at once."""
+    print("computing", file=sys.stderr, flush=True)
+    time.sleep(60 if item else 0)
+    return item
+
+
+def negative(item: Ints) -> Ints:
+    return -item
+
+
+def strides(item: Any) -> tuple[int, ...]:
+    return item.strides
+
+
+def die_once(item: int, folder: Path) -> int:
+    """Items 1 and 4 kill their worker where the folder has no note that they did so before."""
+    note = folder / str(item)
+    if item in (1, 4) and not note.exists():
+        if folder.exists():
+            note.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
     return item
 
 
@@ -28,5 +55,4 @@ def refuse(item: int) -> int:
 
 if __name__ == "__main__":
     with open_engine(2) as engine:
-        print("ready", file=sys.stderr, flush=True)
-        engine.map(wait, range(8))
+        engine.map(wait, range(1, 8))

@@ -3,6 +3,7 @@
 import os
 import pty
 import socket
+import sys
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -29,14 +30,18 @@ def test_packages_are_told_with_their_versions_and_those_that_lack() -> None:
         [
             "numpy>=2.0",
             "no-such-package>=3,<4",
+            'no-such-driver>=1; python_version < "3.11"',
             'no-such-tables>=1; extra == "tables"',
             'no-such-linter; extra == "dev"',
         ]
     )
-    there, lacking, optional = found
+    there, lacking, later, optional = found
     assert there.said.startswith("numpy 2.")
     assert (lacking.name, lacking.state) == ("no-such-package", "problem")
     assert "pip install 'no-such-package>=3,<4'" in lacking.mend
+    assert (later.name, later.state) == ("no-such-driver", "warning")
+    assert f"no wheel for Python {sys.version_info[0]}.{sys.version_info[1]}" in later.said
+    assert "Python 3.11 or 3.12" in later.mend
     assert (optional.name, optional.state) == ("optional: tables", "ok")
     assert "hilcal[tables]" in optional.mend
 

@@ -1,19 +1,34 @@
 """Many computations: the same bits wherever they run, and nothing lost or left."""
 
 import os
+import shutil
 import signal
+import socket
 import subprocess
 import sys
-import time
+from functools import partial
+from itertools import permutations
 from pathlib import Path
 
+import dask
+import numpy as np
 import psutil
 import pytest
 
-from hilcal.engine.engine import ClusterError, open_engine
+from hilcal.engine.cluster import Cluster
+from hilcal.engine.engine import open_engine
+from hilcal.engine.tasks import ClusterError
 from hilcal.errors import InputError
-from tests.support.cluster import HERE, WORKER, running, scheduler
-from tests.support.engine_cases import refuse, singular_value
+from tests.support.cluster import (
+    HERE,
+    WORKER,
+    certificates,
+    in_environment,
+    running,
+    scheduler,
+    tls,
+)
+from tests.support.engine_cases import die_once, negative, refuse, singular_value, strides, wait
 from tests.support.paths import ROOT
 
 ITEMS = range(40)
@@ -30,8 +45,8 @@ def test_a_cluster_gives_the_same_bits_though_a_worker_is_killed() -> None:
     with scheduler() as address:
         start = ("dask", "worker", address, *WORKER)
         with running(*start) as doomed, running(*start), open_engine(scheduler=address) as engine:
-            assert engine.client is not None
-            engine.client.wait_for_workers(2, timeout=60)
+            assert isinstance(engine.workers, Cluster)
+            engine.workers.client.wait_for_workers(2, timeout=60)
             done: list[int] = []
 
             def advance(step: int) -> None:
@@ -44,21 +59,61 @@ def test_a_cluster_gives_the_same_bits_though_a_worker_is_killed() -> None:
             assert len(done) == len(ITEMS)
 
 
-@pytest.mark.parametrize("threads", [pytest.param(False, marks=pytest.mark.slow), True])
-def test_workers_of_this_machine_give_the_same_bits_and_listen_to_it_alone(threads: bool) -> None:
-    with open_engine(2, threads=threads) as engine:
-        this = psutil.Process()
-        every = [this, *this.children(recursive=True)]
-        bound = [c.laddr.ip for p in every for c in p.net_connections() if c.status == "LISTEN"]
+def test_workers_of_this_machine_give_the_same_bits_and_can_be_reached_by_nobody() -> None:
+    with open_engine(2) as engine:
         assert engine.map(singular_value, ITEMS, SEED) == here()
+        going = engine.results(wait, range(2))
+        assert next(going) == (0, 0)
+        assert len(workers()) == 2
+        assert sockets() == []
+        going.close()  # while a worker computes
         with pytest.raises(ValueError, match="item 3 is odd"):
             engine.map(refuse, range(6))
-    assert bound
-    assert set(bound) == {"127.0.0.1"}
+        large = [np.full(200_000, k) for k in range(6)]  # more than a pipe holds
+        assert [found[-1] for found in engine.map(negative, large)] == [-k for k in range(6)]
+        turned = [np.zeros((2, 3, 4)).transpose(axes) for axes in permutations(range(3))]
+        assert engine.map(strides, turned) == tuple(map(strides, turned))
+    assert not workers()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def workers() -> list[psutil.Process]:
+    """Every process below this one but that which Python keeps for its semaphores."""
+    every = psutil.Process().children(recursive=True)
+    return [p for p in every if "resource_tracker" not in " ".join(p.cmdline())]
+
+
+def sockets() -> list[str]:
+    """What the processes of the engine listen at, or have on a network; this process included."""
+    every = [psutil.Process(), *workers()]
+    return [
+        f"{c.laddr} {c.status}"
+        for p in every
+        for c in p.net_connections("all")
+        if c.family != socket.AF_UNIX or c.laddr
+    ]
+
+
+def test_what_a_killed_worker_held_is_computed_by_another(tmp_path: Path) -> None:
+    with open_engine(2) as engine:
+        found = engine.map(partial(die_once, folder=tmp_path), range(6))
+        assert found == tuple(range(6))
+        assert len(list(tmp_path.iterdir())) == 2
+        with pytest.raises(ClusterError, match=r"ended 4 workers") as ended:
+            engine.map(partial(die_once, folder=tmp_path / "none"), range(6))
+        assert ended.value.exit_code == 3
+        assert engine.map(refuse, range(2)) == (0, 1)  # nothing of it is left
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        signal.SIGINT,
+        *(
+            pytest.param(kind, marks=pytest.mark.slow)
+            for kind in (signal.SIGTERM, signal.SIGHUP, signal.SIGKILL)
+        ),
+    ],
+)
 def test_a_signal_leaves_no_process_and_no_folder(kind: signal.Signals, tmp_path: Path) -> None:
     process = subprocess.Popen(
         [sys.executable, "-m", "tests.support.engine_cases"],
@@ -69,10 +124,9 @@ def test_a_signal_leaves_no_process_and_no_folder(kind: signal.Signals, tmp_path
         start_new_session=True,
     )
     assert process.stderr is not None
-    assert process.stderr.readline() == "ready\n"
+    assert process.stderr.readline() == "computing\n"  # by the first of its workers
     workers = psutil.Process(process.pid).children(recursive=True)
     assert len(workers) >= 2
-    time.sleep(0.5)
     assert list(tmp_path.glob("hilcal-workers-*"))
     if kind is signal.SIGINT:  # as a terminal sends it: to all of them
         os.killpg(process.pid, kind)
@@ -81,6 +135,8 @@ def test_a_signal_leaves_no_process_and_no_folder(kind: signal.Signals, tmp_path
     told = process.communicate(timeout=30)[1]
     _, alive = psutil.wait_procs(workers, timeout=5)
     assert not alive
+    if kind is signal.SIGKILL:  # nothing can be tidied
+        return
     assert not list(tmp_path.glob("hilcal-workers-*"))
     if kind is signal.SIGINT:
         assert told.count("Traceback") == 1  # of the program itself, which does not catch it
@@ -88,6 +144,33 @@ def test_a_signal_leaves_no_process_and_no_folder(kind: signal.Signals, tmp_path
     else:
         assert process.returncode == 128 + kind
         assert "Traceback" not in told
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="needs openssl")
+def test_a_cluster_with_certificates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    certificates(tmp_path, ("ours", "theirs"))
+    for name, value in in_environment(tls(tmp_path, "ours")).items():
+        monkeypatch.setenv(name, value)  # of the cluster's processes
+    with scheduler("tls") as address, running("dask", "worker", address, *WORKER):
+        with dask.config.set(tls(tmp_path, "ours")), open_engine(scheduler=address) as engine:
+            assert engine.map(singular_value, ITEMS, SEED) == here()
+        with (
+            dask.config.set(tls(tmp_path, "theirs")),
+            pytest.raises(ClusterError, match="our certificate"),
+            open_engine(scheduler=address),
+        ):
+            pass
+
+
+def test_certificates_that_are_not_there_are_said_in_one_line(tmp_path: Path) -> None:
+    for settings, why in (({}, "none are named"), (tls(tmp_path, "none"), "No such file")):
+        with (
+            dask.config.set(settings),
+            pytest.raises(InputError, match=why),
+            open_engine(scheduler="tls://127.0.0.1:1"),
+        ):
+            pass
 
 
 def test_what_is_no_cluster_is_said_in_one_line() -> None:
@@ -103,7 +186,7 @@ def test_what_is_no_cluster_is_said_in_one_line() -> None:
 
 
 def test_a_scheduler_without_workers_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hilcal.engine.engine.WORKERS_S", 0.2)
+    monkeypatch.setattr("hilcal.engine.cluster.WORKERS_S", 0.2)
     with (
         scheduler() as address,
         pytest.raises(ClusterError, match="dask worker"),

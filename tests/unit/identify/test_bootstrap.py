@@ -70,7 +70,7 @@ def test_the_bits_depend_on_the_seed_and_not_on_the_workers() -> None:
     found = fitted(poses=12)
     one = drawn(found, 23)
     told: list[int] = []
-    with open_engine(2, threads=True) as engine:
+    with open_engine(2) as engine:
         two = bootstrap(found, engine, 23, advance=told.append)
     assert sum(told) == 23
     assert one.theta.shape == (23, found.model.size)

@@ -92,8 +92,8 @@ def test_errors_are_those_of_the_noise(found: StreamFit, in_memory: Fit) -> None
     assert abs(found.variance_factor - 1) < 4 * np.sqrt(2 / found.dof)
 
 
-def test_two_threads_give_the_same_bits(stream: Path, found: StreamFit) -> None:
-    with open_engine(2, threads=True) as engine:
+def test_two_workers_give_the_same_bits(stream: Path, found: StreamFit) -> None:
+    with open_engine(2) as engine:
         again = fit_stream(opened(stream), cell(), engine, EFFECT)
     assert np.array_equal(again.theta, found.theta)
     assert np.array_equal(again.covariance, found.covariance)

@@ -251,8 +251,7 @@ def test_same_seed_same_study() -> None:
     assert first == second
 
 
-@pytest.mark.parametrize("threads", [pytest.param(False, marks=pytest.mark.slow), True])
-def test_the_same_bits_on_several_workers(threads: bool) -> None:
+def test_the_same_bits_on_several_workers() -> None:
     correlations, done = (0.5, 0.9), []
 
     def on(engine: Engine) -> ScalingStudy:
@@ -268,7 +267,7 @@ def test_the_same_bits_on_several_workers(threads: bool) -> None:
     after = every.random()
     with open_engine(1) as engine:
         alone = on(engine)
-    with open_engine(2, threads=threads) as engine:
+    with open_engine(2) as engine:
         assert on(engine) == alone
     assert len(done) == 2 * experiments(correlations)
     assert experiments() == 2 * len(CORRELATIONS)
