@@ -262,7 +262,7 @@ class ForceStream:
         if now - self._byte_time > STALE_S or not self._bytes:
             return f"{where}: nothing came {since}; check the sensor's power and cable"
         if self._impossible and self._deframer.frames:
-            return f"{where}: frames come, but their values were impossible {since}"
+            return f"{where}: frames come, but their values or their clock were impossible {since}"
         return (
             f"{where}: bytes come at {self._port.baudrate} Bd, but no whole frame {since}; the "
             f"rate is wrong, the line is disturbed, or it is no {self._sensor.name}"

@@ -10,6 +10,7 @@ from rich.console import Console
 from hilcal.acquire.devices import Report
 from hilcal.config import CellConfig, Load
 from hilcal.errors import DeviceError, InputError
+from hilcal.names import escaped
 
 _NO_TERMINAL = (
     "operator: standard input is not a terminal, so nobody can be asked to hang a load; "
@@ -50,14 +51,31 @@ class TerminalOperator:
         Raises:
             DeviceError: the person gives up with q, or nobody is there to be asked.
         """
+        said = "nothing hangs" if load is None else f"{load.name} hangs"
+        self._ask(f"Not yet: {why}" if why else "", self._request(load), said)
+
+    def confirm(self, question: str) -> None:
+        """Ask whether the arm may go on; see `hilcal.acquire.devices.ConfirmingOperator`.
+
+        Raises:
+            DeviceError: the person gives up with q, or nobody is there to be asked.
+        """
+        self._ask(f"Look at the arm: {question}.", ["May it go on?"], "it goes on")
+
+    def _ask(self, warning: str, request: list[str], said: str) -> None:
+        """Ask and wait for Enter.
+
+        Raises:
+            DeviceError: the person gives up, or nobody is there to be asked.
+        """
         if not _is_terminal():
             raise DeviceError(_NO_TERMINAL)
         self._say()
         if self._console.is_terminal:
             self._console.bell()
-        if why:
-            self._say(f"Not yet: {why}", style="bold red")
-        for line in self._request(load):
+        if warning:
+            self._say(warning, style="bold red")
+        for line in request:
             self._say(line, style="bold")
         with contextlib.suppress(termios.error, OSError, ValueError):
             termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)
@@ -69,10 +87,10 @@ class TerminalOperator:
                 raise DeviceError(f"operator: the terminal is gone ({error})") from None
             if not answer:
                 self._say()
-                raise DeviceError("operator: the terminal was closed before the load was hung")
+                raise DeviceError("operator: the terminal was closed before it was answered")
             answer = answer.strip().lower()
             if answer == "":
-                self._say("Done: " + ("nothing hangs." if load is None else f"{load.name} hangs."))
+                self._say(f"Done: {said}.")
                 return
             if answer in ("q", "quit"):
                 self._say("Given up.")
@@ -84,6 +102,7 @@ class TerminalOperator:
     def _say(self, words: str = "", *, style: str | None = None, end: str = "\n") -> None:
         """Print above nothing: the live display is gone. A terminal's lines break between words."""
         whole = not self._console.is_terminal
+        words = "\n".join(map(escaped, words.split("\n")))
         self._console.print(words, style=style, end=end, markup=False, soft_wrap=whole)
 
     def close(self) -> None:

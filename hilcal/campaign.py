@@ -16,7 +16,7 @@ from hilcal.data.purpose import refuse_fitting
 from hilcal.data.readings import Readings
 from hilcal.data.records import content_hash
 from hilcal.data.revision import STORED, RevisionRecord
-from hilcal.data.robot_file import ROBOT_FILE
+from hilcal.data.robot_file import ROBOT_FILE, check_robot
 from hilcal.data.whitening import Mode, usual_mode
 from hilcal.diagnose.diagnosis import Diagnosis, History
 from hilcal.diagnose.verdict import diagnose
@@ -90,6 +90,7 @@ class Campaign:
         file = CampaignFile.open(path, read_only=read_only)
         try:
             config = CellConfig.from_json(file.config_json)
+            check_robot(file.path, file.config_json, file.about(ROBOT_FILE))
             cell = cell_from_config(config, Path(file.base_dir), file.about(ROBOT_FILE))
             readings = campaign_readings(file, cell, config)
         except BaseException:
@@ -124,6 +125,11 @@ class Campaign:
             return stored
         added = covariance_parts(INSTRUMENT, self.config) != "instrument"
         return WHOLE if added else INSTRUMENT
+
+    @property
+    def data_hash(self) -> str:
+        """SHA-256 of its readings as the file stores them, without those appended since."""
+        return self.file.data_hash(len(self.readings))
 
     def close(self) -> None:
         """Close the file."""
@@ -191,8 +197,7 @@ class Campaign:
         """Return the fit of a stored revision; raises as `fit` does."""
         check_sources(record, self.path, self.catalogue)
         try:
-            stored = self.file.data_hash()
-            return restore(record, self.cell, self.readings, self.catalogue, stored)
+            return restore(record, self.cell, self.readings, self.catalogue, self.data_hash)
         except InputError as error:
             if record.number != self.file.accepted():
                 raise
@@ -274,7 +279,8 @@ class Campaign:
         number = 0
         if isinstance(found, Refinement):
             for step in found.steps:
-                number = self.store(step.fit, step.diagnosis, step.added, step.removed)
+                parent = number or None
+                number = self.store(step.fit, step.diagnosis, step.added, step.removed, parent)
             return number
         if isinstance(found, Diagnosis):
             return self.store(found.fit, found)
@@ -304,8 +310,6 @@ class Campaign:
             InputError: it was fitted to other readings than those of this campaign, or these are
                 of a validation campaign (`data.purpose`).
         """
-        if parent == len(self.file.revisions()):
-            parent = None
         return self.file.append_revision(self.record(found, diagnosis, added, removed, parent))
 
     def record(
@@ -323,7 +327,7 @@ class Campaign:
             raise InputError(f"{self.path}: the fit is of other readings than this campaign's")
         document = None if diagnosis is None else to_json(diagnosis)
         record = to_record(found, document, added, hashed, removed, parent)
-        own = {STORED: self.file.data_hash(), **typed_now()}
+        own = {STORED: self.data_hash, **typed_now()}
         return replace(record, options={**record.options, **own})
 
     def fit_in_use(

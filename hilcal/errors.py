@@ -19,6 +19,10 @@ class DeviceError(HilcalError):
     exit_code = 3
 
 
+class MovedFileError(DeviceError):
+    """A campaign was deleted, replaced or moved while it was open; says where its readings are."""
+
+
 class CannotAnswerError(HilcalError):
     """The data cannot answer the question; says what to measure."""
 

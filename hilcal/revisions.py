@@ -129,13 +129,15 @@ def _fitted_to(record: RevisionRecord, readings: Readings, stored: str | None) -
     bits are those of the machine that fitted; elsewhere their number of readings has to do. Stored
     readings cannot be changed, only appended, and each has a checksum.
     """
+    reported = record.result_json.get("identify")
+    told = reported.get("n_readings") if isinstance(reported, Mapping) else None
+    if told is not None and told != len(readings):
+        return False
     if stored is not None and stored == record.options.get(STORED):
         return True
     if record.data_hash == content_hash(readings):
         return True
-    reported = record.result_json.get("identify")
-    told = reported.get("n_readings") if isinstance(reported, Mapping) else None
-    return STORED not in record.options and told == len(readings)
+    return STORED not in record.options and told is not None
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from pydantic.fields import FieldInfo
 
 from hilcal import limits
 from hilcal.errors import InputError
+from hilcal.names import check_names
 
 Number = Annotated[float, Strict()]
 NonNegative = Annotated[float, Strict(), Field(ge=0)]
@@ -69,8 +70,10 @@ def check_section(data: object, section: type[S], where: str) -> S:
     """Check a dictionary against `section`; `where` names its origin in messages.
 
     Raises:
-        InputError: unknown key (lists the valid ones), missing key or bad value.
+        InputError: unknown key (lists the valid ones), missing key, bad value, or a text with a
+            character that no name may hold.
     """
+    check_names(data, where)
     try:
         return section.model_validate(data)
     except ValidationError as error:

@@ -1,8 +1,6 @@
 """`report`: collects what a campaign says, and writes it as one HTML page."""
 
 import hashlib
-import os
-import tempfile
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -24,6 +22,7 @@ from hilcal.procedure.state import IMPROVED, Files
 from hilcal.report.build_story import Chapter, build_story
 from hilcal.report.html.content import ReportContent, Tested
 from hilcal.validate import validate
+from hilcal.whole_file import replace_file
 
 Say = Callable[[str], None]
 
@@ -128,7 +127,7 @@ def write_report(
         say("writing the page")
         html, first = page(m), first_screen(m)
         verdict = None if m.diagnosis is None else m.diagnosis.verdict
-    _write(path, html)
+    replace_file(path, html)
     return ReportSummary(first.headline, first.limit, first.passed, verdict)
 
 
@@ -186,7 +185,7 @@ def write_fleet_report(found: Fleet, directory: Path, path: Path) -> None:
     """
     from hilcal.report.html.fleet import page
 
-    _write(path, page(found, directory.resolve().name, utc_now(), hilcal.__version__))
+    replace_file(path, page(found, directory.resolve().name, utc_now(), hilcal.__version__))
 
 
 def _scalings(last: Fit, chapters: list[Chapter], say: Say) -> dict[Scaling, Fit]:
@@ -219,19 +218,3 @@ def _sha256(path: Path) -> str:
     """Hash of a campaign file as it is on the disk."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
-def _write(path: Path, html: str) -> None:
-    """Replace a file whole, or leave it as it is."""
-    try:
-        handle, part = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        try:
-            with os.fdopen(handle, "w", encoding="utf-8") as stream:
-                stream.write(html)
-            Path(part).chmod(0o644)
-            Path(part).replace(path)
-        except BaseException:
-            Path(part).unlink(missing_ok=True)
-            raise
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror})") from None

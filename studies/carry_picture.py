@@ -18,6 +18,7 @@ from plotly.offline import get_plotlyjs
 
 from hilcal.errors import InputError
 from hilcal.report.charts.style import GREY, HOLDOUT, LIGHT, MEASURED, figure
+from hilcal.whole_file import replace_file
 
 PICTURE = "../images/carry-over.svg"
 """Its place from the page of results."""
@@ -56,7 +57,7 @@ def carry_picture(
             points += [Point(**p) for p in json.loads(path.read_text(encoding="utf-8"))["points"]]
         except (OSError, KeyError, TypeError, ValueError) as error:
             raise InputError(f"{path}: not kept by studies carry ({error})") from None
-    output.write_text(svg(chart(points)), encoding="utf-8")
+    replace_file(output, svg(chart(points)))
 
 
 def chart(points: Sequence[Point]) -> go.Figure:

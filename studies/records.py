@@ -13,6 +13,7 @@ import typer
 
 from hilcal import __version__
 from hilcal.errors import InputError
+from hilcal.whole_file import replace_file
 
 Keep = Annotated[
     Path | None,
@@ -79,7 +80,7 @@ def keep(
     date = datetime.now(UTC).date().isoformat()
     record = Record(title, command, date, __version__, tuple(figures))
     content = {**asdict(record), **(more or {})}
-    _write(path, json.dumps(content, indent=1, ensure_ascii=False) + "\n")
+    replace_file(path, json.dumps(content, indent=1, ensure_ascii=False) + "\n")
 
 
 def _kept_words(given: Sequence[str]) -> list[str]:
@@ -97,7 +98,7 @@ def results(
     output: Annotated[Path, typer.Option("-o", "--output", metavar="F.md", help="The page.")],
 ) -> None:
     """Make the page of results from what the studies kept."""
-    _write(output, page(folder))
+    replace_file(output, page(folder))
 
 
 def page(folder: Path) -> str:
@@ -129,10 +130,3 @@ def page(folder: Path) -> str:
         if picture := record.get("picture"):
             out += ["", f"![{record['title']}]({picture})"]
     return "\n".join(out) + "\n"
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror})") from None

@@ -4,8 +4,8 @@
         [--rate HZ] [--on S]
 
 Admin operations besides those of the line (`pty_port.FAULTS`): `overload {force}` adds a wrench
-(6 numbers, N and N·m), `stall {on}` stops sending while the sensor's clock goes on, `state`;
-Bota: `saturate {on}` and `clock {us}`.
+(6 numbers, N and N·m), `freeze {on}` repeats one reading, `stall {on}` stops sending while the
+sensor's clock goes on, `state`; Bota: `saturate {on}` and `clock {us}`.
 """
 
 import argparse
@@ -97,6 +97,8 @@ class Stream:
                 if force.shape != (6,):
                     raise ValueError(f"force has the shape {force.shape}; valid: 6 numbers")
                 self.gauge.overload = force
+            case "freeze":
+                self.gauge.frozen = self.gauge.read(1)[0] if arguments["on"] else None
             case "stall":
                 self.stalled = bool(arguments["on"])
             case "state":

@@ -4,7 +4,8 @@
         --transverse-std C E --seed N [--baud 115200]
 
 Admin operations besides those of the line (`pty_port.FAULTS`): `beam {on}` blocks it, `hide
-{targets}` covers reflectors by number, `lock_lost`,
+{targets}` covers reflectors by number, `lock_lost`, `freeze {on}` repeats the last measurement,
+`stray {on}` follows a reflector at rest where the target is now,
 `dist_error {on}`, `warn {code}` (1283 or 1284, 0 is none), `busy {on}`, `delay {rpc, seconds,
 count}` in real time, `wrong_trid {count}`, `meas_s {seconds}` of world time, `log`, `state`.
 """
@@ -60,6 +61,10 @@ def operate(station: Station, port: PtyPort, op: str, arguments: dict[str, Any])
             station.locked = station.locked and station.number not in station.hidden
         case "lock_lost":
             station.locked = False
+        case "freeze":
+            station.stuck = station.seen if arguments["on"] else None
+        case "stray":
+            station.stray = station.target() if arguments["on"] else None
         case "dist_error":
             station.dist_error = bool(arguments["on"])
         case "warn":

@@ -65,6 +65,15 @@ class SimulatedOperator:
             self.clock.sleep(self.hand)
         admin.ask(self.socket, "hang", name=None if load is None else load.name)
 
+    def confirm(self, question: str) -> None:
+        """Say that the arm may go on; a person is asked.
+
+        Raises:
+            DeviceError: the person gives up.
+        """
+        if self.person is not None:
+            self.person.confirm(question)
+
     def close(self) -> None:
         """Nothing to give back."""
 

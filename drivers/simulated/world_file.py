@@ -15,6 +15,7 @@ from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
 from hilcal.errors import InputError
 from hilcal.types import Floats
+from hilcal.whole_file import replace_file
 
 FORMAT = "hilcal-world"
 VERSION = 2
@@ -61,9 +62,7 @@ def write_world(path: Path, world: World, config: CellConfig, base_dir: Path | N
             "orientation_std": noise.orientation_std,
         },
     }
-    new = path.with_name(path.name + ".new")
-    new.write_text(json.dumps(content, indent=1), encoding="utf-8")
-    new.replace(path)
+    replace_file(path, json.dumps(content, indent=1))
 
 
 def read_world(path: Path) -> tuple[World, CellConfig]:

@@ -26,6 +26,10 @@ class WrongLoadError(DeviceError):
     """What hangs is not what was asked for."""
 
 
+class LoadChangedError(DeviceError):
+    """What hangs is no longer what should hang; worth another try once a person has mended it."""
+
+
 @dataclass(frozen=True, slots=True)
 class Report:
     """Identity, state and problems of a device, read without any motion.
@@ -307,6 +311,22 @@ class OperatorDevice(Protocol):
 
     def close(self) -> None:
         """Give the terminal back. Never raises, may be called twice."""
+        ...
+
+
+@runtime_checkable
+class ConfirmingOperator(OperatorDevice, Protocol):
+    """An operator who can be asked whether the arm may go on."""
+
+    def confirm(self, question: str) -> None:
+        """Ask and wait for the answer.
+
+        Args:
+            question: what the arm does next, one or more sentences.
+
+        Raises:
+            DeviceError: the person gives up.
+        """
         ...
 
 

@@ -16,6 +16,7 @@ from hilcal.acquire.tool_load import (
 from hilcal.cell import Cell
 from hilcal.config import ForceSensor as Settings
 from hilcal.config import Load, Operator
+from hilcal.errors import CannotAnswerError, DeviceError
 from hilcal.robot import chain as chains
 from hilcal.robot import se3
 from hilcal.types import Floats
@@ -65,6 +66,11 @@ class ForceMeter:
     hook, less the tool of the configuration. Wrenches of sessions are comparable after it,
     whatever the sensor's own zero did while it was off; how the real tool differs from the
     configured one stays in them, the same in all sessions.
+
+    Attributes:
+        zero: (6,) what the sensor reads with nothing on it, N and N·m, sensor axes.
+        tool: what it carries.
+        identified: whether the tool has been weighed, else it is that of the configuration.
     """
 
     def __init__(
@@ -84,7 +90,7 @@ class ForceMeter:
         self._origin = np.array(settings.origin_m)
         self._axes = se3.rotation(np.array(settings.rotvec_rad))
         self._com = self._axes.T @ (cell.tool_com - self._origin)
-        self._identified = False
+        self.identified = False
         nothing = np.zeros((PARAMETERS, PARAMETERS))
         moment = cell.tool_mass * self._com
         self.tool = ToolLoad(np.zeros(6), cell.tool_mass, moment, nothing, cell.gravity, 0.0, 0, 0)
@@ -101,12 +107,18 @@ class ForceMeter:
         """Return a mean of at least `MIN_FRAMES` frames, as the sensor gives it.
 
         Raises:
-            DeviceError: the stream is dead, or gives too few frames.
+            DeviceError: the stream is dead, gives too few frames, or stands still.
         """
         sample = self.sensor.average(self._seconds)
         if sample.frames < MIN_FRAMES:  # a fast clock's window is too short for the real line
             self._seconds *= 1.2 * MIN_FRAMES / max(sample.frames, 1)
             sample = self.sensor.average(self._seconds)
+        variance, rounding = np.diagonal(sample.covariance), 1e-12 * (1.0 + np.abs(sample.wrench))
+        if sample.frames >= MIN_FRAMES and np.all(variance <= rounding**2):
+            raise DeviceError(
+                f"force sensor: {sample.frames} frames are the same to the last digit: it sends "
+                "old values. Switch it off and on"
+            )
         return sample
 
     def tared(self, sample: WrenchSample, q: Floats) -> TaredWrench:
@@ -130,25 +142,43 @@ class ForceMeter:
         covariance = sample.covariance / max(sample.frames, 1) + _FLOOR
         zero = tare(sample.wrench, covariance, rotation, cell.gravity, cell.tool_mass, self._com)
         self.zero = zero.bias
-        if not self._identified:
+        if not self.identified:
             self.tool = replace(zero, bias=np.zeros(6))
 
-    def identify(self, unloaded: list[TaredWrench]) -> ToolLoad | None:
-        """Find the real tool from unloaded readings; None where they are too few.
+    def identify(self, unloaded: list[TaredWrench], tolerance_N: float) -> tuple[int, ...] | None:
+        """Find the real tool from unloaded readings.
+
+        A reading whose force the tool does not explain to the tolerance was not unloaded, or
+        somebody leaned on the tool: the worst is left out until all are explained.
+
+        Args:
+            unloaded: the readings.
+            tolerance_N: by how much a force may differ.
+
+        Returns:
+            Numbers of the readings that were left out; None where they are too few.
 
         Raises:
-            HilcalError: their poses do not determine it.
+            HilcalError: their poses do not determine it, or fewer than `ENOUGH_POSES` agree.
         """
+        kept = list(range(len(unloaded)))
+        while len(kept) >= ENOUGH_POSES:
+            used = [unloaded[k] for k in kept]
+            rotation = np.array([self.frame(f.q).rotation for f in used])
+            wrench = np.array([f.wrench for f in used])
+            covariance = np.array([f.covariance for f in used])
+            tool = identify_tool_load(wrench, covariance, rotation, self._cell.gravity)
+            off = np.linalg.norm((wrench - tool.tool_wrench(rotation))[:, :3], axis=1)
+            if off.max() <= tolerance_N:
+                self.tool, self.identified = tool, True
+                return tuple(sorted(set(range(len(unloaded))) - set(kept)))
+            del kept[int(np.argmax(off))]
         if len(unloaded) < ENOUGH_POSES:
             return None
-        self.tool = identify_tool_load(
-            np.array([f.wrench for f in unloaded]),
-            np.array([f.covariance for f in unloaded]),
-            np.array([self.frame(f.q).rotation for f in unloaded]),
-            self._cell.gravity,
+        raise CannotAnswerError(
+            f"no {ENOUGH_POSES} of the {len(unloaded)} unloaded readings of the force sensor agree "
+            f"to {tolerance_N:g} N; does something touch the tool?"
         )
-        self._identified = True
-        return self.tool
 
     def load_wrench(self, tared: TaredWrench) -> Floats:
         """Return the (6,) wrench of the load at the load point, base axes, N and N·m."""

@@ -1,20 +1,24 @@
 """Limits that are checked at every sample, in motion and at rest."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from hilcal.acquire import workspace
 from hilcal.acquire.devices import ArmSample
+from hilcal.acquire.feasibility import Feasibility, Margins
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.robot.chain import evaluate
+from hilcal.data.plan import UNLOADED
 from hilcal.types import Floats
 
 NORMAL = "normal"
 """The safety state of an arm where all is well."""
+HOW_ON = "drive it by hand to a free place in the middle of its workspace"
 SLACK_M = 0.005
 """An arm that sags at the edge of its workspace is not stopped for it, m."""
+SLACK = Margins(joint=-0.01, inside=-SLACK_M, clear=0.0, itself=0.0, bear=1.02)
+"""How much less is kept in motion than in a dry run: an arm sags and follows late, and a motion is
+checked at samples. Nothing may touch."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,15 +32,28 @@ class Guard:
 
     cell: Cell
     config: CellConfig
+    _limits: Feasibility = field(init=False, repr=False)
 
-    def check(self, sample: ArmSample, felt: Floats | None = None) -> str | None:
+    def __post_init__(self) -> None:
+        """Build the shapes once."""
+        object.__setattr__(self, "_limits", Feasibility(self.cell, self.config, SLACK))
+
+    def check(
+        self, sample: ArmSample, felt: Floats | None = None, hanging: str = UNLOADED
+    ) -> str | None:
         """Return in one line what is wrong, or None.
 
         Args:
             sample: of the arm.
             felt: (6,) wrench on the force sensor, N and N·m; None where there is none.
+            hanging: name of the load that hangs.
         """
-        return self.state(sample) or self._speed(sample) or self._place(sample) or self._pull(felt)
+        return (
+            self.state(sample)
+            or self._speed(sample)
+            or self._place(sample.q, hanging)
+            or self._pull(felt)
+        )
 
     def state(self, sample: ArmSample) -> str | None:
         """Return in one line why a sample is not one of this arm, ready to move; or None."""
@@ -57,15 +74,9 @@ class Guard:
         name = self.cell.arm.joint_names[k]
         return f"arm: {name} moves at {speed[k]:.3g} rad/s; joint_speed_rad_s is {limit:g}"
 
-    def _place(self, sample: ArmSample) -> str | None:
-        chain = evaluate(self.cell.arm, sample.q[None])
-        for name, axis, over, limit in workspace.outside(self.cell, self.config, chain):
-            if over[0] > SLACK_M:
-                return (
-                    f"arm: {name} is {over[0]:.3g} m outside the workspace, whose {axis} ends at "
-                    f"{limit:g} m"
-                )
-        return None
+    def _place(self, q: Floats, hanging: str) -> str | None:
+        found = next(self._limits.findings(q[None], hanging), None)
+        return found and f"{found.at('arm')}; {HOW_ON}"
 
     def _pull(self, felt: Floats | None) -> str | None:
         sensor = self.config.force_sensor

@@ -1,17 +1,25 @@
 """Changing the load: the operator, the payload of the controller, and the force sensor's check."""
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
 from hilcal.acquire.clock import Clock
-from hilcal.acquire.devices import ArmDevice, OperatorDevice, TerminalPerson, WrongLoadError
+from hilcal.acquire.devices import (
+    ArmDevice,
+    ConfirmingOperator,
+    OperatorDevice,
+    TerminalPerson,
+    WrongLoadError,
+)
 from hilcal.acquire.force import ForceMeter
 from hilcal.acquire.motion import Mover
 from hilcal.acquire.progress import Answered, Phase, Question, Remark, Watcher
 from hilcal.cell import Cell
 from hilcal.config import CellConfig, Load
 from hilcal.data.plan import UNLOADED
+from hilcal.errors import DeviceError
 from hilcal.types import Floats
 
 Wrong = Callable[[], str]
@@ -81,24 +89,79 @@ class Hook:
         heavier = payload(self._cell, new)[0] > payload(self._cell, old)[0]
         if heavier:
             self._arm.set_payload(*payload(self._cell, new))
+        self._suspend(self.hanging, name)
         self._ask(new, lambda: self._differs(new))
         if not heavier:
             self._arm.set_payload(*payload(self._cell, new))
-        self.hanging, self.since = name, self._clock.now()
+        self._hangs(name)
 
-    def _ask(self, load: Load | None, wrong: Wrong) -> None:
-        """Ask until nothing is wrong, `TRIES` times."""
+    def restore(self, why: str) -> None:
+        """Have what should hang put right, where the arm stands, after it was found wrong.
+
+        The controller is told at once if nothing hangs any more.
+
+        Raises:
+            DeviceError: the person gives up.
+            WrongLoadError: what hangs is wrong three times.
+        """
+        name, load = self.hanging, self.load(self.hanging)
+        self._suspend(UNLOADED, name)
+        if load is not None and not self._differs(None):
+            self._arm.set_payload(*payload(self._cell, None))
+        self._ask(load, lambda: self._differs(load), why)
+        self._hangs(name)
+
+    def confirm(self, question: str) -> None:
+        """Ask whether the arm may go on.
+
+        Raises:
+            DeviceError: the person gives up, or the operator's driver cannot ask that.
+        """
+        operator = self._operator
+        if not isinstance(operator, ConfirmingOperator):
+            raise DeviceError(f"arm: {question}: look at it, and start again")
+        if not (isinstance(operator, TerminalPerson) and operator.at_terminal):
+            self._watcher.notify(Remark(question))
+        self._watcher.notify(Phase("waiting for the operator to look at the arm"))
+        self._asked(partial(operator.confirm, question))
+
+    def _suspend(self, *hanging: str) -> None:
+        """Take note that one of some loads hangs, and do not watch it."""
+        self._mover.hanging = hanging
+        if self._mover.watch is not None:
+            self._mover.watch.suspend()
+
+    def _hangs(self, name: str) -> None:
+        """Take note that a load hangs, and watch it from now on."""
+        self.hanging, self.since = name, self._clock.now()
+        self._mover.hanging = (name,)
+        if self._mover.watch is not None:
+            self._mover.watch.expect(self.load(name))
+
+    def _asked(self, ask: Callable[[], None]) -> None:
+        """Ask a person; one at the terminal gets it from the display."""
+        person = isinstance(self._operator, TerminalPerson) and self._operator.at_terminal
+        if person:
+            self._watcher.notify(Question())
+        ask()
+        if person:
+            self._watcher.notify(Answered())
+
+    def _ask(self, load: Load | None, wrong: Wrong, why: str = "") -> None:
+        """Ask until nothing is wrong, `TRIES` times; an arm moved meanwhile is put back.
+
+        Args:
+            load: what to hang.
+            wrong: what is wrong after the answer.
+            why: why it is asked for, empty at the first time.
+        """
         what = "take everything off" if load is None else f"hang {load.name}"
         person = isinstance(self._operator, TerminalPerson) and self._operator.at_terminal
-        why = ""
         for _ in range(TRIES):
             self._watcher.notify(Phase(f"waiting for the operator to {what}"))
-            if person:
-                self._watcher.notify(Question())
-            self._operator.hang(load, why)
-            if person:
-                self._watcher.notify(Answered())
+            self._asked(partial(self._operator.hang, load, why))
             self._watcher.notify(Phase("checking what hangs"))
+            self._mover.put_back(self.confirm)
             self._mover.look()
             why = wrong()
             if not why:

@@ -150,6 +150,11 @@ class Measurer:
         why = self._mover.check_still(before, after)
         if why is not None:
             return None, why
+        if len({sample.value.tobytes() for sample in tracker}) == 1:
+            return None, (
+                f"tracker: {len(tracker)} measurements are the same to the last digit: it repeats "
+                "an old one"
+            )
         try:
             mean = average(tracker, self._config.acquire.systematic_share)
         except DeviceError as error:

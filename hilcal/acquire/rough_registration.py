@@ -6,13 +6,19 @@ from hilcal.cell import Cell
 from hilcal.data.covariance import joint_scatter
 from hilcal.robot import chain as chains
 from hilcal.robot.chain import drive_jacobian
-from hilcal.types import Floats
+from hilcal.types import Bools, Floats
 
 ENOUGH = 4
 SPREAD_M = 0.05
 """Second extent of a cloud of positions that fixes a rotation, m."""
 PLAUSIBLE_M = 0.1
 """A reading so far from where the nominal arm holds the target is not believed, m."""
+STUCK_M = 1e-5
+"""Two readings so close to each other at poses that are not are one old reading, m."""
+STUCK_SHARE = 0.2
+"""A target that moves by less than this share of what the arm moves it by is not on the arm."""
+MOVES_M = 0.005
+"""The arm has to move a target by so much before that is asked, m; geometric errors are less."""
 
 
 class RoughRegistration:
@@ -27,11 +33,19 @@ class RoughRegistration:
         self._cell = cell
         self._held: list[Floats] = []
         self._seen: list[Floats] = []
+        self._target: list[int] = []
 
     def add(self, q: Floats, position: Floats, target: int = 0) -> None:
-        """Take note of a reading: joint angles (n,) and position (3,), sensor axes, m."""
-        self._held.append(self._positions(q)[target])
+        """Take note of a reading: joint angles (n,) and position (3,), sensor axes, m.
+
+        One that repeats an earlier one is left out; older versions stored such.
+        """
+        held = self._positions(q)[target]
+        if self._stuck(held, position, target) is not None:
+            return
+        self._held.append(held)
         self._seen.append(np.asarray(position))
+        self._target.append(target)
 
     def pose(self) -> tuple[Floats, Floats] | None:
         """Return rotation (3, 3) and translation (3,) of T_sensor_base; None while unknown.
@@ -42,9 +56,10 @@ class RoughRegistration:
         known = self._cell.registration
         if self._cell.registration_known:
             return known[:3, :3], known[:3, 3]
-        if len(self._held) < ENOUGH:
+        agree = self._agreeing()
+        if agree.sum() < ENOUGH:
             return None
-        held, seen = np.array(self._held), np.array(self._seen)
+        held, seen = np.array(self._held)[agree], np.array(self._seen)[agree]
         h, s = held - held.mean(axis=0), seen - seen.mean(axis=0)
         if np.linalg.svd(h, compute_uv=False)[1] < SPREAD_M:
             return None
@@ -60,6 +75,9 @@ class RoughRegistration:
 
     def implausible(self, q: Floats, position: Floats, target: int = 0) -> str | None:
         """Return in one line why a reading cannot be of the target on the arm, or None."""
+        stuck = self._stuck(self._positions(q)[target], position, target)
+        if stuck is not None:
+            return stuck
         places = self.expected(q)
         if places is None or not self._cell.known_targets[target]:
             return None
@@ -68,8 +86,42 @@ class RoughRegistration:
             return None
         return (
             f"tracker: it sees its target {off:.3g} m from where the arm holds it; does it follow "
-            "another reflector, or has it been moved?"
+            "another reflector, or has it been moved? Have it see the target; where it has been "
+            "moved, go on in a new campaign"
         )
+
+    def _stuck(self, held: Floats, position: Floats, target: int) -> str | None:
+        """Why a reading is the one before it or of something at rest, or None.
+
+        Distances between positions do not depend on where the tracker stands.
+        """
+        same = np.flatnonzero(np.array(self._target) == target)
+        if not len(same):
+            return None
+        last = int(same[-1])
+        moved = float(np.linalg.norm(held - self._held[last]))
+        seen = float(np.linalg.norm(position - self._seen[last]))
+        known = self._cell.known_targets[target]
+        limit = max(STUCK_M, STUCK_SHARE * moved if known else 0.0)
+        if moved <= MOVES_M or seen > limit:
+            return None
+        return (
+            f"tracker: its target has moved by {1e3 * seen:.3g} mm where the arm has moved it by "
+            f"{1e3 * moved:.3g} mm: it repeats an old reading, or follows a reflector that is not "
+            "on the arm. Have it see the target"
+        )
+
+    def _agreeing(self) -> Bools:
+        """Return which readings (K,) are of the target: the most that agree with one of them.
+
+        Two agree whose distance is that of the nominal positions to `PLAUSIBLE_M`.
+        """
+        held, seen = np.array(self._held), np.array(self._seen)
+        if not len(held):
+            return np.zeros(0, dtype=np.bool_)
+        apart = [np.linalg.norm(x[:, None] - x, axis=2) for x in (held, seen)]
+        agree = np.abs(apart[0] - apart[1]) <= PLAUSIBLE_M
+        return np.asarray(agree[int(np.argmax(agree.sum(axis=1)))])
 
     def repeatability(self, q: Floats, joint_std: Floats) -> Floats:
         """Return the (3, 3) covariance that the joints' scatter adds to a position, sensor axes.

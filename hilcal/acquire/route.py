@@ -36,6 +36,18 @@ def home(plan: Plan) -> str:
     return REFERENCE if REFERENCE in plan.pose_names else plan.pose_names[0]
 
 
+def beside(q: Floats, arm: Arm, margin: float) -> Floats:
+    """Return (n,) where the arm comes from to a reference pose (n,) at the start, rad.
+
+    Args:
+        q: the reference pose, rad.
+        arm: the arm.
+        margin: distance kept from the joint limits, rad.
+    """
+    side = np.where(q - APPROACH_RAD >= arm.q_min + margin, 1.0, -1.0)
+    return np.asarray(q - side * APPROACH_RAD)
+
+
 def route(plan: Plan, arm: Arm, margin: float = 0.0) -> tuple[Stop, ...]:
     """Return every stop for the steps of a plan.
 
@@ -50,16 +62,15 @@ def route(plan: Plan, arm: Arm, margin: float = 0.0) -> tuple[Stop, ...]:
     """
     base = home(plan)
     q_home = plan.joints(base)
-    side = np.where(q_home - APPROACH_RAD >= arm.q_min + margin, 1.0, -1.0)
-    beside = Stop(f"beside {base}", q_home - side * APPROACH_RAD, UNLOADED)
-    stops = [beside, Stop(base, q_home, UNLOADED)]
+    first = Stop(f"beside {base}", beside(q_home, arm, margin), UNLOADED)
+    stops = [first, Stop(base, q_home, UNLOADED)]
     for step in plan.steps:
         last = stops[-1]
         hanging = last.hanging if last.change_to is None else last.change_to
         if step.load != hanging:
             stops.append(Stop(base, q_home, hanging, change_to=step.load))
         elif last.step is not None and last.step.pose == step.pose:
-            away = (beside.name, beside.q) if step.pose == base else (base, q_home)
+            away = (first.name, first.q) if step.pose == base else (base, q_home)
             stops.append(Stop(*away, hanging))
         stops.append(Stop(step.pose, plan.joints(step.pose), step.load, step=step))
     return tuple(stops)

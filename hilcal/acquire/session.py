@@ -10,17 +10,18 @@ import numpy as np
 
 from hilcal.acquire.arrival import ArrivalReader, TargetReading
 from hilcal.acquire.clock import Clock
+from hilcal.acquire.devices import LoadChangedError, TargetLostError
 from hilcal.acquire.drift import Shift
-from hilcal.acquire.dry_run import route_problems
 from hilcal.acquire.eta import Eta
 from hilcal.acquire.force import ForceMeter, TaredWrench
 from hilcal.acquire.guard import Guard
-from hilcal.acquire.loads import Hook, payload
+from hilcal.acquire.loads import TRIES, Hook, payload
 from hilcal.acquire.measure import Measured, Measurer
 from hilcal.acquire.motion import Mover
 from hilcal.acquire.progress import ArmAt, LiveResidual, Phase, ReadingStored, Remark, Watcher
 from hilcal.acquire.reading_record import detail, reading_of, sample_json, stored_wrench
 from hilcal.acquire.rig import Rig
+from hilcal.acquire.rough_registration import RoughRegistration
 from hilcal.acquire.route import Stop
 from hilcal.acquire.session_state import SessionState
 from hilcal.acquire.stopping_rule import GoalCheck, StoppingRule, way_home
@@ -116,7 +117,7 @@ class Session:
         total = len(self._plan.steps)
         self._event("start", {"missing": sum(s.step is not None for s in stops)})
         self._begin(stops[:2])
-        pace = Eta(self._clock)
+        pace = self._pace = Eta(self._clock)
         behind, ahead = list(stops[:2]), stops[2:]
         if self._goal.newly_met(last=False):  # an earlier session was stopped on its way home
             ahead = way_home(self._cell, self._config, self._plan, behind, self._store.done())
@@ -124,13 +125,9 @@ class Session:
             stop, *rest = ahead
             ahead = tuple(rest)
             behind.append(stop)
-            self._move(stop)
-            if stop.change_to is not None:
-                pace.arrived()
-                self._change(stop.change_to)
-                pace.changed()
-            if stop.step is not None:
-                reading, settling = self._reading(stop, stop.step)
+            read = self._visit(stop)
+            if stop.step is not None and read is not None:
+                reading, settling = read
                 pace.read()
                 if self._goal.newly_met(last=all(s.step is None for s in ahead)):
                     done = self._store.done()
@@ -142,27 +139,63 @@ class Session:
                 self._tell(stop.step, reading, total, left, settling)
         self._finish()
 
+    def _visit(self, stop: Stop) -> tuple[Readings, float] | None:
+        """Go to a stop, change the load, measure; again after what hangs has been put right."""
+        for left in reversed(range(TRIES)):
+            try:
+                self._move(stop)
+                if stop.change_to not in (None, self._hook.hanging):
+                    self._pace.arrived()
+                    self._change(stop.change_to)
+                    self._pace.changed()
+                return None if stop.step is None else self._reading(stop, stop.step)
+            except LoadChangedError as error:
+                self._rig.arm.stop()
+                if not left:
+                    raise
+                self._mover.left_here()
+                self._event("load", {"hanging": None, "why": str(error)})
+                self._watcher.notify(Remark(f"{error} The arm stands"))
+                self._hook.restore(str(error))
+                self._event("load", {"hanging": self._hook.hanging})
+        return None
+
     def _begin(self, start: tuple[Stop, ...]) -> None:
-        """Check where the arm stands, have the load taken off, go to the reference, tare."""
+        """Check where the arm stands, have the load taken off, go to the reference, tare.
+
+        What is checked is checked again after every question and, by the mover, before each motion:
+        the arm may be moved by hand meanwhile. In a campaign that goes on, people are asked where
+        it does not stand where it was read last.
+        """
         sample = self._rig.arm.sample()
         unfit = self._guard.state(sample)
         if unfit is not None:
             raise DeviceError(unfit)
         if self._temperatures is None:
             self._temperatures = bool(np.isfinite(sample.joint_temperature).all())
-        here = Stop("where the arm stands", sample.q, UNLOADED)
-        problems = route_problems(self._cell, self._config, (here, start[0]))
-        if problems:
-            raise DeviceError(
-                f"arm: it cannot go to {start[0].name} from where it stands: {problems[0]}. Drive "
-                "it by hand to a free place in the middle of its workspace"
-            )
+        first, last = start[0], self._state.last_q
+        self._mover.check_way(sample.q, first.q, first.name)
         self._hook.begin()
+        left = sample.q if last is None else last
+        self._mover.goal = self._mover.agreed(first.q, first.name, left, self._hook.confirm)
         self.in_control = True
         self._rig.arm.take_control(*payload(self._cell, None))
+        seen = []
         for stop in start:
             self._move(stop)
+            with suppress(TargetLostError):  # it is searched for when it is to be read
+                seen.append((stop.q, self._rig.tracker.measure().value[:3]))
+        self._check_tracker(seen)
         self._tare()
+
+    def _check_tracker(self, seen: list[tuple[Floats, Floats]]) -> None:
+        """Refuse a tracker whose target did not move with the arm."""
+        registration = RoughRegistration(self._cell)
+        for q, position in seen:
+            wrong = registration.implausible(q, position)
+            if wrong is not None:
+                raise DeviceError(wrong)
+            registration.add(q, position)
 
     def _move(self, stop: Stop) -> None:
         if not self._mover.is_at(stop.q):
@@ -178,6 +211,8 @@ class Session:
         sample = self._meter.average()
         q = self._mover.look().q
         self._meter.set_zero(sample, q)
+        if self._mover.watch is not None:
+            self._mover.watch.expect(None)
         self._event("tare", {"force": sample_json(sample), "q": q.tolist()})
 
     def _change(self, name: str) -> None:
@@ -193,13 +228,22 @@ class Session:
         if self._meter is None:
             return
         self._identified = len(self._state.tared_wrenches)
+        tolerance = self._config.operator.tolerance_N
         try:
-            tool = self._meter.identify(self._state.tared_wrenches)
+            left_out = self._meter.identify(self._state.tared_wrenches, tolerance)
         except HilcalError as error:
             self._watcher.notify(Remark(f"the tool is not identified: {error}"))
             return
-        if tool is None:
+        if left_out is None:
             return
+        tool = self._meter.tool
+        if left_out:
+            self._watcher.notify(
+                Remark(
+                    f"{len(left_out)} of {self._identified} unloaded readings differ by more than "
+                    f"{tolerance:g} N from the tool that the others weigh: was the tool touched?"
+                )
+            )
         self._event(
             "tool",
             {
@@ -208,9 +252,10 @@ class Session:
                 "bias": tool.bias.tolist(),
                 "variance_factor": tool.chi2 / max(tool.dof, 1),
                 "readings": self._identified,
+                "left_out": list(left_out),
             },
         )
-        differs = self._meter.tool_differs(self._config.operator.tolerance_N)
+        differs = self._meter.tool_differs(tolerance)
         if differs is not None:
             self._watcher.notify(Remark(differs))
 
@@ -222,12 +267,8 @@ class Session:
         found = self._reader.read(stop.q, stop.name)
         rows, details = [], []
         for one in found:
-            wrong = self._state.registration.implausible(
-                one.measured.q, one.measured.mean.value[:3], one.target or 0
-            )
-            if wrong is not None:
-                raise DeviceError(wrong)
             reading, told = self._row(stop, step, one)
+            self._check(one, told)
             rows.append(reading)
             details.append(told)
         first = rows[0]
@@ -245,6 +286,27 @@ class Session:
             if shift is not None:
                 self._tell_drift(step, shift)
         return first, sum(one.measured.settling for one in found)
+
+    def _check(self, one: TargetReading, told: dict[str, Any]) -> None:
+        """Refuse a reading of another target or another load; it is kept as doubted.
+
+        Raises:
+            LoadChangedError: what hangs is not what should hang.
+            DeviceError: it cannot be the target's.
+        """
+        measured, watch = one.measured, self._mover.watch
+        position = measured.mean.value[:3]
+        wrong = self._state.registration.implausible(measured.q, position, one.target or 0)
+        if wrong is not None:
+            self._event("doubted", {"why": wrong, "reading": told})
+            raise DeviceError(wrong)
+        tared = self._tared(measured)
+        if watch is None or tared is None or not watch.watching:
+            return
+        wrong = watch.wrong(tared)
+        if wrong:
+            self._event("doubted", {"why": wrong, "reading": told})
+            raise LoadChangedError(wrong)
 
     def _row(self, stop: Stop, step: Step, one: TargetReading) -> tuple[Readings, dict[str, Any]]:
         """One reading, and what is stored with it."""

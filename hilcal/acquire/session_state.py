@@ -19,12 +19,14 @@ class SessionState:
     Attributes:
         registration: where the tracker roughly stands.
         tared_wrenches: the unloaded wrenches, from which the tool is identified.
+        last_q: (n,) actual joint angles of the last reading, rad; None before the first.
     """
 
     def __init__(self, cell: Cell, joint_std: Floats) -> None:
         """Start empty; `joint_std` (n,) is the arm's repeatability as configured, rad."""
         self.registration = RoughRegistration(cell)
         self.tared_wrenches: list[TaredWrench] = []
+        self.last_q: Floats | None = None
         self._cell, self._joint_std = cell, joint_std
         self._unloaded: dict[tuple[str, int, int], Floats] = {}
         self._visits: list[UnloadedVisit] = []
@@ -50,6 +52,7 @@ class SessionState:
             target: its number; drift, scatter and wrench are taken from the first one.
         """
         position = value[:3]
+        self.last_q = q
         scatter = self.registration.repeatability(q, self._joint_std)
         self.registration.add(q, position, target)
         if step.load != UNLOADED:

@@ -9,7 +9,7 @@ from hilcal.cell import tracker_place
 from hilcal.config import Obstacle
 from hilcal.robot import chain as chains
 from hilcal.robot import se3
-from hilcal.robot.scene import FLOOR, Segment
+from hilcal.robot.scene import Segment
 from hilcal.robot.segments import segment_distance
 from hilcal.types import Bools, Floats
 
@@ -37,8 +37,8 @@ class LineOfSight:
 
         There is a beam to each target; all of them have to be free. A beam ends shortly before
         its target. Not in its way are the way from the flange to the target and what else of the
-        tool is next to it, whose shape is not known; obstacles that the tracker stands in or on;
-        and the floor of a plan, which nothing is built on.
+        tool is next to it, whose shape is not known, and obstacles that the tracker stands in or
+        on.
         """
         targets = range(len(self.clearance.cell.all_targets))
         return np.asarray(np.all([self.sees(q, load, k) for k in targets], axis=0))
@@ -46,7 +46,7 @@ class LineOfSight:
     def sees(self, q: Floats, load: str, target: int) -> Bools:
         """Return (N,) in which states the beam to one target is free."""
         beam = self.beam(q, target)
-        out = ~self.clearance.scene.touching(q, beam, 0.0)
+        out = ~self.clearance.scene.free.touching(q, 0.0, beam)
         for other in self.clearance.segments(q, load):
             gap = segment_distance(beam.start, beam.end, other.start, other.end)
             out &= gap > beam.radius + other.radius
@@ -69,22 +69,23 @@ class LineOfSight:
             out.append(np.arctan2(np.linalg.norm(se3.cross(looks, way), axis=1), along))
         return np.asarray(np.max(out, axis=0))
 
-    def problems(self, q: Floats, load: str, where: str) -> dict[tuple[str, ...], str]:
+    def problems(self, q: Floats, load: str, where: str) -> list[str]:
         """Return why the tracker would not see the target in one state (1, n)."""
-        out: dict[tuple[str, ...], str] = {}
+        out = []
         most = self.clearance.config.sight.incidence_max_rad
         angle = self.incidence(q)
         if angle is not None and float(angle.max()) > most:
-            out["incidence", where] = (
+            out.append(
                 f"{where}: the beam meets the reflector at {float(angle.max()):.3g} rad; [sight] "
                 f"incidence_max_rad is {most:g}"
             )
         hidden = self.hidden(q, load)
         if len(hidden) == len(self.clearance.cell.all_targets):  # a hidden one is a reading less
-            names = self.clearance.scene.blocking(q, self.beam(q))
+            found = self.clearance.scene.free.named(q, 0.0, self.beam(q))
+            names = tuple(dict.fromkeys(name for name, _ in found))
             names += tuple(x.name for x in self.clearance.segments(q, load) if not names)
             what = "target" if len(hidden) == 1 else "targets"
-            out["sight", where] = f"{where}: {' and '.join(names)} between tracker and {what}"
+            out.append(f"{where}: {' and '.join(names)} between tracker and {what}")
         return out
 
     def hidden(self, q: Floats, load: str) -> tuple[int, ...]:
@@ -105,7 +106,7 @@ class LineOfSight:
         start = np.broadcast_to(self.tracker, end.shape)
         stands = [x.name for x in config.obstacles if _holds(x, self.tracker, radius)]
         near = self.clearance.near(offset, radius)
-        return Segment("beam", start, end, max(radius, 1e-4), near.union(stands, {FLOOR}))
+        return Segment("beam", start, end, max(radius, 1e-4), near.union(stands))
 
 
 def sight_of(clearance: Clearance) -> LineOfSight | None:

@@ -27,6 +27,7 @@ import numpy as np
 import tomli_w
 
 from hilcal.errors import InputError
+from hilcal.names import csv_text, escaped
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.robot.chain import evaluate
@@ -138,7 +139,7 @@ def to_csv(rows: DhRows, arm: Arm) -> str:
     out.writerow(("joint", "a_m", "d_m", "alpha_rad", "offset_rad"))
     numbers = zip(*(x.tolist() for x in (rows.a, rows.d, rows.alpha, rows.offset)), strict=True)
     for name, row in zip(arm.joint_names, numbers, strict=True):
-        out.writerow((name, *map(repr, row)))
+        out.writerow((csv_text(name), *map(repr, row)))
     return stream.getvalue()
 
 
@@ -162,9 +163,9 @@ def to_toml(rows: DhRows, arm: Arm, title: str) -> str:
         )
     com = _centres(rows, arm)
     content: dict[str, object] = {
-        "title": title,
+        "title": escaped(title),
         "payload_kg": float(arm.payload),
-        "source": f"{arm.source}; corrected by calibration",
+        "source": escaped(f"{arm.source}; corrected by calibration"),
         "convention": rows.convention,
         "base_m_rad": se3.six(rows.base),
         "flange_m_rad": se3.six(rows.flange),
@@ -173,7 +174,7 @@ def to_toml(rows: DhRows, arm: Arm, title: str) -> str:
         content["repeatability_m"] = arm.repeatability
     content["joints"] = [
         {
-            "name": arm.joint_names[k],
+            "name": escaped(arm.joint_names[k]),
             "a_m": float(rows.a[k]),
             "d_m": float(rows.d[k]),
             "alpha_deg": float(np.degrees(rows.alpha[k])),

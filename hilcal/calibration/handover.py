@@ -21,6 +21,7 @@ from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.corrected import Corrected
 from hilcal.calibration.dh_table import screw, twist_first
 from hilcal.errors import InputError
+from hilcal.names import escaped
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.types import Floats
@@ -36,7 +37,7 @@ def urdf(arm: Arm, note: str = "") -> str:
         arm: without couplings.
         note: stands in a comment at the top.
     """
-    root = Element("robot", name=arm.name)
+    root = Element("robot", name=escaped(arm.name))
     SubElement(root, "link", name="base_link")
     links = ["base_link", *(f"link_{k}" for k in range(1, arm.n + 1)), "tool0"]
     for k in range(arm.n):
@@ -46,7 +47,7 @@ def urdf(arm: Arm, note: str = "") -> str:
     SubElement(root, "link", name="tool0")
     for k, place in enumerate(arm.links):
         fixed = k == arm.n
-        name = "flange" if fixed else arm.joint_names[k]
+        name = "flange" if fixed else escaped(arm.joint_names[k])
         joint = SubElement(root, "joint", name=name, type="fixed" if fixed else "revolute")
         xyz, rpy = _origin(place)
         SubElement(joint, "origin", xyz=_numbers(xyz), rpy=_numbers(rpy))
@@ -56,7 +57,7 @@ def urdf(arm: Arm, note: str = "") -> str:
             SubElement(joint, "axis", xyz="0 0 1")
             _limit(joint, arm, k)
     indent(root)
-    comment = f"<!-- {note.replace('--', '- -')} -->\n" if note else ""
+    comment = f"<!-- {re.sub('-(?=-)', '- ', escaped(note))} -->\n" if note else ""
     return f'<?xml version="1.0"?>\n{comment}{tostring(root, encoding="unicode")}\n'
 
 
@@ -96,7 +97,7 @@ def ur_kinematics(
         lines += [f"    {key}: {_yaml(v)}" for key, v in zip(keys, (*xyz, *rpy), strict=True)]
     own = int.from_bytes(hashlib.sha256("\n".join(lines).encode()).digest()[:8])
     lines.append(f"  hash: {digest or f'calib_{own}'}")
-    comment = [f"# {line}" for line in note.splitlines()]
+    comment = [f"# {escaped(line)}" for line in note.split("\n")]
     return "\n".join([*comment, *lines]) + "\n", screw(-turn, -shift[-1]) @ arm.links[-1]
 
 

@@ -28,9 +28,11 @@ from hilcal.data.whitening import MODES
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError
 from hilcal.model import Model
+from hilcal.names import check_names
 from hilcal.robot.arm import Arm
 from hilcal.toml import parse_json
 from hilcal.types import Floats
+from hilcal.whole_file import replace_file
 
 FORMAT, VERSION = "hilcal-calibration", 2
 BY_FACTOR = 1
@@ -49,10 +51,7 @@ def write(c: Calibration, path: Path) -> None:
         InputError: it cannot be written.
     """
     content = json.dumps(to_json(c), indent=1, allow_nan=False)
-    try:
-        path.write_text(content + "\n", encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+    replace_file(path, content + "\n")
 
 
 def read(path: Path, catalogue: Catalogue | None = None) -> Calibration:
@@ -121,6 +120,7 @@ def from_json(content: Mapping[str, Any], catalogue: Catalogue | None = None) ->
             f"a calibration of version {content['version']}, written by hilcal "
             f"{content['hilcal']}; this program reads versions {BY_FACTOR} and {VERSION}"
         )
+    check_names({k: v for k, v in content.items() if k != "source"}, "calibration")
     known = catalogue or installed()
     arm = _arm(content["arm"])
     check_arm(arm)

@@ -1,109 +1,153 @@
 """The waypoints of a URScript program, and the program with other joint values in their place.
 
-Waypoints are the first arguments of `movej`, `movel`, `movep` and `servoj`: joint values
-`[q1, …, q6]`, a pose `p[x, y, z, rx, ry, rz]`, a variable that one of these is assigned to once, or
-`get_inverse_kin(pose, qnear=joints)`. Each becomes a list of joint values, which all of these
-functions take. A pose is of the tool centre point that `set_tcp(p[…])` set last before it.
-Source: Universal Robots, *The URScript Programming Language*, e-Series, software 5.11, chapter 2.
+A waypoint is the target of `movej`, `movel`, `movep` or `servoj`. It is understood where it is the
+same whatever way the program takes: joint values `[q1, …, q6]`, a pose `p[x, y, z, rx, ry, rz]`, a
+variable that has one assignment in the whole program, of one of these, before the waypoint and in a
+block around it, or `get_inverse_kin(pose, qnear=joints)`. Its text becomes a list of joint values,
+which all of these functions take; nothing else of the program is changed. Every other waypoint is
+left. What could make a corrected waypoint another one (an unknown function, a tool or payload that
+changes on the way, a value that depends on where the arm stands) refuses the program.
+
+A pose is of the tool centre point that `set_tcp(p[…])` set before it. The controller takes the
+solution near to where the arm stands; that is the waypoint before where this one always follows it.
+Source: Universal Robots, *The URScript Programming Language*, e-Series, software 5.11.
 """
 
+import ast
+import math
+import operator
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from hilcal import limits
 from hilcal.calibration.points import Points
+from hilcal.calibration.urscript_statements import Statement, statements
 from hilcal.errors import InputError
+from hilcal.names import escaped
 from hilcal.robot import se3
 from hilcal.types import Floats
 
-MOVES = ("movej", "movel", "movep", "servoj")
 JOINTS = 6
-_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-_LIST = re.compile(rf"(p?)\[\s*({_NUMBER}(?:\s*,\s*{_NUMBER}){{5}})\s*\]")
-_NAME = re.compile(r"[A-Za-z_]\w*")
-_ASSIGNED = re.compile(rf"^\s*(?:global\s+|local\s+)?([A-Za-z_]\w*)\s*=\s*({_LIST.pattern})\s*$")
-_CALL = re.compile(rf"\b({'|'.join(MOVES)}|set_tcp)\s*\(")
-_INVERSE = re.compile(r"get_inverse_kin\s*\(")
+MOVES = {"movej": 4, "movel": 4, "movep": 3, "servoj": None}
+"""Functions that move to a waypoint, and which of their arguments is the blend radius."""
+_OTHER_MOVES = ("movec", "servoc", "speedj", "speedl")
+"""Functions that move otherwise; they are left as they are."""
+_STOPS = ("stopj", "stopl")
+_TOOL = "set_tcp"
+_PAYLOAD = ("set_payload", "set_payload_mass", "set_payload_cog", "set_target_payload")
+_SETUP = (_TOOL, *_PAYLOAD, "set_gravity")
+_HARMLESS = re.compile(
+    r"a?(cos|sin|tan)|atan2|ceil|floor|d2r|r2d|log|pow|sqrt|norm|random|length|get_list_length"
+    r"|(integer|binary_list)_to_(binary_list|integer)|rotvec2rpy|rpy2rotvec|inv|size|transpose"
+    r"|pose_(add|sub|dist|inv|trans)|point_dist|interpolate_pose|wrench_trans"
+    r"|to_(num|str)|str_(at|cat|empty|find|len|sub)|sleep|sync|textmsg|popup|time|powerdown"
+    r"|(get|set)_(standard_|configurable_|tool_)?(digital|analog)_(in|out)|set_tool_voltage"
+    r"|set_(standard_|configurable_|tool_)?(digital|analog)_(in|out)put_?(action|domain|mode|range)"
+    r"|set_(runstate|input_actions)_\w+|set_tool_(communication|output_mode)"
+    r"|set_safety_mode_transition_hardness"
+    r"|(read|write)_(input|output)_(boolean|integer|float)_register|read_port_(bit|register)"
+    r"|write_port_(bit|register)|modbus_\w+"
+    r"|socket_(open|close|get_var|set_var|(read|send)_\w+)|request_\w+_from_primary_client"
+    r"|is_steady|get_steptime|get_tcp_force|force|get_joint_temp|get_controller_temp"
+    r"|get_tool_(temp|current)",
+    re.ASCII,
+)
+"""Functions that neither move the arm, nor tell where it stands, nor change what a target means."""
+_WHERE = re.compile(r"get_(actual|target)_\w+|get_forward_kin|get_inverse_kin\w*", re.ASCII)
+_VALID = (
+    "valid: joint values, a pose p[…], or a variable that is assigned one of them once, before it; "
+    "--leave keeps other waypoints as they are"
+)
+_NO_BRANCH = (
+    "a pose without joint values that no waypoint always comes right before; "
+    "get_inverse_kin(pose, qnear=joints) has them"
+)
+
+_ARITHMETIC: dict[type[ast.operator], Callable[[float, float], float]] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+}
+"""Without division, of which it is not known whether whole numbers stay whole."""
+
+Value = float | tuple[str, tuple[float, ...]]
+"""A number, or a list ("") or pose ("p") of numbers."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Waypoint:
-    """One waypoint of a program.
+    """One waypoint of a program, or another motion.
 
     Attributes:
         line: of the program, from 1.
-        begin: where its argument begins in the text.
+        begin: where its target begins in the text.
         end: where it ends.
         q: (6,) joint values, or those that its branch is near to, rad; None where neither is given.
         pose: (4, 4) T_base_tool; None where the joint values are the target.
         tool: (4, 4) T_flange_tool that was set; None where none was.
+        blend_m: radius within which the arm passes it without a stop, m.
+        left: why it is left as it is; empty where it is understood.
     """
 
     line: int
     begin: int
     end: int
-    q: Floats | None
-    pose: Floats | None
-    tool: Floats | None
+    q: Floats | None = None
+    pose: Floats | None = None
+    tool: Floats | None = None
+    blend_m: float = 0.0
+    left: str = ""
 
 
 def waypoints(program: str) -> tuple[Waypoint, ...]:
     """Find the waypoints of a program, in the order of its text.
 
     Raises:
-        InputError: there are none, or one that is computed while the program runs.
-    """
-    text = _without_comments(program)
-    values = _assigned(text)
-    found: list[Waypoint] = []
-    tool: Floats | None = None
-    for call in _CALL.finditer(text):
-        first, end = _argument(text, call.end())
-        line = text.count("\n", 0, call.start()) + 1
-        if call[1] == "set_tcp":
-            _, pose = _target(first, values, line)
-            if pose is None:
-                raise InputError(f"line {line}: set_tcp without a pose p[x, y, z, rx, ry, rz]")
-            tool = pose
-            continue
-        q, pose = _target(first, values, line)
-        found.append(Waypoint(line, call.end(), end, q, pose, tool))
-    if not found:
-        raise InputError(f"no waypoints; valid: a URScript program with {', '.join(MOVES)}")
-    return tuple(found)
-
-
-def program_points(path: Path) -> tuple[str, tuple[Waypoint, ...], Points, Floats | None]:
-    """Read a program: its text, its waypoints, these as points, and T_flange_tool if it is set.
-
-    Raises:
-        InputError: see `waypoints`; or more than one tool centre point.
+        InputError: there are none, or something that could change what they mean; names the line.
     """
     try:
-        program = limits.read_text(path, limits.PROGRAM)
+        found = _waypoints(_Program.of(statements(program)))
+    except RecursionError:
+        raise InputError("nested too deeply; valid: a URScript program") from None
+    if not found:
+        raise InputError(f"no waypoints; valid: a URScript program with {', '.join(MOVES)}")
+    return found
+
+
+def program_points(
+    path: Path, leave: bool = False
+) -> tuple[str, tuple[Waypoint, ...], Points, Floats | None]:
+    """Read a program: its text, its waypoints, the understood ones as points, and T_flange_tool.
+
+    Args:
+        path: of the program.
+        leave: keep waypoints that are not understood as they are.
+
+    Raises:
+        InputError: see `waypoints`; or a waypoint that is not understood.
+    """
+    try:
+        # ends of lines stay as they are
+        program = limits.read_bytes(path, limits.PROGRAM).decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read as a program: {error}") from None
     try:
-        found = waypoints(program)
+        every = waypoints(program)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    first = found[0].tool
-    for w in found:
-        both = first is not None and w.tool is not None and np.array_equal(first, w.tool)
-        if not both and not (first is None and w.tool is None):
-            raise InputError(
-                f"{path}: line {w.line}: another tool centre point than before; valid: one "
-                "set_tcp before the first waypoint"
-            )
+    found = [w for w in every if not w.left]
+    for w in every:
+        if w.left and not (leave and found):
+            raise InputError(f"{path}: line {w.line}: {w.left}; {_VALID}")
     none, nowhere = np.full(JOINTS, np.nan), np.full((4, 4), np.nan)
     q = np.stack([none if w.q is None else w.q for w in found])
     wanted = np.stack([nowhere if w.pose is None else w.pose for w in found])
     names = tuple(f"line {w.line}" for w in found)
-    return program, found, Points(names, q, wanted), first
+    return program, every, Points(names, q, wanted), found[0].tool
 
 
 def with_joints(program: str, found: Sequence[Waypoint], q: Floats) -> str:
@@ -125,61 +169,280 @@ def movej_program(names: Sequence[str], q: Floats) -> str:
 
     The controller runs it as it is when it comes in on its script ports (30001 to 30003).
     """
-    lines = [f"  movej({urscript_list(row)})  # {name}" for name, row in zip(names, q, strict=True)]
+    rows = zip(names, q, strict=True)
+    lines = [f"  movej({urscript_list(row)})  # {escaped(name)}" for name, row in rows]
     return "\n".join(["def compensated():", *lines, "end", ""])
 
 
-def _without_comments(program: str) -> str:
-    """Return the program with blanks where comments and strings are, so that places are kept."""
-    blank = re.compile(r'#[^\n]*|"[^"\n]*"')
-    return blank.sub(lambda found: " " * len(found[0]), program)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Program:
+    """Statements, and what their names stand for.
+
+    Attributes:
+        statements: in the order of the text.
+        functions: names that it defines.
+        bound: by name, the number of each statement that gives it a value, with that value; None
+            for a parameter, an element or a function.
+        aliased: whether an element is assigned of what may be another variable's list.
+        known: values that were computed.
+    """
+
+    statements: tuple[Statement, ...]
+    functions: frozenset[str]
+    bound: dict[str, list[tuple[int, ast.expr | None]]]
+    aliased: bool
+    known: dict[int, Value | None] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, found: tuple[Statement, ...]) -> "_Program":
+        """Collect names.
+
+        Raises:
+            InputError: one of the language's own is given another meaning.
+        """
+        bound: dict[str, list[tuple[int, ast.expr | None]]] = {}
+        functions, elements = set(), set()
+        for k, s in enumerate(found):
+            given: dict[str, ast.expr | None] = {}
+            match s.node:
+                case ast.FunctionDef(name=name):
+                    functions.add(name)
+                    given = dict.fromkeys([name, *(a.arg for a in s.node.args.args)])
+                case ast.Assign(targets=[ast.Name(name)]):
+                    given = {name: s.node.value}
+                case ast.Assign(targets=[ast.Subscript(value=ast.Name(name))]):
+                    given = {name: None}
+                    elements.add(name)
+            for name, value in given.items():
+                if _of_urscript(name):
+                    raise InputError(
+                        f"line {s.line}: '{name}' is a name of URScript's own; valid: another name"
+                    )
+                bound.setdefault(name, []).append((k, value))
+        aliased = any(
+            (value is None and not isinstance(found[k].node, ast.Assign))
+            or (value is not None and not isinstance(value, ast.List | ast.Subscript))
+            for name in elements
+            for k, value in bound[name]
+        )  # fmt: skip
+        return cls(found, frozenset(functions), bound, aliased)
+
+    def value(self, node: ast.expr, k: int) -> Value | None:
+        """Value of an expression in statement k, if it has the same one in every run."""
+        match node:
+            case ast.Constant(value=bool()):
+                return None
+            case ast.Constant(value=int() | float() as number):
+                return float(number) if abs(number) < 1e100 else None
+            case ast.Name(name):
+                return self._variable(name, k)
+            case ast.List(elts=parts):
+                return self._vector("", parts, k)
+            case ast.Subscript(value=ast.Name("p"), slice=ast.Tuple(elts=parts)):
+                return self._vector("p", parts, k)
+            case ast.UnaryOp(op=ast.USub() | ast.UAdd() as sign, operand=inner):
+                x = self.value(inner, k)
+                if isinstance(x, float):
+                    return -x if isinstance(sign, ast.USub) else x
+            case ast.BinOp(left=a, op=op, right=b) if type(op) in _ARITHMETIC:
+                x, y = self.value(a, k), self.value(b, k)
+                if isinstance(x, float) and isinstance(y, float):
+                    return _ARITHMETIC[type(op)](x, y)
+            case ast.Call(func=ast.Name("d2r"), args=[inner], keywords=[]):
+                x = self.value(inner, k)
+                return math.radians(x) if isinstance(x, float) else None
+        return None
+
+    def _vector(self, kind: str, parts: Sequence[ast.expr], k: int) -> Value | None:
+        values = [self.value(part, k) for part in parts]
+        numbers = tuple(v for v in values if isinstance(v, float) and math.isfinite(v))
+        return (kind, numbers) if len(numbers) == len(parts) else None
+
+    def _variable(self, name: str, k: int) -> Value | None:
+        bound = self.bound.get(name, [])
+        if len(bound) != 1 or self.aliased:
+            return None
+        ((at, node),) = bound
+        if node is None or at >= k or not self.around(at, k):
+            return None
+        if at not in self.known:
+            self.known[at] = self.value(node, at)
+        return self.known[at]
+
+    def around(self, at: int, k: int) -> bool:
+        """Whether statement `at` stands in a block that is around statement k, or the same."""
+        blocks = self.statements[at].blocks
+        return self.statements[k].blocks[: len(blocks)] == blocks
+
+    def target(self, node: ast.expr, k: int) -> tuple[Floats | None, Floats | None] | None:
+        """Joint values (6,) and pose (4, 4) of a waypoint, each None where it has none.
+
+        None where it is not understood.
+        """
+        match node:
+            case ast.Call(func=ast.Name("get_inverse_kin"), args=[pose, *more], keywords=named):
+                near = [*more, *(n.value for n in named if n.arg == "qnear")]
+                if len(near) != len(more) + len(named) or len(near) > 1:
+                    return None
+                wanted, branch = self.value(pose, k), [self.value(n, k) for n in near]
+                if not _is_six(wanted, "p") or not all(_is_six(b, "") for b in branch):
+                    return None
+                return (_six(branch[0]) if branch else None), _pose(wanted)
+        value = self.value(node, k)
+        if _is_six(value, "p"):
+            return None, _pose(value)
+        return (_six(value), None) if _is_six(value, "") else None
+
+    def why_not(self, node: ast.expr, s: Statement) -> str:
+        """Say why a target is not understood."""
+        what = f"the waypoint '{s.written(node)[:40]}' is computed while the program runs"
+        if isinstance(node, ast.Name) and node.id in self.bound:
+            lines = sorted({self.statements[k].line for k, _ in self.bound[node.id]})
+            many = f"lines {', '.join(map(str, lines))}" if len(lines) > 1 else f"line {lines[0]}"
+            what += f" ('{node.id}' has its value from {many})"
+        return what
 
 
-def _assigned(text: str) -> dict[str, str]:
-    """Lists by the names of the variables that they alone are assigned to."""
-    found: dict[str, str] = {}
-    for line in text.splitlines():
-        match = _ASSIGNED.match(line)
-        if match:
-            found[match[1]] = match[2]
-    for name in list(found):
-        if len(re.findall(rf"(?m)^\s*(?:global\s+|local\s+)?{name}\s*=[^=]", text)) > 1:
-            del found[name]
-    return found
-
-
-def _argument(text: str, begin: int) -> tuple[str, int]:
-    """Return the first argument of a call, and where it ends."""
-    depth, k = 0, begin
-    while k < len(text) and not (depth == 0 and text[k] in ",)"):
-        depth += (text[k] in "([") - (text[k] in ")]")
-        k += 1
-    return text[begin:k].strip(), k
-
-
-def _target(
-    argument: str, values: dict[str, str], line: int
-) -> tuple[Floats | None, Floats | None]:
-    """Joint values (6,) and pose (4, 4) of an argument, each None where it has none.
+def _waypoints(p: _Program) -> tuple[Waypoint, ...]:
+    """Go through the statements: motions in the order of the text.
 
     Raises:
-        InputError: it is computed while the program runs.
+        InputError: something could change where a corrected waypoint leads.
     """
-    written = values.get(argument, argument)
-    inverse = _INVERSE.match(written)
-    if inverse:
-        pose, at = _argument(written, inverse.end())
-        near = _argument(written, at + 1)[0] if written[at : at + 1] == "," else ""
-        near = re.sub(r"^qnear\s*=\s*", "", near)
-        branch = _target(near, values, line)[0] if near else None
-        return branch, _target(pose, values, line)[1]
-    numbers = _LIST.fullmatch(written)
-    if numbers is None:
+    out: list[Waypoint] = []
+    stands: tuple[int, ...] | None = None  # blocks of the waypoint at which the arm stands
+    setup: dict[str, tuple[int, list[Value | None]]] = {}
+    moving = {*MOVES, *_OTHER_MOVES}
+    called = {name for s in p.statements for name in s.called.values()}
+    head = p.statements[0].node if p.statements else None
+    wrapped = (  # the whole program is one function, which runs once
+        isinstance(head, ast.FunctionDef)
+        and head.name not in called
+        and all(s.blocks for s in p.statements[1:])
+    )
+    side_by_side = any(
+        {"thread", "sec"} & set(s.kinds) and moving & set(s.called.values()) for s in p.statements
+    )
+    for k, s in enumerate(p.statements):
+        _check_calls(p, s)
+        name = "" if s.call is None else s.called[s.call]
+        if p.functions & set(s.called.values()) or name in _STOPS:
+            stands = None
+        if name in _SETUP:
+            _set_up(p, k, setup, moved=bool(out))
+        elif name in moving:
+            found = _waypoint(p, k, setup)
+            again = "while" in s.kinds or s.kinds.count("def") > wrapped
+            known = stands == s.blocks or (not out and not again)
+            if found.pose is not None and found.q is None and (side_by_side or not known):
+                found = replace(found, left=_NO_BRANCH)
+            stands = None if found.left else s.blocks
+            out.append(found)
+    return tuple(out)
+
+
+def _waypoint(p: _Program, k: int, setup: Mapping[str, tuple[int, list[Value | None]]]) -> Waypoint:
+    """Return the waypoint of a motion.
+
+    Raises:
+        InputError: the tool or the payload that it has depends on the way to it.
+    """
+    s = p.statements[k]
+    assert s.call is not None  # noqa: S101 - see `_check_calls`
+    name, named = s.called[s.call], {n.arg: n.value for n in s.call.keywords}
+    target = s.call.args[0] if s.call.args else named.get("q", named.get("pose"))
+    if name in _OTHER_MOVES or target is None:
+        return Waypoint(s.line, 0, 0, left=f"{name} is not corrected")
+    out = Waypoint(s.line, *s.place(target))
+    if (at := MOVES[name]) is not None:
+        radius = named.get("r", s.call.args[at] if len(s.call.args) > at else None)
+        blend = 0.0 if radius is None else p.value(radius, k)
+        if not isinstance(blend, float):
+            return replace(out, left="its blend radius is computed while the program runs")
+        out = replace(out, blend_m=blend)
+    found = p.target(target, k)
+    if found is None or (name == "servoj" and found[1] is not None):
+        return replace(out, left=p.why_not(target, s))
+    for at, _ in setup.values():
+        if not p.around(at, k):
+            raise InputError(
+                f"line {s.line}: the set_tcp or payload of line {p.statements[at].line} need not "
+                "come before it; valid: once before the first motion, not in if or while"
+            )
+    tool = setup[_TOOL][1][0] if _TOOL in setup else None
+    return replace(out, q=found[0], pose=found[1], tool=None if tool is None else _pose(tool))
+
+
+def _set_up(
+    p: _Program, k: int, setup: dict[str, tuple[int, list[Value | None]]], *, moved: bool
+) -> None:
+    """Take note of a tool centre point, a payload or gravity.
+
+    Raises:
+        InputError: it is computed, or another one than before.
+    """
+    s = p.statements[k]
+    assert s.call is not None  # noqa: S101 - see `_check_calls`
+    name = s.called[s.call]
+    values = [p.value(a, k) for a in (*s.call.args, *(n.value for n in s.call.keywords))]
+    if name == _TOOL:
+        values = values[:1]
+        if not values or not _is_six(values[0], "p"):
+            raise InputError(f"line {s.line}: set_tcp without a pose of numbers; valid: p[x, y, …]")
+    elif None in values:
+        raise InputError(f"line {s.line}: {name} is computed while it runs; valid: numbers")
+    if setup.setdefault(name, (k, values))[1] != values or (moved and name != _TOOL):
+        what = "tool centre point" if name == _TOOL else name.removeprefix("set_")
         raise InputError(
-            f"line {line}: the waypoint {argument[:40]!r} is computed while the program runs; "
-            "valid: joint values, a pose p[…], or a variable that is assigned one of them once"
+            f"line {s.line}: another {what} than before; valid: one {name} before the first "
+            "waypoint, and a program for each load"
         )
-    six = np.array([float(v) for v in numbers[2].split(",")])
-    if not numbers[1]:
-        return six, None
-    return None, se3.matrix(se3.rotation(six[3:]), six[:3])
+    if moved and setup[name][0] == k:
+        raise InputError(f"line {s.line}: {name} after a motion; valid: before the first one")
+
+
+def _check_calls(p: _Program, s: Statement) -> None:
+    """Refuse functions that are not known, and motions within expressions.
+
+    Raises:
+        InputError: names the line and the function.
+    """
+    moves = s.call is not None and s.called[s.call] in MOVES
+    targets = [*s.call.args[:1], *(n.value for n in s.call.keywords)] if moves and s.call else []
+    for call, name in s.called.items():
+        if _WHERE.fullmatch(name):
+            near = len(call.args) > 1 or any(n.arg == "qnear" for n in call.keywords)
+            stated = name == "get_forward_kin" and call.args
+            if not stated and (name != "get_inverse_kin" or not (near or call in targets)):
+                raise InputError(
+                    f"line {s.line}: {name} depends on where the arm stands, which corrections "
+                    "change; valid: values that do not"
+                )
+        elif name in MOVES or name in (*_OTHER_MOVES, *_STOPS, *_SETUP):
+            if call is not s.call:
+                raise InputError(f"line {s.line}: {name} within an expression; valid: on its own")
+        elif name not in p.functions and not _HARMLESS.fullmatch(name):
+            raise InputError(
+                f"line {s.line}: it is not known what '{name[:40]}' does to a waypoint; valid: "
+                "motions, set_tcp, payload, inputs, outputs, arithmetic and functions of its own"
+            )
+
+
+def _of_urscript(name: str) -> bool:
+    """Whether a name has a meaning that a program must not change."""
+    words = ("p", *MOVES, *_OTHER_MOVES, *_STOPS, *_SETUP)
+    return name in words or bool(_HARMLESS.fullmatch(name) or _WHERE.fullmatch(name))
+
+
+def _is_six(value: Value | None, kind: str) -> bool:
+    return isinstance(value, tuple) and value[0] == kind and len(value[1]) == JOINTS
+
+
+def _six(value: Value | None) -> Floats:
+    assert isinstance(value, tuple)  # noqa: S101 - see `_is_six`
+    return np.array(value[1])
+
+
+def _pose(value: Value | None) -> Floats:
+    six = _six(value)
+    return se3.matrix(se3.rotation(six[3:]), six[:3])

@@ -1,5 +1,6 @@
 """The command line: one file per group of commands, imported where it is used."""
 
+import errno
 import itertools
 import os
 import shlex
@@ -17,13 +18,14 @@ from hilcal.cli.commands import COMMANDS, Command, load
 from hilcal.cli.failing import Failures, Watched
 from hilcal.cli.help import EXIT_CODES, EXIT_CODES_OF_RUN, Group, InOrderOfWork
 from hilcal.data.command_line import typed
-from hilcal.errors import HilcalError, StoppedError
+from hilcal.errors import DeviceError, HilcalError, StoppedError
 
 DEBUG = "HILCAL_DEBUG"
 _COMPLETE = "_HILCAL_COMPLETE"
 _BROKEN_PIPE = 141
 _INTERRUPTED = StoppedError.exit_code
 _USAGE = 2
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _FRAMES = "⠋⠙⠹⠸⠼⠴⠦⠧⠇⠏"
 _FRAME_S = 0.2
 
@@ -216,6 +218,10 @@ def _run(
             return failures.tell(error, what + hint, _USAGE)
         if type(error).__name__ == "Abort":
             return failures.tell(error, "interrupted", _INTERRUPTED)
+        if isinstance(error, OSError) and error.errno in _FULL:  # output, or a library's cache
+            words = f"{error.filename or 'a file'} cannot be written ({os.strerror(error.errno)})"
+            hint = "make room on the disks of output, program and temporary files"
+            return failures.tell(error, f"{words}: {hint}", DeviceError.exit_code)
         from hilcal.effects.failure import failure_of  # loads numpy, which takes a while
 
         if failed := failure_of(error):

@@ -25,6 +25,7 @@ from hilcal.plan.nominal_model import check_effects
 from hilcal.report import text
 from hilcal.robot.catalogue import load_arm, robot_names
 from hilcal.toml import check_section
+from hilcal.whole_file import replace_file
 
 SIMULATED = "simulated"
 """Port of a force sensor that exists in the rehearsal only."""
@@ -315,10 +316,7 @@ def init(
             )
     _complete(draft)
     written = cell_text(draft.data, f"The cell of a {draft.data['robot']['model']}")
-    try:
-        cell.write_text(written, encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{cell}: cannot be written ({error.strerror})") from None
+    replace_file(cell, written)
     t.show(text.heading(f"Written: {cell}"))
     t.show(
         "Look it over: what was not answered stands there as an example. Then, without any "

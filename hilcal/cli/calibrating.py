@@ -28,7 +28,14 @@ from hilcal.data.quantities import parse_duration, parse_length
 from hilcal.data.run_log import RunLog
 from hilcal.data.whitening import Mode
 from hilcal.effects.catalogue import Catalogue
-from hilcal.errors import CannotAnswerError, HilcalError, InputError, LimitError, StoppedError
+from hilcal.errors import (
+    CannotAnswerError,
+    HilcalError,
+    InputError,
+    LimitError,
+    MovedFileError,
+    StoppedError,
+)
 from hilcal.plan.nominal_model import check_effects
 from hilcal.procedure.procedure import Procedure, continued
 from hilcal.procedure.state import DECIDED, REFINED, VALIDATED, Settings, Step
@@ -113,10 +120,18 @@ def calibrate(
         asked["prior"] = str(prior.absolute())
     on = ["hilcal", "calibrate", str(cell), "-o", str(output)]
     more = ["--rehearse"] * rehearse + ["--yes"] * yes + ["--view"] * view
+    if prior is not None:
+        more += ["--prior", str(prior)]
     for path in effects_from or ():
         more += ["--effects-from", str(path)]
     told = _Told(t, shlex.join([*on, "--resume", *more]), shlex.join([*on, *more]))
     p = _procedure(cell, output, resume, rehearse, config, numbers, catalogue, asked, told)
+    kept = p.settings.prior
+    if kept is not None and prior is None and Path(kept).parent != output.absolute().parent:
+        raise InputError(
+            f"{output}: its prior is {kept!r}, and no file elsewhere is read because a campaign "
+            f"names it; give it yourself: --prior {kept}"
+        )
     if p.settings.prior is not None and p.next().kind in FITTED_LATER:
         known = PriorOptions(Path(p.settings.prior), "arm", None).load(catalogue)
         p = replace(p, known=known)
@@ -193,7 +208,7 @@ class _Told:
 
         def safe() -> str:
             if not p.run.exists():
-                return f"nothing has been measured; begin again with: {self.again}"
+                return f"{p.run} is not there; begin again with: {self.again}"
             return f"everything measured so far is safe; go on with: {self.on}"
 
         try:
@@ -204,7 +219,8 @@ class _Told:
             raise
         except HilcalError as error:
             words = str(error).removesuffix(HOW_ON).rstrip(". ")
-            raise type(error)(f"{words}; {safe()}") from error
+            how = f"then go on with: {self.on}" if isinstance(error, MovedFileError) else safe()
+            raise type(error)(f"{words}; {how}") from error
 
 
 def _procedure(

@@ -1,5 +1,6 @@
-"""`info` and `accept`: what a campaign holds, and which revision of it is used."""
+"""`info`, `accept` and `repair`: what a campaign holds, and which revisions of it are used."""
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -8,6 +9,8 @@ from hilcal.cli.terminal import Json, Run, terminal
 from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.covariance import COVERS
 from hilcal.data.overview import overview
+from hilcal.data.repair import put_robot
+from hilcal.data.repair import repair as repaired
 from hilcal.data.revision import RevisionRecord
 from hilcal.errors import InputError
 from hilcal.identify.full_covariance import covariance_parts
@@ -61,6 +64,39 @@ def accept(
             "latest": records[-1].number,
         }
     )
+
+
+def repair(
+    run: Run,
+    robot: Annotated[
+        Path | None,
+        typer.Option(
+            "--robot",
+            metavar="FILE",
+            help="URDF or DH table of its robot, for a campaign that does not hold it.",
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Open a campaign again that a bad revision closes: it is set aside, no reading is."""
+    t = terminal(as_json)
+    done = repaired(run)
+    if robot is not None:
+        put_robot(run, robot)
+        t.show(f"{run} holds its robot now: {robot}")
+    put = None if robot is None else str(robot)
+    if done is None:
+        if robot is None:
+            t.show(f"{run}: no revision is bad; nothing was changed.")
+        t.document({"set_aside": [], "original": None, "robot": put})
+        return
+    numbers = ", ".join(map(str, done.revisions))
+    t.show(
+        f"{run}: {done.why}. Set aside: revision{'s' * (len(done.revisions) > 1)} {numbers}. All "
+        f"readings are there; the file as it was is {done.original}. Fit again with:"
+    )
+    t.command(f"hilcal identify {run}")
+    t.document({"set_aside": list(done.revisions), "original": str(done.original), "robot": put})
 
 
 def _named(record: RevisionRecord) -> str:

@@ -32,7 +32,7 @@ SECTIONS = {
     "Try it": ("demo", "simulate"),
     "All in one": ("calibrate",),
     "Prepare": ("init", "config", "check", "plan"),
-    "Measure": ("run", "import", "info"),
+    "Measure": ("run", "import", "info", "repair"),
     "Fit, and find what is missing": (
         *("identify", "compare", "diagnose", "add", "remove", "refine", "discover", "next"),
         *("bootstrap", "workbench"),
@@ -76,6 +76,10 @@ COMMANDS = {
     "info": Command(
         "campaigns:info",
         "Say what a campaign holds: readings, instruments, drift, events, revisions.",
+    ),
+    "repair": Command(
+        "campaigns:repair",
+        "Open a campaign again that a bad revision closes: it is set aside, no reading is.",
     ),
     "identify": Command(
         "fitting:identify", "Fit a model to the readings, and keep it as a revision."

@@ -3,8 +3,7 @@
 import csv
 import io
 import json
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -14,7 +13,13 @@ import typer
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.compensated import Compensation
 from hilcal.calibration.points import Points, on_branch, read_points
-from hilcal.calibration.urscript import JOINTS, movej_program, program_points, with_joints
+from hilcal.calibration.urscript import (
+    JOINTS,
+    Waypoint,
+    movej_program,
+    program_points,
+    with_joints,
+)
 from hilcal.campaign import Campaign
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.terminal import Json, Revision, Terminal, terminal
@@ -22,10 +27,12 @@ from hilcal.data.columns import joint_columns
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.fit_document import plain
+from hilcal.names import csv_text
 from hilcal.report import text_compensate
 from hilcal.report.progress import working
 from hilcal.robot import se3
 from hilcal.types import Floats
+from hilcal.whole_file import replace_file
 
 PROGRAMS = (".script", ".urscript")
 WRITTEN = (".csv", ".json", *PROGRAMS)
@@ -40,12 +47,14 @@ class _Task:
     Attributes:
         points: the points.
         tool: (4, 4) T_flange_tool; the tracked target where None.
-        rewrite: makes the program with other joint values, where the points are of a program.
+        program: text of the program that the points are of.
+        waypoints: of that program, those that are left too.
     """
 
     points: Points
     tool: Floats | None
-    rewrite: Callable[[Floats], str] | None
+    program: str | None = None
+    waypoints: tuple[Waypoint, ...] = ()
 
 
 def compensate(
@@ -97,6 +106,12 @@ def compensate(
         bool,
         typer.Option("--allow-outside", help="Also points outside of what was measured."),
     ] = False,
+    leave: Annotated[
+        bool,
+        typer.Option(
+            "--leave", help="Keep waypoints of a program that cannot be corrected as they are."
+        ),
+    ] = False,
     revision: Revision = None,
     effects_from: EffectsFrom = None,
     force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
@@ -110,7 +125,7 @@ def compensate(
         say(f"reading {model}")
         calibration = _calibration(model, catalogue, revision)
         arm = calibration.model.cell.arm
-        task = _task(points, calibration, tool)
+        task = _task(points, calibration, tool, leave)
         given = _wrench(task.points, calibration, load, wrench)
         start = None if near is None else np.radians(_numbers(near, arm.n, "--near"))
         say(f"compensating {len(task.points.names)} points")
@@ -124,11 +139,20 @@ def compensate(
             f"note: {', '.join(slow)} has no compiled form: a point takes 25 to 60 ms, not 0.1 ms"
         )
     refused = text_compensate.refusals(found, outside)
-    _refuse(points, task.points.names, refused, found)
-    document = text_compensate.document(calibration, task.points.names, found, refused)
+    fates = text_compensate.fates(task.waypoints, refused)
+    kept = [k for k, why in enumerate(refused) if not why]
+    if not leave or not kept:
+        _refuse(points, task.points.names, refused, found)
+    elif any(refused):
+        q, task = q[kept], _only(task, kept, refused)
+        found = calibration.compensate(q, acting, tool=task.tool)
+    document = text_compensate.document(calibration, task.points.names, found)
+    if fates:
+        document["waypoints"] = [asdict(fate) for fate in fates]
     for path in output or ():
         _write(path, task, found, document)
     t.show(text_compensate.report(calibration, task.points.names, q, found))
+    t.show(text_compensate.waypoints(fates))
     _say_written(t, output or [])
     t.document({**document, "written": [str(path) for path in output or ()]})
 
@@ -154,7 +178,7 @@ def _calibration(path: Path, catalogue: Catalogue, revision: int | None) -> Cali
         return run.calibration(revision)
 
 
-def _task(path: Path, calibration: Calibration, tool: str | None) -> _Task:
+def _task(path: Path, calibration: Calibration, tool: str | None, leave: bool) -> _Task:
     """Read what is to be compensated.
 
     Raises:
@@ -168,7 +192,7 @@ def _task(path: Path, calibration: Calibration, tool: str | None) -> _Task:
     if path.suffix in PROGRAMS:
         if arm.n != JOINTS:
             raise InputError(f"{path}: a UR program, and {arm.name} has {arm.n} joints")
-        program, found, points, own = program_points(path)
+        program, every, points, own = program_points(path, leave)
         if own is None and given is None and points.wanted is not None:
             poses = np.isfinite(points.wanted[:, 0, 0])
             if poses.any():
@@ -177,12 +201,25 @@ def _task(path: Path, calibration: Calibration, tool: str | None) -> _Task:
                     f"{path}: {name} is a pose of a tool centre point that the program does not "
                     'set; give --tool "X Y Z RX RY RZ" as the installation has it'
                 )
-        return _Task(
-            points, given if own is None else own, lambda q: with_joints(program, found, q)
-        )
+        return _Task(points, given if own is None else own, program, every)
+    if leave:
+        raise InputError(f"{path}: --leave is for waypoints of a program; valid: without it")
     if path.suffix != ".csv":
         raise InputError(f"{path}: valid: a table .csv or a UR program {' or '.join(PROGRAMS)}")
-    return _Task(read_points(path, arm, calibration.loads), given, None)
+    return _Task(read_points(path, arm, calibration.loads), given)
+
+
+def _only(task: _Task, kept: list[int], refused: list[str]) -> _Task:
+    """Return the task of a program without the waypoints that are refused."""
+    wanted = task.points.wanted
+    points = Points(
+        tuple(task.points.names[k] for k in kept),
+        task.points.q[kept],
+        None if wanted is None else wanted[kept],
+    )
+    why = iter(refused)
+    waypoints = tuple(w if w.left else replace(w, left=next(why)) for w in task.waypoints)
+    return replace(task, points=points, waypoints=waypoints)
 
 
 def _wrench(
@@ -260,14 +297,11 @@ def _write(path: Path, task: _Task, found: Compensation, document: dict[str, obj
         content = _csv(names, found)
     elif n != JOINTS:
         raise InputError(f"{path}: a UR program has {JOINTS} joints, this arm has {n}")
-    elif task.rewrite is None:
+    elif task.program is None:
         content = movej_program(names, found.q)
     else:
-        content = task.rewrite(found.q)
-    try:
-        path.write_text(content, encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+        content = with_joints(task.program, [w for w in task.waypoints if not w.left], found.q)
+    replace_file(path, content)
 
 
 def _csv(names: tuple[str, ...], found: Compensation) -> str:
@@ -279,5 +313,5 @@ def _csv(names: tuple[str, ...], found: Compensation) -> str:
     for k, name in enumerate(names):
         numbers = (found.before.error_m[k], found.after.std_m[k], found.after.band_m[k])
         values = [f"{v:.9f}" for v in found.q[k]]
-        rows.writerow([name, *values, *(f"{x:.4g}" for x in numbers)])
+        rows.writerow([csv_text(name), *values, *(f"{x:.4g}" for x in numbers)])
     return out.getvalue()

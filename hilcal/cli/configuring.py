@@ -1,6 +1,5 @@
 """`config`: every key of CELL.toml."""
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -11,6 +10,7 @@ from hilcal.cli.terminal import Json, terminal
 from hilcal.config import reference
 from hilcal.report import text_config
 from hilcal.toml import Section
+from hilcal.whole_file import replace_file
 
 DRIVERS_OWN: dict[str, type[Section]] = {
     "robot.options": UrOptions,
@@ -38,4 +38,4 @@ def config(
 
 def write_page(path: str = "docs/reference/cell-configuration.md") -> None:
     """Write the page of the reference."""
-    Path(path).write_text(text_config.page(reference.tables(DRIVERS_OWN)), encoding="utf-8")
+    replace_file(path, text_config.page(reference.tables(DRIVERS_OWN)))

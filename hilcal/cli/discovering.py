@@ -21,6 +21,7 @@ from hilcal.identify.fit import fit
 from hilcal.report import text
 from hilcal.report.progress import working
 from hilcal.report.text_discover import discovery_report, silence, to_json
+from hilcal.whole_file import replace_file
 
 
 def discover(
@@ -84,10 +85,7 @@ def discover(
     written = {name: d.source, **rivals}
     places = {own: output.with_name(f"{own}.py") for own in written}
     for own, source in written.items():
-        try:
-            places[own].write_text(source, encoding="utf-8")
-        except OSError as error:
-            raise InputError(f"{places[own]}: cannot be written ({error.strerror})") from None
+        replace_file(places[own], source)
     t.show(
         f"\n{output} has the first law as the effect {name}. Add it, and judge the model with it:"
     )

@@ -21,6 +21,7 @@ from hilcal.effects.written import option_defaults, written
 from hilcal.errors import InputError
 from hilcal.identify.fit_document import plain
 from hilcal.report import text
+from hilcal.whole_file import replace_file
 
 OPTIONS_NOTE = (
     'options are given in parentheses: --effects "joint_compliance, hysteresis(joints=1-3)"; no '
@@ -115,13 +116,7 @@ def new(
     _check_name(name)
     if path.suffix != ".py":
         raise InputError(f"{path}: effects are in a Python file; end its name in .py")
-    try:
-        with path.open("x", encoding="utf-8") as stream:
-            stream.write(template_of(name))
-    except FileExistsError:
-        raise InputError(f"{path}: the file exists; choose another name") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+    replace_file(path, template_of(name), must_be_new=True)
     t.show(
         f"{path} has the effect {name}: change its law, then try it with:\n"
         f"  hilcal effects --effects-from {path}\n"

@@ -1,6 +1,5 @@
 """`export`: a campaign and what was identified, for other programs, controllers and people."""
 
-import csv
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from hilcal.campaign import Campaign
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.terminal import Json, Revision, Run, Terminal, terminal
 from hilcal.data.covariance import INSTRUMENT
+from hilcal.data.records import content_hash
 from hilcal.data.revision_table import revision_table
 from hilcal.data.robot_file import ROBOT_FILE
 from hilcal.data.table import with_what_rounding_does, write_table
@@ -27,6 +27,7 @@ from hilcal.identify import parameters_document
 from hilcal.identify.residual_table import residual_table
 from hilcal.report.numbers import length
 from hilcal.report.progress import Say, working
+from hilcal.whole_file import replace_file
 
 MANY = 10.0
 """m; a distance along a joint's axis beyond which it is said that it cancels with others."""
@@ -178,7 +179,7 @@ def _write_data(
     if readings is not None:
         stored = run.file.readings()
         covers = run.stored_covers
-        about["readings_sha256"] = run.file.data_hash()
+        about["readings_sha256"] = content_hash(stored)
         write_table(stored, readings, with_what_rounding_does(covers, stored), about)
         with_arm = "" if covers == INSTRUMENT else ", the arm's scatter in their covariance"
         t.show(f"{readings}: {len(stored)} readings as stored{with_arm}")
@@ -192,7 +193,7 @@ def _write_data(
             robot = cell.parent / Path(run.config.robot.model).name
             _beside(robot, kept, force)
             t.show(f"{robot}: the robot, as the campaign keeps it")
-        _text(cell, cell_toml(run))
+        replace_file(cell, cell_toml(run))
         t.show(f"{cell}: the cell's configuration")
 
 
@@ -200,7 +201,7 @@ def _beside(path: Path, text: str, force: bool) -> None:
     """Write a robot's file; one of another content is replaced with --force only."""
     if path.exists() and not force and path.read_bytes() != text.encode():
         raise InputError(f"{path}: another file is there; choose another folder or give --force")
-    _text(path, text)
+    replace_file(path, text)
 
 
 def cell_toml(run: Campaign) -> str:
@@ -244,7 +245,7 @@ def _write_model(
         if parameters is not None:
             say("computing uncertainties")
             found = parameters_document.to_json(fitted, source)
-            _text(parameters, json.dumps(found, indent=1, allow_nan=False) + "\n")
+            replace_file(parameters, json.dumps(found, indent=1, allow_nan=False) + "\n")
             known, every = found["covariance_of"], found["parameters"]
             t.show(
                 f"{parameters}: {_count(every)} parameters of revision {number}, covariance of the "
@@ -284,7 +285,7 @@ def _write_geometry(found: Calibration, wanted: Geometry) -> Iterator[str]:
     write: list[Callable[[], object]] = []
 
     def later(path: Path, text: str) -> None:
-        write.append(lambda: _text(path, text))
+        write.append(lambda: replace_file(path, text))
 
     if wanted.ur_kinematics is not None:
         words = _ur_note(note, arm, wanted.ur_hash)
@@ -353,18 +354,5 @@ def _dh_words(path: Path, rows: dh_table.DhRows, holds: str, alone: bool) -> Ite
 
 def _write_parameters(path: Path, rows: Sequence[dict[str, object]]) -> None:
     names = ("name", "value", "std", "unit", "identifiable")
-    try:
-        with path.open("w", encoding="utf-8", newline="") as stream:
-            out = csv.writer(stream, lineterminator="\n")
-            out.writerow(names)
-            for row in rows:
-                out.writerow("" if row[k] is None else row[k] for k in names)
-    except OSError as e:
-        raise InputError(f"{path}: cannot be written ({e.strerror})") from e
-
-
-def _text(path: Path, text: str) -> None:
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as e:
-        raise InputError(f"{path}: cannot be written ({e.strerror})") from None
+    columns = {name: [row[name] for row in rows] for name in names}
+    write_columns(path, columns, {})

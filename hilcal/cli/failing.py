@@ -16,6 +16,7 @@ from hilcal.errors import (
     LimitError,
     StoppedError,
 )
+from hilcal.names import escaped
 
 _COMMAND = re.compile(r"(.*:) (hilcal [^,;()]*)$")
 _KINDS = {
@@ -29,7 +30,7 @@ _KINDS = {
 
 def error_document(error: HilcalError) -> dict[str, object]:
     """Return an error as a command's document holds it."""
-    return _document(" ".join(str(error).split()), error.exit_code)
+    return _document(escaped(" ".join(str(error).split())), error.exit_code)
 
 
 def _document(line: str, code: int) -> dict[str, object]:
@@ -68,7 +69,7 @@ class Failures:
         """Say what failed in one line, and in one document; returns the exit code."""
         if self._debug and error is not None:
             traceback.print_exception(error)
-        line = " ".join(message.split())
+        line = escaped(" ".join(message.split()))
         print(_laid_out(f"error: {line}"), file=sys.stderr)
         if self._json and not self.out.written:
             self.out.write(json.dumps(_document(line, code), indent=2) + "\n")

@@ -14,6 +14,7 @@ from hilcal.errors import InputError
 from hilcal.plan.checked_plan import CheckedPlan
 from hilcal.plan.next import PairPower
 from hilcal.report.progress import working
+from hilcal.whole_file import replace_file
 
 POSES = 20
 
@@ -62,10 +63,7 @@ def write(
     made.save(output)
     if csv is not None:
         pulls = {load.name: load.wrench(cell.gravity) for load in config.loads}
-        try:
-            csv.write_text(plan_csv(made.plan, pulls), encoding="utf-8")
-        except OSError as error:
-            raise InputError(f"{csv}: cannot be written ({error.strerror})") from None
+        replace_file(csv, plan_csv(made.plan, pulls))
     if record is not None:
         from hilcal.report.viewer.plan_stream import record_plan  # loads the viewer, which lasts
 

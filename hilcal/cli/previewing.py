@@ -11,6 +11,7 @@ from hilcal.errors import InputError
 from hilcal.identify.table_preview import preview_table
 from hilcal.report import text
 from hilcal.report.text_import import preview
+from hilcal.whole_file import replace_file
 
 
 def show_preview(
@@ -35,10 +36,7 @@ def show_preview(
     if output is not None:
         if second is not None:
             _relative_second(proposal, output)
-        try:
-            output.write_text(proposal.to_toml(table.name), encoding="utf-8")
-        except OSError as e:
-            raise InputError(f"{output}: cannot be written ({e.strerror})") from e
+        replace_file(output, proposal.to_toml(table.name))
         t.notice(f"{output}: the mapping; import with --format {output}")
     else:
         t.notice("nothing was written; -o mapping.toml keeps this as a mapping to edit")

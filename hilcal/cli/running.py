@@ -39,7 +39,14 @@ from hilcal.data.plan import Plan, load_plan
 from hilcal.data.run_log import RunLog, check_same_cell, create_run
 from hilcal.diagnose.live_model import LiveModel
 from hilcal.effects.catalogue import Catalogue
-from hilcal.errors import CannotAnswerError, DeviceError, HilcalError, InputError, StoppedError
+from hilcal.errors import (
+    CannotAnswerError,
+    DeviceError,
+    HilcalError,
+    InputError,
+    MovedFileError,
+    StoppedError,
+)
 from hilcal.plan.checked_plan import refuse
 from hilcal.plan.goal_rule import GoalRule
 from hilcal.report.goal_words import full_words, missed_words
@@ -98,7 +105,7 @@ def run(
                 raise InputError("--append begins a further plan, --resume goes on; give one")
             if plan is not None:
                 raise InputError("--plan with --resume: the plan is in the campaign; leave it out")
-            campaign = stack.enter_context(CampaignFile.open(output))
+            campaign = stack.enter_context(CampaignFile.open(output, check_revisions=False))
             check_same_cell(campaign, config, base_dir)
             made = RunLog(campaign).plans[0]
         elif append:
@@ -193,7 +200,13 @@ def _says_how_to_resume(campaign: CampaignFile, planned: int, on: str) -> Iterat
         return f"{campaign.n_readings} of {planned} readings are safe; go on with: {on}"
 
     try:
-        yield
+        try:
+            yield
+        finally:
+            campaign.check_place()
+    except MovedFileError as error:
+        words = str(error).removesuffix(HOW_ON).rstrip(". ")
+        raise MovedFileError(f"{words}; then go on with: {on}") from error
     except KeyboardInterrupt:
         raise StoppedError(f"interrupted: the arm stands, {safe()}") from None
     except HilcalError as error:
@@ -219,7 +232,7 @@ def _append(
     """
     if plan is None:
         raise InputError("--append needs the further plan: give it with --plan PLAN")
-    campaign = stack.enter_context(CampaignFile.open(output))
+    campaign = stack.enter_context(CampaignFile.open(output, check_revisions=False))
     check_same_cell(campaign, config, base_dir)
     further = RunLog(campaign).with_new_names(load_plan(plan))
     refuse(dry_checked(t, cell, config, further), str(plan))

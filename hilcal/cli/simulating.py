@@ -20,6 +20,7 @@ from hilcal.config.write import to_toml
 from hilcal.data.plan import load_plan
 from hilcal.errors import InputError
 from hilcal.report.progress import working
+from hilcal.whole_file import replace_file
 
 FASTEST = 200.0
 """Clock of a simulated world, as `[simulation] clock` allows."""
@@ -82,7 +83,7 @@ def simulate(
             there = stack.enter_context(simulated_cell(secret, number, base_dir, output))
         target = output / "cell.toml"
         told = with_person(there.config) if person else there.config
-        target.write_text(to_toml(_placed(told, base_dir)), encoding="utf-8")
+        replace_file(target, to_toml(_placed(told, base_dir)))
         t.show(f"The devices run. Their cell is {target}; go on in another terminal with:")
         t.command(shlex.join(("hilcal", "check", str(target))))
         which = () if plan is None else ("--plan", str(plan))

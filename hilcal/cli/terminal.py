@@ -13,6 +13,7 @@ from rich.console import Console, RenderableType
 from hilcal.cli.failing import error_document
 from hilcal.errors import HilcalError
 from hilcal.identify.fit_document import plain
+from hilcal.report.progress import SafeConsole
 
 WIDTH = 100
 
@@ -98,4 +99,4 @@ def console(*, stderr: bool) -> Console:
     """Return a console; 100 columns where the stream is not a terminal."""
     stream = sys.stderr if stderr else sys.stdout
     width = None if stream.isatty() else WIDTH
-    return Console(file=stream, width=width)
+    return SafeConsole(file=stream, width=width)

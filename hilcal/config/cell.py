@@ -98,8 +98,8 @@ class Target(Section):
 
     @model_validator(mode="after")
     def _sound(self) -> "Target":
-        if self.name != self.name.strip() or not self.name.isprintable():
-            raise ValueError(f"name = {self.name!r}: a name must be printable and not padded")
+        if self.name != self.name.strip():
+            raise ValueError(f"name = {self.name!r}: a name must not be padded")
         _check_target(self.target_m, self.target_rotvec_rad)
         return self
 

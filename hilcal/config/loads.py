@@ -86,12 +86,13 @@ class Limits(Section):
     )
     workspace_min_m: Vector3 | None = Field(
         None,
-        description=VECTOR_M + ": a corner that flange, target and load point stay above",
+        description=VECTOR_M + ": a corner that forearm, wrists, tool and what hangs stay above; "
+        "if absent, the mounting plane z = 0 is the floor",
         examples=[[-1.2, -1.2, 0.05]],
     )
     workspace_max_m: Vector3 | None = Field(
         None,
-        description=VECTOR_M + ": a corner that flange, target and load point stay below",
+        description=VECTOR_M + ": a corner that forearm, wrists, tool and what hangs stay below",
         examples=[[1.2, 1.2, 1.5]],
     )
     joint_speed_rad_s: Positive = Field(

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from hilcal.config.reference import Key, Table, inline, table, tables
+from hilcal.names import escaped
 
 SHOWN: dict[str, tuple[str, ...]] = {
     "robot": ("model", "driver", "host"),
@@ -34,7 +35,7 @@ def cell_text(data: Mapping[str, Any], title: str) -> str:
         data: the sections and keys that have values, as TOML has them.
         title: first line.
     """
-    lines, known = [_HEAD.format(title=title)], tables()
+    lines, known = [_HEAD.format(title=escaped(title))], tables()
     for name, keys in SHOWN.items():
         lines += [*_section(table(name, known), keys, data.get(name)), ""]
     return "\n".join(lines)

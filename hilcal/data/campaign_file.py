@@ -2,7 +2,8 @@
 
 import json
 import sqlite3
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -13,17 +14,20 @@ import numpy as np
 from hilcal import __version__
 from hilcal.data import rows, schema
 from hilcal.data.command_line import typed_now
+from hilcal.data.in_place import identity, moved_to, rescued
 from hilcal.data.new_campaign import write_new
 from hilcal.data.readings import Readings
 from hilcal.data.records import Layout, content_hash, layout_of, read_layout
 from hilcal.data.revision import RevisionRecord, fitted_to, from_text, to_text, utc_now
 from hilcal.data.robot_file import robot_file_of
 from hilcal.data.stored_priors import join, split
-from hilcal.errors import InputError
+from hilcal.errors import HilcalError, InputError, MovedFileError
 
 _TARGETS = "targets"
-_ACCEPTED = "accepted {}"
+ACCEPTED = "accepted {}"
 """Keys of the acceptances, numbered from 1; the last one holds."""
+_MEANWHILE = 1000
+"""Readings that were appended during a fit, at most; a choice: each takes a second."""
 _META = ("config", "base_dir", "source", "created", "program_version")
 
 
@@ -38,6 +42,9 @@ class CampaignFile:
         """Take over an open connection; use `create` or `open`."""
         self.path = path
         self._connection = connection
+        self._identity = identity(path)
+        self._now: Path | None = None
+        self._written = False
         self._meta = self._read_meta()
 
     @classmethod
@@ -68,26 +75,28 @@ class CampaignFile:
         meta = dict(
             zip(_META, (config_json, base_dir, source, utc_now(), __version__), strict=True)
         )
-        try:
-            kept = robot_file_of(config_json, base_dir)
-            meta |= {**typed_now(), **kept, **(more or {})}
-            write_new(path, meta, overwrite)
-        except OSError as e:
-            raise InputError(f"{path}: cannot be written ({e.strerror})") from e
+        meta |= {**typed_now(), **robot_file_of(config_json, base_dir), **(more or {})}
+        write_new(path, meta, overwrite)
         return cls.open(path)
 
     @classmethod
-    def open(cls, path: str | Path, *, read_only: bool = False) -> Self:
+    def open(
+        cls, path: str | Path, *, read_only: bool = False, check_revisions: bool = True
+    ) -> Self:
         """Open a campaign and check that it is whole.
 
         Args:
             path: the file.
             read_only: write nothing, see `schema.connect`.
+            check_revisions: refuse bad ones (`bad_revision`); what needs the readings alone, as to
+                measure on, does not.
 
         Raises:
             InputError: no such file, another format, a newer version, damaged or truncated.
         """
         path = Path(path)
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise InputError(f"{path}: a device or a pipe; valid: a campaign file")
         try:
             with path.open("rb") as stream:
                 head = stream.read(len(schema.HEADER))
@@ -103,7 +112,8 @@ class CampaignFile:
             try:
                 schema.check_file(connection, path)
                 file = cls(path, connection)
-                file._check_hashes()
+                if check_revisions and (bad := file.bad_revision()) is not None:
+                    raise InputError(f"{path}: {bad[1]}; set it aside: hilcal repair {path}")
                 return file
             except BaseException:
                 connection.close()
@@ -123,8 +133,12 @@ class CampaignFile:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Close the file."""
-        self.close()
+        """Close the file; what was written is not left in one that is not in its place."""
+        try:
+            if self._written and self._now is None:
+                self.check_place()
+        finally:
+            self.close()
 
     @property
     def n_readings(self) -> int:
@@ -162,6 +176,38 @@ class CampaignFile:
         """The open file, for the other modules of this package."""
         return self._connection
 
+    @contextmanager
+    def transaction(self) -> Iterator[sqlite3.Connection]:
+        """Store everything of a block, or nothing.
+
+        Raises:
+            InputError: it cannot be stored.
+            DeviceError: the disk is full or failed, or see `check_place`.
+        """
+        self._written = True
+        try:
+            with schema.sqlite_errors(self.path), schema.transaction(self._connection) as found:
+                yield found
+        except HilcalError:
+            self.check_place()  # which is why
+            raise
+        self.check_place()
+
+    def check_place(self) -> None:
+        """Refuse to go on where the open file is not the one of its name any more.
+
+        Raises:
+            MovedFileError: it was deleted, replaced or moved; says where its readings are.
+        """
+        if identity(self.path) == self._identity:
+            return
+        if self._now is None:
+            self._now = moved_to(self._identity) or rescued(self._connection, self.path)
+        raise MovedFileError(
+            f"{self.path}: deleted, replaced or moved while it was open; all {self.n_readings} "
+            f"readings stored so far are in {self._now}: move that back to {self.path} first"
+        )
+
     def append_readings(self, readings: Readings) -> int:
         """Append readings in one transaction; names already known keep their numbers.
 
@@ -172,7 +218,7 @@ class CampaignFile:
             InputError: other quantities, joints or elements than the readings before; a known
                 pose with other commanded joints; not finite; the file cannot be written.
         """
-        with schema.sqlite_errors(self.path), schema.transaction(self._connection):
+        with self.transaction():
             return self.insert(readings)
 
     def insert(self, readings: Readings) -> int:
@@ -201,9 +247,9 @@ class CampaignFile:
             names = self._target_names()
             return rows.fetch_readings(self._connection, self.path, layout, names)
 
-    def data_hash(self) -> str:
-        """SHA-256 of the readings; see `content_hash`."""
-        return content_hash(self.readings())
+    def data_hash(self, count: int | None = None) -> str:
+        """SHA-256 of the readings, or of the first ones; see `content_hash`."""
+        return content_hash(self.readings()[:count])
 
     def append_revision(self, record: RevisionRecord) -> int:
         """Append a model revision.
@@ -215,15 +261,17 @@ class CampaignFile:
             InputError: the file cannot be written.
             ValueError: a number in it is not finite.
         """
-        with schema.sqlite_errors(self.path), schema.transaction(self._connection):
+        with self.transaction():
             return self.insert_revision(record)
 
     def insert_revision(self, record: RevisionRecord) -> int:
         """Do the same inside a transaction that the caller has begun."""
-        record, key, posterior = split(record)
-        text = to_text(record)
         (last,) = self._connection.execute("SELECT ifnull(max(id), 0) FROM revisions").fetchone()
         number = int(last) + 1
+        if record.parent == last:
+            record = replace(record, parent=None)
+        record, key, posterior = split(record)
+        text = to_text(record)
         if record.parent is not None:
             schema.require(self._connection, schema.CHOSEN_REVISION)
         if key is not None:
@@ -231,12 +279,12 @@ class CampaignFile:
                 rows.insert_meta(self._connection, key, posterior)
             schema.require(self._connection, schema.CARRIED_PRIOR)
         row = (number, text, rows.text_crc(str(number), text))
-        self._connection.execute("INSERT INTO revisions VALUES (?, ?, ?)", row)
+        rows.insert(self._connection, "revisions", [row])
         return number
 
     def accepted(self) -> int | None:
         """Number of the accepted revision; None where the latest one is used."""
-        found = self._acceptances()
+        found = self.acceptances()
         return found[-1] if found else None
 
     def accept(self, number: int | None) -> None:
@@ -247,17 +295,17 @@ class CampaignFile:
         """
         if number is not None:
             self.revision(number)
-        with schema.sqlite_errors(self.path), schema.transaction(self._connection):
-            key = _ACCEPTED.format(len(self._acceptances()) + 1)
+        with self.transaction():
+            key = ACCEPTED.format(len(self.acceptances()) + 1)
             rows.insert_meta(self._connection, key, json.dumps(number))
             schema.require(self._connection, schema.CHOSEN_REVISION)
 
-    def _acceptances(self) -> list[int | None]:
+    def acceptances(self) -> list[int | None]:
         """All that was accepted, in order."""
         with schema.sqlite_errors(self.path):
             meta = self._read_meta()
         found: list[int | None] = []
-        while (text := meta.get(_ACCEPTED.format(len(found) + 1))) is not None:
+        while (text := meta.get(ACCEPTED.format(len(found) + 1))) is not None:
             number = rows.stored_json(self.path, text)
             if number is not None and not isinstance(number, int):
                 raise InputError(f"{self.path}: the campaign file is damaged (an acceptance)")
@@ -270,19 +318,29 @@ class CampaignFile:
         Raises:
             InputError: they are damaged.
         """
+        records, damaged = self._sound_revisions()
+        if damaged is not None:
+            raise InputError(f"{self.path}: {damaged[1]}; set it aside: hilcal repair {self.path}")
+        return records
+
+    def _sound_revisions(self) -> tuple[tuple[RevisionRecord, ...], tuple[int, str] | None]:
+        """Return the revisions before the first damaged one; and its number, and what it is."""
+        records: list[RevisionRecord] = []
         with schema.sqlite_errors(self.path):
             stored = self._connection.execute("SELECT id, content, crc FROM revisions ORDER BY id")
             meta = self._read_meta()
-            records = []
             for expected, (number, text, crc) in enumerate(stored.fetchall(), start=1):
                 try:
                     if number != expected or rows.text_crc(str(number), text) != crc:
                         raise ValueError
                     records.append(join(from_text(text, number), meta))
-                except ValueError as e:
-                    where = f"damaged at revision {expected}" + (f" ({e})" if str(e) else "")
-                    raise InputError(f"{self.path}: the campaign is {where}") from e
-        return tuple(records)
+                except InputError as error:
+                    return tuple(records), (expected, str(error))
+                except (ValueError, TypeError, AttributeError) as error:
+                    what = f"the campaign is damaged at revision {expected}"
+                    why = f" ({error})" if str(error) else ""
+                    return tuple(records), (expected, what + why)
+        return tuple(records), None
 
     def revision(self, number: int) -> RevisionRecord:
         """One revision.
@@ -296,24 +354,30 @@ class CampaignFile:
             raise InputError(f"{self.path}: no revision {number}; {valid}")
         return records[number - 1]
 
-    def _check_hashes(self) -> None:
-        """Refuse readings that are not those which a stored revision was fitted to.
+    def bad_revision(self) -> tuple[int, str] | None:
+        """Return the first revision that is damaged, or was fitted to other readings, and why.
 
-        Raises:
-            InputError: readings were changed; names the revision.
+        The hash of a revision is that of the first readings: of those that it was fitted to, or, as
+        programs before stored it, of some more, which were appended while it was fitted. Either
+        proves that the readings which it was fitted to are as they were.
         """
-        fitted = {(r.number, told) for r in self.revisions() if (told := fitted_to(r)) is not None}
-        if not fitted:
-            return
-        readings = self.readings()
-        counts = {count for _, (count, _) in fitted}
-        hashes = {n: content_hash(readings[:n]) for n in counts if 0 <= n <= len(readings)}
-        for number, (count, stored) in sorted(fitted):
-            if hashes.get(count) != stored:
-                raise InputError(
-                    f"{self.path}: the readings were changed after revision {number} had been "
-                    "fitted to them (their SHA-256 is another); use an untouched copy of the file"
+        records, damaged = self._sound_revisions()
+        fitted = [(r.number, *told) for r in records if (told := fitted_to(r)) is not None]
+        readings = self.readings() if fitted else None
+        hashes: dict[int, str] = {}
+        for number, count, stored in fitted:
+            assert readings is not None  # noqa: S101
+            for n in range(count, min(len(readings), count + _MEANWHILE) + 1):
+                if n not in hashes:
+                    hashes[n] = content_hash(readings[:n])
+                if hashes[n] == stored:
+                    break
+            else:
+                return number, (
+                    f"the readings were changed after revision {number} had been fitted to them "
+                    "(their SHA-256 is another); use an untouched copy of the file"
                 )
+        return damaged
 
     def _read_meta(self) -> dict[str, str]:
         meta = rows.fetch_meta(self._connection, self.path)

@@ -190,7 +190,7 @@ def check_wrenches(table: CsvTable, wrench: Floats, load: Ints, names: list[str]
 
 
 def check_names(table: CsvTable) -> None:
-    """Refuse empty or unprintable poses and loads, and other spellings of `none`.
+    """Refuse empty poses and loads, and other spellings of `none`.
 
     Raises:
         InputError: names the row.
@@ -200,10 +200,6 @@ def check_names(table: CsvTable) -> None:
             i = table.text[column].index("")
             valid = "; write 'none' where there is no load" if column == "load" else ""
             raise InputError(f"{table.at(i, column)}: the cell is empty{valid}")
-        for name in set(table.text[column]):
-            if not name.isprintable():
-                i = table.text[column].index(name)
-                raise InputError(f"{table.at(i, column)}: {name!r} holds unprintable characters")
     odd = sorted(n for n in set(table.text["load"]) if n != "none" and n.lower() == "none")
     if odd:
         i = table.text["load"].index(odd[0])

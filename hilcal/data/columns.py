@@ -84,7 +84,7 @@ def check_header(
     if "" in header:
         raise InputError(f"{path}: column {header.index('') + 1} has no name in row 1")
     for k, name in enumerate(header, start=1):
-        if not name.isprintable() or len(name) > 80:
+        if len(name) > 80:
             raise InputError(f"{path}: column {k} has no proper name in row 1: {name[:40]!r}")
     for name, count in Counter(header).items():
         if count > 1:

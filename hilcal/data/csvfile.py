@@ -10,6 +10,7 @@ import numpy as np
 
 from hilcal import limits
 from hilcal.errors import InputError
+from hilcal.names import check_name, check_names, from_csv
 from hilcal.types import Bools, Floats, Ints
 
 _BLOCK = 4096
@@ -106,6 +107,7 @@ def read_columns(
             lines = limits.Lines(name, stream)
             reader = csv.reader(lines, delimiter=dialect.delimiter, strict=True)
             header = [cell.strip() for cell in next(reader, [])]
+            check_names(header, f"{name}: row 1, column")
             lines.row(len(header))
             text, number = choose(header)
             return _parse(name, _records(reader, lines), header, text, number, dialect)
@@ -165,7 +167,9 @@ def _parse(
                 )
         columns = list(zip(*(cells for _, cells in block), strict=True))
         for column in text:
-            texts[column].extend(cell.strip() for cell in columns[at[column]])
+            for row, cell in zip(here, columns[at[column]], strict=True):
+                found = check_name(cell.strip(), f"{name}: row {row}, column '{column}'")
+                texts[column].append(from_csv(found))
         for column in number:
             numbers[column].append(_numbers(name, here, column, columns[at[column]], dialect))
         rows += here

@@ -16,6 +16,7 @@ import numpy as np
 from hilcal import limits
 from hilcal.data.mapping_sections import FileFormat
 from hilcal.errors import InputError
+from hilcal.names import check_name, check_names, from_csv
 from hilcal.types import Bools, Floats, Ints
 
 Cell = str | float | datetime | None
@@ -59,6 +60,10 @@ class Grid:
     formats: tuple[FileFormat, ...]
     units: dict[str, str] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        """Refuse names of columns that no name may be."""
+        check_names(self.names, f"{self.path}: column")
+
     def at(self, index: int, column: str) -> str:
         """Where a cell is, for messages."""
         return f"{self.path}: row {self.rows[index]}, column '{column}'"
@@ -96,8 +101,14 @@ class Grid:
         return self.columns[self.names.index(self.name(column))]
 
     def text(self, column: str | int) -> list[str]:
-        """Cells as text; whole numbers without a decimal point, nothing for empty cells."""
-        return [_text(c) for c in self.cells(column)]
+        """Cells as text; whole numbers without a decimal point, nothing for empty cells.
+
+        Raises:
+            InputError: no such column, or a text that no name may be.
+        """
+        name = self.name(column)
+        cells = (_text(c) for c in self.cells(column))
+        return [from_csv(check_name(c, self.at(k, name))) for k, c in enumerate(cells)]
 
     def numbers(self, column: str | int) -> Floats:
         """(N,) numbers of a column, NaN where a value is missing.

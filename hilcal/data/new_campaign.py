@@ -5,6 +5,7 @@ from pathlib import Path
 
 from hilcal.data import rows, schema
 from hilcal.errors import InputError
+from hilcal.whole_file import replacing
 
 
 def write_new(path: Path, about: dict[str, str], overwrite: bool) -> None:
@@ -16,18 +17,16 @@ def write_new(path: Path, about: dict[str, str], overwrite: bool) -> None:
         overwrite: replace an existing campaign.
 
     Raises:
-        InputError: as for `may_write`.
-        OSError: it cannot be written.
+        InputError: as for `may_write`, or it cannot be written.
     """
-    new = path.with_name(f".{path.name}.new")
     may_write(path, overwrite)
-    for leftover in (new, *_sidecars(new)):
-        leftover.unlink(missing_ok=True)
-    new.touch()
-    _fill(new, about)
-    for leftover in _sidecars(path):  # a journal of another file would be rolled back in
-        leftover.unlink(missing_ok=True)
-    os.replace(new, path)
+    with replacing(path) as new:
+        try:
+            _fill(new, about)
+        except BaseException:
+            _without_sidecars(new)
+            raise
+        _without_sidecars(Path(os.path.realpath(path)))  # another file's journal
 
 
 def may_write(path: Path, overwrite: bool) -> None:
@@ -44,8 +43,10 @@ def may_write(path: Path, overwrite: bool) -> None:
         raise InputError(f"{path}: exists and is not a campaign; it is not overwritten")
 
 
-def _sidecars(path: Path) -> tuple[Path, ...]:
-    return tuple(path.with_name(path.name + end) for end in ("-journal", "-wal", "-shm"))
+def _without_sidecars(path: Path) -> None:
+    """Remove what would be rolled back into a new file of this name."""
+    for end in ("-journal", "-wal", "-shm"):
+        path.with_name(path.name + end).unlink(missing_ok=True)
 
 
 def _fill(path: Path, about: dict[str, str]) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from hilcal import limits
 from hilcal.errors import InputError
+from hilcal.names import check_names
 from hilcal.toml import read_json, suggest
 from hilcal.types import Floats
 
@@ -106,6 +107,7 @@ def read_plan(text: str, where: str) -> Plan:
         raise InputError(f'{where}: not a plan; a plan has "format": "{FORMAT}"')
     if data.get("version") != VERSION:
         raise InputError(f"{where}: version {data.get('version')!r}; this hilcal reads {VERSION}")
+    check_names(data, where)
     names, q = _poses(data.get("poses"), where)
     steps = _steps(data.get("steps"), names, where)
     known = {"format", "version", "poses", "steps"}

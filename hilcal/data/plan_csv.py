@@ -8,6 +8,7 @@ import numpy as np
 
 from hilcal.data.columns import TEXT, WRENCH, joint_columns
 from hilcal.data.plan import UNLOADED, Plan
+from hilcal.names import csv_text
 from hilcal.types import Floats
 
 ORDER = "x_order"
@@ -31,7 +32,8 @@ def plan_csv(plan: Plan, wrenches: Mapping[str, Floats] | None = None) -> str:
     forces = WRENCH if wrenches is not None else ()
     writer.writerow((ORDER, *TEXT, "cycle", *joint_columns(plan.q.shape[1]), *forces))
     for k, step in enumerate(plan.steps, start=1):
-        row: list[object] = [k, step.pose, step.load, step.cycle, *plan.joints(step.pose).tolist()]
+        texts = csv_text(step.pose), csv_text(step.load)
+        row: list[object] = [k, *texts, step.cycle, *plan.joints(step.pose).tolist()]
         if wrenches is not None:
             free = step.load == UNLOADED
             row += (np.zeros(6) if free else np.asarray(wrenches[step.load])).tolist()

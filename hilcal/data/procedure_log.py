@@ -66,10 +66,9 @@ class ProcedureLog:
             InputError: the file cannot be written.
             DeviceError: the disk is full or failed.
         """
-        path, connection = self._campaign.path, self._campaign.connection
-        number = len(self.entries()) + 1
         log = None if plan is None else RunLog(self._campaign)
-        with schema.sqlite_errors(path), schema.transaction(connection):
+        with self._campaign.transaction() as connection:
+            number = len(self.entries()) + 1
             stored = tuple(self._campaign.insert_revision(r) for r in revisions)
             if log is not None and plan is not None:
                 key = f"{PLAN} {len(log.plans) + 1}"

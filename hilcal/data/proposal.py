@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from hilcal.data.mapping import Mapping
+from hilcal.names import escaped
 from hilcal.toml import check_section
 
 
@@ -72,7 +73,7 @@ class Proposal:
         if self.unused:
             lines += ["", "# not used:"]
             lines += [f"#   {name} ({why})" for name, why in self.unused]
-        return "\n".join(lines) + "\n"
+        return "\n".join(map(escaped, lines)) + "\n"
 
 
 def _value(value: Any) -> str:
@@ -80,8 +81,7 @@ def _value(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
-        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
-        return '"' + escaped.replace("\t", "\\t").replace("\n", "\\n").replace("\r", "\\r") + '"'
+        return '"' + escaped(value).replace("\\", "\\\\").replace('"', '\\"') + '"'
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(_value, value))}]"
     return repr(value)

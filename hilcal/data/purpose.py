@@ -45,9 +45,9 @@ def release(campaign: CampaignFile, why: str) -> None:
     """
     if purpose_of(campaign) is None or released(campaign):
         return
-    with schema.sqlite_errors(campaign.path), schema.transaction(campaign.connection):
+    with campaign.transaction() as connection:
         text = json.dumps({"utc": utc_now(), "by": why})
-        rows.insert_meta(campaign.connection, RELEASED, text)
+        rows.insert_meta(connection, RELEASED, text)
 
 
 def refuse_fitting(campaign: CampaignFile) -> None:

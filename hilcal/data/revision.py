@@ -8,6 +8,7 @@ from typing import Any
 
 from hilcal.data.stored_schema import Options, Result, check
 from hilcal.errors import InputError
+from hilcal.names import check_names
 from hilcal.toml import parse_json
 
 STORED = "stored_sha256"
@@ -116,6 +117,7 @@ def from_text(text: str, number: int) -> RevisionRecord:
 
     Raises:
         ValueError: not such a text.
+        InputError: a name in it is none.
     """
     try:
         content = parse_json(text)
@@ -131,12 +133,13 @@ def _check(record: RevisionRecord) -> None:
     """Refuse a record whose entries are of other kinds."""
     if not isinstance(record.parameters_json, dict):
         raise TypeError("parameters_json is no document")
-    check(Options, record.options)
-    check(Result, record.result_json)
     texts = (*record.effects, record.data_hash, record.program_version, record.created)
     named = (t for t in (record.added, record.removed) if t is not None)
     if not all(isinstance(text, str) for text in (*texts, *named)):
         raise TypeError("a name is no text")
+    check_names([*texts, *named], f"revision {record.number}, name")
+    check(Options, record.options)
+    check(Result, record.result_json)
     if record.parent is not None and not isinstance(record.parent, int):
         raise TypeError("parent is no number")
 

@@ -12,6 +12,7 @@ from hilcal.data.checks import SAME_POSE, is_covariance
 from hilcal.data.readings import Readings
 from hilcal.data.records import Layout, pack, unpack
 from hilcal.errors import InputError
+from hilcal.names import check_name, check_names
 from hilcal.toml import parse_json
 from hilcal.types import Ints
 
@@ -21,7 +22,6 @@ _NAMES = {
     "poses": "SELECT name FROM poses ORDER BY id",
     "loads": "SELECT name FROM loads ORDER BY id",
 }
-_NEW_NAME = {"poses": "INSERT INTO poses VALUES (?, ?)", "loads": "INSERT INTO loads VALUES (?, ?)"}
 
 
 def text_crc(key: str, text: str) -> int:
@@ -33,9 +33,23 @@ def _reading_crc(number: int, where: Sequence[int], record: bytes) -> int:
     return zlib.crc32(record, zlib.crc32(np.array([number, *where], dtype="<i8").tobytes()))
 
 
+def insert(connection: sqlite3.Connection, table: str, rows: Sequence[Sequence[object]]) -> None:
+    """Append rows to a table.
+
+    Raises:
+        sqlite3.DatabaseError: not all of them are in it.
+    """
+    if not rows:
+        return
+    marks = ", ".join("?" * len(rows[0]))
+    done = connection.executemany(f"INSERT INTO {table} VALUES ({marks})", rows)  # noqa: S608
+    if done.rowcount != len(rows):
+        raise sqlite3.DatabaseError(f"{len(rows) - done.rowcount} rows of {table} were not stored")
+
+
 def insert_meta(connection: sqlite3.Connection, key: str, value: str) -> None:
     """Store a text about the campaign; it cannot be changed later."""
-    connection.execute("INSERT INTO meta VALUES (?, ?, ?)", (key, value, text_crc(key, value)))
+    insert(connection, "meta", [(key, value, text_crc(key, value))])
 
 
 def fetch_meta(connection: sqlite3.Connection, path: Path) -> dict[str, str]:
@@ -60,14 +74,15 @@ def insert_names(connection: sqlite3.Connection, table: str, names: Sequence[str
     """Numbers of names; new ones are appended in order.
 
     Raises:
-        InputError: a name stands for two of them.
+        InputError: a name stands for two of them, or is none.
     """
     if len(set(names)) != len(names):
         raise InputError(f"readings: two {table} have the same name")
     known = {name: k for k, name in enumerate(fetch_names(connection, table))}
     for name in names:
         if name not in known:
-            connection.execute(_NEW_NAME[table], (len(known), name))
+            check_name(name, table)
+            insert(connection, table, [(len(known), name)])
             known[name] = len(known)
     return np.array([known[name] for name in names], dtype=np.int64)
 
@@ -79,15 +94,13 @@ def insert_readings(connection: sqlite3.Connection, readings: Readings) -> int:
     load = insert_names(connection, "loads", readings.load_names)[readings.load]
     (last,) = connection.execute("SELECT ifnull(max(id), 0) FROM readings").fetchone()
     index = np.stack([pose, load, readings.cycle], axis=1).tolist()
-    connection.executemany(
-        "INSERT INTO readings VALUES (?, ?, ?, ?, ?, ?)",
-        (
-            (number, *where, record, _reading_crc(number, where, record))
-            for number, (where, record) in enumerate(
-                zip(index, map(bytes, records), strict=True), start=int(last) + 1
-            )
-        ),
-    )
+    stored = [
+        (number, *where, record, _reading_crc(number, where, record))
+        for number, (where, record) in enumerate(
+            zip(index, map(bytes, records), strict=True), start=int(last) + 1
+        )
+    ]
+    insert(connection, "readings", stored)
     return int(last) + len(readings)
 
 
@@ -97,7 +110,7 @@ def fetch_readings(
     """All readings, in order.
 
     Raises:
-        InputError: one is missing or damaged.
+        InputError: one is missing or damaged, or a name of a pose, load or target is none.
     """
     rows = connection.execute(
         "SELECT id, pose, load, cycle, record, crc FROM readings ORDER BY id"
@@ -105,6 +118,7 @@ def fetch_readings(
     if not rows:
         raise InputError(f"{path}: the campaign file is damaged (its readings are gone)")
     names = [fetch_names(connection, table) for table in ("poses", "loads")]
+    check_names([*names, target_names], f"{path}: name")
     size = 8 * sum(width for _, width in layout)
     for number, (key, *where, record, crc) in enumerate(rows, start=1):
         try:

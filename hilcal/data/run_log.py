@@ -162,8 +162,7 @@ class RunLog:
         Raises:
             DeviceError: the disk is full or failed.
         """
-        path, connection = self._campaign.path, self._campaign.connection
-        with schema.sqlite_errors(path), schema.transaction(connection):
+        with self._campaign.transaction() as connection:
             rows.insert_meta(connection, f"{PLAN} {len(self.plans) + 1}", plan.to_json())
         self.plans = (*self.plans, plan)
 
@@ -182,19 +181,18 @@ class RunLog:
         details = (detail, *more)
         if len(reading) != len(details):
             raise ValueError(f"{len(reading)} readings of one step, {len(details)} details")
-        path, connection = self._campaign.path, self._campaign.connection
-        with schema.sqlite_errors(path), schema.transaction(connection):
+        with self._campaign.transaction() as connection:
             last = self._campaign.insert(reading)
             for k, content in enumerate(details):
                 number, text = last - len(details) + 1 + k, json.dumps(content, allow_nan=False)
                 key = _key(step, reading, k)
                 try:
-                    connection.execute(
-                        "INSERT INTO details VALUES (?, ?, ?, ?)",
-                        (number, key, text, rows.text_crc(f"{number}{key}", text)),
-                    )
+                    crc = rows.text_crc(f"{number}{key}", text)
+                    rows.insert(connection, "details", [(number, key, text, crc)])
                 except sqlite3.IntegrityError:
-                    raise InputError(f"{path}: {step} has been measured already") from None
+                    raise InputError(
+                        f"{self._campaign.path}: {step} has been measured already"
+                    ) from None
 
     def event(self, kind: str, content: dict[str, Any]) -> None:
         """Append what happened, with the time (UTC).
@@ -203,12 +201,11 @@ class RunLog:
             DeviceError: the disk is full or failed.
         """
         text = json.dumps({"kind": kind, "utc": utc_now(), **content}, allow_nan=False)
-        connection = self._campaign.connection
-        with schema.sqlite_errors(self._campaign.path), schema.transaction(connection):
+        with self._campaign.transaction() as connection:
             (last,) = connection.execute("SELECT ifnull(max(id), 0) FROM events").fetchone()
             number = int(last) + 1
             row = (number, text, rows.text_crc(str(number), text))
-            connection.execute("INSERT INTO events VALUES (?, ?, ?)", row)
+            rows.insert(connection, "events", [row])
 
     def done(self) -> frozenset[Step]:
         """Return the steps that have been measured."""

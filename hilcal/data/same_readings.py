@@ -11,6 +11,8 @@ instrument's last digit is coarser than its scatter. A digest of rounded numbers
 copies on both sides of a rounding boundary have different digests, however fine the rounding is.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from hilcal.data.readings import Readings
@@ -22,6 +24,9 @@ ANGLE_RAD = 1e-5
 """A table in degrees with three decimals is off by 0.9e-5; a choice."""
 ATTITUDE_RAD = 2e-5
 """Three such angles together make an attitude; a choice."""
+SHARED = 0.1
+"""Share of a campaign's readings that are another's, from which both are of one measurement; a
+choice: where a table's last digit is as coarse as the scatter, some hundredths agree by chance."""
 _APART = 10.0
 """Distance of loaded from unloaded readings, in units of the tolerance."""
 
@@ -64,6 +69,36 @@ def among(readings: Readings, kept: Floats) -> Bools:
 
     distance, _ = cKDTree(kept).query(own, p=np.inf, distance_upper_bound=1.0 + 1e-9)
     return np.asarray(np.isfinite(distance))
+
+
+def shared(campaigns: Sequence[Floats]) -> tuple[int, int] | None:
+    """Return the numbers of two campaigns that share readings; None where all are their own.
+
+    Args:
+        campaigns: (N, n + 4) `prints` of each; of another number of joints are other arms.
+    """
+    from scipy.spatial import cKDTree  # slow to import
+
+    for width in sorted({of.shape[1] for of in campaigns}):
+        own = [(k, np.unique(of, axis=0)) for k, of in enumerate(campaigns) if of.shape[1] == width]
+        of = np.concatenate([np.full(len(rows), k) for k, rows in own])
+        rows = np.concatenate([rows for _, rows in own])
+        if len(rows) < 2:
+            continue
+        tree = cKDTree(rows)
+        told = tree.query(rows, k=2, p=np.inf, distance_upper_bound=1.0 + 1e-9)
+        here, (distance, nearest) = np.arange(len(rows)), map(np.asarray, told)
+        second = (nearest[:, 0] == here).astype(int)  # one of the two is the reading itself
+        distance, nearest = distance[here, second], nearest[here, second]
+        found = np.isfinite(distance)
+        other = np.full(len(rows), -1)
+        other[found] = of[nearest[found]]
+        for k, unique in own:
+            others = other[of == k]
+            others = others[(others >= 0) & (others != k)]
+            if len(others) > SHARED * len(unique):
+                return k, int(np.bincount(others).argmax())
+    return None
 
 
 def never_fitted(readings: Readings, fitted: Readings, deflections: bool) -> tuple[Bools, Bools]:

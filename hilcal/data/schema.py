@@ -6,9 +6,13 @@ undoing of an unfinished transaction and is gone after the next opening. Source:
 documentation, "Atomic Commit In SQLite" and "PRAGMA synchronous".
 """
 
+import os
 import sqlite3
+import sys
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
+from functools import cache
 from pathlib import Path
 
 from hilcal import limits
@@ -53,6 +57,8 @@ _KEYS = {"meta": "key"} | dict.fromkeys(
     ("poses", "loads", "readings", "revisions", "details", "events"), "id"
 )
 _SINCE = {"details": 2, "events": 2}
+_LONGEST_S = 60.0
+"""No check of a file that is opened takes as long; a choice."""
 
 
 def statements() -> list[str]:
@@ -128,7 +134,7 @@ def connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
             what a killed program left unfinished; SQLite has to undo that before anybody can
             read, and then the file is opened for writing all the same.
     """
-    unfinished = path.with_name(f"{path.name}-journal").exists()
+    unfinished = Path(f"{os.path.realpath(path)}-journal").exists()  # beside a link's file
     mode = "ro" if read_only and not unfinished else "rw"
     connection = sqlite3.connect(
         f"{path.absolute().as_uri()}?mode={mode}", uri=True, isolation_level=None, timeout=5.0
@@ -137,15 +143,18 @@ def connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
     for pragma in ("synchronous = EXTRA", "foreign_keys = ON", "trusted_schema = OFF"):
         connection.execute(f"PRAGMA {pragma}")
     connection.execute("PRAGMA cell_size_check = ON")
+    connection.setlimit(sqlite3.SQLITE_LIMIT_ATTACHED, 0)
+    if sys.version_info >= (3, 12):
+        connection.setconfig(sqlite3.SQLITE_DBCONFIG_DEFENSIVE, True)
     return connection
 
 
 @contextmanager
-def transaction(connection: sqlite3.Connection) -> Iterator[None]:
+def transaction(connection: sqlite3.Connection) -> Iterator[sqlite3.Connection]:
     """Commit everything or nothing."""
     connection.execute("BEGIN IMMEDIATE")
     try:
-        yield
+        yield connection
         connection.execute("COMMIT")
     except BaseException:
         if connection.in_transaction:
@@ -161,11 +170,18 @@ def require(connection: sqlite3.Connection, version: int) -> None:
 
 
 def check_file(connection: sqlite3.Connection, path: Path) -> None:
-    """Refuse what is not a sound campaign of a known version.
+    """Refuse what is not a sound campaign of a known version, and of exactly its schema.
 
     Raises:
         InputError: names it.
     """
+    end = time.monotonic() + _LONGEST_S
+    connection.set_progress_handler(lambda: time.monotonic() > end, 100_000)
+    _check_file(connection, path)
+    connection.set_progress_handler(None, 0)
+
+
+def _check_file(connection: sqlite3.Connection, path: Path) -> None:
     (application,) = connection.execute("PRAGMA application_id").fetchone()
     if application != APPLICATION_ID:
         raise InputError(f"{path}: an SQLite file, but not a hilcal campaign")
@@ -174,6 +190,7 @@ def check_file(connection: sqlite3.Connection, path: Path) -> None:
         raise InputError(
             f"{path}: made by a newer hilcal (schema {version}, this one reads up to {VERSION})"
         )
+    _check_schema(connection, path, version)
     (pages,) = connection.execute("PRAGMA page_count").fetchone()
     (page_size,) = connection.execute("PRAGMA page_size").fetchone()
     if path.stat().st_size < pages * page_size:  # SQLite fills a cut page with zeros
@@ -181,7 +198,43 @@ def check_file(connection: sqlite3.Connection, path: Path) -> None:
     (sound,) = connection.execute("PRAGMA quick_check(1)").fetchone()
     if sound != "ok":
         raise InputError(f"{path}: the campaign file is damaged ({' '.join(sound.split())})")
-    rows = connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
-    wanted = {table for table in _KEYS if version >= _SINCE.get(table, 1)}
-    if missing := sorted(wanted - {name for (name,) in rows}):
-        raise InputError(f"{path}: the campaign file is damaged (no table '{missing[0]}')")
+
+
+def _check_schema(connection: sqlite3.Connection, path: Path, version: int) -> None:
+    """Refuse tables, views, triggers and indexes that are not exactly those of a campaign.
+
+    A received file could act by them: swallow what is stored, show other readings, never end.
+    """
+    found, wanted = _schema(connection), _wanted()
+    wanted = {entry for entry in wanted if version >= _SINCE.get(entry[2], 1)}
+    if extra := sorted(found - wanted):
+        kind, name, *_ = extra[0]
+        raise InputError(
+            f"{path}: has a {kind} {name!r} that no hilcal made; a campaign that another program "
+            "has changed is not opened; valid: the file as hilcal wrote it"
+        )
+    if missing := sorted(wanted - found):
+        kind, name, *_ = missing[0]
+        raise InputError(f"{path}: the campaign file is damaged (no {kind} '{name}')")
+    if connection.execute("PRAGMA journal_mode").fetchone() == ("wal",):
+        raise InputError(
+            f"{path}: another program has put its changes into a write-ahead log beside it, which "
+            "no hilcal does; valid: the file as hilcal wrote it"
+        )
+
+
+def _schema(connection: sqlite3.Connection) -> set[tuple[str, str, str, str]]:
+    """Type, name, table and statement of everything in a file."""
+    rows = connection.execute(
+        "SELECT type, name, tbl_name, ifnull(sql, '') FROM sqlite_master LIMIT 1000"
+    )
+    return {tuple(map(str, row)) for row in rows}  # type: ignore[misc]
+
+
+@cache
+def _wanted() -> set[tuple[str, str, str, str]]:
+    """Do so for a campaign as this program makes it; no version made a table differently."""
+    with closing(sqlite3.connect(":memory:")) as empty:
+        for statement in statements():
+            empty.execute(statement)
+        return _schema(empty)

@@ -15,6 +15,7 @@ from hilcal.data.readings import Readings, States
 from hilcal.data.stated_noise import LEAST, floored, rounding_variance, with_rounding
 from hilcal.data.tabular import Column, is_parquet, read_parquet, write_columns
 from hilcal.errors import InputError
+from hilcal.names import check_name
 from hilcal.robot.arm import Arm
 from hilcal.toml import suggest
 from hilcal.types import Floats, Ints
@@ -359,8 +360,8 @@ def with_what_rounding_does(covers: str, readings: Readings) -> str:
 def _names(names: Sequence[str], index: Ints, what: str) -> list[str]:
     used = [names[k] for k in dict.fromkeys(index.tolist())]
     for name in used:
-        if not name or name != name.strip() or not name.isprintable():
-            raise InputError(f"{what} {name!r}: a name must be printable, not empty, not padded")
+        if not check_name(name, what) or name != name.strip():
+            raise InputError(f"{what} {name!r}: a name must be not empty and not padded")
         if what == "load" and name != "none" and name.lower() == "none":
             raise InputError(f"load '{name}' must be spelled 'none'")
     if len(set(used)) < len(used):

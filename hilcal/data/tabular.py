@@ -7,7 +7,6 @@ metadata, and what the table is about is in the schema's, as JSON under the key 
 
 import csv
 import json
-import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,9 @@ import numpy as np
 from hilcal import limits
 from hilcal.data.csvfile import CsvTable
 from hilcal.errors import InputError
+from hilcal.names import check_name, check_names, csv_text, escaped
 from hilcal.types import Floats
+from hilcal.whole_file import replacing
 
 UNITS = ("m2", "rad2", "m", "rad", "N", "Nm", "s", "degC")
 """Ends of names that are units."""
@@ -51,21 +52,20 @@ def write_columns(path: Path, columns: Mapping[str, Column], about: Mapping[str,
         InputError: another ending, no pyarrow for Parquet, or the file cannot be written.
     """
     check_suffix(path)
-    plain = {k: v.tolist() if isinstance(v, np.ndarray) else list(v) for k, v in columns.items()}
+    plain = {
+        escaped(k): v.tolist() if isinstance(v, np.ndarray) else list(v) for k, v in columns.items()
+    }
     if path.suffix.lower() == ".parquet":
         table = _arrow(path, plain, about)
         parquet = pyarrow_module(path, "pyarrow.parquet")
-        _replaced(path, lambda new: parquet.write_table(table, new))
+        with replacing(path) as new:
+            parquet.write_table(table, new)
         return
-
-    def write(new: Path) -> None:
-        with new.open("w", encoding="utf-8", newline="") as stream:
-            out = csv.writer(stream, lineterminator="\n")
-            out.writerow(plain)
-            cells = [[_cell(v) for v in values] for values in plain.values()]
-            out.writerows(zip(*cells, strict=True))
-
-    _replaced(path, write)
+    with replacing(path) as new, new.open("w", encoding="utf-8", newline="") as stream:
+        out = csv.writer(stream, lineterminator="\n")
+        out.writerow(map(csv_text, plain))
+        cells = [[_cell(v) for v in values] for values in plain.values()]
+        out.writerows(zip(*cells, strict=True))
 
 
 def read_parquet(
@@ -96,6 +96,7 @@ def read_parquet(
     except Exception as e:  # what a reader makes of a damaged file is not documented
         words = " ".join(str(e).split())[:80]
         raise InputError(f"{path}: damaged, or not a Parquet file ({words})") from e
+    check_names(header, f"{path}: column")
     text, number = chosen
     rows = np.arange(1, found.num_rows + 1)
     if not found.num_rows:
@@ -179,12 +180,15 @@ def unit_of(name: str) -> str | None:
 
 def _cell(value: object) -> object:
     """Return a cell as CSV writes it."""
+    if isinstance(value, str):
+        return csv_text(value)
     return "" if value is None else repr(value) if isinstance(value, float) else value
 
 
 def _arrow(path: Path, columns: Mapping[str, list[Any]], about: Mapping[str, object]) -> Any:
     arrow = pyarrow_module(path, "pyarrow")
-    arrays = [arrow.array(values) for values in columns.values()]
+    texts = ([escaped(v) if isinstance(v, str) else v for v in c] for c in columns.values())
+    arrays = [arrow.array(values) for values in texts]
     fields = []
     for name, array in zip(columns, arrays, strict=True):
         unit = unit_of(name)
@@ -197,7 +201,7 @@ def _texts(path: Path, name: str, values: list[object]) -> list[str]:
     for k, value in enumerate(values, start=1):
         if not isinstance(value, str):
             raise InputError(f"{path}: row {k}, column '{name}': {value!r} is no text")
-    return [str(value).strip() for value in values]
+    return [check_name(str(v).strip(), f"{path}: column '{name}'") for v in values]
 
 
 def _numbers(path: Path, name: str, column: Any) -> Floats:
@@ -208,17 +212,6 @@ def _numbers(path: Path, name: str, column: Any) -> Floats:
         if not number or not np.isfinite(value):
             raise InputError(f"{path}: row {k}, column '{name}': {value!r} is not a finite number")
     return np.array(values, dtype=float)
-
-
-def _replaced(path: Path, write: Callable[[Path], object]) -> None:
-    """Write a file beside its place, and put it there when it is complete."""
-    new = path.with_name(f".{path.name}.new")
-    try:
-        write(new)
-        os.replace(new, path)
-    except (OSError, UnicodeEncodeError) as e:
-        new.unlink(missing_ok=True)
-        raise InputError(f"{path}: cannot be written ({e})") from e
 
 
 def pyarrow_module(path: Path, module: str) -> Any:

@@ -13,6 +13,7 @@ from hilcal.discover.discovery import Discovery, discover
 from hilcal.effects.from_file import effects_of
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit, fit
+from hilcal.whole_file import replace_file
 
 MOST_SEARCHES = 3
 """Searches of one refinement at most; a choice, by time."""
@@ -80,11 +81,7 @@ class LawSearch:
             if name not in self._sources:
                 continue
             where = self.path(name)
-            try:
-                with where.open("x", encoding="utf-8") as stream:
-                    stream.write(self._sources[name])
-            except OSError as error:
-                raise InputError(f"{where}: cannot be written ({error.strerror})") from None
+            replace_file(where, self._sources[name], must_be_new=True)
             self.files[name] = where
 
     def _free(self, of: Fit) -> str:

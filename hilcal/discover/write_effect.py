@@ -8,7 +8,10 @@ from types import ModuleType
 import numpy as np
 
 from hilcal.discover.law import LETTERS, Coefficient, Form, Part
+from hilcal.effects.check import NAME
 from hilcal.effects.protocol import Effect
+from hilcal.errors import InputError
+from hilcal.names import escaped
 
 USUAL = 1e-4
 """Ordinary magnitude of a coefficient that nothing is known of, SI; a choice."""
@@ -87,6 +90,9 @@ def source_of_form(
 ) -> str:
     """Return the Python file of a law.
 
+    Raises:
+        InputError: the name is none of an effect.
+
     Args:
         form: the law.
         name: of its effect.
@@ -94,6 +100,8 @@ def source_of_form(
         evidence: what speaks for it, in lines.
         file: the file's own name.
     """
+    if not NAME.fullmatch(name):
+        raise InputError(f"effect {escaped(name)!r}; valid: lower-case letters, digits and _")
     attributes = ["    elastic = True\n"] if form.elastic else []
     if form.of_setup:
         attributes.append("    of_setup = True\n")
@@ -103,8 +111,8 @@ def source_of_form(
     source = _HEAD.format(
         name=name,
         formula=form.text(),
-        file=file,
-        evidence=evidence,
+        file=_in_docstring(file),
+        evidence="\n".join(map(_in_docstring, evidence.split("\n"))),
         imports=", Response" if form.elastic else "",
         class_name=class_name(name),
         attributes="".join(attributes),
@@ -120,6 +128,10 @@ def source_of_form(
     elif not form.elastic:
         source = source.replace(_FLOATS, "")
     return source
+
+
+def _in_docstring(line: str) -> str:
+    return escaped(line).replace("\\", "\\\\").replace('"', '\\"')
 
 
 def class_name(name: str) -> str:

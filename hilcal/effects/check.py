@@ -26,6 +26,7 @@ from hilcal.effects.protocol import (
 from hilcal.effects.source import source_of
 from hilcal.effects.total import total
 from hilcal.errors import HilcalError, InputError
+from hilcal.names import escaped
 from hilcal.robot.deviation import Deviation
 from hilcal.robot.statics import load_wrench_change, slot_wrenches
 from hilcal.types import Floats
@@ -95,7 +96,7 @@ def _need(good: object, wrong: str) -> None:
 
 
 def _is_text(value: object) -> bool:
-    return isinstance(value, str) and bool(value.strip())
+    return isinstance(value, str) and bool(value.strip()) and escaped(value) == value
 
 
 def _class(kind: type[Effect]) -> None:
@@ -110,7 +111,7 @@ def _class(kind: type[Effect]) -> None:
             "lower-case letters, digits and _, a letter first",
             lambda v: isinstance(v, str) and bool(NAME.fullmatch(v)),
         ),
-        ("summary", "the law in one line", lambda v: _is_text(v) and "\n" not in v),
+        ("summary", "the law in one line", _is_text),
         ("elastic", "True, False", lambda v: isinstance(v, bool)),
         ("local_response", "True, False", lambda v: isinstance(v, bool)),
         ("of_setup", "True, False", lambda v: isinstance(v, bool)),

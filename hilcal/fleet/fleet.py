@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from hilcal.data.same_readings import shared
 from hilcal.engine.engine import Advance, Engine
-from hilcal.errors import CannotAnswerError
-from hilcal.fleet.members import Entry, Failure, Member, entries, member_of, member_with
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.fleet.members import Entry, Failure, Member, entries, member_of, member_with, prints_of
 from hilcal.fleet.pooled import Pooled, effects_seen, pooled
 from hilcal.identify.carried import SAME_M
 
@@ -49,10 +50,17 @@ def fleet(directory: Path, engine: Engine, counting: Counting = _unseen) -> Flee
         counting: shows how far it is, as `report.progress.counting` does.
 
     Raises:
-        InputError: no directory, or no campaigns.
+        InputError: no directory, no campaigns, or two of the same readings, which would count
+            twice: copies, or one and its extension.
         CannotAnswerError: no type of which anything can be said.
     """
     listed = entries(directory)
+    if same := shared(engine.map(prints_of, listed)):
+        one, other = sorted(listed[k].name for k in same)
+        raise InputError(
+            f"{directory}: {one} and {other} have readings in common: one measurement counts "
+            "once; leave one of them out"
+        )
     with counting("campaigns", len(listed)) as advance:
         results = engine.map(member_of, listed, advance=advance)
     failures = [r for r in results if isinstance(r, Failure)]

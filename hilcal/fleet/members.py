@@ -5,10 +5,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from hilcal.campaign import Campaign
+from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.overview import overview
 from hilcal.data.purpose import refuse_fitting
 from hilcal.data.revision import seconds_of
+from hilcal.data.same_readings import prints
 from hilcal.diagnose.verdict import diagnose
 from hilcal.effects.failure import failure_of
 from hilcal.errors import HilcalError, InputError
@@ -16,7 +20,9 @@ from hilcal.identify.baseline import baseline, with_effects
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.learnt import of_arm
 from hilcal.identify.posterior import Posterior, Source
+from hilcal.names import check_names
 from hilcal.refine import refine
+from hilcal.types import Floats
 
 LIST = "arms.csv"
 """File beside the campaigns that says which arm each is of, and when it was measured."""
@@ -109,6 +115,7 @@ def _listed(path: Path) -> Mapping[str, tuple[str, str]]:
             if not {"campaign", "arm"} <= set(rows.fieldnames or ()):
                 raise InputError(f"{path}: valid: columns campaign, arm and, where known, date")
             for k, row in enumerate(rows, start=2):
+                check_names(dict(row), f"{path}: row {k}")
                 date = (row.get("date") or "").strip()
                 if date:
                     seconds_of(date, f"{path}: row {k}, column 'date'")
@@ -116,6 +123,15 @@ def _listed(path: Path) -> Mapping[str, tuple[str, str]]:
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: cannot be read ({error})") from None
     return found
+
+
+def prints_of(entry: Entry) -> Floats:
+    """Return what the readings of a campaign are known by; none where it cannot be read."""
+    try:
+        with CampaignFile.open(entry.path, read_only=True, check_revisions=False) as file:
+            return prints(file.readings())
+    except HilcalError:
+        return np.zeros((0, 0))
 
 
 def member_of(entry: Entry) -> Member | Failure:

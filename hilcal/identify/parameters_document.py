@@ -11,6 +11,7 @@ import numpy as np
 from hilcal import __version__, limits
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit
+from hilcal.names import check_names
 from hilcal.toml import parse_json
 from hilcal.types import Bools, Floats
 
@@ -110,6 +111,7 @@ def from_json(content: Mapping[str, Any]) -> Parameters:
     """
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise InputError(f'no parameters; valid: a JSON document with "format": "{FORMAT}"')
+    check_names({k: v for k, v in content.items() if k != "source"}, "parameters")
     rows = content["parameters"]
     limits.check_parameters(len(rows))
     names = tuple(row["name"] for row in rows)

@@ -15,8 +15,10 @@ from hilcal.data.ranges import Range
 from hilcal.data.whitening import MODES
 from hilcal.errors import InputError
 from hilcal.identify.posterior import LearntEffect, Posterior, Source
+from hilcal.names import check_names
 from hilcal.toml import parse_json
 from hilcal.types import Floats
+from hilcal.whole_file import replace_file
 
 FORMAT, VERSION = "hilcal-posterior", 1
 
@@ -57,6 +59,7 @@ def from_json(content: Mapping[str, Any]) -> Posterior:
             f"a prior of version {content.get('version')}, written by hilcal "
             f"{content.get('hilcal')}; this program reads version {VERSION}"
         )
+    check_names({k: v for k, v in content.items() if k != "source"}, "prior")
     try:
         return _read(content)
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
@@ -85,10 +88,7 @@ def write(p: Posterior, path: Path) -> None:
     Raises:
         InputError: it cannot be written.
     """
-    try:
-        path.write_text(json.dumps(to_json(p), allow_nan=False) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+    replace_file(path, json.dumps(to_json(p), allow_nan=False) + "\n")
 
 
 def _read(content: Mapping[str, Any]) -> Posterior:

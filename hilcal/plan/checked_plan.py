@@ -9,6 +9,7 @@ from hilcal.config import CellConfig
 from hilcal.data.plan import Plan
 from hilcal.errors import InputError
 from hilcal.plan.summary import PlanSummary
+from hilcal.whole_file import replace_file
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,10 +37,7 @@ class CheckedPlan:
         Raises:
             InputError: it cannot be written.
         """
-        try:
-            Path(path).write_text(self.plan.to_json() + "\n", encoding="utf-8")
-        except OSError as error:
-            raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+        replace_file(path, self.plan.to_json() + "\n")
 
     def to_dict(self) -> dict[str, object]:
         """Return the JSON document."""

@@ -136,13 +136,8 @@ def _too_few(drawn: int, left: dict[str, int], least: int) -> str:
 
 def _unusable(space: Space, q: Floats, load: str) -> str:
     """Why no pose bears a load."""
-    hung = space.shapes.load(load)
-    mass = space.cell.tool_mass + (0.0 if hung is None else hung.mass_kg)
-    if mass > space.cell.arm.payload:
-        return (
-            f'load "{load}": tool and load are {mass:.4g} kg; the payload of '
-            f"{space.cell.arm.name} is {space.cell.arm.payload:g} kg"
-        )
+    if (heavy := space.unbearable(load).get("payload")) is not None:
+        return heavy
     told = []
     before = len(q)
     for reason in _OF_LOADS:

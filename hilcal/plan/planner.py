@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Literal
 
 import numpy as np
@@ -210,7 +211,7 @@ def _reference(space: Space, drawn: Drawn, rng: np.random.Generator) -> tuple[Fl
 
     It is central, and of some such poses the one from which most others are reached.
     """
-    every = drawn.allowed.any(axis=0)  # loads that are of use at all
+    every = np.asarray(drawn.allowed.any(axis=0))  # loads that are of use at all
     bears = np.flatnonzero(drawn.allowed[:, every].all(axis=1))
     if not len(bears):
         raise CannotAnswerError(
@@ -218,7 +219,14 @@ def _reference(space: Space, drawn: Drawn, rng: np.random.Generator) -> tuple[Fl
             "or widen [limits]"
         )
     q = drawn.q[bears]
-    central = bears[np.argsort(np.linalg.norm(q - np.median(drawn.q, axis=0), axis=1))[:HOMES]]
+    nearest = bears[np.argsort(np.linalg.norm(q - np.median(drawn.q, axis=0), axis=1))]
+    usable = [name for name, used in zip(drawn.loads, every, strict=True) if used]
+    begins = (k for k in nearest if space.begins(drawn.q[k], usable))
+    central = list(islice(begins, HOMES))
+    if not central:
+        raise CannotAnswerError(
+            "no pose that bears every load can be approached; widen [limits] or the room around"
+        )
     probes = drawn.q[rng.permutation(len(drawn.q))[:PROBES]]
     reached = [int(space.passable(drawn.q[k], probes, UNLOADED).sum()) for k in central]
     home = int(central[int(np.argmax(reached))])

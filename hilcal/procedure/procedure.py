@@ -214,7 +214,7 @@ class Procedure(ValidationSteps):
         records = [
             o.record(step.fit, step.diagnosis, step.added, step.removed) for step in found.steps
         ]
-        content = {"readings_sha256": o.file.data_hash(), "verdict": found.verdict}
+        content = {"readings_sha256": o.data_hash, "verdict": found.verdict}
         self._found[:] = [found]
         return ProcedureLog(o.file).append(REFINED, content, revisions=records)
 

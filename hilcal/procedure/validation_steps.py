@@ -13,6 +13,7 @@ from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.plan import Plan, read_plan
 from hilcal.data.procedure_log import ProcedureLog
 from hilcal.data.purpose import CORRECTED, VALIDATION
+from hilcal.data.records import content_hash
 from hilcal.data.run_log import PLAN
 from hilcal.data.same_readings import already
 from hilcal.errors import InputError
@@ -106,10 +107,11 @@ class ValidationSteps(Shared):
         Raises:
             InputError: it is another.
         """
-        frozen, hashed = log.last(FROZEN), unseen.data_hash()
+        frozen, readings = log.last(FROZEN), unseen.readings()
+        hashed = content_hash(readings)
         if frozen is None:
             content = {"file": unseen.path.name, "readings_sha256": hashed}
-            log.append(FROZEN, {**content, "readings": unseen.n_readings})
+            log.append(FROZEN, {**content, "readings": len(readings)})
         elif frozen["readings_sha256"] != hashed:
             raise InputError(
                 f"{unseen.path}: other readings than when it was frozen "

@@ -3,8 +3,9 @@
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -13,9 +14,30 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.segment import Segment
+from rich.text import Text
+
+from hilcal.names import escaped
 
 Say = Callable[[str], None]
 Advance = Callable[[int], None]
+
+
+class SafeConsole(Console):
+    """A console on which no text moves the cursor, changes colours or turns its direction."""
+
+    def render_str(self, text: str, **how: Any) -> Text:
+        """Return a text as it is printed, so that tables have room for it."""
+        return super().render_str("\n".join(map(escaped, text.split("\n"))), **how)
+
+    def render(
+        self, renderable: RenderableType, options: ConsoleOptions | None = None
+    ) -> Iterator[Segment]:
+        """Yield what is printed; ends of lines stay."""
+        for part in super().render(renderable, options):
+            lines = part.text.split("\n")
+            text = part.text if part.control else "\n".join(map(escaped, lines))
+            yield Segment(text, part.style, part.control)
 
 
 @contextmanager
@@ -28,7 +50,7 @@ def working(console: Console) -> Iterator[Say]:
     begun = time.monotonic()
     if console.is_terminal:
         with console.status("") as status:
-            yield lambda text: status.update(f"{text} ...", spinner="dots")
+            yield lambda text: status.update(Text(f"{text} ..."), spinner="dots")
         return
 
     def say(text: str) -> None:
@@ -45,7 +67,8 @@ def counting(console: Console, what: str, total: int) -> Iterator[Advance]:
         console.print(f"{what}: {total}", markup=False, highlight=False)
         yield lambda step: None
         return
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+    what_column = TextColumn("{task.description}", markup=False)
+    columns = (what_column, BarColumn(), MofNCompleteColumn())
     times = (TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
     with Progress(*columns, *times, console=console, transient=True) as bar:
         task = bar.add_task(what, total=total)

@@ -1,6 +1,7 @@
 """What `compensate` says: error before and after at each point, and why points are refused."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from rich.console import RenderableType
@@ -9,6 +10,7 @@ from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.compensated import Compensation
 from hilcal.calibration.measured import Outside
 from hilcal.calibration.poses import BAND
+from hilcal.calibration.urscript import Waypoint
 from hilcal.report import numbers, text
 from hilcal.types import Floats
 
@@ -107,9 +109,48 @@ def _parts(calibration: Calibration) -> list[str]:
     return parts
 
 
-def document(
-    calibration: Calibration, names: Sequence[str], c: Compensation, refused: Sequence[str]
-) -> dict[str, object]:
+@dataclass(frozen=True, slots=True)
+class Fate:
+    """What became of a waypoint of a program.
+
+    Attributes:
+        line: of the program.
+        done: "corrected", "left" (not understood) or "refused"; the latter two are as they were.
+        why: it is left or refused.
+        blend_m: radius within which the arm passes it without a stop, m.
+    """
+
+    line: int
+    done: str
+    why: str | None
+    blend_m: float
+
+
+def fates(waypoints: Sequence[Waypoint], refused: Sequence[str]) -> list[Fate]:
+    """Return what becomes of each waypoint; `refused` says why, of those that are not left."""
+    rest, out = iter(refused), []
+    for w in waypoints:
+        why = w.left or next(rest)
+        done = "left" if w.left else "refused" if why else "corrected"
+        out.append(Fate(w.line, done, why or None, w.blend_m))
+    return out
+
+
+def waypoints(found: Sequence[Fate]) -> Iterator[RenderableType]:
+    """Yield a table of all waypoints of a program; nothing where there are none."""
+    if not found:
+        return
+    out = text.table("line", "waypoint", "why")
+    for f in found:
+        passed = f"the arm passes its place within {numbers.length(f.blend_m)} and does not stop"
+        out.add_row(str(f.line), f.done, f.why or (passed if f.blend_m > 0 else ""))
+    yield ""
+    yield out
+    if any(f.blend_m > 0 and f.done == "corrected" for f in found):
+        yield "Of a blended waypoint the corner of the path is corrected; the radius stays."
+
+
+def document(calibration: Calibration, names: Sequence[str], c: Compensation) -> dict[str, object]:
     """Return the JSON document, SI.
 
     `expected_error_m` is the rms error to be expected at the corrected joint values: what the
@@ -139,7 +180,7 @@ def document(
                 "residual_m": float(c.inverse.residual_m[k]),
                 "std_m": float(c.after.std_m[k]),
                 "band_m": float(c.after.band_m[k]),
-                "refused": refused[k] or None,
+                "refused": None,
             }
             for k, name in enumerate(names)
         ],

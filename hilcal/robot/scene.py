@@ -1,6 +1,6 @@
 """The arm among obstacles: which parts touch, by Pinocchio and Coal."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +13,6 @@ from hilcal.robot.body import Capsule, capsules
 from hilcal.robot.pinocchio_model import pinocchio_model
 from hilcal.types import Bools, Floats
 
-FLOOR = "the floor"
 _SAMPLES = 256  # states that tell which pairs touch by their crude shape alone
 _SHORT = 1e-12  # m, of a segment without a direction
 _ALWAYS = 0.3  # share of those states from which on a pair is not checked
@@ -43,14 +42,18 @@ class Scene:
 
     Pairs within one body and of neighbouring bodies are not checked, nor are pairs of which
     the crude shapes touch in a large share of all states, as those about a spherical wrist.
+
+    Attributes:
+        parts: capsules of the arm, then what the flange carries.
+        rates: (P, n) by part and joint: no point of the part goes farther than this per radian, m.
+        itself: pairs of parts.
+        around: parts and obstacles; base and shoulder stand where the arm is mounted, and are not
+            checked.
+        free: parts and obstacles against a segment that is given with the states.
     """
 
     def __init__(
-        self,
-        arm: Arm,
-        carried: Sequence[Capsule] = (),
-        obstacles: Sequence[Obstacle] = (),
-        floor: float | None = None,
+        self, arm: Arm, carried: Sequence[Capsule] = (), obstacles: Sequence[Obstacle] = ()
     ) -> None:
         """Build the shapes.
 
@@ -58,16 +61,16 @@ class Scene:
             arm: the arm.
             carried: what the flange carries.
             obstacles: what stands around.
-            floor: height that forearm and all beyond stay above, base axes, m; None for none.
         """
         self.parts = (*capsules(arm), *carried)
-        self._things = [(thing.name, *_obstacle(thing)) for thing in obstacles]
-        if floor is not None:
-            up = pin.coal.Halfspace(np.array([0.0, 0.0, 1.0]), floor)
-            self._things.append((FLOOR, up, pin.SE3.Identity()))
-        self._turned, self._model = arm, pinocchio_model(arm)
+        self._arm, self._model = arm, pinocchio_model(arm)
         self._data = self._model.createData()
+        self._things = [(thing.name, *_obstacle(thing)) for thing in obstacles]
+        far = np.array([_farthest(arm, part) for part in self.parts])
+        bodies = np.array([part.body for part in self.parts])
+        self.rates = np.where(np.arange(1, arm.n + 1) <= bodies[:, None], far, 0.0)
         count = len(self.parts)
+        last = count + len(self._things)
         reach = [
             (a, b)
             for a in range(count)
@@ -75,82 +78,49 @@ class Scene:
             if abs(self.parts[a].body - self.parts[b].body) > 1
         ]
         around = [
-            (a, count + b)
-            for a in range(count)
-            for b, thing in enumerate(self._things)
-            if self.parts[a].body > (1 if thing[0] != FLOOR else min(2, arm.n - 1))
+            (a, b) for a in range(count) if self.parts[a].body > 1 for b in range(count, last)
         ]
-        own = self._not_always(arm, reach)
-        self._self, self._around = self._group(own), self._group(around)
-        self._own, self._arm = len(own), self._group([*own, *around])
-        last = count + len(self._things)
-        self._free = self._group([(a, last) for a in range(last)])
+        own = self._not_always(reach)
+        self.itself = self._pairs(own, [self._apart(a, b, far) for a, b in own])
+        self.around = self._pairs(around, [self.rates[a] for a, _ in around])
+        self.free = self._pairs([(a, last) for a in range(last)])
 
-    def self_touching(self, q: Floats, margin: float) -> Bools:
-        """Return (N,) in which states (N, n) parts of the arm are closer than `margin`, m."""
-        return self._self.touching(q, margin)
+    def towards(self, point: Floats) -> Floats:
+        """Return how fast parts and obstacles near what hangs from a point of the flange, m/rad.
 
-    def obstacles_touching(self, q: Floats, margin: float) -> Bools:
-        """Return (N,) in which states (N, n) the arm is closer to an obstacle than `margin`, m.
-
-        Base and shoulder stand where the arm is mounted, and are not checked.
-        """
-        return self._around.touching(q, margin)
-
-    def arm_touching(self, q: Floats, itself: float, margin: float) -> Bools:
-        """Return (N,) in which states the arm touches itself or an obstacle.
+        It moves with the point and does not turn. A joint that turns a part turns the point with
+        it, so that they near each other by no more than their distance per radian.
 
         Args:
-            q: (N, n) joint angles, rad.
-            itself: distance below which parts of the arm touch, m.
-            margin: distance below which they touch an obstacle, m.
+            point: (3,) flange axes, m.
+
+        Returns:
+            (P + obstacles, n), by joint.
         """
-        return self._arm.touching(q, margin, first=(self._own, itself))
+        arm, fixed = self._arm, len(self._things)
+        at = on_flange(arm, point)
+        moves = np.array([from_axis(arm, arm.n, at[None], i) for i in range(1, arm.n + 1)])
+        out = np.tile(moves, (len(self.parts) + fixed, 1))
+        for row, part in zip(out, self.parts, strict=False):
+            ends = np.array([part.start, part.end])
+            if part.body == arm.n:
+                far = np.linalg.norm(ends - at, axis=1).max()
+            else:
+                far = _along(arm, part.body, ends, arm.n) + np.linalg.norm(at)
+            row[: part.body] = far
+        return out
 
-    def touching(self, q: Floats, segment: Segment, margin: float) -> Bools:
-        """Return (N,) in which states (N, n) a segment is closer to anything than `margin`, m."""
-        return self._free.touching(q, margin, segment)
+    def _apart(self, a: int, b: int, far: Floats) -> Floats:
+        """(n,) how fast two parts near each other by a joint between them, m/rad.
 
-    def pairs(
-        self,
-        q: Floats,
-        margin: float,
-        segments: Iterable[Segment] = (),
-        *,
-        itself: bool = True,
-    ) -> tuple[tuple[str, str], ...]:
-        """Return the names of all that touch in any of the states (N, n), each pair once.
-
-        Args:
-            q: joint angles, rad.
-            margin: distance from which on things touch, m.
-            segments: what is checked against everything.
-            itself: whether the arm is checked against itself.
+        Their distance is the same whichever of them stands still: the slower one counts.
         """
-        found: dict[tuple[str, str], None] = {}
-        for group in (self._self, self._around) if itself else (self._around,):
-            found.update(dict.fromkeys(group.named(q, margin)))
-        for segment in segments:
-            found.update(dict.fromkeys(self._free.named(q, margin, segment)))
-        return tuple(found)
+        low, high = sorted((self.parts[a].body, self.parts[b].body))
+        joint = np.arange(1, self._arm.n + 1)
+        between = (joint > low) & (joint <= high)
+        return np.where(between, np.minimum(far[a], far[b]), 0.0)
 
-    def blocking(self, q: Floats, segment: Segment) -> tuple[str, ...]:
-        """Return the names of all that a segment touches in any of the states (N, n)."""
-        return tuple(dict.fromkeys(a for a, _ in self._free.named(q, 0.0, segment)))
-
-    def distance(self, q: Floats, segment: Segment | None = None) -> float:
-        """Return the least distance in one state (n,), m; negative where things overlap.
-
-        Args:
-            q: (n,) joint angles, rad.
-            segment: its distance to everything; without it that within the arm and from the
-                arm to obstacles.
-        """
-        if segment is not None:
-            return self._free.distance(q, segment)
-        return min(self._self.distance(q), self._around.distance(q))
-
-    def _group(self, pairs: Iterable[tuple[int, int]]) -> "_Group":
+    def _pairs(self, pairs: Sequence[tuple[int, int]], rates: Sequence[Floats] = ()) -> "Pairs":
         geometry = pin.GeometryModel()
         names = []
         for part in self.parts:
@@ -166,23 +136,23 @@ class Scene:
             )
         free = pin.coal.Capsule(1.0, 1.0)
         geometry.addGeometryObject(pin.GeometryObject("free", 0, 0, pin.SE3.Identity(), free))
-        chosen = tuple(pairs)
-        for a, b in chosen:
+        for a, b in pairs:
             geometry.addCollisionPair(pin.CollisionPair(a, b))
         parts = (*names, "free")
-        return _Group(self._turned, self._model, self._data, geometry, parts, chosen)
+        speed = np.reshape(rates, (-1, self._arm.n))
+        return Pairs(self._arm, self._model, self._data, geometry, parts, tuple(pairs), speed)
 
-    def _not_always(self, arm: Arm, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    def _not_always(self, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
         """Leave out what touches in many states, whatever the arm does."""
-        group = self._group(pairs)
+        arm = self._arm
         drawn = _spread(_SAMPLES, arm.n)
         low, high = np.maximum(arm.q_min, -np.pi), np.minimum(arm.q_max, np.pi)
-        often = group.how_often(low + drawn * (high - low))
+        often = self._pairs(pairs).how_often(low + drawn * (high - low))
         return [pair for pair, share in zip(pairs, often, strict=True) if share < _ALWAYS]
 
 
-class _Group:
-    """Pairs that are checked together."""
+class Pairs:
+    """Pairs of shapes that are checked together; `rates` (K, n): how fast they near, m/rad."""
 
     def __init__(
         self,
@@ -192,85 +162,136 @@ class _Group:
         geometry: Any,
         names: tuple[str, ...],
         pairs: tuple[tuple[int, int], ...],
+        rates: Floats,
     ) -> None:
-        self._turned = arm
-        self._model, self._data, self._geometry = model, data, geometry
+        """Take shapes and pairs from `Scene`, which makes these."""
+        self.rates = rates
+        self._arm, self._model, self._data, self._geometry = arm, model, data, geometry
         self._state = geometry.createData()
         self._names, self._pairs = names, pairs
         self._free = len(names) - 1
 
     def touching(
-        self,
-        q: Floats,
-        margin: float,
-        segment: Segment | None = None,
-        first: tuple[int, float] = (0, 0.0),
+        self, q: Floats, margin: float | Floats = 0.0, segment: Segment | None = None
     ) -> Bools:
-        """(N,) whether anything touches; the first so many pairs by another margin."""
+        """Return (N,) in which states (N, n) any pair is closer than its margin, m.
+
+        Args:
+            q: (N, n) joint angles, rad.
+            margin: of all pairs, or (K,) of each; negative where shapes may overlap.
+            segment: what is given with the states, of `Scene.free`.
+        """
         out = np.zeros(len(q), dtype=np.bool_)
         if not self._pairs:
             return out
-        self._prepare(margin, segment, first)
+        self._prepare(margin, segment)
         lies = None if segment is None else _lies(segment, len(q))
-        for i, at in enumerate(np.ascontiguousarray(q)):
-            self._place(at, lies, i)
+        for i, turned in enumerate(np.ascontiguousarray(self._arm.chain_angles(q))):
+            self._place(turned, lies, i)
             out[i] = pin.computeCollisions(self._geometry, self._state, True)
         return out
 
     def named(
-        self, q: Floats, margin: float, segment: Segment | None = None
-    ) -> list[tuple[str, str]]:
+        self, q: Floats, margin: float = 0.0, segment: Segment | None = None
+    ) -> dict[tuple[str, str], float]:
+        """Return the pairs closer than a margin in any state (N, n), and their least distance, m.
+
+        It is negative where they overlap.
+        """
         hit = np.flatnonzero(self.touching(q, margin, segment))
         lies = None if segment is None else _lies(segment, len(q))
-        out = []
+        out: dict[tuple[str, str], float] = {}
         for i in hit.tolist():
-            self._place(q[i], lies, i)
+            self._place(self._arm.chain_angles(q[i]), lies, i)
             for k, (a, b) in enumerate(self._pairs):
                 active = self._state.activeCollisionPairs[k]
                 if active and pin.computeCollision(self._geometry, self._state, k):
-                    second = self._names[b] if segment is None else segment.name
-                    out.append((self._names[a], second))
+                    name = self._names[a], self._names[b] if segment is None else segment.name
+                    out[name] = min(out.get(name, np.inf), self._gap(k))
         return out
 
     def how_often(self, q: Floats) -> Floats:
-        """(P,) share of the states in which each pair touches."""
+        """(K,) share of the states in which each pair touches."""
         count = np.zeros(len(self._pairs))
-        for at in q:
-            self._place(at)
+        for turned in self._arm.chain_angles(q):
+            self._place(turned)
             pin.computeCollisions(self._geometry, self._state, False)
             count += [result.isCollision() for result in self._state.collisionResults]
         return np.asarray(count / len(q))
 
     def distance(self, q: Floats, segment: Segment | None = None) -> float:
-        if not self._pairs:
-            return float("inf")
+        """Return the least distance in one state (n,), m; negative where shapes overlap."""
         self._prepare(0.0, segment)
-        self._place(q, None if segment is None else _lies(segment, 1))
+        self._place(self._arm.chain_angles(q), None if segment is None else _lies(segment, 1))
+        active = self._state.activeCollisionPairs
         return min(
-            float(pin.computeDistance(self._geometry, self._state, k).min_distance)
-            for k in range(len(self._pairs))
-            if self._state.activeCollisionPairs[k]
+            (self._gap(k) for k in range(len(self._pairs)) if active[k]), default=float("inf")
         )
 
-    def _prepare(
-        self, margin: float, segment: Segment | None, first: tuple[int, float] = (0, 0.0)
-    ) -> None:
-        """Set the margin of all pairs, and which of them count."""
-        for k, request in enumerate(self._state.collisionRequests):
-            request.security_margin = first[1] if k < first[0] else margin
+    def _gap(self, k: int) -> float:
+        return float(pin.computeDistance(self._geometry, self._state, k).min_distance)
+
+    def _prepare(self, margin: float | Floats, segment: Segment | None) -> None:
+        """Set the margins of all pairs, and which of them count."""
+        each = np.broadcast_to(margin, len(self._pairs)).tolist()
+        for request, kept in zip(self._state.collisionRequests, each, strict=True):
+            request.security_margin = kept
         if segment is not None:
             self._geometry.geometryObjects[self._free].geometry.radius = segment.radius
             for k, (a, _) in enumerate(self._pairs):
                 self._state.activeCollisionPairs[k] = self._names[a] not in segment.ignored
 
-    def _place(self, q: Floats, lies: "_Lies | None" = None, i: int = 0) -> None:
-        """Put all shapes where they are in one state; a segment is that of state i."""
-        turned = self._turned.chain_angles(q)
+    def _place(self, turned: Floats, lies: "_Lies | None" = None, i: int = 0) -> None:
+        """Put all shapes where they are at angles of the chain (n,); a segment as in state i."""
         pin.updateGeometryPlacements(self._model, self._data, self._geometry, self._state, turned)
         if lies is not None:
             half, turn, middle = lies
             self._geometry.geometryObjects[self._free].geometry.halfLength = half[i]
             self._state.oMg[self._free] = pin.SE3(turn[i], middle[i])
+
+
+def from_axis(arm: Arm, body: int, points: Floats, joint: int) -> float:
+    """Return a bound on how far points of a body are from the axis of a joint, m, in every state.
+
+    So far they go at most per radian of the joint, or it per radian seen from them. It is the
+    length of the way along the links, |L_k| each; exact for a body that the joint carries, or
+    that carries the joint.
+
+    Args:
+        arm: the arm.
+        body: 0 the base, i what joint i moves.
+        points: (K, 3) points in the body's frame, m.
+        joint: 1 to n.
+    """
+    if joint > body:
+        if joint > body + 1:
+            return _along(arm, body, points, joint)
+        link = arm.links[body]
+        off = (points - link[:3, 3]) @ link[:3, :3]
+        return float(np.hypot(off[:, 0], off[:, 1]).max())
+    if joint == body:
+        return float(np.hypot(points[:, 0], points[:, 1]).max())
+    lengths = np.linalg.norm(arm.links[joint + 1 : body, :3, 3], axis=1)
+    first = float(np.hypot(*arm.links[joint][:2, 3]))
+    return float(first + lengths.sum() + np.linalg.norm(points, axis=1).max())
+
+
+def on_flange(arm: Arm, point: Floats) -> Floats:
+    """Return (3,) a point in flange axes in the frame of the last body, m."""
+    flange = arm.links[arm.n]
+    return np.asarray(flange[:3, :3] @ point + flange[:3, 3])
+
+
+def _farthest(arm: Arm, part: Capsule) -> Floats:
+    """(n,) bound on how far a part's segment is from each axis, m."""
+    ends = np.array([part.start, part.end])
+    return np.array([from_axis(arm, part.body, ends, i) for i in range(1, arm.n + 1)])
+
+
+def _along(arm: Arm, body: int, points: Floats, last: int) -> float:
+    """The longest way from points of a body along the links to the frame of a later body, m."""
+    lengths = np.linalg.norm(arm.links[body + 1 : last, :3, 3], axis=1).sum()
+    return float(np.linalg.norm(points - arm.links[body][:3, 3], axis=1).max() + lengths)
 
 
 def _spread(count: int, n: int) -> Floats:

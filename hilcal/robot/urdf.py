@@ -16,6 +16,7 @@ import pinocchio as pin
 
 from hilcal import limits
 from hilcal.errors import InputError
+from hilcal.names import check_name
 from hilcal.robot.arm import Arm
 from hilcal.robot.mimic import mimics, with_mimics
 from hilcal.toml import suggest
@@ -82,6 +83,7 @@ def _arm(model: pin.Model, base: pin.SE3, tip: pin.SE3, path: Path) -> Arm:
     after = [*turns, np.eye(4)]
     lower, upper, effort = zip(*(_limits(model, joint) for joint in joints), strict=True)
     masses = np.array([model.inertias[joint].mass for joint in joints])
+    names = tuple(check_name(model.names[joint], f"{path.name}: a joint") for joint in joints)
     return Arm(
         name=path.stem,
         links=np.array([b @ m @ a for b, m, a in zip(before, placements, after, strict=True)]),
@@ -91,7 +93,7 @@ def _arm(model: pin.Model, base: pin.SE3, tip: pin.SE3, path: Path) -> Arm:
         q_max=np.array(upper),
         torque_max=np.array(effort),
         payload=math.inf,
-        joint_names=tuple(model.names[joint] for joint in joints),
+        joint_names=names,
         source=f"URDF {path.name}",
         notes=tuple(_missing(model, masses)),
     )

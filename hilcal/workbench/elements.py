@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -9,6 +10,7 @@ import plotly.graph_objects as go
 from nicegui import ui
 from nicegui.events import GenericEventArguments
 
+from hilcal.names import escaped
 from hilcal.report import numbers
 from hilcal.report.charts import style
 from hilcal.workbench.work import Work
@@ -80,6 +82,4 @@ def point(e: GenericEventArguments) -> dict[str, Any]:
 
 def plain(words: str) -> str:
     """Return words without a meaning in HTML."""
-    return (
-        words.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;").replace("'", "&#39;")
-    )
+    return html.escape(escaped(words))

@@ -273,7 +273,7 @@ class Session:
 
     def _forget_others(self, o: Campaign) -> None:
         """Forget what was fitted to other readings than the file has now."""
-        stored = o.file.data_hash()
+        stored = o.data_hash
         if stored != self._hash:
             self._known, self._hash = {}, stored
 

@@ -1,9 +1,13 @@
 """`calibrate`: refusals, and what is said of a calibration that is there."""
 
+import os
 from pathlib import Path
 
 import pytest
 
+from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.procedure_log import ProcedureLog
+from hilcal.procedure.state import BEGUN
 from tests.support.calibrate_process import CELL
 from tests.support.cli_cases import ok, refused, run
 from tests.support.procedure_cases import Drawn, drawn, small
@@ -139,5 +143,14 @@ def test_devices_that_are_not_there_end_it_with_the_line_that_goes_on(
     assert line.startswith("error: tracker: ") or line.startswith("error: arm")
     assert line.endswith(f"go on with: hilcal calibrate {path} -o {out} --resume --yes")
     assert "readings:" not in result.out
+    elsewhere = tmp_path / "elsewhere" / "prior.json"
+    elsewhere.parent.mkdir()
+    os.mkfifo(elsewhere)  # reading it would never end
+    with CampaignFile.open(out) as file:
+        log = ProcedureLog(file)
+        log.append(BEGUN, {"settings": {**log.last(BEGUN)["settings"], "prior": str(elsewhere)}})
+    told = run(capsys, "calibrate", path, "-o", out, "--yes", "--resume")
+    assert told.code == 2
+    assert f"--prior {elsewhere}" in told.err
     again = refused(capsys, 2, "calibrate", path, "-o", out, "--yes")
     assert '"Measure" (16 of 16 readings are missing)' in again

@@ -97,6 +97,65 @@ def test_a_program_is_rewritten_and_a_calibration_file_will_do(capsys, fitted, t
     assert document["written"] == [str(out)]
 
 
+def test_waypoints_are_corrected_left_or_refused_and_that_is_said(capsys, fitted, tmp_path) -> None:
+    with hc.Campaign.open(fitted, read_only=True) as run:
+        first = ", ".join(f"{v:.9f}" for v in run.readings.states.q[0] + 0.01)
+    program, out = tmp_path / "p.script", tmp_path / "new.script"
+    lines = [
+        f"q = [{first}]",
+        "movej(q, a=1, v=1, r=0.02)",
+        f"w = [{first}]",
+        "w[0] = 1.57",
+        "movej(w)",
+        "movel([3.1, -0.1, 0.1, -3.1, -1.4, 3.1])",
+    ]
+    program.write_text("\r\n".join(lines) + "\r\n", newline="")
+    said = refused(capsys, 2, "compensate", fitted, program, "-o", out)
+    assert "p.script: line 5: the waypoint 'w' is computed" in said
+    assert "--leave" in said
+    assert not out.exists()
+    told = ok(capsys, "compensate", fitted, program, "-o", out, "--leave", "--json")
+    fates = told.document["waypoints"]
+    assert [(f["line"], f["done"]) for f in fates] == [
+        (2, "corrected"),
+        (5, "left"),
+        (6, "refused"),
+    ]
+    assert fates[0]["blend_m"] == 0.02
+    assert "'w' has its value from lines 3, 4" in fates[1]["why"]
+    assert "measured" in fates[2]["why"]
+    assert "beyond" not in told.err
+    assert len(told.document["points"]) == 1
+    now = out.read_bytes().decode().split("\r\n")
+    kept = [a == b for a, b in zip(lines, now[:-1], strict=True)]
+    assert kept == [True, False, True, True, True, True]
+    (q,) = [w.q for w in waypoints(now[1] + "\n")]
+    np.testing.assert_allclose(q, told.document["points"][0]["q_corrected"], atol=1e-9)
+    shown = ok(capsys, "compensate", fitted, program, "--leave").out
+    assert "passes its place within 20" in " ".join(shown.split())
+    assert "--leave is for" in refused(
+        capsys, 2, "compensate", fitted, table(tmp_path, fitted), "--leave"
+    )
+
+
+def test_a_name_is_neither_a_line_of_a_program_nor_a_formula(capsys, fitted, tmp_path) -> None:
+    points, out = table(tmp_path, fitted), tmp_path / "o.script"
+    plain = points.read_text()
+    evil = '"P1\n movej([0,0,0,0,0,0], a=10, v=3)\n #"'
+    points.write_text(plain.replace("w1", evil))
+    said = refused(capsys, 2, "compensate", fitted, points, "-o", out)
+    assert "row 3, column 'pose': 'P1\\u000a movej(" in said
+    assert "valid: " in said
+    assert not out.exists()
+    points.write_text(plain.replace("w1", "=1+1"))
+    ok(capsys, "compensate", fitted, points, "-o", tmp_path / "a.csv")
+    assert "\n'=1+1," in (tmp_path / "a.csv").read_text()
+    kept = [line.rsplit(",", 3)[0] for line in (tmp_path / "a.csv").read_text().splitlines()]
+    points.write_text("\n".join(kept) + "\n")
+    told = ok(capsys, "compensate", fitted, points, "--json").document
+    assert [point["name"] for point in told["points"]] == ["w0", "=1+1", "w2"]
+
+
 def test_the_corrected_geometry_is_handed_over(capsys, fitted, tmp_path) -> None:
     paths = [tmp_path / name for name in ("a.urdf", "a.yaml", "f.json")]
     options = zip(("--urdf", "--ur-kinematics", "--frames"), paths, strict=True)

@@ -169,6 +169,11 @@ class FakeOperator:
         w.time += 20.0
         w.load = w.wrong.pop(0) if w.wrong else name
 
+    def confirm(self, question: str) -> None:
+        self.world.call("operator.confirm")
+        assert not self.world.is_moving, "a person asked to look at a moving arm"
+        self.asked.append(("confirm", question))
+
     def close(self) -> None:
         return
 

@@ -23,6 +23,7 @@ from tests.support.campaign_cases import STARVED, Fault, right, stopped_on_its_w
 from tests.support.campaign_run import BEGUN, EndedError, Run
 from tests.support.campaign_site import Site, site
 from tests.support.spread_plan import spread_plan
+from tests.wire import test_fault_matrix_person as person
 from tests.wire.test_fault_matrix_arm import MOTION, REST
 from tests.wire.test_fault_matrix_serial import FORCE, OVERCOME, TRACKER
 
@@ -30,6 +31,18 @@ PATIENCE = 25.0
 """So long a program may go on with a fault before it counts as overcome, s."""
 STANDS = 1.0
 """So long after its program was killed an arm may move, s: half of it to be noticed, and a ramp."""
+NOTICED = re.compile(r"touch the tool|does not stand|asked \d times")
+"""What is said of a load that fell."""
+DONE = "readings are in"
+"""What a run says at its end."""
+BESIDE = (
+    ("identify",),
+    ("identify", "--readings", "absolute"),
+    ("diagnose",),
+    ("refine",),
+    ("report", "-o", "/dev/null"),
+)
+"""Commands that are run on a campaign while it is measured."""
 CODES = (0, 3, 130, -signal.SIGKILL)
 """Exit codes: done, a device failed, interrupted, killed."""
 
@@ -91,12 +104,15 @@ class Soak:
     def act(self) -> None:
         """Do one thing by chance, and check what must hold after it."""
         ways: list[tuple[float, Callable[[], str]]] = [
-            (0.40, self.one_fault),
-            (0.20, self.two_faults),
-            (0.12, self.fault_during_recovery),
-            (0.12, self.signal),
-            (0.08, self.check),
-            (0.08, self.calibrate),
+            (0.30, self.one_fault),
+            (0.15, self.two_faults),
+            (0.10, self.fault_during_recovery),
+            (0.12, self.load_falls),
+            (0.05, self.wrong_weights),
+            (0.10, self.second_process),
+            (0.08, self.signal),
+            (0.05, self.check),
+            (0.05, self.calibrate),
         ]
         (way,) = self.rng.choices([w for _, w in ways], [p for p, _ in ways])
         self.do(way)
@@ -153,6 +169,68 @@ class Soak:
             second.undo(self.site)
         self._sound()
         return f"{first.name}, {second.name}"
+
+    def load_falls(self) -> str:
+        """A load falls off in motion or while it is measured, and is hung again."""
+        run, moment = self._begun()
+        try:
+            person.loaded(run)
+            if moment == "moving":
+                run.wait_until(lambda: self.site.ask("arm", "state")["moving"], "motion")
+            since = len(run.words)
+            name = self.site.ask("world", "state")["load"]
+            self.site.ask("world", "hang", name=None)
+            self.counts["faults"] += 1
+            if name is not None:  # else it was being taken off just then
+                run.wait_until(lambda: NOTICED.search(run.words[since:]), "words about the load")
+        except EndedError:
+            self._ended(run)  # the campaign was done before
+        else:
+            run.interrupt()
+            self._ended(run)
+        self._sound()
+        return "load falls"
+
+    def wrong_weights(self) -> str:
+        """The person hangs another weight than asked for, once or every time."""
+        run = self._run()
+        times = self.rng.choice((1, 3))
+        for _ in range(times):
+            wrong = self.rng.choice(self.site.config.loads)
+            self.site.ask("world", "mistake", name=wrong.name)
+            self.counts["faults"] += 1
+        try:
+            run.some_readings()
+        except EndedError:
+            self._ended(run)
+        else:
+            run.interrupt()
+            self._ended(run)
+        self._sound()
+        return "wrong weights"
+
+    def second_process(self) -> str:
+        """Another command fits the campaign, and stores its revision, while it is measured."""
+        run, _ = self._begun()
+        beside: list[subprocess.Popen[bytes]] = []
+        for command in self.rng.sample(BESIDE, 2):
+            arguments = [sys.executable, "-m", "hilcal", *command[:1], str(self.path), *command[1:]]
+            beside.append(
+                subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+            )
+            time.sleep(self.rng.uniform(0.0, 2.0))
+        self.counts["faults"] += len(beside)
+        for process in beside:
+            _, said = process.communicate(timeout=120.0)
+            words = said.decode()
+            assert "Traceback" not in words, words[-2000:]
+            assert process.returncode in (0, 2, 4), words[-600:]
+            self.counts[f"beside: exit {process.returncode}"] += 1
+        if run.process.poll() is None:
+            run.interrupt()
+        self._ended(run)
+        self._sound()
+        return "second process"
 
     def signal(self) -> str:
         """Ctrl-C or a kill at any moment."""
@@ -258,9 +336,14 @@ class Soak:
         return run, moment
 
     def _drawn(self, moment: str) -> Fault:
-        serial = (*TRACKER, *FORCE, *_overcome())
-        arm = MOTION if moment == "moving" else REST
-        return self.rng.choice(arm if self.rng.random() < 0.5 else serial)
+        """A fault; a person's and a device's that repeats itself come after the tare only."""
+        kinds: list[tuple[Fault, ...]] = [
+            MOTION if moment == "moving" else REST,
+            (*TRACKER, *FORCE, *_overcome()),
+        ]
+        if moment != "any":
+            kinds.append(person.MOTION if moment == "moving" else person.REST)
+        return self.rng.choice(self.rng.choice(kinds))
 
     def _count(self, fault: Fault) -> None:
         self.counts["faults"] += 1
@@ -314,6 +397,8 @@ class Soak:
     def _ended(self, run: Run, faults: tuple[Fault, ...] = ()) -> None:
         code, words = run.end()
         assert "Traceback" not in words, words[-2000:]
+        if code == -signal.SIGINT and DONE in words:
+            code = 0  # it was interrupted after its work, on its way out
         assert code in CODES, f"exit code {code}: {words[-600:]}"
         lines = [line for line in words.splitlines() if line.startswith("error:")]
         assert len(lines) == (code != 0), words[-2000:]

@@ -42,6 +42,33 @@ def placed(part: Capsule, at: list[Floats]) -> Floats:
     return along(part.start, part.end) @ frame[:3, :3].T + frame[:3, 3]
 
 
+def reached(cell: Cell, parts: tuple[Capsule, ...], q: Floats) -> tuple[Floats, Floats]:
+    """(3,) what all that is held to a workspace reaches in states (N, n): lowest and highest, m.
+
+    Forearm, wrists and tool; the upper arm to the sides that the shoulder keeps as it turns.
+    """
+    turns = np.zeros((25, cell.arm.n))
+    turns[:, 0] = np.linspace(-np.pi, np.pi, 25)
+    low, high = extent([p for p in parts if p.body > 2], cell, q)
+    upper = extent([p for p in parts if p.body == 2], cell, q)
+    stands, rises = extent([p for p in parts if p.body < 2], cell, turns)
+    low = np.where(stands > low, np.minimum(low, upper[0]), low)
+    return low, np.where(rises < high, np.maximum(high, upper[1]), high)
+
+
+def extent(parts: list[Capsule], cell: Cell, q: Floats) -> tuple[Floats, Floats]:
+    """(3,) lowest and highest of capsules in states (N, n) along each axis, m."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for state in q:
+        at = frames(cell.arm, state)
+        for part in parts:
+            ends = np.stack([part.start, part.end]) @ at[part.body][:3, :3].T
+            ends = ends + at[part.body][:3, 3]
+            low = np.minimum(low, ends.min(axis=0) - part.radius)
+            high = np.maximum(high, ends.max(axis=0) + part.radius)
+    return low, high
+
+
 def gap(a: Floats, b: Floats) -> float:
     """The least distance of the points of two segments."""
     return float(np.linalg.norm(a[:, None] - b[None], axis=2).min())

@@ -227,4 +227,7 @@ def test_values_that_cannot_be_never_pass(tmp_path, bad):
         assert sample.wrench == pytest.approx(good)
         assert sensor.losses().corrupt > 0
     with talker(tmp_path, lambda k: bota_frame(k, wrong)) as path:
-        fails(lambda: OPEN["bota"](config("bota", path)), "their values were impossible")
+        fails(
+            lambda: OPEN["bota"](config("bota", path)),
+            "their values or their clock were impossible",
+        )

@@ -230,7 +230,7 @@ def test_a_closed_terminal_is_no_answer(sit):
     person.types("\x04")  # end of file
     assert person.found() == (
         [],
-        ["error: operator: the terminal was closed before the load was hung"],
+        ["error: operator: the terminal was closed before it was answered"],
     )
 
 

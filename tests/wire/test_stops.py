@@ -174,5 +174,40 @@ def test_two_programs_at_one_campaign_file(cell: Site, tmp_path: Path) -> None:
     finish(short, path)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("how", "interrupted"),
+    [("deleted", False), ("deleted", True), ("moved", False), ("replaced", False)],
+)
+def test_a_campaign_that_is_gone_is_said_and_found(
+    cell: Site, tmp_path: Path, how: str, interrupted: bool
+) -> None:
+    """Deleted, moved or replaced by another program: the arm stops, and nothing is lost."""
+    short = cell.shorter(tmp_path, poses=2)
+    path = tmp_path / "gone.hilcal"
+    run, _ = begin(short, path, Run.measuring)
+    with CampaignFile.open(path, read_only=True) as campaign:
+        measured = campaign.n_readings
+    if how == "moved":
+        path.rename(tmp_path / "there.hilcal")
+    elif how == "deleted":
+        path.unlink()
+    else:
+        path.with_name("other").write_text("another")
+        path.with_name("other").replace(path)
+    if interrupted:
+        run.interrupt()
+    line = failed(run)
+    assert "gone.hilcal: deleted, replaced or moved while it was open; all" in line
+    assert "then go on with: hilcal run" in line
+    assert not cell.ask("arm", "state")["moving"]
+    place = Path(line.partition(" are in ")[2].partition(": move that back")[0])
+    assert place.name == ("there.hilcal" if how == "moved" else "gone.rescued.hilcal")
+    with CampaignFile.open(place) as campaign:
+        assert campaign.n_readings >= measured > 0
+    place.replace(path)  # as the line says
+    finish(short, path)
+
+
 def test_the_stopped_campaign_has_every_reading_exactly_once(cell: Site, path: Path) -> None:
     finish(cell, path)

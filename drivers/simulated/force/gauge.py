@@ -31,6 +31,7 @@ class Gauge:
         noise: (6,) standard deviation of one frame.
         overload: (6,) wrench added by a fault.
         on: how long the sensor has been on when the world begins, s.
+        frozen: (6,) what it reads whatever it feels; None is the truth.
     """
 
     board: Blackboard
@@ -40,6 +41,7 @@ class Gauge:
     noise: Floats
     overload: Floats
     on: float
+    frozen: Floats | None = None
 
     @staticmethod
     def draw(
@@ -63,6 +65,8 @@ class Gauge:
 
     def read(self, count: int) -> Floats:
         """Return (count, 6) wrenches of the frames that are due now, N and N·m."""
+        if self.frozen is not None:
+            return np.tile(self.frozen, (count, 1))
         truth = self.board.read("truth")["sensor_wrench"]
         since = self._own_heat(self.board.time) - self._own_heat(0.0)
         mean = truth + self.bias + self.drift * since + self.overload

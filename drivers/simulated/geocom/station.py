@@ -48,6 +48,9 @@ class Station:
         number: of the target that is held, or was last.
         hidden: numbers of targets that cannot be seen.
         several: whether the tool carries several targets.
+        seen: the last measurement.
+        stuck: what is measured to the last digit whatever the target does; None is the target.
+        stray: a reflector at rest that is followed instead; None is the target.
     """
 
     board: Blackboard
@@ -80,6 +83,9 @@ class Station:
     number: int = 0
     hidden: set[int] = field(default_factory=set)
     several: bool = False
+    seen: PolarPoint | None = None
+    stuck: PolarPoint | None = None
+    stray: PolarPoint | None = None
 
     def targets(self) -> dict[int, PolarPoint]:
         """Return where the targets that can be seen truly are at this moment, by number."""
@@ -97,7 +103,7 @@ class Station:
 
     def target(self) -> PolarPoint | None:
         """Return where its target truly is at this moment; None where it cannot be seen."""
-        return self.targets().get(self.number)
+        return self.stray or self.targets().get(self.number)
 
     def held(self) -> PolarPoint | None:
         """Return where the held target truly is; None without lock or sight."""
@@ -108,8 +114,8 @@ class Station:
         true = self.held()
         if true is None:
             return None
-        seen = self.beam.observe(true, self.rng)
-        self.pointing = seen
+        seen = self.stuck or self.beam.observe(true, self.rng)
+        self.pointing = self.seen = seen
         self.measured += 1
         return seen
 

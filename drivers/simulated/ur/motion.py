@@ -123,6 +123,13 @@ class Trajectory:
             return
         self._begin(goal, speed, acceleration)
 
+    def place(self, q: Floats) -> None:
+        """Stand at joint angles (n,), rad, at once: the arm was moved by hand."""
+        self._segment = self._next = None
+        self._stopping = False
+        self.q, self.qd = np.array(q, dtype=np.float64), np.zeros_like(self.q)
+        self.arrivals += 1
+
     def stop(self, deceleration: float, now: float) -> None:
         """Decelerate along the line, rad/s² of the leading joint, and forget what was next.
 

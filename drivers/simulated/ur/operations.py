@@ -6,13 +6,16 @@ import os
 import time
 from typing import Any
 
+import numpy as np
+
 from drivers.simulated.ur.server import Server, read_version
 from hilcal.errors import InputError
+from hilcal.types import Floats
 
 OPERATIONS = (
     "state, protective_stop, emergency_stop, release_emergency_stop, local_mode, remote_mode, "
     "kill_script, rtde_drop, rtde_stall {on}, rtde_mute {on}, rtde_half_frame, "
-    "dashboard_mute {on}, dashboard_drop, refuse {on}, refuse_motion {on}, "
+    "dashboard_mute {on}, dashboard_drop, refuse {on}, refuse_motion {on}, freeze {on}, jog {q}, "
     "set {version, slider, speed_scaling, unlock_s}, die, log"
 )
 
@@ -75,6 +78,11 @@ class AdminOperations:
                 await server.accept(not arguments.get("on", True))
             case "refuse_motion":
                 server.arm.refuses_motion = bool(arguments.get("on", True))
+            case "freeze":  # the joint angles that are told stand still, all else goes on
+                on = bool(arguments.get("on", True))
+                server.arm.frozen_q = server.arm.trajectory.q.copy() if on else None
+            case "jog":  # somebody moves the arm by hand
+                server.arm.trajectory.place(_joints(arguments["q"]))
             case _:
                 raise InputError(f"no operation {op!r}; valid: {OPERATIONS}")
 
@@ -121,6 +129,13 @@ class AdminOperations:
             "input_ns": arm.input_ns,
             "now_ns": time.monotonic_ns(),
         }
+
+
+def _joints(q: Any) -> Floats:
+    place = np.asarray(q, dtype=np.float64)
+    if place.shape != (6,) or not np.all(np.abs(place) <= 2.0 * np.pi):
+        raise InputError(f"q = {q!r}; valid: 6 numbers within a turn, rad")
+    return place
 
 
 def _share(key: str, value: Any) -> float:

@@ -132,6 +132,8 @@ class Sensors:
         return self._is_told and same and not motion.moving
 
     def _q(self) -> Floats:
+        if self._arm.frozen_q is not None:
+            return self._arm.frozen_q
         if self._at_rest:
             return np.asarray(self._truth["encoder"])
         return self._arm.trajectory.q + self._noise(_ENCODER_STD)

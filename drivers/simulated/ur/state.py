@@ -107,6 +107,7 @@ class ArmState:
         slider: the speed slider.
         digital_outputs: RTDE `actual_digital_output_bits`.
         refuses_motion: whether a motion that is commanded ends the program instead.
+        frozen_q: (n,) what the encoders tell in spite of any motion, rad; None is the truth.
         fault_ns: `time.monotonic_ns` of the last fault that was switched on.
         input_ns: the same of the last input package.
         log: (monotonic_ns, what happened).
@@ -128,6 +129,7 @@ class ArmState:
     slider: float = 1.0
     digital_outputs: int = 0
     refuses_motion: bool = False
+    frozen_q: Floats | None = None
     fault_ns: int = 0
     input_ns: int = 0
     log: deque[tuple[int, str]] = field(default_factory=lambda: deque(maxlen=2000))

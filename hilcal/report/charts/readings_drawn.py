@@ -1,11 +1,13 @@
 """Readings as points: which of very many are drawn, their names for people, their levels."""
 
+import html
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from hilcal.data.plan import UNLOADED
+from hilcal.names import escaped as without_controls
 from hilcal.report import numbers
 from hilcal.report.charts import style
 from hilcal.report.story import Story, StoryRevision
@@ -87,7 +89,7 @@ def place(story: Story, i: int) -> str:
 
 def escaped(words: str) -> str:
     """Return words without a meaning in the HTML that plotly takes for labels."""
-    return words.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+    return html.escape(without_controls(words), quote=False)
 
 
 def worst_count(most: int) -> int:

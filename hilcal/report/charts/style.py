@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import plotly.graph_objects as go
 
+from hilcal.names import escaped
 from hilcal.regression import distributions
 from hilcal.types import Floats, Ints
 
@@ -80,7 +81,7 @@ def figure(
         layout: more of plotly's layout.
     """
     out = go.Figure(data=list(traces))
-    out.update_layout(template=template(False), height=height, meta={"says": says})
+    out.update_layout(template=template(False), height=height, meta={"says": escaped(says)})
     out.update_layout(xaxis={"title": {"text": x}}, yaxis={"title": {"text": y}})
     out.update_layout(**layout)
     return out

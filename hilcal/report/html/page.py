@@ -8,6 +8,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
+from hilcal.names import escaped
 from hilcal.report.charts import style
 from hilcal.report.html.certificate import certificate
 from hilcal.report.html.content import ReportContent
@@ -61,6 +62,13 @@ def _plain(value: object) -> object:
     return to_json()
 
 
+def _shown(value: object) -> object:
+    """Return what a page shows of a value; ends of lines are blanks in HTML anyway."""
+    if not isinstance(value, str) or isinstance(value, Markup):
+        return value
+    return "\n".join(map(escaped, value.split("\n")))
+
+
 @cache
 def _environment() -> Environment:
     """Every text is escaped; what is markup is named in `render`."""
@@ -68,6 +76,7 @@ def _environment() -> Environment:
         loader=FileSystemLoader(HERE),
         autoescape=True,
         undefined=StrictUndefined,
+        finalize=_shown,
         trim_blocks=True,
         lstrip_blocks=True,
     )

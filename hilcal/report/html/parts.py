@@ -8,6 +8,7 @@ from rich.console import RenderableType
 from rich.table import Table as RichTable
 from rich.text import Text
 
+from hilcal.names import escaped
 from hilcal.report.charts import style
 
 
@@ -87,8 +88,8 @@ def chart(title: str, figure: go.Figure, *, wide: bool = False) -> Chart:
 
 
 def in_script(json: str) -> str:
-    """Return JSON that nothing in it can end the script that holds it."""
-    return json.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
+    """Return JSON that nothing in it can end the script that holds it, or turn its text."""
+    return escaped(json).replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
 
 
 def from_terminal(parts: Iterable[RenderableType], caption: str = "") -> tuple[Part, ...]:

@@ -172,7 +172,7 @@ def _sight(
     out = np.where(~free, HIDDEN, np.where(turned, TURNED, SEEN))
     why = [""] * count
     for i in np.flatnonzero(out != SEEN).tolist():
-        told = view.problems(q[i : i + 1], loads[load[i]], "").values()
+        told = view.problems(q[i : i + 1], loads[load[i]], "")
         why[i] = "; ".join(line.removeprefix(": ") for line in told)
         if not why[i]:  # some of several targets
             hidden = view.hidden(q[i : i + 1], loads[load[i]])

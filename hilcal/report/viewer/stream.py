@@ -3,7 +3,6 @@
 import contextlib
 import hashlib
 import logging
-import os
 import shutil
 import socket
 import subprocess
@@ -21,6 +20,7 @@ from hilcal.report.live_viewer import PORT
 from hilcal.report.story import Story, StoryRevision, check
 from hilcal.report.viewer import charts, errors, layout, scene, style, words
 from hilcal.report.viewer.digest import Digest, Limits, digest
+from hilcal.whole_file import replace_file
 
 APPLICATION = "hilcal"
 _FLUSH_TIMEOUT = 10.0
@@ -162,25 +162,19 @@ def require_folder(path: Path) -> None:
 def write(
     rec: rr.RecordingStream, blueprint: rrb.Blueprint, tell: Callable[[], None], path: Path
 ) -> None:
-    """Write what is told to a stream as a file, whole or not at all, and close the stream.
+    """Write what is told to a stream as a file, and close the stream.
 
     The recording is encoded in memory: rerun's own file sink can wait forever on a full disk.
 
     Raises:
-        HilcalError: the file cannot be written.
+        InputError: the file cannot be written.
     """
     memory = rec.memory_recording()
     rec.send_blueprint(blueprint, make_active=True, make_default=True)
     tell()
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        part.write_bytes(memory.drain_as_bytes())
-        part.replace(path)
-    except OSError as error:
-        raise HilcalError(f"recording {path}: cannot be written: {error.strerror}") from error
+        replace_file(path, memory.drain_as_bytes())
     finally:
-        with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
         rec.disconnect()
 
 

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hilcal.acquire.clearance import clearance_of
 from hilcal.acquire.devices import ArmSample
 from hilcal.acquire.guard import SLACK_M, Guard
-from hilcal.acquire.workspace import points
-from hilcal.config import ForceSensor, Limits
-from hilcal.robot.chain import evaluate
+from hilcal.config import ForceSensor, Limits, Load
 from tests.support.fake_bench import POSES, Bench
+from tests.support.space_cases import reached
 
 
 @pytest.fixture
@@ -103,21 +103,37 @@ def test_wrong_number_of_joints(bench: Bench) -> None:
 @pytest.mark.parametrize("side", ["min", "max"])
 @pytest.mark.parametrize("axis", range(3))
 def test_workspace_of_the_actual_pose(bench: Bench, side: str, axis: int) -> None:
-    """A box that ends at the outermost point, less and more than the slack."""
-    names, place = points(bench.cell, evaluate(bench.cell.arm, np.array(POSES["p1"])[None]))
-    at = place[0, :3, axis]  # flange, target, load point
-    if axis == 2:
-        at = place[0, :, 2]
-    edge = at.min() if side == "min" else at.max()
-    name = names[int(np.argmin(at) if side == "min" else np.argmax(at))]
+    """A box that ends where forearm, wrists and tool do, less and more than the slack."""
+    parts = clearance_of(bench.cell, bench.config).scene.parts
+    low, high = reached(bench.cell, parts, np.array([POSES["p1"]]))
+    edge = (low if side == "min" else high)[axis]
     inwards = 1.0 if side == "min" else -1.0
     for over, wrong in ((0.5 * SLACK_M, False), (2 * SLACK_M, True)):
-        low, high = [-3.0] * 3, [3.0] * 3
-        (low if side == "min" else high)[axis] = edge + inwards * over
-        limits = Limits(workspace_min_m=tuple(low), workspace_max_m=tuple(high))
+        box = {"min": [-3.0] * 3, "max": [3.0] * 3}
+        box[side][axis] = edge + inwards * over
+        limits = Limits(workspace_min_m=tuple(box["min"]), workspace_max_m=tuple(box["max"]))
         config = bench.config.model_copy(update={"limits": limits})
         said = Guard(bench.cell, config).check(sample(bench))
         assert (said is not None) is wrong
         if said is not None:
-            assert name in said
-            assert f"whose {'xyz'[axis]}" in said
+            assert f"is {2 * SLACK_M:.3g} m outside the workspace, whose {'xyz'[axis]}" in said
+
+
+def test_what_hangs_stops_the_arm_when_it_is_told() -> None:
+    """At 0.45 m a weight that hangs 0.5 m low is through the floor, and nothing else is."""
+    load = Load(name="long", mass_kg=2.0, hang_m=0.5)
+    bench = Bench(loads=(load,), limits=Limits(), force_sensor=None)
+    guard, here = Guard(bench.cell, bench.config), sample(bench, q=np.array(POSES["reference"]))
+    assert guard.check(here) is None
+    said = guard.check(here, hanging="long")
+    assert said is not None
+    assert "what hangs (long)" in said
+    assert "mounting plane" in said
+
+
+def test_arm_and_obstacles_that_touch_stop_the_arm() -> None:
+    folded = (0.0, -1.5, 3.0, -1.5, -1.5, 0.0)
+    bench = Bench(limits=Limits(workspace_min_m=(-2, -2, -2)))
+    said = Guard(bench.cell, bench.config).check(sample(bench, q=np.array(folded)))
+    assert said is not None
+    assert "shoulder and forearm collide" in said

@@ -88,7 +88,7 @@ def test_an_arm_that_stands_outside_its_workspace_is_not_moved() -> None:
     b = Bench(limits=Limits(workspace_min_m=(-1.2, -0.5, 0.05), workspace_max_m=(1.2, 1.2, 1.5)))
     b.world.q = np.array([1.5, -1.3, 1.6, -1.4, -1.4, 0.1])  # beyond y = -0.5
     plan = plan_of(("reference", "none", 0), poses={"reference": POSES["reference"]})
-    with pytest.raises(DeviceError, match=r"outside the workspace.*Drive it by hand"):
+    with pytest.raises(DeviceError, match=r"outside the workspace.*drive it by hand"):
         measure(b, plan)
     assert "arm.start_move" not in b.world.calls
     assert "arm.take_control" not in b.world.calls
@@ -166,17 +166,17 @@ def test_a_motion_that_never_ends_is_given_up() -> None:
 
 def test_a_lost_target_is_found_again() -> None:
     b = Bench()
-    b.world.lost = 1
+    b.world.lost = 3  # at both stops of the approach, where nothing is read, and at the reading
     readings = measure(b)
     assert len(readings) == len(usual_plan().steps)
     assert b.world.calls.count("tracker.find_target") == 1
     assert any("found again" in x for x in json.loads(b.store.rows[0][2])["remarks"])
 
 
-@pytest.mark.parametrize("lost", [3, 1000])
+@pytest.mark.parametrize("lost", [5, 1000])
 def test_a_target_that_stays_lost_ends_the_run(lost: int) -> None:
     b = Bench()
-    b.world.lost, b.world.not_found = lost, 0 if lost == 3 else 1000
+    b.world.lost, b.world.not_found = lost, 0 if lost == 5 else 1000
     with pytest.raises(DeviceError, match=r"line of sight.*--resume$"):
         measure(b)
     assert b.store.rows == []

@@ -130,13 +130,13 @@ def test_a_program_of_moves_has_them_as_waypoints() -> None:
         ("movej(q)\n", "is computed"),
         ("a=[1,2,3,4,5,6]\na=[1,2,3,4,5,7]\nmovej(a)\n", "is computed"),
         ("movej([1,2,3])\n", "is computed"),
-        ("movej(", "is computed"),
-        ("set_tcp(x)\nmovej([1,2,3,4,5,6])\n", "is computed"),
+        ("movej(", "line 1: 'movej(' is not understood"),
+        ("set_tcp(x)\nmovej([1,2,3,4,5,6])\n", "set_tcp without a pose"),
         ("set_tcp([1,2,3,4,5,6])\nmovej([1,2,3,4,5,6])\n", "set_tcp without a pose"),
         (
             "set_tcp(p[0,0,0,0,0,0])\nmovej([1,2,3,4,5,6])\nset_tcp(p[0,0,1,0,0,0])\n"
             "movej([1,2,3,4,5,6])\n",
-            "line 4: another tool centre point",
+            "line 3: another tool centre point",
         ),
     ],
 )

@@ -17,6 +17,7 @@ from hilcal.data.rows import _reading_crc
 from hilcal.errors import InputError
 from hilcal.revisions import restore
 from tests.support.paths import ROOT
+from tests.support.unguarded import unguarded
 
 FILES = sorted((ROOT / "tests" / "data" / "campaigns").glob("*.hilcal.gz"))
 HASHED = next(path for path in FILES if "hashed" in path.name)
@@ -93,8 +94,7 @@ def test_changed_readings_are_found_by_their_hash(
 ) -> None:
     """One coordinate moved by 1 µm, and its checksum mended."""
     path = unpacked(HASHED, tmp_path)
-    with sqlite3.connect(path) as db:
-        db.execute("DROP TRIGGER readings_no_update")
+    with sqlite3.connect(path) as db, unguarded(db):
         row = db.execute("SELECT id, pose, load, cycle, record FROM readings WHERE id = 7")
         number, *where, record = row.fetchone()
         values = np.frombuffer(record, "<f8").copy()

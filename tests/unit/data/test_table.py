@@ -187,8 +187,11 @@ BAD: dict[str, tuple[Table, str]] = {
     ),
     "no load": (with_cell(3, load=" "), r"row 3, column 'load': the cell is empty"),
     "no pose": (with_cell(3, pose=""), r"row 3, column 'pose': the cell is empty"),
-    "two lines": (with_cell(3, pose="a\nb"), r"row 3, column 'pose': 'a\\nb' holds unprintable"),
-    "column of two lines": (with_column("a\nb", ""), r"column 21 has no proper name"),
+    "two lines": (with_cell(3, pose="a\nb"), r"row 3, column 'pose': 'a\\u000ab' holds the"),
+    "column of two lines": (
+        with_column("a\nb", ""),
+        r"row 1, column 21: 'a\\u000ab' holds the char",
+    ),
     "None": (with_cell(2, load="None"), r"row 2, column 'load': 'None' must be spelled 'none'"),
     "wrench without a load": (
         with_cell(4, fz_N="-50"),

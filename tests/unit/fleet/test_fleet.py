@@ -249,3 +249,50 @@ def test_a_directory_without_campaigns_is_refused(capsys: Capsys, tmp_path: Path
     assert "no campaign files" in refused(capsys, 2, "fleet", tmp_path, "-o", tmp_path / "p.json")
     told = refused(capsys, 2, "fleet", tmp_path / "none", "-o", tmp_path / "p.json")
     assert "no directory" in told
+
+
+@pytest.mark.parametrize(
+    "how", ["a copy", "a link", "imported again", "extended", "two extensions", "many copies"]
+)
+def test_campaigns_of_the_same_readings_are_refused(
+    how: str, capsys: Capsys, tmp_path: Path
+) -> None:
+    """They would make an arm look like several, and its spread like none."""
+    folder, names = tmp_path / "fleet", ("a.hilcal", "b.hilcal", "c.hilcal")
+    folder.mkdir()
+    write(folder, names)
+    rng, other = np.random.default_rng(3), folder / "d.hilcal"
+    with CampaignFile.open(folder / "b.hilcal", read_only=True) as file:
+        x, config = file.readings(), file.config_json
+    again = replace(x, value=x.value + rng.normal(0, 1e-5, x.value.shape), cycle=x.cycle + 1)
+
+    def extended(path: Path, more: Readings) -> None:
+        with CampaignFile.create(path, config, "", "extended") as file:
+            file.append_readings(x)
+            for k in range(4):
+                moved = more.value + rng.normal(0, 1e-5, more.value.shape)
+                file.append_readings(replace(more, value=moved, cycle=more.cycle + k))
+
+    if how == "a copy":
+        other.write_bytes((folder / "b.hilcal").read_bytes())
+    elif how == "a link":
+        other.symlink_to("b.hilcal")
+    elif how == "imported again":  # other names, another order, six decimals
+        poses = tuple(f"P {k}" for k in range(len(x.pose_names)))
+        renamed = replace(x, value=x.value.round(8), pose_names=poses)
+        with CampaignFile.create(other, config, "", "again") as file:
+            file.append_readings(renamed[np.random.default_rng(1).permutation(len(x))])
+    elif how == "extended":
+        extended(other, again)
+    elif how == "two extensions":
+        (folder / "b.hilcal").unlink()
+        extended(other, again)
+        extended(folder / "e.hilcal", again)
+    else:
+        for k in range(25):
+            (folder / f"d{k:02d}.hilcal").write_bytes((folder / "b.hilcal").read_bytes())
+    told = refused(capsys, 2, "fleet", folder, "-o", tmp_path / "p.json", "--workers", "1")
+    assert "have readings in common" in told
+    first = "d.hilcal" if how == "two extensions" else "b.hilcal"
+    assert first in told or how == "many copies"
+    assert not (tmp_path / "p.json").exists()

@@ -89,7 +89,7 @@ def test_a_file_that_cannot_grow_leaves_what_was_there(tmp_path):
         check=False,
         timeout=60,
     )
-    assert done.stderr.strip().splitlines()[-1].startswith("hilcal.errors.HilcalError: recording")
+    assert done.stderr.strip().splitlines()[-1].startswith("hilcal.errors.InputError: ")
     assert "cannot be written" in done.stderr
     assert path.read_text() == "before"
     assert list(tmp_path.iterdir()) == [path]

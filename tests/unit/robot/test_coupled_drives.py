@@ -159,7 +159,7 @@ def test_shapes_of_turned_and_coupled_joints_are_those_of_the_drawn_arm():
             )
     here, there = Scene(arm), Scene(drawn)
     for one, two in zip(q, theta, strict=True):
-        assert here.distance(one) == pytest.approx(there.distance(two), abs=1e-9)
+        assert here.itself.distance(one) == pytest.approx(there.itself.distance(two), abs=1e-9)
 
 
 def test_the_situation_says_whose_angles_they_are():

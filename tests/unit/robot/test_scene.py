@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from hilcal.config import Obstacle
 from hilcal.robot.body import capsules, is_known
 from hilcal.robot.catalogue import load_arm, robot_names
-from hilcal.robot.scene import FLOOR, Scene, Segment
+from hilcal.robot.chain import evaluate
+from hilcal.robot.scene import Scene, Segment
 from hilcal.robot.segments import segment_distance
 from tests.support.arm_cases import ODD, arm_of
 from tests.support.fake_bench import POSES
@@ -53,14 +54,15 @@ def test_usual_poses_are_free_and_folded_ones_are_not(name: str) -> None:
     scene = Scene(load_arm(name), obstacles=(TABLE,))
     usual = np.array([UPRIGHT, [0.0, -1.5, 1.5, -1.5, -1.5, 0.0], *POSES.values()])
     assert is_known(load_arm(name))
-    assert scene.pairs(usual, 0.01) == ()
+    assert scene.itself.named(usual, 0.01) == {}
+    assert scene.around.named(usual, 0.01) == {}
     folded = np.array([[0.0, -1.5, 3.0, -1.5, -1.5, 0.0]])
-    hit = {name for pair in scene.pairs(folded, 0.0) for name in pair}
+    hit = {name for pair in scene.itself.named(folded) for name in pair}
     assert {"upper arm", "wrist 1"} <= hit
-    assert scene.self_touching(folded, 0.0).all()
+    assert scene.itself.touching(folded).all()
     down = np.array([[0.0, 0.4, 0.3, -1.5, -1.5, 0.0]])  # through the table
-    assert ("forearm", "table") in scene.pairs(down, 0.0)
-    assert scene.obstacles_touching(down, 0.0).all()
+    assert ("forearm", "table") in scene.around.named(down)
+    assert scene.around.touching(down).all()
 
 
 FOOT = {"ur3": 128, "ur3e": 128, "ur5": 149, "ur5e": 149, "ur20": 245, "ur30": 245}
@@ -87,28 +89,15 @@ def test_known_distances_to_a_ball_a_box_and_a_cylinder() -> None:
     at = 0.5 * side + [0.0, 0.0, height]
     ball = Segment("ball", at, at, 0.05)
     scene = Scene(arm)
-    assert scene.distance(UPRIGHT, ball) == pytest.approx(0.5 - 0.1762 - 0.06 - 0.05, abs=1e-6)
+    assert scene.free.distance(UPRIGHT, ball) == pytest.approx(0.5 - 0.1762 - 0.06 - 0.05, abs=1e-6)
     turned = np.array([np.pi, *UPRIGHT[1:]])
-    assert scene.distance(turned, ball) > 0.4
+    assert scene.free.distance(turned, ball) > 0.4
     box = Obstacle(name="wall", center_m=(0.0, -0.5, height), size_m=(0.1, 0.2, 0.1))
     tube = 0.5 - 0.1 - 0.1762 - 0.06
     for thing in (box, Obstacle(name="x", bottom_m=(0, -0.5, 0.45), radius_m=0.1, height_m=0.06)):
         for margin, touches in ((tube - 1e-3, False), (tube + 1e-3, True)):
-            hit = Scene(arm, obstacles=(thing,)).obstacles_touching(UPRIGHT[None], margin)
+            hit = Scene(arm, obstacles=(thing,)).around.touching(UPRIGHT[None], margin)
             assert hit.all() == touches
-
-
-def test_the_floor_stops_forearm_and_wrists_but_not_the_mount() -> None:
-    arm = load_arm("ur10e")
-    straight = np.zeros((1, 6))  # stretched out at the height of the shoulder, wrist 2 hangs
-    at = frames(arm, straight[0])
-    parts = [p for p in capsules(arm) if p.body > 2]
-    low = min(float(placed(p, at)[:, 2].min()) - p.radius for p in parts)
-    for floor, touches in ((low - 0.021, False), (low - 0.019, True)):
-        scene = Scene(arm, floor=floor)
-        assert scene.obstacles_touching(straight, 0.02).all() == touches
-    assert {b for _, b in Scene(arm, floor=low + 0.01).pairs(straight, 0.0)} == {FLOOR}
-    assert not Scene(arm, floor=0.0).obstacles_touching(UPRIGHT[None], 0.0).any()
 
 
 things = st.one_of(
@@ -135,9 +124,7 @@ def test_whatever_is_free_is_free_by_another_way_to_count(
     arm = load_arm(name)
     scene = Scene(arm, obstacles=(thing,))
     q = np.random.default_rng(seed).uniform(-np.pi, np.pi, (20, 6))
-    itself, around = scene.self_touching(q, 0.01), scene.obstacles_touching(q, 0.02)
-    both = scene.arm_touching(q, 0.01, 0.02)
-    np.testing.assert_array_equal(both, itself | around)
+    itself, around = scene.itself.touching(q, 0.01), scene.around.touching(q, 0.02)
     coarse = 0.04 * arm.reach / 2  # the ends of the points' spacing
     for k, state in enumerate(q):
         at = frames(arm, state)
@@ -147,6 +134,26 @@ def test_whatever_is_free_is_free_by_another_way_to_count(
         assert far >= 0.02 - 1e-9 or around[k]
         assert own <= 0.01 + coarse or not itself[k]
         assert far <= 0.02 + coarse or not around[k]
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.sampled_from(["ur3e", "ur10e", ODD]), things, st.integers(0, 999))
+def test_no_gap_closes_faster_than_its_rate(name: str, thing: Obstacle, seed: int) -> None:
+    """What is nearest after turns of the joints was no farther before than the bound says."""
+    arm, rng = arm_of(name), np.random.default_rng(seed)
+    scene, point = Scene(arm, obstacles=(thing,)), rng.normal(0.0, 0.1, 3)
+    towards = scene.towards(point)
+    q = rng.uniform(-2.0, 2.0, (20, arm.n))
+    turns = rng.uniform(-1.0, 1.0, q.shape) * np.eye(arm.n)[rng.integers(0, arm.n, len(q))]
+    places = [evaluate(arm, states).point(point) for states in (q, q + turns)]
+    for k, turn in enumerate(np.abs(turns)):
+        old, new = q[k : k + 1], (q + turns)[k : k + 1]
+        was, here = (Segment("hung", at[k], at[k] - [0.0, 0.0, 0.2], 0.02) for at in places)
+        for pairs in (scene.itself, scene.around):
+            near = pairs.distance(new[0]) + pairs.rates @ turn + 1e-4
+            assert pairs.touching(old, near).all()
+        near = scene.free.distance(new[0], here) + towards @ turn + 1e-4
+        assert scene.free.touching(old, near, was).all()
 
 
 def test_an_arm_of_unknown_shape_gets_links_and_can_move() -> None:
@@ -159,7 +166,7 @@ def test_an_arm_of_unknown_shape_gets_links_and_can_move() -> None:
             np.linalg.norm(arm.links[part.body][:3, 3])
         )
     q = np.random.default_rng(0).uniform(-2.0, 2.0, (200, arm.n))
-    share = Scene(arm).self_touching(q, 0.0).mean()
+    share = Scene(arm).itself.touching(q, 0.0).mean()
     assert 0.0 < share < 0.9
 
 

@@ -22,6 +22,7 @@ from hilcal.data.mapping_sections import FileFormat
 from hilcal.data.rows import text_crc
 from hilcal.data.sheets import open_grid
 from hilcal.errors import InputError
+from tests.support.unguarded import unguarded
 from tests.unit.data.test_file_versions import HASHED, unpacked
 
 SHEET = "xl/worksheets/sheet1.xml"
@@ -153,8 +154,7 @@ def test_effect_files_of_a_campaign_that_one_was_sent_are_not_run(
     """Its revision names a file that lies beside it; nobody gave it by --effects-from."""
     path, mark, law = unpacked(HASHED, tmp_path), tmp_path / "mark", tmp_path / "law.py"
     law.write_text(f"open({str(mark)!r}, 'w')\n")
-    with sqlite3.connect(path) as db:
-        db.execute("DROP TRIGGER revisions_no_update")
+    with sqlite3.connect(path) as db, unguarded(db):
         content = json.loads(db.execute("SELECT content FROM revisions").fetchone()[0])
         content["effects"].append("their_law")
         content["options"]["effects"]["their_law"] = {}

@@ -1,0 +1,210 @@
+"""The statements of a URScript program, one per line, of the part of the language that is known.
+
+URScript's expressions are written as Python's, so that Python's own parser reads them; what is
+not in the list of known forms is refused by its line, not guessed. A statement stands on one line.
+Source: Universal Robots, *The URScript Programming Language*, e-Series, software 5.11, chapter 1.
+"""
+
+import ast
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from hilcal.errors import InputError
+from hilcal.names import check_name
+
+_WORD = re.compile(r"[A-Za-z_]\w*", re.ASCII)
+_MARK = re.compile(r'\$\s*\d+(\s+"[^"\\]*")*\s*(#.*)?')
+"""A line that PolyScope writes before each node of its tree."""
+_STRING_OR_COMMENT = re.compile(r'"[^"\\]*"|#.*')
+_OTHER_SIGN = re.compile(r"""[^\t -~]|["'\\;`]""")
+_NUMBER = re.compile(r"\d+\.?\d*([eE][-+]?\d+)?|\.\d+([eE][-+]?\d+)?")
+_OPENS = ("def", "thread", "sec", "if", "while")
+_ALONE = ("halt", "enter_critical", "exit_critical")
+_EXPRESSIONS = (
+    ast.Name, ast.Constant, ast.List, ast.Tuple, ast.Subscript, ast.Call, ast.keyword, ast.UnaryOp,
+    ast.BinOp, ast.BoolOp, ast.Compare, ast.expr_context, ast.boolop,
+    ast.Eq, ast.NotEq, ast.Lt, ast.LtE, ast.Gt, ast.GtE,
+    ast.USub, ast.UAdd, ast.Not, ast.Add, ast.Sub, ast.Mult, ast.Div, ast.Mod,
+)  # fmt: skip
+VALID = "valid: one statement of URScript per line, as chapter 1 of its manual has them"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Statement:
+    """One statement.
+
+    Attributes:
+        line: of the program, from 1.
+        begin: where in the program the text begins that `node` is of.
+        text: that text.
+        node: as parsed; of `if`, `while` and `def` only the head.
+        blocks: numbers of the blocks that it stands in, the outermost first.
+        kinds: the words that these begin with.
+        called: all calls in it, with the names of their functions.
+    """
+
+    line: int
+    begin: int
+    text: str
+    node: ast.stmt
+    blocks: tuple[int, ...]
+    kinds: tuple[str, ...]
+    called: dict[ast.Call, str]
+
+    @property
+    def call(self) -> ast.Call | None:
+        """The call that it is."""
+        value = self.node.value if isinstance(self.node, ast.Expr) else None
+        return value if isinstance(value, ast.Call) else None
+
+    def place(self, node: ast.expr) -> tuple[int, int]:
+        """Where an expression of it begins and ends in the program."""
+        ends = (node.col_offset, node.end_col_offset or 0)
+        first, last = (len(self.text.encode()[:end].decode()) for end in ends)
+        return self.begin + first, self.begin + last
+
+    def written(self, node: ast.expr) -> str:
+        """Return the text of an expression."""
+        first, last = (at - self.begin for at in self.place(node))
+        return self.text[first:last]
+
+
+def statements(program: str) -> tuple[Statement, ...]:
+    """Parse a program.
+
+    Raises:
+        InputError: names the line that is not understood.
+    """
+    out: list[Statement] = []
+    open_blocks: list[tuple[str, int]] = []
+    at = made = 0
+    for number, whole in enumerate(program.split("\n"), start=1):
+        line = whole.removesuffix("\r")
+        check_name(line.replace("\t", " "), f"line {number}")
+        body = line.strip(" \t")
+        begin = at + len(line) - len(line.lstrip(" \t"))
+        at += len(whole) + 1
+        if not body or body.startswith("#") or _MARK.fullmatch(body):
+            continue
+        found = _WORD.match(body)
+        word = found[0] if found else ""
+        plain = _STRING_OR_COMMENT.sub("", body).strip()
+        if word in ("else", "elif"):
+            if not open_blocks or open_blocks[-1][0] not in ("if", "elif"):
+                raise _refused(number, f"{word} without if")
+            open_blocks.pop()
+        elif plain == "end":
+            if not open_blocks:
+                raise _refused(number, "end without a beginning")
+            open_blocks.pop()
+            continue
+        made += 1
+        blocks, kinds = tuple(b for _, b in open_blocks), tuple(kind for kind, _ in open_blocks)
+        if word in (*_OPENS, "elif", "else"):
+            open_blocks.append((word, made))
+        if word == "else":
+            if "".join(plain.split()) != "else:":
+                raise _refused(number, f"'{body[:40]}' is not understood")
+            continue
+        text, shift = _as_python(body, word)
+        node = _parsed(text, number, word)
+        out.append(Statement(number, begin + shift, text, node, blocks, kinds, _called(node)))
+    if open_blocks:
+        raise _refused(number, f"the program ends inside of {open_blocks[-1][0]}")
+    return tuple(out)
+
+
+def _as_python(body: str, word: str) -> tuple[str, int]:
+    """Return what Python's parser takes for a line, and how many signs it leaves out before."""
+    if word in ("thread", "sec"):  # nothing in this line is ever replaced
+        return "def" + body.removeprefix(word), 0
+    if word == "elif":
+        return body[2:], 2
+    if word in ("global", "local", "run", "join", "kill"):
+        rest = body.removeprefix(word).lstrip(" \t")
+        return rest, len(body) - len(rest)
+    return re.sub(r"=(\s*)run\s", lambda m: m[0].replace("run", "   "), body, count=1), 0
+
+
+def _parsed(text: str, number: int, word: str) -> ast.stmt:
+    """Parse one line, which begins with a word.
+
+    Raises:
+        InputError: it is not one known statement.
+    """
+    for sign in _OTHER_SIGN.findall(_STRING_OR_COMMENT.sub("", text)):
+        raise _refused(number, f"the sign {sign!a} outside of a comment")
+    what, header = f"'{text[:40]}' is not understood", word in (*_OPENS, "elif")
+    try:
+        (node,) = ast.parse(text + "\n pass" * header).body
+        known = all(_known(n, text) for n in _parts(node))
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        raise _refused(number, what) from None
+    alone = isinstance(node, ast.Expr) and isinstance(node.value, ast.Name)
+    known &= not alone or word in ("join", "kill", *_ALONE)
+    if not known or isinstance(node, ast.If | ast.While | ast.FunctionDef) != header:
+        raise _refused(number, what)
+    return node
+
+
+def _parts(node: ast.stmt) -> Iterator[ast.AST]:
+    """Yield all nodes of a statement but the `pass` that `_parsed` put into it.
+
+    Raises:
+        ValueError: it is of another kind than the known ones.
+    """
+    match node:
+        case ast.If(test=test) | ast.While(test=test):
+            yield from ast.walk(test)
+        case ast.FunctionDef(args=given) if (
+            not (given.kwonlyargs or given.posonlyargs or given.vararg or given.kwarg)
+            and all(a.annotation is None for a in given.args)
+            and node.returns is None
+        ):
+            for value in given.defaults:
+                yield from ast.walk(value)
+        case (
+            ast.Assign(targets=[ast.Name()])
+            | ast.Assign(targets=[ast.Subscript(value=ast.Name())])
+            | ast.Expr(value=ast.Call())
+            | ast.Return()
+            | ast.Break()
+            | ast.Continue()
+        ):
+            yield from (n for n in ast.walk(node) if n is not node)
+        case ast.Expr(value=ast.Name()):
+            yield node.value
+        case _:
+            raise ValueError
+
+
+def _called(node: ast.stmt) -> dict[ast.Call, str]:
+    calls = (n for n in ast.walk(node) if isinstance(n, ast.Call))
+    return {n: n.func.id for n in calls if isinstance(n.func, ast.Name)}
+
+
+def _known(node: ast.AST, text: str) -> bool:
+    """Whether a part of an expression means in URScript what Python reads."""
+    match node:
+        case ast.Constant(value=bool() | str()):
+            return True
+        case ast.Constant(value=int() | float()):
+            written = text.encode()[node.col_offset : node.end_col_offset].decode()
+            return _NUMBER.fullmatch(written) is not None
+        case ast.Constant():
+            return False
+        case ast.Subscript(value=ast.Name("p"), slice=ast.Tuple()):
+            end = node.value.end_col_offset or 0
+            return text.encode()[end : end + 1] == b"["
+        case ast.Subscript():
+            return not isinstance(node.slice, ast.Tuple)
+        case ast.Call():
+            return isinstance(node.func, ast.Name)
+        case ast.keyword():
+            return node.arg is not None
+    return isinstance(node, _EXPRESSIONS)
+
+
+def _refused(line: int, what: str) -> InputError:
+    return InputError(f"line {line}: {what}; {VALID}")

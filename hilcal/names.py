@@ -1,0 +1,76 @@
+"""Names that people, files and devices give: what none of them may hold, and how it is written.
+
+A name ends up in programs, tables, pages and on terminals. Characters that end a line, move a
+cursor or turn the direction of text would make something else of what stands after them there.
+They are refused where names come in, and escaped where text goes out.
+"""
+
+import re
+
+from hilcal.errors import InputError
+
+_REFUSED = re.compile(
+    "[\x00-\x1f\x7f-\x9f"  # control characters, among them all ends of lines of C0 and C1
+    "\u2028\u2029"  # ends of lines and paragraphs
+    "\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069"  # direction of text
+    "\ud800-\udfff\ufeff\ufffe\uffff]"  # halves of characters, byte order marks
+)
+_FORMULA = ("=", "+", "-", "@")
+"""What a spreadsheet takes a text for a formula by (a tab and a carriage return are escaped)."""
+
+
+def escaped(text: str) -> str:
+    r"""Return a text with `\u….` in the place of each character that no name may hold."""
+    return _REFUSED.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+
+
+def check_name(text: str, where: str) -> str:
+    r"""Return a text if it is of one line, without control characters; `where` names its origin.
+
+    Raises:
+        InputError: it holds another character; names it as `\u….`.
+    """
+    if found := _REFUSED.search(text):
+        begin = max(found.start() - 20, 0)
+        shown = ("…" if begin else "") + escaped(text[begin : found.start() + 20])
+        raise InputError(
+            f"{where}: '{shown}' holds the character {escaped(found[0])}; valid: text of one line "
+            "without control characters"
+        )
+    return text
+
+
+def check_names(value: object, where: str) -> None:
+    """Check all texts in lists and dictionaries, keys too.
+
+    Raises:
+        InputError: see `check_name`.
+    """
+    pending = [(value, where)]  # documents of others are nested deeper than Python calls itself
+    while pending:
+        inner, at = pending.pop()
+        if isinstance(inner, str):
+            check_name(inner, at)
+        elif isinstance(inner, dict):
+            for key in inner:
+                check_name(str(key), at)
+            pending += [(one, f"{at}: {key}") for key, one in inner.items()]
+        elif isinstance(inner, list | tuple):
+            texts = ((k, x) for k, x in enumerate(inner, start=1) if not isinstance(x, float | int))
+            pending += [(one, f"{at} {k}") for k, one in texts]
+
+
+def csv_text(text: str) -> str:
+    """Return a text for a cell of CSV: an apostrophe before what spreadsheets take for a formula.
+
+    Source: OWASP, "CSV Injection". A further apostrophe stands before a text that looks so, so that
+    `from_csv` returns each text as it was.
+    """
+    text = escaped(text)
+    return f"'{text}" if text.lstrip("'").startswith(_FORMULA) else text
+
+
+def from_csv(cell: str) -> str:
+    """Return the text of a cell that `csv_text` wrote."""
+    marked = cell.startswith("'") and cell.lstrip("'").startswith(_FORMULA)
+    return cell[1:] if marked else cell

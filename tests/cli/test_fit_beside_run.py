@@ -1,0 +1,227 @@
+"""Two programs on one campaign: one measures into it, the other one fits it and stores the fit."""
+
+import sqlite3
+import time
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hilcal as hc
+from hilcal.config import load_config
+from hilcal.data import rows, schema
+from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.covariance import COVERS, WHOLE
+from hilcal.data.records import content_hash
+from hilcal.data.revision import STORED, fitted_to, from_text, to_text
+from hilcal.errors import InputError
+from tests.support.appending import again, appending
+from tests.support.cli_cases import CELL, ok, refused, rehearsal
+from tests.support.unguarded import unguarded
+
+Capsys = pytest.CaptureFixture[str]
+
+
+@pytest.fixture(scope="module")
+def fresh(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """A campaign without revisions."""
+    path, config = tmp_path_factory.mktemp("fresh") / "run.hilcal", load_config(CELL).to_json()
+    with CampaignFile.create(path, config, str(CELL.parent), "made", more={COVERS: WHOLE}) as file:
+        file.append_readings(rehearsal("hysteresis", poses=8).readings)
+    return path.read_bytes()
+
+
+@pytest.fixture
+def run(fresh: bytes, tmp_path: Path) -> Path:
+    path = tmp_path / "run.hilcal"
+    path.write_bytes(fresh)
+    return path
+
+
+def more(path: Path, cycle: int) -> None:
+    """Measure one pose again, by another connection."""
+    with CampaignFile.open(path) as file:
+        x = file.readings()
+        file.append_readings(again(x, np.random.default_rng(cycle), cycle))
+
+
+def checked(path: Path) -> int:
+    """Return how many revisions there are; each tells the readings that it was fitted to."""
+    with CampaignFile.open(path, read_only=True) as file:
+        readings, records = file.readings(), file.revisions()
+    for record in records:
+        count, stored = fitted_to(record) or (0, "")
+        assert content_hash(readings[:count]) == stored
+    return len(records)
+
+
+@pytest.mark.parametrize("order", ["append, store", "store, append", "append, store, append"])
+def test_a_revision_is_of_the_readings_that_were_fitted(run: Path, order: str) -> None:
+    with hc.Campaign.open(run) as o:
+        found = hc.fit(hc.baseline(o.cell, o.readings, "absolute"), o.readings, "absolute")
+        before = len(o.readings)
+        for k, step in enumerate(order.split(", "), start=1):
+            if step == "append":
+                more(run, k)
+            else:
+                assert o.append(found) == 1
+                assert o.fit(1).theta == pytest.approx(found.theta)  # by this very program
+    assert checked(run) == 1
+    with hc.Campaign.open(run) as o:
+        assert len(o.readings) > before
+        with pytest.raises(InputError, match="fitted before readings were appended"):
+            o.fit()
+        o.append(hc.fit(found.model, o.readings, "absolute"))
+        assert o.fit(2).readings.value.shape == o.readings.value.shape
+    assert checked(run) == 2
+
+
+def test_what_a_refinement_stores_follows_itself(run: Path) -> None:
+    """Another program's revision comes between two of a chain."""
+    with hc.Campaign.open(run) as one, hc.Campaign.open(run) as other:
+        model = hc.baseline(one.cell, one.readings, "absolute")
+        base = hc.fit(model, one.readings, "absolute")
+        grown = hc.fit(model + hc.effect("hysteresis"), one.readings, "absolute")
+        first = one.store(base)
+        other.store(base)
+        made = one.store(grown, None, "hysteresis", None, first)
+        assert one.file.revision(made).made_from == first
+
+
+BESIDE = [
+    ["identify", "--readings", "absolute"],
+    ["add", "hysteresis"],
+    ["refine", "--readings", "absolute", "--effects", "joint_compliance"],
+]
+
+
+def _fitted_while_appending(path: Path, capsys: Capsys, commands: list[list[str]]) -> None:
+    """Each command fits what it read, whatever comes meanwhile."""
+    with appending(path, 1, pause=0.02) as process:
+        for name, *words in commands:
+            before = checked(path)
+            with CampaignFile.open(path, read_only=True) as file:
+                there = file.n_readings
+            if name == "add":  # of a revision to which readings came it is told, and nothing else
+                told = refused(capsys, 2, name, path, *words)
+                assert "run hilcal identify again" in told
+                continue
+            ok(capsys, name, path, *words)
+            assert checked(path) > before
+            with CampaignFile.open(path, read_only=True) as file:
+                last = file.revisions()[-1]
+                assert there <= last.result_json["identify"]["n_readings"] < file.n_readings
+        assert process.poll() is None
+
+
+def test_commands_beside_a_run(run: Path, capsys: Capsys) -> None:
+    _fitted_while_appending(run, capsys, BESIDE)
+    time.sleep(0.05)
+    ok(capsys, "identify", run)
+    ok(capsys, "add", run, "hysteresis")  # nothing is appended any more
+    checked(run)
+
+
+@pytest.mark.slow
+def test_many_commands_at_random_moments_beside_a_run(fresh: bytes, tmp_path: Path, capsys) -> None:
+    rng = np.random.default_rng(8)
+    for k in range(60):
+        path = tmp_path / f"{k}.hilcal"
+        path.write_bytes(fresh)
+        with appending(path, k, pause=float(rng.choice([0.02, 0.2, 1.0]))):
+            for _ in range(3):
+                time.sleep(rng.uniform(0.0, 0.3))
+                name, *words = BESIDE[rng.choice([0, 2])]
+                ok(capsys, name, path, *words)
+                checked(path)
+
+
+# what programs before left behind
+
+
+def _mixed(path: Path) -> None:
+    """As programs before stored it: the count of what was fitted, the hash of what was there."""
+    with hc.Campaign.open(path) as o:
+        found = hc.fit(hc.baseline(o.cell, o.readings, "absolute"), o.readings, "absolute")
+        record = o.record(found)
+        more(path, 1)
+        record = replace(record, options={**record.options, STORED: o.file.data_hash()})
+        o.file.append_revision(record)
+    more(path, 2)
+
+
+def test_a_count_and_a_hash_of_two_moments_stop_nothing(run: Path, capsys: Capsys) -> None:
+    """Its hash proves the readings that it was fitted to, and those that came meanwhile."""
+    _mixed(run)
+    ok(capsys, "info", run)
+    assert "run hilcal identify again" in refused(capsys, 2, "compare", run)
+    ok(capsys, "identify", run)
+    ok(capsys, "compare", run)
+
+
+def _bad(path: Path, how: str) -> None:
+    """Make revision 2 of three a bad one."""
+    with hc.Campaign.open(path) as o:
+        found = hc.fit(hc.baseline(o.cell, o.readings, "absolute"), o.readings, "absolute")
+        for _ in range(3):
+            o.append(found)
+        o.accept(1)
+        o.accept(3)
+        wrong = replace(o.file.revision(2), parent=None)
+    wrong = replace(wrong, options={**wrong.options, STORED: "0" * 64})
+    with closing(sqlite3.connect(path, isolation_level=None)) as db, unguarded(db):
+        text = to_text(wrong) if how == "hash" else "{"
+        crc = rows.text_crc("2", text) if how == "hash" else 0
+        db.execute("UPDATE revisions SET content = ?, crc = ? WHERE id = 2", (text, crc))
+
+
+@pytest.mark.parametrize("how", ["hash", "damage"])
+def test_a_bad_revision_is_set_aside_and_no_reading(run: Path, capsys: Capsys, how: str) -> None:
+    _bad(run, how)
+    original = run.read_bytes()
+    for command in ("info", "identify", "compare", "export"):
+        words = ["--readings", str(run.with_suffix(".csv"))] if command == "export" else []
+        assert f"hilcal repair {run}" in refused(capsys, 2, command, run, *words)
+    told = refused(capsys, 2, "run", CELL, "-o", run, "--resume")  # it looks at no revision
+    assert "was not measured with `hilcal run`" in told
+    with CampaignFile.open(run, check_revisions=False) as file:
+        readings = file.readings()
+        more_hash = content_hash(readings)
+    told = ok(capsys, "repair", run, "--json").document
+    assert told["set_aside"] == [2, 3]
+    beside = Path(told["original"])
+    assert beside.read_bytes() == original
+    assert beside.parent == run.parent
+    with CampaignFile.open(run) as file:
+        assert file.data_hash() == more_hash
+        assert [r.number for r in file.revisions()] == [1]
+        assert file.accepted() == 1
+        with pytest.raises(InputError, match="append only"), schema.sqlite_errors(run):
+            file.connection.execute("DELETE FROM revisions")
+    assert from_text(to_text(_first(run)), 1) == _first(run)
+    ok(capsys, "compare", run)
+    ok(capsys, "identify", run)
+    assert checked(run) == 2
+    before = run.read_bytes()
+    assert ok(capsys, "repair", run, "--json").document["set_aside"] == []
+    assert run.read_bytes() == before
+    assert len(list(run.parent.iterdir())) == 2
+
+
+def _first(path: Path) -> object:
+    with CampaignFile.open(path, read_only=True) as file:
+        return file.revision(1)
+
+
+def test_a_second_repair_keeps_both_originals(run: Path, capsys: Capsys) -> None:
+    _bad(run, "damage")
+    first = Path(ok(capsys, "repair", run, "--json").document["original"])
+    kept = first.read_bytes()
+    with hc.Campaign.open(run) as o:
+        o.append(hc.fit(hc.baseline(o.cell, o.readings, "absolute"), o.readings, "absolute"))
+    _bad(run, "damage")
+    second = Path(ok(capsys, "repair", run, "--json").document["original"])
+    assert first != second
+    assert first.read_bytes() == kept

@@ -1,0 +1,149 @@
+"""A disk that fills up while a command writes: the old file is whole, or there is none."""
+
+import os
+import resource
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+import hilcal as hc
+from hilcal.config import load_config
+from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.covariance import COVERS, WHOLE
+from hilcal.data.table import write_table
+from tests.support.cli_cases import CELL, ok, rehearsal, run
+from tests.support.paths import ROOT
+
+OLD = "what was there"
+POINTS = "pose,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad\n" + "\n".join(
+    f"w{k},{0.1 + 0.01 * k},-1.2,1.4,-1.7,-1.5,0.2" for k in range(40)
+)
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a campaign of one revision, points and a table."""
+    folder = tmp_path_factory.mktemp("full")
+    readings = rehearsal("nothing").readings
+    path, config = folder / "run.hilcal", load_config(CELL).to_json()
+    with CampaignFile.create(path, config, str(CELL.parent), "made", more={COVERS: WHOLE}) as file:
+        file.append_readings(readings)
+    with hc.Campaign.open(path) as opened:
+        model = hc.baseline(opened.cell, opened.readings, "absolute")
+        opened.append(hc.fit(model, opened.readings, "absolute"))
+        opened.calibration().compensate(readings.states.q[:1])  # keeps machine code on the disk
+    (folder / "points.csv").write_text(POINTS)
+    write_table(readings, folder / "table.csv", WHOLE)
+    return folder
+
+
+@contextmanager
+def full_after(size: int) -> Iterator[None]:
+    """No file grows beyond a size: writes fail in the system, as on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+COMMANDS = [
+    *(
+        ("export", "run.hilcal", option, name)
+        for option, name in (
+            ("--readings", "r.csv"),
+            ("--readings", "r.parquet"),
+            ("--table", "t.csv"),
+            ("--cell", "C.toml"),
+            ("--parameters", "p.csv"),
+            ("--parameters", "p.json"),
+            ("--residuals", "e.csv"),
+            ("--calibration", "c.json"),
+        )
+    ),
+    *(
+        ("compensate", "run.hilcal", "points.csv", "--load", "10kg", "-o", name)
+        for name in ("o.script", "o.csv", "o.json")
+    ),
+    ("report", "run.hilcal", "-o", "story.html"),
+    ("import", "table.csv", "--preview", "-o", "m.toml"),
+    ("effects", "new", "mine", "-o", "mine.py"),
+]
+
+
+@pytest.mark.parametrize("size", [0, 200])
+def test_a_full_disk_leaves_no_half_file(
+    capsys, fitted: Path, monkeypatch: pytest.MonkeyPatch, size: int
+) -> None:
+    monkeypatch.chdir(fitted)
+    for command in COMMANDS:
+        output = Path(command[-1])
+        for old in (None, OLD):
+            output.unlink(missing_ok=True)
+            if old is not None:
+                output.write_text(old)
+            if command[0] == "effects" and old is not None:
+                continue
+            force = ["--force"] if old and command[0] in ("export", "import", "compensate") else []
+            here = {*Path().iterdir(), output}
+            with full_after(size):
+                ended = run(capsys, *command, *force)
+            assert ended.code == 2, (command, ended)
+            assert f"{output}: cannot be written (File too large)" in ended.err, command
+            assert (output.read_text() if output.exists() else None) == old, command
+            assert set(Path().iterdir()) <= here, command
+
+
+def test_a_link_stays_and_output_may_be_a_pipe(capsys, fitted: Path, monkeypatch) -> None:
+    monkeypatch.chdir(fitted)
+    real, link = Path("real.script"), Path("link.script")
+    real.write_text(OLD)
+    link.symlink_to(real)
+    ok(capsys, "compensate", "run.hilcal", "points.csv", "--load", "10kg", "-o", link, "--force")
+    assert link.is_symlink()
+    assert "movej" in real.read_text()
+    Path("link.csv").symlink_to("none.csv")
+    ok(capsys, "export", "run.hilcal", "--readings", "link.csv", "--force")
+    assert Path("none.csv").read_text().startswith("pose,")
+
+
+@pytest.mark.parametrize("redirected", [False, True])
+def test_standard_output_is_written_straight(fitted: Path, redirected: bool) -> None:
+    """`--preview -o /dev/stdout` would be no .toml: a link gives the name."""
+    link, out = fitted / f"out-{redirected}.toml", fitted / "redirected"
+    link.symlink_to("/dev/stdout")
+    command = [sys.executable, "-m", "hilcal", "import", "table.csv", "--preview"]
+    command += ["-o", str(link), "--force"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    with out.open("w") as stream:
+        ended = subprocess.run(
+            command,
+            cwd=fitted,
+            env=environment,
+            stdout=stream if redirected else subprocess.PIPE,
+            check=True,
+            text=True,
+        )
+    told = out.read_text() if redirected else ended.stdout
+    assert "proposed by `hilcal import --preview`" in told
+    assert link.is_symlink()
+
+
+def test_output_that_finds_no_room_is_one_line(fitted: Path) -> None:
+    with Path("/dev/full").open("w") as full:
+        ended = subprocess.run(
+            [sys.executable, "-m", "hilcal", "info", str(fitted / "run.hilcal")],
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            stdout=full,
+            stderr=subprocess.PIPE,
+            check=False,
+            text=True,
+        )
+    assert ended.returncode == 3
+    assert "cannot be written (No space left on device): make room" in ended.stderr
+    assert "Traceback" not in ended.stderr

@@ -1,0 +1,58 @@
+"""A process that measures into a campaign while others fit it.
+
+Its arguments are the file, a seed, and the longest pause between two readings in s. It appends
+until it is killed, and prints how many readings there are.
+"""
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from subprocess import PIPE, Popen
+
+import numpy as np
+
+from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.readings import Readings
+from tests.support.paths import ROOT
+
+
+def again(x: Readings, rng: np.random.Generator, cycle: int) -> Readings:
+    """One pose of those that are there, all its loads, measured again."""
+    rows = np.flatnonzero((x.pose == rng.choice(x.pose)) & (x.cycle == 0))
+    one = x[rows]
+    value = one.value + rng.normal(0.0, 1e-6, one.value.shape)
+    return replace(one, value=value, cycle=np.full(len(one), cycle))
+
+
+def append(path: Path, seed: int, pause: float) -> None:
+    """Append until the process is killed."""
+    rng = np.random.default_rng(seed)
+    with CampaignFile.open(path, read_only=True) as file:
+        x = file.readings()
+    first = int(x.cycle.max()) + 1
+    for cycle in range(first, first + 100_000):
+        with CampaignFile.open(path) as file:
+            print(file.append_readings(again(x, rng, cycle)), flush=True)
+        time.sleep(rng.uniform(0.0, pause))
+
+
+@contextmanager
+def appending(path: Path, seed: int, pause: float) -> Iterator["Popen[str]"]:
+    """A process that has begun to append, and is killed at the end."""
+    command = [sys.executable, "-m", "tests.support.appending", str(path), str(seed), str(pause)]
+    process = Popen(command, stdout=PIPE, stderr=PIPE, cwd=ROOT, text=True)
+    try:
+        assert process.stdout is not None
+        assert int(process.stdout.readline()) > 0
+        yield process
+        assert process.poll() is None, process.stderr and process.stderr.read()
+    finally:
+        process.kill()
+        process.communicate()
+
+
+if __name__ == "__main__":
+    append(Path(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3]))

@@ -1,0 +1,166 @@
+"""A campaign that somebody sent is an SQLite file made by anyone: nothing in it acts."""
+
+import json
+import os
+import sqlite3
+import time
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from hilcal.calibration.handover import urdf
+from hilcal.config import load_config
+from hilcal.data import rows
+from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.covariance import COVERS, WHOLE
+from hilcal.errors import InputError
+from hilcal.robot.catalogue import load_arm
+from tests.support.cli_cases import CELL, ok, refused, rehearsal
+from tests.support.cli_cases import run as run_of
+from tests.unit.data.test_campaign import REVISION
+
+Capsys = pytest.CaptureFixture[str]
+FOREVER = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT"
+FOREIGN = {
+    "swallows revisions": (
+        "CREATE TRIGGER x BEFORE INSERT ON revisions BEGIN SELECT RAISE(IGNORE); END"
+    ),
+    "never ends": f"CREATE TRIGGER x BEFORE INSERT ON meta BEGIN {FOREVER} max(i) FROM n; END",
+    "a view instead of a table": (
+        "ALTER TABLE readings RENAME TO r;"
+        f"CREATE VIEW readings AS {FOREVER} i AS id, 0 AS pose, 0 AS load, 0 AS cycle,"
+        " x'' AS record, 0 AS crc FROM n"
+    ),
+    "another view": f"CREATE VIEW v AS {FOREVER} max(i) FROM n",
+    "another table": "CREATE TABLE notes (text TEXT)",
+    "a generated column": "ALTER TABLE loads ADD COLUMN x GENERATED ALWAYS AS (zeroblob(9))",
+    "another index": "CREATE INDEX i ON readings (abs(cycle))",
+    "another check": (
+        "DROP TABLE events;"
+        "CREATE TABLE events (id INTEGER PRIMARY KEY, content TEXT NOT NULL,"
+        " crc INTEGER NOT NULL CHECK (randomblob(9) IS NOT NULL))"
+    ),
+    "a virtual table": "CREATE VIRTUAL TABLE v USING fts5(text)",
+    "statistics": "ANALYZE",
+    "a guard gone": "DROP TRIGGER readings_no_update",
+    "a guard that guards nothing": (
+        "DROP TRIGGER meta_no_update;"
+        "CREATE TRIGGER meta_no_update BEFORE UPDATE ON meta BEGIN SELECT 1; END"
+    ),
+    "a write-ahead log": "PRAGMA journal_mode = WAL",
+}
+
+
+def make(path: Path, config: str | None = None, base: str = "", robot: str | None = None) -> Path:
+    told = {COVERS: WHOLE} | ({} if robot is None else {"robot_file": robot})
+    config = load_config(CELL).to_json() if config is None else config
+    with CampaignFile.create(path, config, base, "made", more=told) as file:
+        file.append_readings(rehearsal("nothing", poses=8).readings)
+    return path
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    return make(tmp_path_factory.mktemp("plain") / "run.hilcal").read_bytes()
+
+
+@pytest.fixture
+def run(plain: bytes, tmp_path: Path) -> Path:
+    path = tmp_path / "run.hilcal"
+    path.write_bytes(plain)
+    return path
+
+
+@pytest.mark.parametrize("what", FOREIGN)
+def test_what_no_hilcal_wrote_is_refused(what: str, run: Path, capsys: Capsys) -> None:
+    with closing(sqlite3.connect(run)) as db:
+        db.executescript(FOREIGN[what])
+    before, begun = run.read_bytes(), time.monotonic()
+    for command in ("info", "identify", "diagnose"):
+        told = refused(capsys, 2, command, run)
+        assert str(run) in told
+        assert "hilcal" in told
+    assert time.monotonic() - begun < 10.0
+    assert run.read_bytes() == before
+
+
+def test_what_the_tables_hold_is_not_part_of_their_names(run: Path) -> None:
+    """A name of an object that would write on a terminal is told as it is spelled."""
+    with closing(sqlite3.connect(run)) as db:
+        db.execute('CREATE TABLE "x\x1b[2J\ny" (a)')
+    with pytest.raises(InputError) as told:
+        CampaignFile.open(run)
+    assert str(told.value).isprintable()
+
+
+@pytest.mark.parametrize("what", ["revisions", "meta", "readings", "poses", "events", "details"])
+def test_nothing_is_said_to_be_stored_that_is_not(what: str, run: Path) -> None:
+    """Whatever swallows a row, also after the file was opened, is noticed."""
+    with CampaignFile.open(run) as file:
+        count, x, width = file.n_readings, file.readings(), {"events": 3, "details": 4}
+        new = replace(x, pose_names=tuple(f"{name} again" for name in x.pose_names))
+        file.connection.execute(
+            f"CREATE TEMP TRIGGER x BEFORE INSERT ON main.{what} BEGIN SELECT RAISE(IGNORE); END"
+        )
+
+        def store() -> None:
+            if what == "revisions":
+                file.append_revision(REVISION)
+            elif what == "meta":
+                file.accept(None)
+            elif what in ("events", "details"):
+                with file.transaction() as connection:
+                    rows.insert(connection, what, [(1, *("a", "b", 0)[4 - width[what] :])])
+            else:
+                file.append_readings(x if what == "readings" else new)
+
+        with pytest.raises(InputError, match="not stored"):
+            store()
+        assert file.n_readings == count
+
+
+def test_a_pipe_in_the_place_of_a_campaign_is_not_waited_for(
+    tmp_path: Path, capsys: Capsys
+) -> None:
+    os.mkfifo(tmp_path / "x.hilcal")
+    assert "a pipe" in refused(capsys, 2, "info", tmp_path / "x.hilcal")
+    assert run_of(capsys, "fleet", tmp_path, "-o", tmp_path / "p.json", "--workers", "1").code == 4
+
+
+# the robot
+
+
+def own_robot(tmp_path: Path, model: str, robot: str | None = None) -> Path:
+    config = json.loads(load_config(CELL).to_json())
+    config["robot"]["model"] = model
+    return make(tmp_path / "run.hilcal", json.dumps(config), str(tmp_path / "gone"), robot)
+
+
+def test_no_robot_is_read_that_is_not_in_the_campaign(tmp_path: Path, capsys: Capsys) -> None:
+    """A pipe at its place would never end; its content would be told."""
+    pipe = tmp_path / "pipe.urdf"
+    os.mkfifo(pipe)
+    for name in (str(pipe), "../pipe.urdf", "/etc/hosts.urdf", "//server/share/x.urdf", "a.toml"):
+        path = own_robot(tmp_path, name)
+        for command in ("identify", "compare"):
+            told = refused(capsys, 2, command, path)
+            assert "hilcal repair" in told
+            assert "--robot" in told
+        path.unlink()
+
+
+def test_the_user_gives_the_robot_of_an_old_campaign(tmp_path: Path, capsys: Capsys) -> None:
+    path = own_robot(tmp_path, "own.urdf")
+    mine, other = tmp_path / "mine.urdf", tmp_path / "other.urdf"
+    mine.write_text(urdf(load_arm("ur10e")))
+    other.write_text("<robot/>")
+    before = path.read_bytes()
+    refused(capsys, 2, "repair", path, "--robot", other)
+    refused(capsys, 2, "repair", path, "--robot", tmp_path / "none.urdf")
+    assert path.read_bytes() == before
+    told = ok(capsys, "repair", path, "--robot", mine, "--json").document
+    assert told["robot"] == str(mine)
+    ok(capsys, "identify", path)
+    assert "is in it" in refused(capsys, 2, "repair", path, "--robot", mine)

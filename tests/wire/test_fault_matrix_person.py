@@ -1,0 +1,132 @@
+"""A person beside the arm, another program, and instruments that repeat themselves, in a campaign.
+
+As for the arm: one campaign on one simulated cell, and every run meets something. What a person
+can put right is asked for and put right, and the run goes on; all else ends it with one line.
+"""
+
+import re
+import socket
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.support.campaign_cases import (
+    Fault,
+    act,
+    begin,
+    cell,
+    each,
+    failed,
+    finish,
+    meets,
+    nothing,
+    nothing_goes_on,
+    path,
+    right,
+)
+from tests.support.campaign_run import Run
+from tests.support.campaign_site import Site
+
+__all__ = ["cell", "nothing_goes_on", "path"]  # fixtures
+
+SCRIPT_PORT = 30003
+HAND = [20.0, 35.0, -44.0, 0.0, 0.0, 0.0]
+NOBODY = [0.0] * 6
+MORE_READINGS = 8
+
+
+def somebody_jogs(s: Site) -> None:
+    """Move the arm by hand, a little, from where it is."""
+    q = s.ask("arm", "state")["q"]
+    s.ask("arm", "jog", q=[q[0] + 0.1, *q[1:5], q[5] + 0.2])
+
+
+def another_program(s: Site) -> None:
+    """Send the arm elsewhere by the script port, as any program of the network may."""
+    q = np.array(s.ask("arm", "state")["q"]) + np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.5])
+    text = f"def other():\n  movej([{', '.join(map(str, q))}], a=1.4, v=1.0)\nend\n"
+    assert s.config.robot.host is not None
+    with socket.create_connection((s.config.robot.host, SCRIPT_PORT), timeout=5.0) as line:
+        line.sendall(text.encode())
+
+
+def switch(name: str, device: str, op: str, *says: str, fast: bool = False) -> Fault:
+    return Fault(name, act(device, op, on=True), act(device, op, on=False), says, fast=fast)
+
+
+LEANING = Fault(
+    "somebody leans on the tool",
+    act("world", "push", wrench=HAND),
+    act("world", "push", wrench=NOBODY),
+    ("asked 3 times", "touch the tool|hangs|pulls|felt"),
+)
+FOREIGN = "another program|left the straight way|did not take|by its watchdog"
+MOTION = (
+    switch("joint angles stand still", "arm", "freeze", "stood still|its angle is old", fast=True),
+    Fault("another program", another_program, nothing, (FOREIGN,)),
+    LEANING,
+)
+REST = (
+    Fault("jogged", somebody_jogs, nothing, ("moved it|has commanded it",)),
+    Fault("another program", another_program, nothing, (FOREIGN,), fast=True),
+    switch("tracker stands still", "tracker", "freeze", "same to the last digit", fast=True),
+    switch("another reflector", "tracker", "stray", "follows a reflector|sees its target"),
+    switch("force sensor stands still", "force", "freeze", "same to the last digit"),
+    LEANING,
+)
+
+
+@each(MOTION)
+def test_in_motion(fault: Fault, cell: Site, path: Path) -> None:
+    meets(fault, cell, path, moving=True)
+
+
+@each(REST)
+def test_at_rest(fault: Fault, cell: Site, path: Path) -> None:
+    meets(fault, cell, path, moving=False)
+
+
+def loaded(run: Run) -> str:
+    """Wait for a reading under a load; returns its name."""
+    found: list[str] = []
+
+    def under_load() -> bool:
+        name = run.site.ask("world", "state")["load"]
+        found[:] = [] if name is None else [name]
+        now = run.words.rstrip().rpartition("\n")[2]
+        return bool(found) and "measuring" in now and found[0] in now
+
+    run.wait_until(under_load, "a reading under a load")
+    return found[0]
+
+
+def test_a_load_that_falls_off_is_asked_for_again_and_no_reading_is_without_it(
+    cell: Site, path: Path
+) -> None:
+    run, name = begin(cell, path, loaded)
+    cell.ask("world", "hang", name=None)
+    run.wait_until(lambda: "touch the tool" in run.words, "words about the load")
+    run.wait_until(lambda: cell.ask("world", "state")["load"] == name, "the load again")
+    run.next_reading("the load that was hung again")
+    run.interrupt()
+    failed(run, 130)
+    right(cell, path)
+
+
+@pytest.mark.slow
+def test_an_arm_jogged_before_a_campaign_goes_on_is_asked_for(cell: Site, path: Path) -> None:
+    run, _ = begin(cell, path, Run.measuring)
+    run.kill()
+    run.end()
+    somebody_jogs(cell)
+    again = Run(cell, path)
+    again.wait_until(lambda: "does not stand where it was left" in again.words, "a question")
+    again.interrupt()
+    again.end()
+
+
+@pytest.mark.slow
+def test_the_campaign_is_finished(cell: Site, path: Path) -> None:
+    finish(cell, path)
+    assert re.search("doubted", path.with_suffix(".hilcal").read_bytes().decode("latin-1"))
