@@ -41,6 +41,10 @@ PARAMETERS = 4000
 """Parameters of a model that a file holds."""
 NUMBERS = 1 << 26
 """Numbers of an array that a file makes."""
+SHARED = 1 << 24
+"""Numbers of the joint covariances of readings that share an error, (L m)² for L of m elements."""
+JUDGED = 150_000
+"""Readings, times elements, that are diagnosed or refined together."""
 MEMORY = 3 << 28
 """Bytes that reading one file may take beyond what the process has."""
 STREAM = "a longer series is fitted as a stream (docs/how-to/fit-a-stream.md)"
@@ -116,6 +120,26 @@ def check_numbers(what: str, count: int) -> None:
     """Refuse an array of so many numbers; raises as `check_size` does."""
     if count > NUMBERS:
         raise InputError(f"{what}: {count:.2g} numbers; valid: at most {NUMBERS:.2g}")
+
+
+def check_judged(readings: int, elements: int) -> None:
+    """Refuse to diagnose so many readings; raises as `check_size` does."""
+    if readings * elements > JUDGED:
+        raise InputError(
+            f"{readings} readings of {elements} elements; valid: at most {JUDGED // elements} to "
+            f"diagnose or refine: import fewer, or means of repeats; {STREAM}"
+        )
+
+
+def check_shared(shared: int, elements: int, groups: int) -> None:
+    """Refuse so many readings that share an error, in each group; raises as `check_size` does."""
+    if groups * (shared * elements) ** 2 > SHARED:
+        raise InputError(
+            f"{shared} loaded readings share one unloaded reading or arrival"
+            f"{f', {groups} times' if groups > 1 else ''}; valid: at most "
+            f"{int((SHARED / groups) ** 0.5) // elements} of {elements} elements: measure unloaded "
+            "again between them (another cycle), or fit absolute readings (--readings absolute)"
+        )
 
 
 def read_bytes(path: Path, most: int) -> bytes:

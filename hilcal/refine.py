@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+from hilcal import limits
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode
 from hilcal.diagnose.diagnosis import Diagnosis, History, Verdict
@@ -113,7 +114,11 @@ def refine(
             resemble what is missing are added, and where the misfit is taken for the arm's scatter;
             the law is then added and judged like any effect.
         seen: takes each step as soon as it is judged; of the last one the verdict can still change.
+
+    Raises:
+        InputError: too many readings.
     """
+    limits.check_judged(len(readings), readings.m)
     say(f"fitting {' + '.join(model.names) or 'the bare arm'}")
     readings = with_prior_scatter(model, readings)
     first = fit(model, readings, mode)

@@ -19,6 +19,7 @@ from typing import Literal
 
 import numpy as np
 
+from hilcal import limits
 from hilcal.data.reading_groups import arrival_groups, deflection_groups, has_unloaded
 from hilcal.data.readings import Readings
 from hilcal.errors import InputError
@@ -262,6 +263,7 @@ def whitening(readings: Readings, mode: Mode, scaling: Scaling = "gc") -> Whiten
     rank = 0
     groups = deflection_groups if mode == "deflection" else arrival_groups
     for loaded, reference, weights in groups(readings):
+        limits.check_shared(loaded.shape[1], m, len(loaded))
         covariance = _group_covariance(readings, loaded, reference, weights)
         factor = inverse_root(covariance, scaling)
         rank += int(np.count_nonzero(factor.any(axis=-1)))

@@ -41,6 +41,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from hilcal import limits
 from hilcal.data.arm_scatter import ArmScatter
 from hilcal.diagnose.arm_repeatability import instrument_instead, of_repeatability_size
 from hilcal.diagnose.diagnosis import Diagnosis, History, Reason
@@ -79,8 +80,9 @@ def diagnose(
         say: takes progress, one line each.
 
     Raises:
-        InputError: for a fit whose residual is not whitened.
+        InputError: for a fit whose residual is not whitened, or of too many readings.
     """
+    limits.check_judged(len(fit.readings), fit.readings.m)
     return judge(Evidence(fit, say=say), history)
 
 

@@ -5,10 +5,8 @@ import numpy as np
 from hilcal.types import Floats, Ints
 
 _MOST = 2_000_000
-"""Pairs that are compared one by one; a choice. More are sought in a tree, which takes as long to
-load as a thousand poses to group."""
-_DENSE = 20_000_000
-"""Near pairs from which on not all of them are listed, a third of a gigabyte; a choice."""
+"""Pairs that are compared one by one; a choice. More are sought cell by cell, by a tree
+that takes as long to load as a thousand poses to group."""
 
 
 def connected(a: Ints, b: Ints, count: int) -> Ints:
@@ -35,29 +33,50 @@ def _by_cells(points: Floats, distance: float) -> tuple[Ints, Ints]:
     Points of one cell of half the distance are joined in a row; of two cells that are not yet
     joined one near pair is sought.
     """
-    from scipy.spatial import cKDTree
+    from scipy.spatial import cKDTree  # slow to import
 
     place = np.floor(points / (distance / 2)) if distance else points
     cells, of = np.unique(place, axis=0, return_inverse=True)
-    order = np.argsort(of.reshape(-1), kind="stable")
-    breaks = np.flatnonzero(np.diff(of.reshape(-1)[order])) + 1
-    members = np.split(order, breaks)
-    inside = np.ones(max(len(order) - 1, 0), dtype=bool)
-    inside[breaks - 1] = False
-    joined = [np.stack([order[:-1][inside], order[1:][inside]], axis=1)]
-    group = np.arange(len(cells))
-    for i, j in cKDTree(cells).query_pairs(3.0 if distance else 0.0, p=np.inf):
-        if group[i] == group[j]:
-            continue
-        few, many = sorted((members[i], members[j]), key=len)
-        bound = float(np.nextafter(distance, np.inf))
-        far, at = cKDTree(points[many]).query(points[few], p=np.inf, distance_upper_bound=bound)
-        k = int(np.argmin(far))
-        if far[k] <= distance:
-            joined.append(np.array([[few[k], many[at[k]]]]))
-            group[group == group[j]] = group[i]
+    of = of.reshape(-1)
+    order = np.argsort(of, kind="stable")
+    alone = np.diff(of[order], append=-1) != 0
+    joined = [np.stack([order[:-1], order[1:]], axis=1)[~alone[:-1]]]
+    # Equal points are one: a tree does not divide them.
+    first = np.sort(np.unique(points, axis=0, return_index=True)[1])
+    if 2 * len(cells) > len(first):  # hardly any are in one cell
+        joined.append(first[cKDTree(points[first]).query_pairs(distance, np.inf, 0, "ndarray")])
+        pairs = np.concatenate(joined)
+        return pairs[:, 0], pairs[:, 1]
+    members = [first[rows] for rows in _split(of[first])]
+    tree, up = cKDTree(cells), np.arange(len(cells))
+
+    def group(k: Ints) -> Ints:
+        while np.any(up[k] != k):
+            up[k] = k = up[up[k]]
+        return k
+
+    for i in range(len(cells)):
+        near = np.array(tree.query_ball_point(cells[i], 3.0 if distance else 0.0, p=np.inf))
+        for j in near[group(near) != group(np.array([i]))].tolist():
+            own, other = group(np.array([i, j])).tolist()
+            if own == other:
+                continue
+            few, many = sorted((members[i], members[j]), key=len)
+            far, at = cKDTree(points[many]).query(
+                points[few], p=np.inf, distance_upper_bound=float(np.nextafter(distance, np.inf))
+            )
+            k = int(np.argmin(far))
+            if far[k] <= distance:
+                joined.append(np.array([[few[k], many[at[k]]]]))
+                up[max(own, other)] = min(own, other)
     pairs = np.concatenate(joined)
     return pairs[:, 0], pairs[:, 1]
+
+
+def _split(group: Ints) -> list[Ints]:
+    """Return the members of each group."""
+    order = np.argsort(group, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(group[order])) + 1)
 
 
 def groups_within(points: Floats, distance: float) -> Ints:
@@ -69,7 +88,7 @@ def groups_within(points: Floats, distance: float) -> Ints:
 
 
 def _near(points: Floats, distance: float) -> tuple[Ints, Ints]:
-    """Return the pairs (K,) and (K,) of points that differ by at most `distance`."""
+    """Return pairs (K,) and (K,) of points within `distance`, as many as join all that are."""
     if not points.size:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     along = points[:, np.argmax(np.ptp(points, axis=0))]
@@ -78,13 +97,7 @@ def _near(points: Floats, distance: float) -> tuple[Ints, Ints]:
     reach = sorted_along + distance * (1.0 + 1e-9) + np.spacing(np.abs(sorted_along))
     follow = np.searchsorted(sorted_along, reach, side="right") - np.arange(len(points)) - 1
     if follow.sum() > _MOST:
-        from scipy.spatial import cKDTree  # slow to import
-
-        tree = cKDTree(points)
-        if tree.count_neighbors(tree, distance, p=np.inf) > _DENSE:
-            return _by_cells(points, distance)
-        pairs = tree.query_pairs(distance, p=np.inf, output_type="ndarray")
-        return pairs[:, 0], pairs[:, 1]
+        return _by_cells(points, distance)
     first = np.repeat(np.arange(len(points)), follow)
     second = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(follow) - follow, follow)
     a, b = order[first], order[second]
