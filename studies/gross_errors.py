@@ -12,7 +12,7 @@ from hilcal.identify.baseline import baseline
 from hilcal.identify.gross_errors import gross_errors
 from hilcal.refine import refine
 from hilcal.types import Ints
-from studies.study_cases import effects_shown, study_case
+from studies.study_cases import study_case
 
 ARMS = ("ur3", "ur3e", "ur5", "ur5e", "ur10", "ur10e", "ur16e", "ur20", "ur30")
 POSES = (4, 6, 10, 20, 30)
@@ -22,8 +22,20 @@ STRENGTHS = (3.0, 10.0, 20.0)
 
 
 HIDDEN: dict[Mode, tuple[str, ...]] = {
-    "absolute": ("encoder_offset", "transmission_error", "link_geometry", "hysteresis", "thermal_growth"),
-    "deflection": ("base_compliance", "joint_tilt_compliance", "hysteresis", "backlash", "tracker_drift"),
+    "absolute": (
+        "encoder_offset",
+        "transmission_error",
+        "link_geometry",
+        "hysteresis",
+        "thermal_growth",
+    ),
+    "deflection": (
+        "base_compliance",
+        "joint_tilt_compliance",
+        "hysteresis",
+        "backlash",
+        "tracker_drift",
+    ),
 }
 
 
@@ -53,6 +65,7 @@ class Counted:
         wrong: of these with a gross error.
         found: of these set aside.
         false: good readings that were listed as gross errors.
+        said: whether it is said that too many readings disagree.
         outcome: the verdict, "refused" where the program declined to fit or judge.
         what: arm, number of poses, what was hidden, and the message of a refusal.
     """
@@ -63,20 +76,22 @@ class Counted:
     wrong: int
     found: int
     false: int
+    said: bool
     outcome: str
     what: str
 
 
-def spoil(readings: Readings, share: float, size: float, rng: np.random.Generator) -> tuple[
-    Readings, Ints
-]:
+def spoil(
+    readings: Readings, share: float, size: float, rng: np.random.Generator
+) -> tuple[Readings, Ints]:
     """Shift a share of the readings, every third in one coordinate alone, else in any direction."""
     rows = rng.choice(len(readings), round(share * len(readings)), replace=False)
     shift = rng.normal(size=(len(rows), 3))
     one = rng.random(len(rows)) < 1 / 3
     shift[one] = np.eye(3)[rng.integers(3, size=one.sum())] * rng.choice([-1, 1], (one.sum(), 1))
+    sizes = size * 1.25 ** rng.uniform(-1, 1, (len(rows), 1))
     value = readings.value.copy()
-    value[rows, :3] += size * shift / np.linalg.norm(shift, axis=1, keepdims=True)
+    value[rows, :3] += sizes * shift / np.linalg.norm(shift, axis=1, keepdims=True)
     return replace(readings, value=value), rows
 
 
@@ -93,7 +108,8 @@ def count(config: CellConfig, asked: Spoilt) -> Counted:
     try:
         found = refine(baseline(case.cell, readings, mode), readings, mode)
     except (InputError, CannotAnswerError) as error:
-        return Counted(asked, mode, len(readings), len(wrong), 0, 0, "refused", f"{what}: {error}")
+        what = f"{what}: {error}"
+        return Counted(asked, mode, len(readings), len(wrong), 0, 0, False, "refused", what)
     listed = {g.row for g in gross_errors(found.fit)}
     return Counted(
         asked,
@@ -102,6 +118,7 @@ def count(config: CellConfig, asked: Spoilt) -> Counted:
         len(wrong),
         int(found.fit.outlier[wrong].sum()),
         len(listed.difference(wrong.tolist())),
+        found.fit.disagreement is not None,
         found.verdict,
         what,
     )

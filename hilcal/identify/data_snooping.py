@@ -17,10 +17,11 @@ from hilcal.data.reading_groups import deflection_groups
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode, inverse_root
 from hilcal.identify.gauss_newton import Solution
+from hilcal.identify.off_alike import off_alike
 from hilcal.identify.outliers import MISFIT, bulk, limit
 from hilcal.identify.priors import scales_of
 from hilcal.identify.reading_model import ReadingModel
-from hilcal.identify.robust_start import MOST, nearest, robust_start, trusted
+from hilcal.identify.robust_start import MOST, nearest, robust_start, variance
 from hilcal.identify.smooth_nuisance import smooth_nuisance_columns
 from hilcal.model import Model, Prediction
 from hilcal.regression.distributions import binom, chi2
@@ -35,19 +36,17 @@ ACCIDENT = 1e-3
 cause is a misfit; a choice, the tests of effects on unloaded readings confirm it."""
 CORE = 0.99
 """Probability of the χ² quantile up to which readings join the robust start; a choice."""
+MOST_COLUMNS = 200
+"""Most parameters that are fitted anew with each choice of readings; where there are more, those
+with a prior are held. A choice by timing: hundreds of harmonics hardly depend on one reading."""
+ROUGH_M = 1e-3
+"""Scatter of most readings about model and smooth functions, m, from which on they disagree; a
+choice: more than any arm leaves beside its geometry."""
 ROUNDS = 20
 """Most rounds in which readings join and leave; a choice."""
 EXACT = 1e-6
 """Share of a group's mean covariance that each of its readings has at least; a choice: an unloaded
 reading that is stated to be exact is so all the same."""
-ALIKE = 0.25
-"""Largest difference of two shifts that are the same one, as a share of the larger; a choice."""
-NEXT = 2
-"""Readings beyond that are compared among those that are off: others may lie between; a choice."""
-RUN = 3
-"""Fewest readings in a row that are off alike; a choice."""
-ACCIDENTAL = 0.05
-"""Share of the readings up to which those that are off alike are set aside; a choice."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,7 +107,7 @@ class Snooping:
         at, used = robust_start(_linearised(self, self.y), rng)
         of = at.linear
         d2, centre = of.near(of.fitted(used)[0])
-        misfit = _scale(of, d2, centre)
+        misfit = variance(of, d2, centre)
         of = at.with_nuisance(misfit)
         for _ in range(ROUNDS):
             t2, centre = _tested(of, used)
@@ -116,7 +115,7 @@ class Snooping:
             if np.array_equal(now, used):
                 break
             used = now
-        core = float(chi2.ppf(CORE, of.m)) * _scale(of, t2, centre)
+        core = float(chi2.ppf(CORE, of.m)) * variance(of, t2, centre)
         return self._screened(of, (t2 <= core) | centre, misfit)
 
     def _all_noise(self, every: Bools) -> bool:
@@ -142,30 +141,28 @@ class Snooping:
                 break
             used = now
         agree = used | ~of.tested
-        off = np.flatnonzero(~agree)
+        every, off = np.ones(len(agree), dtype=np.bool_), np.flatnonzero(~agree)
         shared = self.readings.unloaded & of.tested & (of.group >= 0)
         unloaded = int(np.count_nonzero(shared[off]))
         share = float(np.mean(shared[of.tested]))
-        every = np.ones(len(agree), dtype=np.bool_)
         if unloaded and binom.sf(unloaded - 1, len(off), share) < ACCIDENT:
             return Screened(every, every, misfit, None)
-        if len(off) > MOST * count:
+        size = np.sqrt(scale * np.mean(np.trace(self.readings.covariance[:, :3, :3], 0, 1, 2)))
+        if len(off) > MOST * count or (scale > MISFIT[1] and size > ROUGH_M):
+            off = np.flatnonzero((t2 > limit(of.m, count)) & of.tested)
             return Screened(every, every, misfit, Disagreement("many", off))
-        alike = self._alike(of, used, off)
-        if len(alike) <= ACCIDENTAL * count:
+        if not len(off):
+            return Screened(agree, every, misfit, None)
+        white = of.residuals(used)[off, :, None]
+        shift = (np.linalg.pinv(of.root[off]) @ white)[:, :3, 0]
+        axes = self.model.predict(self.readings.states[off], self.solution.theta).observation
+        alike = off_alike(self.readings, of.tested, off, shift, axes.rotation)
+        if not len(alike):
             return Screened(agree, self._fittable(of, agree), misfit, None)
         kept = agree.copy()
         kept[alike] = True
         found = Disagreement("alike", alike)
         return Screened(agree, self._fittable(of, kept), misfit, found)
-
-    def _alike(self, of: ReadingModel, used: Bools, off: Ints) -> Ints:
-        """Rows of those that are off, (F,), in a row by the same shift of sensor or target."""
-        white = of.residuals(used)[off, :, None]
-        shift = (np.linalg.pinv(of.root[off]) @ white)[:, :3, 0]
-        there = self.model.predict(self.readings.states[off], self.solution.theta)
-        turned = (shift[:, None] @ there.observation.rotation)[:, 0]
-        return off[in_a_row(shift) | in_a_row(turned)]
 
     def _fittable(self, of: ReadingModel, agree: Bools) -> Bools:
         """(N,) readings without deflections of which the loaded or all unloaded ones are off."""
@@ -179,19 +176,6 @@ class Snooping:
         gone = of.members[lost]
         used[gone[gone >= 0]] = False
         return used
-
-
-def in_a_row(shift: Floats) -> Bools:
-    """(F,) which shifts (F, 3) are the same as others near them, `RUN` together."""
-    count = len(shift)
-    first = np.arange(count)
-    size = np.linalg.norm(shift, axis=1)
-    for ahead in range(1, NEXT + 1):
-        for k in range(count - ahead):
-            apart = np.linalg.norm(shift[k + ahead] - shift[k])
-            if apart <= ALIKE * max(size[k], size[k + ahead]):
-                first[first == first[k + ahead]] = first[k]
-    return np.asarray(np.bincount(first, minlength=count)[first] >= RUN)
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,9 +224,14 @@ def _linearised(of: Snooping, y: Floats) -> _Linearised:
     root = inverse_root(_covariance(readings, members))
     off = _off(readings, prediction, members)
     live = np.flatnonzero(s.prior > 0)
+    if len(live) > MOST_COLUMNS:
+        live = np.flatnonzero(np.isinf(s.prior))
     scale = s.space.scales(scales_of(model))[live]
-    jacobian = model.jacobian(prediction, theta, readings.m).reshape(-1, model.size)
-    columns = s.space.columns(jacobian)[:, live] * scale
+    if len(s.space.index):
+        jacobian = model.jacobian(prediction, theta, readings.m).reshape(-1, model.size)
+        columns = s.space.columns(jacobian)[:, live] * scale
+    else:
+        columns = model.jacobian(prediction, theta, readings.m, live) * scale
     precision = s.beta * (scale / s.prior[live]) ** 2
     linear = ReadingModel(
         residual=(root @ off[:, :, None])[:, :, 0],
@@ -285,19 +274,15 @@ def _off(readings: Readings, prediction: Prediction, members: Ints) -> Floats:
     position = readings.value[:, :3] - o.position
     if readings.m == 3:
         return position
+    read = se3.rotation(readings.value[:, 3:])
+    if not len(members):
+        turn = se3.rotation_vector(read @ o.rotation.swapaxes(1, 2))
+        return np.concatenate([position, turn], axis=1)
     first = np.arange(len(readings))
     g, s = np.nonzero(members >= 0)
     first[members[g, s]] = members[g, 0]
-
-    def relative(r: Floats) -> Floats:
-        return se3.rotation_vector(r @ r[first].swapaxes(1, 2))
-
-    read = se3.rotation(readings.value[:, 3:])
-    if len(members):
-        turn = relative(read) - relative(o.rotation)
-    else:
-        turn = se3.rotation_vector(read @ o.rotation.swapaxes(1, 2))
-    return np.concatenate([position, turn], axis=1)
+    turn = [se3.rotation_vector(r @ r[first].swapaxes(1, 2)) for r in (read, o.rotation)]
+    return np.concatenate([position, turn[0] - turn[1]], axis=1)
 
 
 def _tested(of: ReadingModel, used: Bools) -> tuple[Floats, Bools]:
@@ -306,10 +291,3 @@ def _tested(of: ReadingModel, used: Bools) -> tuple[Floats, Bools]:
         return of.distances(used), np.zeros_like(used)
     _, centre = of.near(of.fitted(used)[0])
     return of.distances(of.with_lone_centres(used, centre)), centre
-
-
-def _scale(of: ReadingModel, d2: Floats, centre: Bools) -> float:
-    """Variance of the readings by the median of the h least of their squared distances (N,)."""
-    others = np.sort(d2[of.tested & ~centre])
-    half = (trusted(of, len(others)) + 1) // 2
-    return float(others[half - 1] / chi2.ppf(half / (len(others) + 1), of.m))

@@ -208,9 +208,7 @@ def fit(
             used, disagree, solved = _set_aside(model, readings, mode, begun, None)
     if scaling != "gc":
         solved = _solve(model, readings[used], mode, scaling, start, prior)
-    return replace(
-        _assemble(model, readings, ~used, mode, scaling, *solved), disagreement=disagree
-    )
+    return replace(_assemble(model, readings, ~used, mode, scaling, *solved), disagreement=disagree)
 
 
 def _same_drift(before: Floats | None, after: Floats) -> bool:

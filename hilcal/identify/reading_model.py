@@ -172,7 +172,7 @@ class ReadingModel:
         return SINGULAR * np.einsum("nik,nik->k", self.columns, self.columns) + 1e-300
 
     def _offsets(self, used: Bools) -> Floats:
-        """(N, m, K + 1) whitened offsets of columns and residual by the used readings of a group."""
+        """(N, m, K + 1) whitened offsets of columns and residual that the used readings have."""
         weight, own = used[:, None, None], self.group >= 0
         offset = self._offset_covariance(used) @ self._summed(self._parts * weight)
         out = np.zeros_like(self._both)

@@ -17,6 +17,7 @@ from typing import Protocol, Self, TypeVar
 import numpy as np
 
 from hilcal.identify.reading_model import ReadingModel
+from hilcal.regression.distributions import chi2
 from hilcal.types import Bools, Floats, Ints
 
 MOST = 0.45
@@ -28,7 +29,7 @@ FEW, BEST, LAST = 300, 20, 20
 """Readings that subsets are drawn from, the choice of the source; best subsets that are followed to
 the end, and steps at most; choices."""
 ANEW = 6
-"""Most linearisations; a choice: the first is where gross errors may have led, the second is not."""
+"""Most linearisations; a choice: gross errors may have led the first one far off."""
 
 
 class Linearised(Protocol):
@@ -62,15 +63,22 @@ def nearest(of: ReadingModel, d2: Floats, centre: Bools) -> Bools:
     return _nearest(of, d2, centre)[0]
 
 
-def trusted(of: ReadingModel, n: int) -> int:
+def _trusted(of: ReadingModel, n: int) -> int:
     """Return h, how many of n readings that are no centres."""
     wrong = int(MOST * np.count_nonzero(of.tested))
     return min(max(n - wrong, -(-n // 3), of.enough + 2), n)
 
 
+def variance(of: ReadingModel, d2: Floats, centre: Bools) -> float:
+    """Variance of good readings by the median of the h least squared distances (N,)."""
+    others = np.sort(d2[of.tested & ~centre])
+    half = (_trusted(of, len(others)) + 1) // 2
+    return float(others[half - 1] / chi2.ppf(half / (len(others) + 1), of.m))
+
+
 def _nearest(of: ReadingModel, d2: Floats, centre: Bools) -> tuple[Bools, float]:
     others = np.flatnonzero(of.tested & ~centre)
-    h = trusted(of, len(others))
+    h = _trusted(of, len(others))
     chosen = others[np.argpartition(d2[others], h - 1)[:h]] if h else others
     used = centre.copy()
     used[chosen] = True

@@ -20,7 +20,9 @@ def smooth_nuisance_columns(
 ) -> Floats:
     """Columns (N, m, P); only the simplest ones where the `rank` of the readings is small."""
     situation, s = prediction.situation, readings.states
-    moves = motion(model.cell, prediction.observation, situation.chain, prediction.deviation, readings.m)
+    moves = motion(
+        model.cell, prediction.observation, situation.chain, prediction.deviation, readings.m
+    )
     one = np.ones_like(situation.angle)
     functions = [one, situation.torque]
     if s.approach is not None:
