@@ -154,7 +154,7 @@ class ReadingModel:
         if len(self.members):
             both = self._both - self._offsets(used)
             r, b = both[:, :, -1], both[:, :, :-1]
-        rows = b[used].reshape(-1, b.shape[2])
+        rows = b[used].reshape(self.m * np.count_nonzero(used), b.shape[2])
         h = rows.T @ rows
         h[np.diag_indices_from(h)] += self.precision + self._guard
         covariance = np.linalg.inv(h)
