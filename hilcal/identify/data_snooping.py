@@ -102,7 +102,7 @@ class Snooping:
     def begin(self, rng: np.random.Generator) -> Screened:
         """Test all readings from a robust start; the solution may be of bad readings, too."""
         every = np.ones(len(self.readings), dtype=np.bool_)
-        if self._all_noise(every):
+        if self._all_noise():
             return Screened(every, every, 1.0, None)
         at, used = robust_start(_linearised(self, self.y), rng)
         of = at.linear
@@ -118,12 +118,12 @@ class Snooping:
         core = float(chi2.ppf(CORE, of.m)) * variance(of, t2, centre)
         return self._screened(of, (t2 <= core) | centre, misfit)
 
-    def _all_noise(self, every: Bools) -> bool:
+    def _all_noise(self) -> bool:
         """Whether smooth functions beside the model leave noise of each reading: none is off."""
         at = _linearised(self, self.solution.y)
         of = at.with_nuisance(float(np.mean(at.linear.residuals(at.linear.tested) ** 2)))
         t2 = of.distances(of.tested)[of.tested]
-        return bool(bulk(t2, of.m) <= MISFIT[0] and t2.max() <= limit(of.m, len(t2)))
+        return bool(t2.max() <= limit(of.m, len(t2)))
 
     def again(self, before: Screened) -> Screened:
         """Test them from the readings that agreed before, whose solution this is."""
@@ -134,7 +134,8 @@ class Snooping:
         count = int(np.count_nonzero(of.tested))
         for _ in range(ROUNDS):
             t2, centre = _tested(of, used)
-            scale = bulk(t2[used & (t2 > 0)], of.m)
+            judged = t2[used & (t2 > 0)]
+            scale = bulk(judged, of.m) if len(judged) else 1.0
             far = max(limit(of.m, count, scale), SMALLEST * float(t2[used].max()))
             now = of.with_lone_centres((t2 <= far) & of.tested, centre)
             if np.array_equal(now, used):
@@ -212,7 +213,7 @@ class _Linearised:
         columns = self.linear.root @ raw
         length = np.sqrt(np.mean(columns**2, axis=(0, 1)))
         kept = length > 1e-9 * length.max(initial=0.0)
-        size = np.sqrt(max(misfit - 1.0, 0.0) / max(np.count_nonzero(kept), 1))
+        size = np.sqrt(max(misfit - 1.0, 0.0) / max(int(np.count_nonzero(kept)), 1))
         return self.linear.with_columns(columns[:, :, kept] * (size / length[kept]))
 
 
@@ -281,8 +282,10 @@ def _off(readings: Readings, prediction: Prediction, members: Ints) -> Floats:
     first = np.arange(len(readings))
     g, s = np.nonzero(members >= 0)
     first[members[g, s]] = members[g, 0]
-    turn = [se3.rotation_vector(r @ r[first].swapaxes(1, 2)) for r in (read, o.rotation)]
-    return np.concatenate([position, turn[0] - turn[1]], axis=1)
+    measured, predicted = (
+        se3.rotation_vector(r @ r[first].swapaxes(1, 2)) for r in (read, o.rotation)
+    )
+    return np.concatenate([position, measured - predicted], axis=1)
 
 
 def _tested(of: ReadingModel, used: Bools) -> tuple[Floats, Bools]:

@@ -157,19 +157,20 @@ class ReadingModel:
         rows = b[used].reshape(self.m * np.count_nonzero(used), b.shape[2])
         h = rows.T @ rows
         h[np.diag_indices_from(h)] += self.precision + self._guard
-        covariance = np.linalg.inv(h)
+        covariance = np.asarray(np.linalg.inv(h), dtype=float)
         delta = covariance @ (rows.T @ r[used].reshape(-1) - self.pull)
         return delta, covariance, r - b @ delta, b
 
     @cached_property
     def _both(self) -> Floats:
         """(N, m, K + 1) columns and residual."""
-        return np.concatenate([self.columns, self.residual[:, :, None]], axis=2)
+        return np.asarray(np.concatenate([self.columns, self.residual[:, :, None]], axis=2))
 
     @cached_property
     def _guard(self) -> Floats:
         """(K,) ridge against singular equations."""
-        return SINGULAR * np.einsum("nik,nik->k", self.columns, self.columns) + 1e-300
+        squares = np.einsum("nik,nik->k", self.columns, self.columns)
+        return np.asarray(SINGULAR * squares + 1e-300)
 
     def _offsets(self, used: Bools) -> Floats:
         """(N, m, K + 1) whitened offsets of columns and residual that the used readings have."""
@@ -182,7 +183,7 @@ class ReadingModel:
     def _offset_covariance(self, used: Bools) -> Floats:
         """(G, m, m) covariance of the offset of each group; zero without a used reading."""
         weight = self._information * used[:, None, None]
-        return np.linalg.pinv(self._summed(weight), hermitian=True)
+        return np.asarray(np.linalg.pinv(self._summed(weight), hermitian=True), dtype=float)
 
     @cached_property
     def _information(self) -> Floats:
@@ -209,6 +210,6 @@ class ReadingModel:
     @cached_property
     def _differences(self) -> tuple[Floats, Floats]:
         """(N, m, m) W⁻, and (G, S, S, m, m) roots of the precision of differences in a group."""
-        back = np.linalg.pinv(self.root)
+        back = np.asarray(np.linalg.pinv(self.root), dtype=float)
         v = (back @ back.swapaxes(1, 2))[self.members]
         return back, inverse_root(v[:, :, None] + v[:, None, :])

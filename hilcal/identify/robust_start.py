@@ -23,8 +23,9 @@ from hilcal.types import Bools, Floats, Ints
 MOST = 0.45
 """Share of the readings that may be wrong. A choice: with few readings half of them agree on some
 model by chance; least trimmed squares does not allow more than that."""
-STARTS = 300
-"""Random subsets; a choice: of subsets of six readings, 40 % of all wrong, 14 have no wrong one."""
+MISSED, STARTS = 1e-3, 300
+"""Probability that no random subset is without a wrong reading where `MOST` of all are wrong, and
+subsets at most; choices."""
 FEW, BEST, LAST = 300, 20, 20
 """Readings that subsets are drawn from, the choice of the source; best subsets that are followed to
 the end, and steps at most; choices."""
@@ -89,8 +90,10 @@ def _trimmed(of: ReadingModel, rng: np.random.Generator) -> tuple[Bools, Floats]
     """Least trimmed squares: the readings (N,), and δ (K,) from them."""
     rows = _few(of, rng)
     part = of[rows] if len(rows) < len(of) else of
+    size = (part.enough + 1) * (2 if len(part.members) else 1)
+    starts = np.log(MISSED) / np.log1p(-((1.0 - MOST) ** size))
     tried = []
-    for _ in range(STARTS):
+    for _ in range(int(min(np.ceil(starts), STARTS))):
         near = part.near(_from_few(part, rng))
         tried.append(_nearest(part, *near))
     tried.sort(key=lambda each: each[1])
