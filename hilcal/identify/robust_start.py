@@ -16,6 +16,7 @@ from typing import Protocol, Self, TypeVar
 
 import numpy as np
 
+from hilcal.errors import CannotAnswerError
 from hilcal.identify.reading_model import ReadingModel
 from hilcal.regression.distributions import chi2
 from hilcal.types import Bools, Floats, Ints
@@ -29,6 +30,8 @@ subsets at most; choices."""
 FEW, BEST, LAST = 300, 20, 20
 """Readings that subsets are drawn from, the choice of the source; best subsets that are followed to
 the end, and steps at most; choices."""
+HALVINGS = 6
+"""Shorter steps that are tried; a choice."""
 ANEW = 6
 """Most linearisations; a choice: gross errors may have led the first one far off."""
 
@@ -51,12 +54,22 @@ def robust_start(at: L, rng: np.random.Generator) -> tuple[L, Bools]:
     """Return the linearisation that most readings agree on, and which readings do (N,)."""
     used, delta = _trimmed(at.linear, rng)
     for _ in range(ANEW):
-        at = at.moved(delta)
+        at = _moved(at, delta)
         _, now, delta = _concentrated(at.linear, used, LAST)
         if np.array_equal(now, used):
             break
         used = now
     return at, used
+
+
+def _moved(at: L, delta: Floats) -> L:
+    """Step by δ (K,), half as far each time while there is no static equilibrium."""
+    for halving in range(HALVINGS):
+        try:
+            return at.moved(0.5**halving * delta)
+        except CannotAnswerError:
+            continue
+    return at
 
 
 def nearest(of: ReadingModel, d2: Floats, centre: Bools) -> Bools:
