@@ -16,6 +16,7 @@ from studies.descriptions_command import descriptions
 from studies.diagnosis_command import diagnosis
 from studies.discover_command import discover
 from studies.discover_real_command import discover_real
+from studies.gross_errors_command import gross_errors
 from studies.plans_command import plans
 from studies.real_command import real
 from studies.records import results
@@ -34,6 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     app.command("discover-real")(discover_real)
     app.command("plans")(plans)
     app.command("descriptions")(descriptions)
+    app.command("gross-errors")(gross_errors)
     app.command("scaling")(scaling)
     app.command("real")(real)
     app.command("carry")(carry)

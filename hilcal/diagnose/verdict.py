@@ -88,6 +88,14 @@ def diagnose(
 
 def judge(e: Evidence, history: History) -> Diagnosis:
     """Combine the evidence of a fit with what is known of the way to its model."""
+    found = _with_arrivals(e, history)
+    if e.fit.disagreement is not None and not any(s.passes for s in found.suspects):
+        return replace(found, reason="readings_disagree")
+    return found
+
+
+def _with_arrivals(e: Evidence, history: History) -> Diagnosis:
+    """Judge; where readings of one arrival share its scatter, by arrivals."""
     inner = e.by_arrivals
     if inner is None or e.arm_scatter is None:
         return _judged(e, history)

@@ -1,279 +1,296 @@
-"""Data snooping (Baarda): gross errors, by a test of a shift of each reading.
+"""Which readings are gross errors: data snooping (Baarda) from a robust start.
 
-With P the projection off the columns of the model and of smooth nuisance functions (those with a
-prior by their marginal covariance, see `regression.projection`), and S_k (R, m) the whitened
-effect of a shift of reading k, loaded or the unloaded one that deflections share,
-
-    t²_k = (S_kᵀ P r)ᵀ (S_kᵀ P S_k)⁻¹ (S_kᵀ P r)
-
-is χ²_m for a good reading, whatever its leverage. The search is a forward selection: the shift of
-the reading with the largest t² joins the columns that P projects off, and t² is computed anew, so
-that gross errors neither mask each other nor raise t² of good readings.
+Least trimmed squares (`robust_start`) finds the readings, more than half, that agree best on the
+model. What a model without some effect leaves of them sizes smooth nuisance functions that stand in
+for it, as random effects. Then readings join or leave by their distance t² from the fit to the
+others, which is χ²_m of a good reading (`reading_model`), until none does.
 
 Source: Baarda, *A testing procedure for use in geodetic networks* (1968).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
+from hilcal.data.reading_groups import deflection_groups
 from hilcal.data.readings import Readings
-from hilcal.data.whitening import Whitening
+from hilcal.data.whitening import Mode, inverse_root
 from hilcal.identify.gauss_newton import Solution
-from hilcal.identify.outliers import bulk, limit
+from hilcal.identify.off_alike import off_alike
+from hilcal.identify.outliers import MISFIT, bulk, limit
+from hilcal.identify.priors import scales_of
+from hilcal.identify.reading_model import ReadingModel
+from hilcal.identify.robust_start import MOST, nearest, robust_start, variance
 from hilcal.identify.smooth_nuisance import smooth_nuisance_columns
-from hilcal.model import Model
-from hilcal.regression import products, schur
-from hilcal.regression.distributions import binom
-from hilcal.regression.factored import Factored, Tall, beside, of_rows, written
-from hilcal.regression.products import times
-from hilcal.regression.small_forms import quadratic_forms
+from hilcal.model import Model, Prediction
+from hilcal.regression.distributions import binom, chi2
+from hilcal.robot import se3
 from hilcal.types import Bools, Floats, Ints
 
 SMALLEST = 3e-3
-"""Share of the largest t² below which errors wait for a new fit; a choice, no study set it."""
-LEVERAGE = 1e-6
-"""Share of a reading's information that P must leave for a test; a choice, no study set it."""
+"""Share of the largest t² of the used readings below which none leaves before a new fit; a choice,
+no study set it."""
 ACCIDENT = 1e-3
 """Binomial probability of so many shared unloaded readings among the gross errors, below which the
 cause is a misfit; a choice, the tests of effects on unloaded readings confirm it."""
-PATIENCE = 10
-"""Selections beyond the last gross error after which the search ends, with half of the most that
-may be set aside; a choice, no study set it."""
+CORE = 0.99
+"""Probability of the χ² quantile up to which readings join the robust start; a choice."""
+MOST_COLUMNS = 200
+"""Most parameters that are fitted anew with each choice of readings; where there are more, those
+with a prior are held. A choice by timing: hundreds of harmonics hardly depend on one reading."""
+ROUGH_M = 1e-3
+"""Scatter of most readings about model and smooth functions, m, from which on they disagree; a
+choice: more than any arm leaves beside its geometry."""
+ROUNDS = 20
+"""Most rounds in which readings join and leave; a choice."""
+EXACT = 1e-6
+"""Share of a group's mean covariance that each of its readings has at least; a choice: an unloaded
+reading that is stated to be exact is so all the same."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SetAside:
-    """Gross errors of a solution.
+class Disagreement:
+    """Readings that are far off, and no gross errors that could be set aside.
 
     Attributes:
-        drop: rows of the readings to set aside.
-        count: number of gross errors; one in a shared unloaded reading drops several rows.
+        kind: "many", where more are off than can be told from good ones; "alike", where readings in
+            a row are off by the same shift.
+        rows: of the readings.
     """
 
-    drop: Ints
-    count: int
-
-
-def find_gross_errors(
-    model: Model, solution: Solution, readings: Readings, w: Whitening, most: int
-) -> SetAside:
-    """Search a gc-scaled solution for at most `most` gross errors.
-
-    More than twice as many, or too large a share of unloaded readings, is a misfit of the model:
-    none is returned.
-    """
-    e, columns, root = _projection(model, solution, readings, w)
-    c = _candidates(w)
-    g = c.gradients(e[:, None])[:, :, 0]
-    off = _Elimination(c, columns, root)
-    a = off.information()
-    trace = np.trace(a, axis1=1, axis2=2)
-    drop: list[Ints] = []
-    taken: list[int] = []
-    largest, found, candidate = 0.0, 0, np.ones(len(c.row), dtype=bool)
-    t2 = _t2(g, a, trace)
-    least, patience = limit(w.m, len(c.row)), most // 2 + PATIENCE
-    while len(drop) <= min(2 * most, found + patience) and (candidate & c.loaded).any():
-        k = int(np.argmax(np.where(candidate, t2, 0.0)))
-        top = float(t2[k])
-        largest = max(largest, top)
-        if top <= max(least, SMALLEST * largest):
-            break
-        drop.append(c.drops[k])
-        taken.append(k)
-        candidate &= ~np.isin(c.row, c.drops[k])
-        # P becomes P − P S (Sᵀ P S)⁻¹ Sᵀ P; it is no projection where parts have a prior.
-        inverse_root = _inverse_root(a[k], float(trace[k]))
-        slope = off.eliminate(k, inverse_root)
-        size = inverse_root.T @ g[k]
-        g = g - slope @ size
-        a = a - slope @ np.swapaxes(slope, 1, 2)
-        t2 = _t2(g, a, trace)
-        # The scale of the bulk is that without the selected shifts, which act on all residuals.
-        if top > limit(w.m, len(c.row), bulk(t2[c.loaded & candidate], w.m)):
-            found = len(drop)
-    shared = int(np.count_nonzero(~c.loaded[taken[:found]]))
-    chance = float(binom.sf(shared - 1, found, np.mean(~c.loaded))) if shared else 1.0
-    if found > 2 * most or chance < ACCIDENT:
-        found = 0
-    found = min(found, most)
-    rows = np.unique(np.concatenate(drop[:found])) if found else np.zeros(0, dtype=np.int64)
-    return SetAside(rows, found)
-
-
-def _projection(
-    model: Model, solution: Solution, readings: Readings, w: Whitening
-) -> tuple[Floats, Tall, Floats]:
-    """Residual (R,), columns B (R, K) of model and smooth nuisance, and T (K, K).
-
-    P = 1 − B TᵀT Bᵀ, see `regression.projection`.
-    """
-    x = smooth_nuisance_columns(model, solution.prediction, readings, w)
-    across = solution.tall.T @ x
-    gram = np.block([[solution.equations.gram, across], [across.T, products.gram(x)]])
-    columns, ridge = beside(solution.tall, x), np.append(solution.ridge, np.ones(x.shape[1]))
-    root = schur.inverse_root(gram + np.diag(ridge))
-    z = np.append(solution.coordinates(), np.zeros(x.shape[1]))
-    step = root.T @ (root @ (columns.T @ solution.white - ridge * z))
-    return np.asarray(solution.white - columns @ step), columns, root
-
-
-def _inverse_root(a: Floats, trace: float) -> Floats:
-    """Root (m, r) of the pseudo-inverse of (m, m), of eigenvalues above `LEVERAGE`."""
-    values, vectors = np.linalg.eigh(a)
-    kept = values > LEVERAGE * max(trace, 1e-300)
-    return np.asarray(vectors[:, kept] / np.sqrt(values[kept]))
-
-
-def _t2(g: Floats, a: Floats, trace: Floats) -> Floats:
-    """(N,) t²; zero for a reading without eigenvalues above `LEVERAGE`."""
-    return quadratic_forms(a, g, LEVERAGE * np.maximum(trace, 1e-300))
+    kind: Literal["many", "alike"]
+    rows: Ints
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Shifts:
-    """Whitened effects of shifts of N candidate readings.
+class Screened:
+    """Readings that were tested for gross errors.
 
     Attributes:
-        row: (N,) the reading.
-        loaded: (N,) whether it is a measurement by itself.
-        drops: rows to set aside with it.
-        blocks: per shape: whitened rows (G, r) and shifts (G, r, c·m) of c readings each.
-        m: elements.
+        agree: (N,) that agree with the model.
+        used: (N,) to fit to: these, and those of a disagreement; without deflections from an
+            unloaded reading that is off.
+        misfit: variance of what the model leaves of good readings, in units of the noise.
+        disagreement: readings that are off and yet used.
     """
 
-    row: Ints
-    loaded: Bools
-    drops: list[Ints]
-    blocks: list[tuple[Ints, Floats]]
-    m: int
-
-    def gradients(self, x: Floats) -> Floats:
-        """(N, m, P) Sᵀ x of whitened columns (R, P)."""
-        out = [
-            (np.swapaxes(s, 1, 2) @ x[rows]).reshape(-1, self.m, x.shape[1])
-            for rows, s in self.blocks
-        ]
-        return np.concatenate(out)
-
-    def place(self, k: int) -> tuple[Floats, Ints, slice, slice]:
-        """Shifts (r, c·m) of candidate k's group, its rows, its candidates, and k's columns."""
-        first = 0
-        for rows, s in self.blocks:
-            each = s.shape[2] // self.m
-            group, i = divmod(k - first, each)
-            if group < len(rows):
-                start = first + group * each
-                own = slice(i * self.m, (i + 1) * self.m)
-                return s[group], rows[group], slice(start, start + each), own
-            first += len(rows) * each
-        raise IndexError(k)
+    agree: Bools
+    used: Bools
+    misfit: float
+    disagreement: Disagreement | None
 
 
-class _Elimination:
-    """P of the model, and of the shifts that were selected, as the candidates see it.
+@dataclass(frozen=True, eq=False)
+class Snooping:
+    """The readings of a fit, as they are tested for gross errors.
 
-    A shift acts on the rows of its own group alone. With L the projection off the selected shifts,
-    group by group, and P = I − Q Qᵀ before, Q = B Tᵀ,
-
-        P = L − L Q C Qᵀ L,    C = (I − Qᵀ (I − L) Q)⁻¹
-
-    so that only C (K, K) has to be kept, and S_kᵀ L Q (m, K) of the candidates whose group has a
-    selected shift. Of the others it is S_kᵀ B Tᵀ, of which only products are formed.
+    Attributes:
+        model: robot and effects.
+        readings: all of them.
+        mode: "deflection" or "absolute".
+        solution: of some of them.
+        y: (P,) parameters that the model is linearised at.
     """
 
-    def __init__(self, shifts: _Shifts, columns: Tall, root: Floats) -> None:
-        """Begin without selected shifts.
+    model: Model
+    readings: Readings
+    mode: Mode
+    solution: Solution
+    y: Floats
 
-        Args:
-            shifts: of the candidates.
-            columns: (R, K) B.
-            root: (K, K) T.
-        """
-        self._shifts, self._columns, self._root = shifts, columns, root
-        self._c = np.eye(len(root))
-        self._local: dict[int, Floats] = {}
-        self._seen: dict[int, tuple[slice, Floats]] = {}
+    def begin(self, rng: np.random.Generator) -> Screened:
+        """Test all readings from a robust start; the solution may be of bad readings, too."""
+        every = np.ones(len(self.readings), dtype=np.bool_)
+        if self._all_noise():
+            return Screened(every, every, 1.0, None)
+        at, used = robust_start(_linearised(self, self.y), rng)
+        of = at.linear
+        d2, centre = of.near(of.fitted(used)[0])
+        misfit = variance(of, d2, centre)
+        of = at.with_nuisance(misfit)
+        for _ in range(ROUNDS):
+            t2, centre = _tested(of, used)
+            now = nearest(of, t2, centre)
+            if np.array_equal(now, used):
+                break
+            used = now
+        core = float(chi2.ppf(CORE, of.m)) * variance(of, t2, centre)
+        return self._screened(of, (t2 <= core) | centre, misfit)
 
-    def information(self) -> Floats:
-        """(N, m, m) Sᵀ P S before the first selection."""
-        m, own = self._shifts.m, []
-        for _, s in self._shifts.blocks:
-            parts = s.reshape(*s.shape[:2], -1, m)
-            own.append(np.einsum("grci,grcj->gcij", parts, parts).reshape(-1, m, m))
-        return np.asarray(np.concatenate(own) - self._gone())
+    def _all_noise(self) -> bool:
+        """Whether smooth functions beside the model leave noise of each reading: none is off."""
+        at = _linearised(self, self.solution.y)
+        of = at.with_nuisance(float(np.mean(at.linear.residuals(at.linear.tested) ** 2)))
+        t2 = of.distances(of.tested)[of.tested]
+        return bool(t2.max() <= limit(of.m, len(t2)))
 
-    def _gone(self) -> Floats:
-        """(N, m, m) Sᵀ Q Qᵀ S."""
-        shifts, columns = self._shifts, self._columns
-        if isinstance(columns, Factored):  # each reading by itself
-            ((rows, s),) = shifts.blocks
-            forms = columns.forms(self._root)[rows[:, 0] // shifts.m]
-            return np.asarray(np.swapaxes(s, 1, 2) @ forms @ s)
-        seen = shifts.gradients(times(columns, self._root.T))
-        return np.asarray(seen @ np.swapaxes(seen, 1, 2))
+    def again(self, before: Screened) -> Screened:
+        """Test them from the readings that agreed before, whose solution this is."""
+        of = _linearised(self, self.y).with_nuisance(before.misfit)
+        return self._screened(of, before.agree, before.misfit)
 
-    def eliminate(self, k: int, inverse_root: Floats) -> Floats:
-        """Project off candidate k, too; returns Sᵀ P S_k times the root, (N, m, r).
+    def _screened(self, of: ReadingModel, used: Bools, misfit: float) -> Screened:
+        count = int(np.count_nonzero(of.tested))
+        for _ in range(ROUNDS):
+            t2, centre = _tested(of, used)
+            judged = t2[used & (t2 > 0)]
+            scale = bulk(judged, of.m) if len(judged) else 1.0
+            far = max(limit(of.m, count, scale), SMALLEST * float(t2[used].max()))
+            now = of.with_lone_centres((t2 <= far) & of.tested, centre)
+            if np.array_equal(now, used):
+                break
+            used = now
+        agree = used | ~of.tested
+        every, off = np.ones(len(agree), dtype=np.bool_), np.flatnonzero(~agree)
+        shared = self.readings.unloaded & of.tested & (of.group >= 0)
+        unloaded = int(np.count_nonzero(shared[off]))
+        share = float(np.mean(shared[of.tested]))
+        if unloaded and binom.sf(unloaded - 1, len(off), share) < ACCIDENT:
+            return Screened(every, every, misfit, None)
+        size = np.sqrt(scale * np.mean(np.trace(self.readings.covariance[:, :3, :3], 0, 1, 2)))
+        if len(off) > MOST * count or (scale > MISFIT[1] and size > ROUGH_M):
+            off = np.flatnonzero((t2 > limit(of.m, count)) & of.tested)
+            return Screened(every, every, misfit, Disagreement("many", off))
+        if not len(off):
+            return Screened(agree, every, misfit, None)
+        white = of.residuals(used)[off, :, None]
+        shift = (np.linalg.pinv(of.root[off]) @ white)[:, :3, 0]
+        axes = self.model.predict(self.readings.states[off], self.solution.theta).observation
+        alike = off_alike(self.readings, of.tested, off, shift, axes.rotation)
+        if not len(alike):
+            return Screened(agree, self._fittable(of, agree), misfit, None)
+        kept = agree.copy()
+        kept[alike] = True
+        found = Disagreement("alike", alike)
+        return Screened(agree, self._fittable(of, kept), misfit, found)
 
-        Args:
-            k: the candidate.
-            inverse_root: (m, r) root of the pseudo-inverse of S_kᵀ P S_k.
-        """
-        m = self._shifts.m
-        shifts, rows, members, own = self._shifts.place(k)
-        local = self._local.get(members.start, shifts)
-        seen = self._of_group(members, shifts, rows)
-        ours = seen[k - members.start].T @ inverse_root
-        along = self._c @ ours
-        slope = -self._shifts.gradients(self._columns @ (self._root.T @ along))
-        for changed, of in self._seen.values():
-            slope[changed] = -(of @ along)
-        mine = local[:, own] @ inverse_root
-        slope[members] += (local.T @ mine).reshape(-1, m, mine.shape[1])
-        self._c += along @ along.T
-        unit, r = np.linalg.qr(mine)
-        gone = np.linalg.solve(r.T, ours.T)
-        now = seen - ((local.T @ unit) @ gone).reshape(-1, m, seen.shape[2])
-        self._seen[members.start] = members, now
-        self._local[members.start] = local - unit @ (unit.T @ local)
-        return slope
-
-    def _of_group(self, members: slice, shifts: Floats, rows: Ints) -> Floats:
-        """(c, m, K) Sᵀ L Q of the candidates of a group."""
-        if members.start in self._seen:
-            return self._seen[members.start][1]
-        mine = np.zeros(len(self._columns), dtype=np.bool_)
-        mine[rows] = True
-        q = written(of_rows(self._columns, mine)) @ self._root.T
-        return np.asarray((shifts.T @ q).reshape(-1, self._shifts.m, q.shape[1]))
+    def _fittable(self, of: ReadingModel, agree: Bools) -> Bools:
+        """(N,) readings without deflections of which the loaded or all unloaded ones are off."""
+        used = agree.copy()
+        if not len(of.members):
+            return used
+        there = of.members >= 0
+        unloaded = self.readings.unloaded[of.members]
+        good = agree[of.members] & there
+        lost = ~((good & unloaded).any(axis=1) & (good & ~unloaded).any(axis=1))
+        gone = of.members[lost]
+        used[gone[gone >= 0]] = False
+        return used
 
 
-def _candidates(w: Whitening) -> _Shifts:
-    m = w.m
-    row, loaded, drops, blocks = [], [], [], []
-    first = 0
-    for b in w.buckets:
-        groups, size = b.loaded.shape
-        refs = b.reference.shape[1]
-        rows = first + np.arange(groups * size * m).reshape(groups, -1)
-        shifts, cells = [b.factor], [b.loaded]
-        each = b.factor.reshape(groups, size * m, size, m)
-        # Where one deflection is taken from one unloaded reading, a shift of either is the same.
-        users = [np.flatnonzero(b.weights[:, u]) for u in range(refs)]
-        alone = [bool(np.all(b.weights[mine, u] == 1.0)) for u, mine in enumerate(users)]
-        tested = [u for u in range(refs) if len(users[u]) > 1 or not alone[u]]
-        shifts += [-np.einsum("grli,l->gri", each, b.weights[:, u]) for u in tested]
-        cells += [b.reference[:, [u]] for u in tested]
-        blocks.append((rows, np.concatenate(shifts, axis=2)))
-        of = np.concatenate(cells, axis=1)
-        row.append(of.reshape(-1))
-        loaded.append(np.tile(np.arange(of.shape[1]) < size, groups))
-        for g in range(groups):
-            drops += [np.array([r]) for r in b.loaded[g]]
-            for u in tested:
-                own = b.reference[g, [u]]
-                drops.append(np.concatenate([own, b.loaded[g, users[u]]]) if alone[u] else own)
-        first += groups * size * m
-    return _Shifts(np.concatenate(row), np.concatenate(loaded), drops, blocks, m)
+@dataclass(frozen=True, eq=False)
+class _Linearised:
+    """The linear model of all readings at parameters y (P,).
+
+    Attributes:
+        of: the fit.
+        y: coordinates of the parameters.
+        live: (K,) those that are estimated, and the columns of `linear`.
+        scale: (K,) their ordinary magnitudes, the units of the columns.
+        prediction: there.
+        linear: the linear model.
+    """
+
+    of: Snooping
+    y: Floats
+    live: Ints
+    scale: Floats
+    prediction: Prediction
+    linear: ReadingModel
+
+    def moved(self, delta: Floats) -> "_Linearised":
+        """Return it after a step δ (K,)."""
+        y = self.y.copy()
+        y[self.live] += self.scale * delta
+        return _linearised(self.of, y)
+
+    def with_nuisance(self, misfit: float) -> ReadingModel:
+        """Return the linear model with smooth nuisance columns of some variance above the noise."""
+        of, readings = self.of, self.of.readings
+        rank = readings.m * int(np.count_nonzero(self.linear.tested))
+        raw = smooth_nuisance_columns(of.model, self.prediction, readings, rank)
+        columns = self.linear.root @ raw
+        length = np.sqrt(np.mean(columns**2, axis=(0, 1)))
+        kept = length > 1e-9 * length.max(initial=0.0)
+        size = np.sqrt(max(misfit - 1.0, 0.0) / max(int(np.count_nonzero(kept)), 1))
+        return self.linear.with_columns(columns[:, :, kept] * (size / length[kept]))
+
+
+def _linearised(of: Snooping, y: Floats) -> _Linearised:
+    model, readings, s = of.model, of.readings, of.solution
+    theta = s.space.theta(y)
+    prediction = model.predict(readings.states, theta)
+    members = _groups(readings) if of.mode == "deflection" else np.zeros((0, 0), dtype=np.int64)
+    root = inverse_root(_covariance(readings, members))
+    off = _off(readings, prediction, members)
+    live = np.flatnonzero(s.prior > 0)
+    if len(live) > MOST_COLUMNS:
+        live = np.flatnonzero(np.isinf(s.prior))
+    scale = s.space.scales(scales_of(model))[live]
+    if len(s.space.index):
+        jacobian = model.jacobian(prediction, theta, readings.m).reshape(-1, model.size)
+        columns = s.space.columns(jacobian)[:, live] * scale
+    else:
+        columns = model.jacobian(prediction, theta, readings.m, live) * scale
+    precision = s.beta * (scale / s.prior[live]) ** 2
+    linear = ReadingModel(
+        residual=(root @ off[:, :, None])[:, :, 0],
+        columns=root @ columns.reshape(*off.shape, len(live)),
+        precision=precision,
+        pull=precision * y[live] / scale,
+        root=root,
+        members=members,
+    )
+    return _Linearised(of, y, live, scale, prediction, linear)
+
+
+def _groups(readings: Readings) -> Ints:
+    """(G, S) rows that share unloaded readings, unloaded first, −1 beyond the last."""
+    groups = deflection_groups(replace(readings, common=None))
+    most = max(loaded.shape[1] + unloaded.shape[1] for loaded, unloaded, _ in groups)
+    out = []
+    for loaded, unloaded, _ in groups:
+        rows = np.concatenate([unloaded, loaded], axis=1)
+        out.append(np.pad(rows, ((0, 0), (0, most - rows.shape[1])), constant_values=-1))
+    return np.concatenate(out)
+
+
+def _covariance(readings: Readings, members: Ints) -> Floats:
+    """(N, m, m) covariances, of a group's readings none zero."""
+    v = readings.covariance
+    if not len(members):
+        return v
+    there = (members >= 0)[:, :, None, None]
+    mean = np.sum(v[members] * there, axis=1) / there.sum(axis=1)
+    out = v.copy()
+    g, s = np.nonzero(members >= 0)
+    out[members[g, s]] += EXACT * mean[g]
+    return out
+
+
+def _off(readings: Readings, prediction: Prediction, members: Ints) -> Floats:
+    """(N, m) measured minus predicted; turns of deflections relative to an unloaded reading."""
+    o = prediction.observation
+    position = readings.value[:, :3] - o.position
+    if readings.m == 3:
+        return position
+    read = se3.rotation(readings.value[:, 3:])
+    if not len(members):
+        turn = se3.rotation_vector(read @ o.rotation.swapaxes(1, 2))
+        return np.concatenate([position, turn], axis=1)
+    first = np.arange(len(readings))
+    g, s = np.nonzero(members >= 0)
+    first[members[g, s]] = members[g, 0]
+    measured, predicted = (
+        se3.rotation_vector(r @ r[first].swapaxes(1, 2)) for r in (read, o.rotation)
+    )
+    return np.concatenate([position, measured - predicted], axis=1)
+
+
+def _tested(of: ReadingModel, used: Bools) -> tuple[Floats, Bools]:
+    """t² (N,) of all readings, and the centres of groups (N,)."""
+    if not len(of.members):
+        return of.distances(used), np.zeros_like(used)
+    _, centre = of.near(of.fitted(used)[0])
+    return of.distances(of.with_lone_centres(used, centre)), centre

@@ -43,6 +43,8 @@ def words(finding: Finding, cell: Cell, readings: Readings) -> str:
         said = [_explained(e, finding, cell) for e in finding.explanations[:MOST_NAMED]]
         line = f"{begin}: {'; or, as well: '.join(said)}"
         return f"{line}; besides, {rows}" if rows else line
+    if rows and not finding.refused:
+        return f"{rows}; the others fit ({size} rms after registration). They are left out of a fit"
     if rows:
         return f"{begin}: {rows}; the others fit. Correct or remove them"
     return (

@@ -8,7 +8,7 @@ import numpy as np
 from hilcal.data.readings import Readings, States
 from hilcal.data.whitening import Mode, Scaling, Whitening, inverse_root, whitening
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identify.data_snooping import find_gross_errors
+from hilcal.identify.data_snooping import Disagreement, Snooping
 from hilcal.identify.drift import Conflict, chosen_drift, conflicts
 from hilcal.identify.errors import ErrorBlock, error_block
 from hilcal.identify.estimates import Estimates
@@ -27,9 +27,9 @@ from hilcal.types import Bools, Floats, Ints
 
 Frame = Literal["sensor", "base"]
 OUTLIER_ROUNDS = 6
-"""Most searches for gross errors, each followed by a new fit; a choice, no study set it."""
-MAX_OUTLIER_SHARE = 0.05
-"""Most readings that are set aside, as a share; a choice: more is a misfit."""
+"""Most fits without gross errors, each followed by a new test; a choice, no study set it."""
+SEED = 0
+"""Of the random subsets of the robust start, so that equal readings give equal fits."""
 
 DRIFT_ROUNDS = 2
 """Most choices of the drift of a carried prior, each followed by a new fit; a choice: the first is
@@ -38,6 +38,7 @@ DRIFT_CHANGED = 0.1
 """Change of a drift, as a share of the largest one, that is worth another fit; a choice."""
 
 _Solved = tuple[Whitening, Solution]
+_Used = tuple[Bools, Disagreement | None, _Solved]
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +63,7 @@ class Fit(WithVarianceFactor):
         chi2: whitened sum of squares.
         dof: degrees of freedom.
         error: error block of the fit.
+        disagreement: readings that are far off and yet fitted; None where there are none.
 
     What takes long, and is of no use for a fit that is only tried, is computed when it is asked
     for: `left_out`, `holdout`, `uncertainty`.
@@ -81,6 +83,7 @@ class Fit(WithVarianceFactor):
     chi2: float
     dof: float
     error: ErrorBlock
+    disagreement: Disagreement | None = None
 
     @once
     def left_out(self) -> Floats:
@@ -185,8 +188,7 @@ def fit(
     `start` and `prior` of an earlier fit reproduce it in few steps. The prior that the model
     carries gets the drift that the readings ask for; where `prior` is given it keeps its own.
 
-    Gross errors, at most `MAX_OUTLIER_SHARE` of the readings, are set aside: they stay in the file
-    and are listed, but are not fitted.
+    Gross errors are set aside: they stay in the file and are listed, but are not fitted.
 
     Raises:
         CannotAnswerError: fewer measured elements than identifiable parameters.
@@ -195,17 +197,18 @@ def fit(
     given = model.prior
     if given is not None and prior is None:
         model = replace(model, prior=given.with_drift(None))
-    used, solved = _set_aside(model, readings, mode, start, prior)
+    used, disagree, solved = _set_aside(model, readings, mode, start, prior)
     if model.prior is not None and prior is None:
         for _ in range(DRIFT_ROUNDS):
             drift = chosen_drift(model, solved[1], solved[0])
             if _same_drift(model.prior.drift, drift):
                 break
             model = replace(model, prior=model.prior.with_drift(drift))
-            used, solved = _set_aside(model, readings, mode, solved[1].theta, None)
+            begun = solved[1].theta
+            used, disagree, solved = _set_aside(model, readings, mode, begun, None)
     if scaling != "gc":
         solved = _solve(model, readings[used], mode, scaling, start, prior)
-    return _assemble(model, readings, ~used, mode, scaling, *solved)
+    return replace(_assemble(model, readings, ~used, mode, scaling, *solved), disagreement=disagree)
 
 
 def _same_drift(before: Floats | None, after: Floats) -> bool:
@@ -216,23 +219,24 @@ def _same_drift(before: Floats | None, after: Floats) -> bool:
 
 def _set_aside(
     model: Model, readings: Readings, mode: Mode, start: Floats | None, prior: Floats | None
-) -> tuple[Bools, _Solved]:
-    """Readings (N,) without gross errors, and their solution in scaling gc."""
+) -> _Used:
+    """Readings (N,) without gross errors, what they disagree in, their solution in scaling gc."""
     used = np.ones(len(readings), dtype=bool)
     solved = _solve(model, readings, mode, "gc", start, prior)
-    left = int(MAX_OUTLIER_SHARE * len(readings))
+    w, solution = solved
+    distance2 = mahalanobis2(solution.raw, w.covariance)
+    if distance2.max() <= limit(w.m, len(distance2)):
+        return used, None, solved
+    y = np.zeros(model.size) if start is None else solution.space.of_theta(start)
+    found = Snooping(model, readings, mode, solution, y).begin(np.random.default_rng(SEED))
     for _ in range(OUTLIER_ROUNDS):
-        w, solution = solved
-        distance2 = mahalanobis2(solution.raw, w.covariance)
-        if distance2.max() <= limit(w.m, len(distance2)):
+        if np.array_equal(found.used, used):
             break
-        found = find_gross_errors(model, solution, readings[used], w, left)
-        if not found.count:
-            break
-        used[np.flatnonzero(used)[found.drop]] = False
-        left -= found.count
+        used = found.used
         solved = _solve(model, readings[used], mode, "gc", solution.theta, prior)
-    return used, solved
+        solution = solved[1]
+        found = Snooping(model, readings, mode, solution, solution.y).again(found)
+    return used, found.disagreement, solved
 
 
 def _solve(

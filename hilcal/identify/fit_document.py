@@ -6,6 +6,7 @@ from dataclasses import asdict
 import numpy as np
 
 from hilcal.identify.before import error_before
+from hilcal.identify.disagreement_words import disagreement_words
 from hilcal.identify.fit import Fit
 from hilcal.identify.frames_document import fit_to_json, frames_of_fit
 from hilcal.identify.full_prediction import full_prediction
@@ -103,6 +104,8 @@ def notes(fit: Fit) -> tuple[str, ...]:
             f"deflections do not see where the base is, only how it is turned: {registered[0]} "
             "is determined by the closed-form registration and by how deflections turn"
         )
+    if fit.disagreement is not None:
+        out.append(disagreement_words(fit))
     weight = weight_note(fit)
     if weight is not None:
         out.append(weight)

@@ -117,7 +117,12 @@ def examine(registered: Registration, readings: Readings) -> Finding | None:
     # A base that is told shows the whole geometric error, however close the positions lie.
     extent = np.inf if cell.registration_known else _extent(readings.value[:, :3])
     noise = float(np.sqrt(np.mean(np.trace(readings.covariance[:, :3, :3], axis1=1, axis2=2))))
-    rms = _size(registered.off)
+    far, rms = registered.far, _size(registered.off)
+    if far.any():
+        others = _size(registered.off[~far])
+        search = _Search(cell, readings, max(3.0 * noise, others))
+        swapped = search.swapped(search.robust(()), np.flatnonzero(far))
+        return Finding(rms if swapped else others, gate, (), far, swapped, 1)
     if rms <= min(LOOK * gate, max(GATE_EXTENT * extent, 5.0 * noise)):
         return None
     close = max(0.02 * min(extent, cell.arm.reach), rms / 50.0)

@@ -25,6 +25,7 @@ from hilcal.identify.rigid_frames import (
     settled,
     sizes,
 )
+from hilcal.identify.robust_frames import far_readings
 from hilcal.robot import chain as chains
 from hilcal.robot import se3
 from hilcal.types import Bools, Floats
@@ -39,6 +40,9 @@ GOOD = 10.0
 be tried: about 1 mm and 1 mrad. A choice: arms are so accurate before calibration."""
 TRIED = 5
 """Starts, the best of all by their misfit, that least squares goes on from; a choice."""
+DISTURBED = 3e-3
+"""Rms misfit, m, from which on readings that are far off are looked for: nominal arms are off by
+less. A choice, a third of the gate's least (`gate.GATE_M`)."""
 TURNED = 1e-3
 """Range of a joint's angle, rad, below which it counts as never turned; a choice."""
 TOLD = 0.05
@@ -72,8 +76,9 @@ class Registration:
     Attributes:
         cell: the cell with base and target in place.
         off: (N, m) measured minus predicted by the nominal arm, sensor axes, m and rad.
-        rms: root mean square of the 3-D position error, m.
+        rms: root mean square of the 3-D position error, m, of the readings that are not far off.
         turn_rms: root mean square of the attitude's error, rad; None for positions alone.
+        far: (N,) readings far off while the others fit, which the frames are not fitted to.
         undetermined: what the poses cannot tell.
         still: (n,) joints that never turned.
         estimated: whether anything was unknown.
@@ -83,6 +88,7 @@ class Registration:
     off: Floats
     rms: float
     turn_rms: float | None
+    far: Bools
     undetermined: tuple[Undetermined, ...]
     still: Bools
     estimated: bool
@@ -101,8 +107,9 @@ def register(cell: Cell, readings: Readings) -> Registration:
     known = np.array(cell.known_targets)
     given = Frames(cell.registration, cell.all_targets)
     if cell.registration_known and cell.target_known:
-        off = misfit(seen, given)
-        return _result(cell, off, angle, (), estimated=False)
+        none = Free.of(False, ~known, False)
+        far = far_readings(readings, seen, given, none, DISTURBED)
+        return _result(cell, misfit(seen, given), angle, (), far, estimated=False)
     distinct = len(np.unique(np.round(angle, 9), axis=0))
     if distinct < MIN_POSES:
         raise CannotAnswerError(
@@ -111,10 +118,14 @@ def register(cell: Cell, readings: Readings) -> Registration:
         )
     free = Free.of(not cell.registration_known, ~known, seen.m == 6)
     found = fit_frames(seen, given, free)
+    far = far_readings(readings, seen, found.frames, free, DISTURBED)
+    if far.any():
+        good = fit_frames(seen[~far], given, free)
+        found = replace(good, off=misfit(seen, good.frames))
     if seen.m == 3 and not cell.registration_known:
         _refuse_lines(seen, found.frames)
     placed = replace(cell.with_targets(found.frames.targets), registration=found.frames.base)
-    return _result(placed, found.off, angle, undetermined(found), estimated=True)
+    return _result(placed, found.off, angle, undetermined(found), far, estimated=True)
 
 
 def angles(readings: Readings) -> Floats:
@@ -202,16 +213,18 @@ def _result(
     off: Floats,
     angle: Floats,
     unknown: tuple[Undetermined, ...],
+    far: Bools,
     *,
     estimated: bool,
 ) -> Registration:
     return Registration(
         cell=cell,
         off=off,
-        rms=float(np.sqrt(np.mean(np.sum(off[:, :3] ** 2, axis=1)))),
-        turn_rms=float(np.sqrt(np.mean(np.sum(off[:, 3:] ** 2, axis=1))))
+        rms=float(np.sqrt(np.mean(np.sum(off[~far, :3] ** 2, axis=1)))),
+        turn_rms=float(np.sqrt(np.mean(np.sum(off[~far, 3:] ** 2, axis=1))))
         if off.shape[1] == 6
         else None,
+        far=far,
         undetermined=unknown,
         still=np.ptp(angle, axis=0) < TURNED,
         estimated=estimated,

@@ -7,23 +7,22 @@ twists, constant and by the moments that the link carries; a drift of the target
 import numpy as np
 
 from hilcal.data.readings import Readings
-from hilcal.data.whitening import Whitening
 from hilcal.model import Model, Prediction
 from hilcal.observe import motion
 from hilcal.types import Floats
 
 MOST_SHARE = 0.35
 """Most columns, as a share of the whitened rows; a choice, no study set it."""
-FREE = 1e3
-"""Prior standard deviation of a column's effect, in σ of all data together; a choice: wide."""
 
 
 def smooth_nuisance_columns(
-    model: Model, prediction: Prediction, readings: Readings, w: Whitening
+    model: Model, prediction: Prediction, readings: Readings, rank: int
 ) -> Floats:
-    """Whitened columns (R, P), each of the length `FREE`; the simplest ones if rows are few."""
+    """Columns (N, m, P); only the simplest ones where the `rank` of the readings is small."""
     situation, s = prediction.situation, readings.states
-    moves = motion(model.cell, prediction.observation, situation.chain, prediction.deviation, w.m)
+    moves = motion(
+        model.cell, prediction.observation, situation.chain, prediction.deviation, readings.m
+    )
     one = np.ones_like(situation.angle)
     functions = [one, situation.torque]
     if s.approach is not None:
@@ -37,9 +36,5 @@ def smooth_nuisance_columns(
         loads.append(moved[:, :, 3:5] * situation.wrench[:, slot, None, 3:5])
     drift = [] if s.time is None else [moves.by_station() * (s.time - s.time.mean())[:, None, None]]
     harmonics = [moves.drives * f(2 * situation.angle)[:, None, :] for f in (np.cos, np.sin)]
-    most = int(MOST_SHARE * w.rank)
-    columns = np.concatenate([*joints, *drift, *loads, *harmonics, *links], axis=2)[:, :, :most]
-    white = w.whiten(w.raw(columns)).reshape(w.m * len(w), -1)
-    length = np.linalg.norm(white, axis=0)
-    kept = length > 1e-9 * length.max(initial=0.0)
-    return np.asarray(white[:, kept] * (FREE / length[kept]))
+    most = int(MOST_SHARE * rank)
+    return np.concatenate([*joints, *drift, *loads, *harmonics, *links], axis=2)[:, :, :most]

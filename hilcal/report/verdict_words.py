@@ -7,6 +7,7 @@ from hilcal.diagnose.noise_verdict import NoiseVerdict
 from hilcal.diagnose.pose_alone import PoseAlone
 from hilcal.diagnose.separability import Separability
 from hilcal.diagnose.stepwise_alternatives import Alternative
+from hilcal.identify.disagreement_words import disagreement_words
 from hilcal.report.numbers import p_equals, sizes
 from hilcal.report.scatter_words import left_to_the_arm, no_repeatability
 
@@ -17,6 +18,8 @@ def message(d: Diagnosis) -> str:
         return _missing(d.suspects[0])
     if d.reason == "inseparable_suspects":
         return _inseparable(d)
+    if d.reason == "readings_disagree":
+        return disagreement_words(d.fit)
     if d.reason == "insufficient_catalogue":
         return _insufficient(d)
     if d.reason == "no_suspect":

@@ -32,7 +32,7 @@ from hilcal.identify.carried import CarriedPrior
 from hilcal.identify.coordinates import coordinates_of
 from hilcal.identify.errors import ErrorBlock
 from hilcal.identify.estimates import Estimates
-from hilcal.identify.fit import MAX_OUTLIER_SHARE, Fit, fit
+from hilcal.identify.fit import Fit, fit
 from hilcal.identify.folds import FOLDS
 from hilcal.identify.full_covariance import with_joint_scatter
 from hilcal.identify.gauss_newton import over_all_parameters, prior_coordinates
@@ -63,6 +63,8 @@ NAMED = 10
 """Gross errors that are named; a choice."""
 OUTLIER_ROUNDS = 2
 """Searches for gross errors, each followed by a new fit; a choice."""
+MAX_OUTLIER_SHARE = 0.05
+"""Most readings that are set aside, as a share; a choice: more is a misfit."""
 
 Counting = Callable[[str, int], AbstractContextManager[Advance]]
 

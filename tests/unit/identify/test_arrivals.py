@@ -9,7 +9,6 @@ from scipy.stats import chi2, kstest
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode, whitening
 from hilcal.identify.baseline import baseline, with_effects
-from hilcal.identify.data_snooping import _candidates
 from hilcal.identify.fit import fit
 from hilcal.identify.full_covariance import with_common_scatter, with_joint_scatter
 from hilcal.types import Floats
@@ -59,20 +58,6 @@ def test_whitening_is_the_root_of_the_full_covariance(mode: Mode, m: int) -> Non
             mine = np.flatnonzero(used[k])
             for key in (readings.pose, readings.cycle, readings.target):
                 assert len(np.unique(key[mine])) == 1
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_a_shift_of_one_reading_moves_its_whitened_rows(mode: Mode) -> None:
-    readings = reflectors(joint_std=STD, poses=3).readings
-    w = whitening(readings, mode)
-    c = _candidates(w)
-    columns = np.swapaxes(c.gradients(np.eye(3 * len(w))), 1, 2)
-    for row, column in zip(c.row, columns, strict=True):
-        shift = np.zeros((len(readings), 3, 3))
-        shift[row] = np.eye(3)
-        np.testing.assert_allclose(column, w.whiten(w.raw(shift)).reshape(-1, 3), atol=1e-6)
-    if mode == "deflection":
-        assert np.count_nonzero(~c.loaded) == np.count_nonzero(readings.unloaded)
 
 
 @pytest.mark.parametrize("mode", MODES)

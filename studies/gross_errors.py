@@ -1,0 +1,124 @@
+"""Campaigns with gross errors in a share of their readings, and what a refinement makes of them."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hilcal.config import CellConfig
+from hilcal.data.readings import Readings
+from hilcal.data.whitening import MODES, Mode
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.identify.baseline import baseline
+from hilcal.identify.gross_errors import gross_errors
+from hilcal.refine import refine
+from hilcal.types import Ints
+from studies.study_cases import study_case
+
+ARMS = ("ur3", "ur3e", "ur5", "ur5e", "ur10", "ur10e", "ur16e", "ur20", "ur30")
+POSES = (4, 6, 10, 20, 30)
+"""Of six readings each."""
+STRENGTHS = (3.0, 10.0, 20.0)
+"""Of what is hidden, in units of the noise: 20 is about 0.4 mm."""
+
+
+HIDDEN: dict[Mode, tuple[str, ...]] = {
+    "absolute": (
+        "encoder_offset",
+        "transmission_error",
+        "link_geometry",
+        "hysteresis",
+        "thermal_growth",
+    ),
+    "deflection": (
+        "base_compliance",
+        "joint_tilt_compliance",
+        "hysteresis",
+        "backlash",
+        "tracker_drift",
+    ),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Spoilt:
+    """What is asked of one campaign.
+
+    Attributes:
+        share: of the readings that are wrong.
+        size_m: of each error, m.
+        seed: of all that is drawn.
+    """
+
+    share: float
+    size_m: float
+    seed: int
+
+
+@dataclass(frozen=True, slots=True)
+class Counted:
+    """What a refinement made of one campaign.
+
+    Attributes:
+        asked: the campaign.
+        mode: its readings.
+        readings: number of readings.
+        wrong: of these with a gross error.
+        found: of these set aside.
+        false: good readings that were listed as gross errors.
+        said: whether it is said that too many readings disagree.
+        outcome: the verdict, "refused" where the program declined to fit or judge.
+        what: arm, number of poses, what was hidden, and the message of a refusal.
+    """
+
+    asked: Spoilt
+    mode: Mode
+    readings: int
+    wrong: int
+    found: int
+    false: int
+    said: bool
+    outcome: str
+    what: str
+
+
+def spoil(
+    readings: Readings, share: float, size: float, rng: np.random.Generator
+) -> tuple[Readings, Ints]:
+    """Shift a share of the readings, every third in one coordinate alone, else in any direction."""
+    rows = rng.choice(len(readings), round(share * len(readings)), replace=False)
+    shift = rng.normal(size=(len(rows), 3))
+    one = rng.random(len(rows)) < 1 / 3
+    shift[one] = np.eye(3)[rng.integers(3, size=one.sum())] * rng.choice([-1, 1], (one.sum(), 1))
+    sizes = size * 1.25 ** rng.uniform(-1, 1, (len(rows), 1))
+    value = readings.value.copy()
+    value[rows, :3] += sizes * shift / np.linalg.norm(shift, axis=1, keepdims=True)
+    return replace(readings, value=value), rows
+
+
+def count(config: CellConfig, asked: Spoilt) -> Counted:
+    """Draw a campaign, refine it as a user does, and count what was set aside."""
+    rng = np.random.default_rng([30, asked.seed])
+    robot, mode = str(rng.choice(ARMS)), MODES[asked.seed % 2]
+    poses = int(rng.choice(POSES))
+    hidden = (str(rng.choice(HIDDEN[mode])),) if rng.random() < 0.5 else ()
+    strength = float(rng.choice(STRENGTHS))
+    case = study_case(config, robot, mode, hidden, strength, asked.seed, n_poses=poses)
+    readings, wrong = spoil(case.readings, asked.share, asked.size_m, rng)
+    what = f"{robot}, {poses} poses, {' + '.join(hidden) or 'nothing'} hidden ({strength:g} σ)"
+    try:
+        found = refine(baseline(case.cell, readings, mode), readings, mode)
+    except (InputError, CannotAnswerError) as error:
+        what = f"{what}: {error}"
+        return Counted(asked, mode, len(readings), len(wrong), 0, 0, False, "refused", what)
+    listed = {g.row for g in gross_errors(found.fit)}
+    return Counted(
+        asked,
+        mode,
+        len(readings),
+        len(wrong),
+        int(found.fit.outlier[wrong].sum()),
+        len(listed.difference(wrong.tolist())),
+        found.fit.disagreement is not None,
+        found.verdict,
+        what,
+    )

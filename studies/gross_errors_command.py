@@ -1,0 +1,134 @@
+"""`python -m studies gross-errors`: campaigns with errors of millimetres in many readings."""
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Annotated
+
+import typer
+
+from hilcal.cli.engine import Jobs, Scheduler
+from hilcal.cli.terminal import Json, terminal
+from hilcal.config import load_config
+from hilcal.engine.engine import open_engine
+from hilcal.report import text
+from hilcal.report.progress import counting
+from hilcal.robot.catalogue import configs_dir
+from studies.gross_errors import Counted, Spoilt, count
+from studies.records import Figure, Keep, keep
+
+CELL = "demo_ur10e.toml"
+ARMS: tuple[tuple[float, float, float | None], ...] = (
+    (0.2, 5e-3, 0.95),
+    (0.4, 5e-3, 0.8),
+    (0.2, 1e-3, None),
+    (0.4, 1e-3, None),
+    (0.2, 5e-2, None),
+    (0.4, 5e-2, None),
+)
+"""Share of the readings, size of the errors in m, and which share of them has to be found."""
+FALSE = 0.01
+"""Share of the good readings that may be set aside."""
+TOO_MANY = 0.6
+"""Share of the readings of which nothing can be told."""
+
+
+def gross_errors(
+    campaigns: Annotated[
+        int, typer.Option("--campaigns", help="Campaigns of each share and size.")
+    ] = 60,
+    jobs: Jobs = None,
+    scheduler: Scheduler = None,
+    as_json: Json = False,
+    keep_file: Keep = None,
+) -> None:
+    """Spoil readings of campaigns, refine their models, and count what was set aside."""
+    t = terminal(as_json)
+    kinds = [(share, size) for share, size, _ in ARMS] + [(0.0, 5e-3), (TOO_MANY, 5e-3)]
+    every = [
+        Spoilt(share, size, k * campaigns + seed)
+        for k, (share, size) in enumerate(kinds)
+        for seed in range(campaigns)
+    ]
+    with (
+        open_engine(jobs, scheduler) as engine,
+        counting(t.progress, "campaigns", len(every)) as advance,
+    ):
+        counted = engine.map(_counted, every, advance=advance)
+    figures = []
+    out = text.table("wrong", "size", "campaigns", "readings", "found", "false", "verdicts")
+    for k, (share, size) in enumerate(kinds):
+        mine = counted[k * campaigns : (k + 1) * campaigns]
+        figures += _figures(mine, share, size)
+        found, wrong = sum(c.found for c in mine), sum(c.wrong for c in mine)
+        readings, false = sum(c.readings for c in mine), sum(c.false for c in mine)
+        row = (len(mine), readings, f"{found} of {wrong}", false, _verdicts(mine))
+        out.add_row(f"{100 * share:.0f} %", f"{1e3 * size:g} mm", *(str(x) for x in row))
+    t.show(out)
+    t.document({"campaigns": [_row(c) for c in counted]})
+    keep(keep_file, "Gross errors", figures)
+
+
+def _counted(asked: Spoilt) -> Counted:
+    return count(load_config(configs_dir() / "cells" / CELL), asked)
+
+
+def _figures(mine: Sequence[Counted], share: float, size: float) -> list[Figure]:
+    """Figures of the campaigns of one share and size."""
+    readings, wrong = sum(c.readings for c in mine), sum(c.wrong for c in mine)
+    found, false = sum(c.found for c in mine), sum(c.false for c in mine)
+    of = f"{100 * share:.0f} % of the readings {1e3 * size:g} mm off"
+    where = f"{len(mine)} campaigns of {readings} readings"
+    adequate = sum(c.outcome == "adequate" for c in mine)
+    verdicts = Figure(f"{of}: verdicts", _verdicts(mine))
+    if share > 0.45:
+        said = sum(c.said or c.outcome == "refused" for c in mine)
+        return [
+            Figure(
+                f"{of}: said, of {where}",
+                f"{said} of {len(mine)}",
+                f"{len(mine)}",
+                said == len(mine),
+            ),
+            Figure(f"{of}: adequate", f"{adequate} of {len(mine)}", "0", adequate == 0),
+            verdicts,
+        ]
+    right = readings - wrong
+    false_share = Figure(
+        f"{of}: good readings set aside",
+        f"{false} of {right} ({100 * false / right:.2f} %)",
+        f"{100 * FALSE:.0f} %",
+        false <= FALSE * right,
+    )
+    if not wrong:
+        return [false_share, verdicts]
+    required = next(r for s, z, r in ARMS if (s, z) == (share, size))
+    return [
+        Figure(
+            f"{of}: found, in {where}",
+            f"{found} of {wrong} ({100 * found / wrong:.1f} %)",
+            "" if required is None else f"{100 * required:.0f} %",
+            None if required is None else found >= required * wrong,
+        ),
+        false_share,
+        verdicts,
+    ]
+
+
+def _verdicts(mine: Sequence[Counted]) -> str:
+    return ", ".join(f"{n} {v}" for v, n in Counter(c.outcome for c in mine).most_common())
+
+
+def _row(c: Counted) -> dict[str, object]:
+    return {
+        "share": c.asked.share,
+        "size_m": c.asked.size_m,
+        "seed": c.asked.seed,
+        "readings": c.readings,
+        "mode": c.mode,
+        "wrong": c.wrong,
+        "found": c.found,
+        "false": c.false,
+        "outcome": c.outcome,
+        "said": c.said,
+        "what": c.what,
+    }
