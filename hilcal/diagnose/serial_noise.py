@@ -1,0 +1,367 @@
+"""Whether the noise of a fit's readings is correlated along their order, and how far.
+
+The law is that of `data.serial_noise`. A misfit looks alike where neighbours in the order are
+neighbours in joint space, so it is estimated beside all that could be missing. With L the whitening
+of the measurements by the covariance without correlation, B the columns of the model and y their
+residual,
+
+    L y ~ N(L B θ, σ² Σ),    Σ = 1 + φ (K(τ) − K(0)) + Σ_f v_f K_f
+
+K(τ) = A (C(τ) ⊗ 1) Aᵀ that of the serial noise, A = L D S with D the differences that measurements
+are of readings. K_f, scaled to a mean variance of 1, is that
+
+- of each effect of the catalogue that is not in the model, Z_f Z_fᵀ;
+- of joints and target that move as powers of the time, of which the catalogue knows few laws;
+- of a smooth field over joint angles and torques, and of poses, A (C_f ⊗ 1) Aᵀ, C_f their
+  neighbourhood: what the catalogue lacks.
+
+φ, τ and v_f maximise the restricted likelihood, σ² profiled. The serial noise is proved where it
+gains more than chance beside all K_f; it stays in doubt where it gains so alone, but neither it nor
+the K_f gain beside the other. Large campaigns are judged by some of their runs.
+
+Source: Patterson and Thompson, Biometrika 58 (1971) 545-554.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import block_diag, solve_triangular
+
+from hilcal.data.reading_groups import Group, arrival_groups, deflection_groups, runs
+from hilcal.data.serial_noise import Clock, SerialNoise
+from hilcal.diagnose.effect_ranking import candidates
+from hilcal.identify.effect_columns import columns_of_each
+from hilcal.identify.fit import Fit, fit
+from hilcal.identify.wide_suspects import WideColumns
+from hilcal.observe import motion
+from hilcal.regression.schur import inverse_root
+from hilcal.types import Floats, Ints
+
+CHANCE = 8.0
+"""Gain of the restricted log likelihood that is more than chance, p = 0.0002 by the mixture of χ²
+with one and two degrees of freedom (Self and Liang, JASA 82 (1987) 605), on two clocks."""
+FEWEST = 12
+"""Readings below which nothing is estimated; a choice."""
+MOST_ROWS = 450
+"""Elements that are used at most, for speed; a choice: ρ of 150 readings is known to 0.05."""
+PIECE = 50
+"""Measurements in each of the runs that are used of a large campaign; a choice."""
+LEAST, MOST = np.exp(-12.0), np.exp(12.0)
+"""Bounds of v_f: none, and far more than noise."""
+MOST_SHARE = 0.98
+"""Bound of φ; with it every covariance has an inverse."""
+STARTS = (0.3, 0.8, 0.97)
+"""Values of ρ from which the likelihood is climbed."""
+
+
+def with_serial_noise(found: Fit) -> Fit:
+    """Return a fit with the correlation of its noise in the covariance, where there is some.
+
+    Estimated anew where the covariance has it already.
+    """
+    before = found.readings.serial
+    white = found
+    if before is not None:
+        white = _refitted(found, None)
+    noise = serial_noise(white)
+    if noise is None:
+        return white
+    after = _refitted(found, noise)
+    return _refitted(after, replace(noise, wider=_wider(white, after)))
+
+
+def _refitted(found: Fit, noise: SerialNoise | None) -> Fit:
+    readings = found.readings.with_serial(noise)
+    if noise is not None and found.readings.serial is not None:
+        same = replace(noise, wider=found.readings.serial.wider)
+        if same == found.readings.serial:
+            return replace(found, readings=readings)
+    return fit(found.model, readings, found.mode, found.scaling, start=found.theta)
+
+
+def _wider(white: Fit, serial: Fit) -> float:
+    """Median ratio of the standard uncertainties of parameters that both determine."""
+    a, b = white.uncertainty, serial.uncertainty
+    both = a.identifiable & b.identifiable & (a.formal > 0)
+    return float(np.median(b.formal[both] / a.formal[both])) if both.any() else 1.0
+
+
+def serial_noise(found: Fit) -> SerialNoise | None:
+    """Estimate the serial noise of a gc-scaled fit with white noise; None where there is none.
+
+    It is returned with `proved` False where effects explain the readings as well as it does.
+    """
+    if found.scaling != "gc" or len(found.raw) < FEWEST:
+        return None
+    clocks: list[Clock] = ["order"] if found.readings.states.time is None else ["time", "order"]
+    best: tuple[_Problem, _Point] | None = None
+    for clock in clocks:
+        problem = _problem(found, clock)
+        if problem is None:
+            continue
+        alone = problem.climbed(problem.none(), serial=True)
+        if best is None or alone.value > best[1].value:
+            best = problem, alone
+    if best is None:
+        return None
+    problem, alone = best
+    if alone.value - problem.climbed(problem.none(), serial=False).value < CHANCE:
+        return None
+    rivals = problem.rivals()
+    effects = problem.climbed(rivals, serial=False)
+    both = problem.climbed(rivals, serial=True, start=effects)
+    gain = both.value - effects.value
+    if gain < CHANCE and both.value - alone.value >= CHANCE:
+        return None
+    proved = gain >= CHANCE
+    return problem.noise(both if proved else alone, gain, proved)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Point:
+    """φ, τ, v_f and the restricted log likelihood there."""
+
+    share: float
+    length: float
+    v: Floats
+    value: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Problem:
+    """What the likelihood is of, R rows of N readings.
+
+    Attributes:
+        fit: the fit.
+        clock: what t is.
+        rows: (N,) readings that are used, of those that were fitted.
+        y: (R,) whitened residual, at the parameters' prior mean.
+        columns: (R, K) of the model, whitened.
+        ridge: (K,) of their priors.
+        factor: (R, N, m) A.
+        difference: (R, N·m) L D.
+        t: (N,) positions.
+        own: (R, R) K(0).
+    """
+
+    fit: Fit
+    clock: Clock
+    rows: Ints
+    y: Floats
+    columns: Floats
+    ridge: Floats
+    factor: Floats
+    difference: Floats
+    t: Floats
+    own: Floats
+
+    @property
+    def step(self) -> float:
+        """Median distance of consecutive readings."""
+        gaps = np.diff(np.sort(self.t))
+        return float(np.median(gaps[gaps > 0])) if (gaps > 0).any() else 1.0
+
+    def correlated(self, c: Floats) -> Floats:
+        """A (C ⊗ 1) Aᵀ (R, R) of a correlation (N, N)."""
+        moved = np.tensordot(self.factor, c, axes=(1, 0))  # (R, m, N)
+        flat = np.swapaxes(self.factor, 1, 2).reshape(len(self.y), -1)
+        return np.asarray(moved.reshape(len(self.y), -1) @ flat.T)
+
+    def none(self) -> Floats:
+        """No K_f (0, R, R)."""
+        return np.zeros((0, len(self.y), len(self.y)))
+
+    def rivals(self) -> Floats:
+        """All K_f (F, R, R)."""
+        return np.stack(
+            [k * (len(k) / size) for k in self._rivals() if (size := np.trace(k)) > 0]
+        )
+
+    def _rivals(self) -> Iterator[Floats]:
+        kept = self.fit.readings[~self.fit.outlier]
+        s = self.fit.solution.prediction.situation
+
+        def of_columns(x: Floats) -> Floats:
+            white = self.difference @ x.reshape(-1, x.shape[2])
+            return np.asarray(white @ white.T)
+
+        for of in columns_of_each(self.fit, candidates(self.fit)):
+            moved = of.of_readings
+            if isinstance(moved, WideColumns):
+                moved = moved.readings(slice(None))
+            yield of_columns(moved[self.rows])
+        time = kept.states.time
+        t = np.arange(len(kept), dtype=float) if time is None else time
+        scaled = 2 * (t - t.min()) / max(float(np.ptp(t)), 1e-300) - 1
+        p = self.fit.solution.prediction
+        moves = motion(
+            self.fit.model.cell, p.observation, p.situation.chain, p.deviation, kept.m
+        )  # fmt: skip
+        axes = np.zeros((len(kept), kept.m, 3))
+        axes[:, :3] = p.observation.axes
+        for motions in (moves.drives, axes):
+            powers = [motions * scaled[:, None, None] ** k for k in (1, 2, 3)]
+            yield of_columns(np.concatenate(powers, axis=2)[self.rows])
+        pose = kept.pose[self.rows]
+        yield self.correlated((pose[:, None] == pose).astype(float))
+        torque = s.torque[self.rows] / np.maximum(np.abs(s.torque).max(axis=0), 1e-300)
+        angle = s.angle[self.rows]
+        x = np.concatenate([np.cos(angle), np.sin(angle), torque], axis=1)
+        square = np.sum((x[:, None] - x) ** 2, axis=2)
+        yield self.correlated(np.exp(-0.5 * square))
+
+    def climbed(
+        self, rivals: Floats, *, serial: bool, start: _Point | None = None
+    ) -> _Point:
+        """Maximise the restricted likelihood, with or without serial noise."""
+        from scipy.optimize import minimize  # slow to import
+
+        step, count = self.step, len(rivals)
+        span = max(float(np.ptp(self.t)), step)
+        lengths = np.log([0.2 * step, 2.0 * span])
+        bounds = [(np.log(LEAST), np.log(MOST))] * count
+        v = np.full(count, -2.0) if start is None else np.log(start.v)
+        if not serial:
+            if not count:
+                value = self._likelihood(rivals, 0.0, step, np.zeros(0))[0]
+                return _Point(0.0, step, np.zeros(0), value)
+
+            def without(x: Floats) -> tuple[float, Floats]:
+                value, slope = self._likelihood(rivals, 0.0, step, np.exp(x))
+                return -value, -slope[2:] * np.exp(x)
+
+            found = minimize(without, v, jac=True, bounds=bounds, method="L-BFGS-B")
+            return _Point(0.0, step, np.exp(found.x), -float(found.fun))
+
+        def beside(x: Floats) -> tuple[float, Floats]:
+            length = float(np.exp(x[1]))
+            value, slope = self._likelihood(rivals, float(x[0]), length, np.exp(x[2:]))
+            return -value, -slope * np.concatenate([[1.0, length], np.exp(x[2:])])
+
+        tried = [(0.5, np.log(-step / np.log(rho))) for rho in STARTS]
+        begin = min(tried, key=lambda s: beside(np.array([*s, *v]))[0])
+        limits = [(0.0, MOST_SHARE), (float(lengths[0]), float(lengths[1])), *bounds]
+        found = minimize(
+            beside, np.array([*begin, *v]), jac=True, bounds=limits, method="L-BFGS-B"
+        )  # fmt: skip
+        x = found.x
+        return _Point(float(x[0]), float(np.exp(x[1])), np.exp(x[2:]), -float(found.fun))
+
+    def _likelihood(
+        self, rivals: Floats, share: float, length: float, v: Floats
+    ) -> tuple[float, Floats]:
+        """ℓ and its slope by φ, τ and v (2 + F,)."""
+        away = np.abs(self.t[:, None] - self.t)
+        c = np.exp(-away / length)
+        serial = self.correlated(c) - self.own if share > 0 else None
+        sigma = np.eye(len(self.y))
+        if serial is not None:
+            sigma += share * serial
+        sigma += np.tensordot(v, rivals, axes=1)
+        lower = np.linalg.cholesky(sigma + 1e-9 * np.eye(len(sigma)))
+        inverse_lower = solve_triangular(
+            lower, np.eye(len(sigma)), lower=True, check_finite=False
+        )  # fmt: skip
+        b = inverse_lower @ self.columns
+        h = b.T @ b + np.diag(self.ridge)
+        t = inverse_root(h)
+        lifted = (inverse_lower.T @ b) @ t.T
+        p = inverse_lower.T @ inverse_lower - lifted @ lifted.T
+        py = p @ self.y
+        free = len(self.y) - int(np.sum(self.ridge == 0))
+        square = float(self.y @ py)
+        log_h = np.linalg.slogdet(h)[1]
+        log_det = 2 * float(np.log(np.diag(lower)).sum()) + float(log_h)
+        value = -0.5 * (free * np.log(square / free) + log_det)
+        slope = -0.5 * (p - (free / square) * np.outer(py, py))
+        by_share = by_length = 0.0
+        if serial is not None:
+            by_share = float(np.vdot(slope, serial))
+            by_length = float(np.vdot(slope, share * self.correlated(c * away / length**2)))
+        by_v = np.tensordot(rivals, slope, axes=2)
+        return value, np.concatenate([[by_share, by_length], by_v])
+
+    def noise(self, at: _Point, gain: float, proved: bool) -> SerialNoise:
+        """The estimate, its uncertainties from the curvature of ℓ along φ and log τ."""
+        hessian = np.zeros((2, 2))
+        step = np.array([0.02, 0.05])
+        share = min(at.share, MOST_SHARE - step[0])
+        rivals = self.rivals() if len(at.v) else self.none()
+
+        def slopes(a: float, b: float) -> Floats:
+            length = at.length * float(np.exp(b))
+            _, g = self._likelihood(rivals, max(share + a, 1e-3), length, at.v)
+            return np.array([g[0], g[1] * length])
+
+        hessian[0] = (slopes(step[0], 0) - slopes(-step[0], 0)) / (2 * step[0])
+        hessian[1] = (slopes(0, step[1]) - slopes(0, -step[1])) / (2 * step[1])
+        values, vectors = np.linalg.eigh(-(hessian + hessian.T) / 2)
+        error = np.sqrt(np.sum(vectors**2 / np.maximum(values, 1e-2), axis=1))
+        rho = float(np.exp(-self.step / at.length))
+        return SerialNoise(
+            clock=self.clock,
+            share=at.share,
+            share_error=float(min(error[0], 1.0)),
+            length=at.length,
+            rho=rho,
+            rho_error=float(min(rho * self.step / at.length * error[1], 1.0)),
+            log_likelihood_ratio=gain,
+            proved=proved,
+        )
+
+
+def _problem(found: Fit, clock: Clock) -> _Problem | None:
+    """Form the likelihood's rows along a clock; None where it stands still, or V has no inverse."""
+    every = found.readings
+    t = every.states.time if clock == "time" else np.arange(len(every), dtype=float)
+    assert t is not None  # noqa: S101 - the caller's condition
+    along = replace(every, along=t)[~found.outlier]
+    if np.ptp(along.along) == 0:
+        return None
+    groups = (deflection_groups if found.mode == "deflection" else arrival_groups)(along)
+    chosen = _some(runs(along, groups, PIECE), found.whitening.m)
+    place = np.zeros(len(along), dtype=np.int64)
+    place[found.whitening.reading] = np.arange(len(found.raw))
+    loaded = np.concatenate([g[0][0] for g in chosen])
+    reference = np.concatenate([g[1][0] for g in chosen])
+    rows = np.concatenate([loaded, reference])
+    m = along.m
+    weights = block_diag(*(g[2] for g in chosen))
+    difference = np.kron(np.concatenate([np.eye(len(loaded)), -weights], axis=1), np.eye(m))
+    some = along[rows]
+    white = block_diag(*some.covariance)
+    if some.common is not None:
+        arrival = some.arrivals
+        flat = some.common.reshape(len(rows) * m, -1)
+        same = np.kron(arrival[:, None] == arrival, np.ones((m, m)))
+        white = np.where(white != 0, white, (flat @ flat.T) * same)
+    v = difference @ white @ difference.T
+    std = np.sqrt(np.diag(v))
+    if not np.all(std > 0):
+        return None
+    try:
+        lower = np.linalg.cholesky(v / std[:, None] / std)
+    except np.linalg.LinAlgError:
+        return None
+    inverse = solve_triangular(lower, np.diag(1 / std), lower=True, check_finite=False)
+    whitened = inverse @ difference
+    s = found.solution
+    live = np.flatnonzero(s.estimated)
+    jacobian = found.model.jacobian(s.prediction, s.theta, m, live)[rows]
+    columns = whitened @ (jacobian.reshape(-1, len(live)) @ s.transform[live])
+    y = inverse @ found.raw[place[loaded]].reshape(-1) + columns @ s.coordinates()
+    root = block_diag(*some.instrument_root())
+    factor = (whitened @ root).reshape(len(y), len(rows), m)
+    flat = factor.reshape(len(y), -1)
+    ridge = s.equations.basis.prior_precision
+    return _Problem(
+        found, clock, rows, y, columns, ridge, factor, whitened, some.along, flat @ flat.T
+    )
+
+
+def _some(pieces: list[Group], m: int) -> list[Group]:
+    """All pieces of an order, or as many of them, evenly spaced, as have `MOST_ROWS`."""
+    size = m * sum(p[0].size for p in pieces)
+    count = max(int(len(pieces) * min(MOST_ROWS / size, 1.0)), 1)
+    return [pieces[k] for k in np.linspace(0, len(pieces) - 1, count).astype(int)]
