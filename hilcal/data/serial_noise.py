@@ -40,7 +40,9 @@ class SerialNoise:
         log_likelihood_ratio: gain of the restricted log likelihood over white noise, with every
             effect that the readings could show beside either.
         proved: whether that is more than chance; False where effects explain the readings as well.
-        wider: by how much the standard uncertainties of the parameters are larger for it, median.
+        instead: what explains them as well, where it is not proved.
+        wider: least and largest factor by which it changes the standard uncertainties of the
+            parameters.
     """
 
     clock: Clock
@@ -51,7 +53,8 @@ class SerialNoise:
     rho_error: float
     log_likelihood_ratio: float
     proved: bool = True
-    wider: float = 1.0
+    instead: tuple[str, ...] = ()
+    wider: tuple[float, float] = (1.0, 1.0)
 
     @property
     def half(self) -> float:
@@ -69,7 +72,9 @@ class SerialNoise:
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> "SerialNoise":
         """Return what `to_json` wrote."""
-        return cls(**{name: value for name, value in content.items() if name != "half"})
+        given: dict[str, Any] = {name: x for name, x in content.items() if name != "half"}
+        lists = given.keys() & {"instead", "wider"}
+        return cls(**{**given, **{name: tuple(given[name]) for name in lists}})
 
 
 def symmetric_root(covariance: Floats) -> Floats:

@@ -30,6 +30,7 @@ Reason = Literal[
     "misjudged_noise",
     "arm_scatter",
     "pose_alone",
+    "serial_or_effect",
 ]
 VERDICTS: dict[Reason, Verdict] = {
     "residual_is_noise": "adequate",
@@ -41,6 +42,7 @@ VERDICTS: dict[Reason, Verdict] = {
     "misjudged_noise": "noise_misjudged",
     "arm_scatter": "adequate",
     "pose_alone": "ambiguous",
+    "serial_or_effect": "ambiguous",
 }
 """The verdict that each reason leads to."""
 

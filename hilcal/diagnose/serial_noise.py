@@ -15,9 +15,14 @@ are of readings. K_f, scaled to a mean variance of 1, is that
 - of a smooth field over joint angles and torques, and of poses, A (C_f ⊗ 1) Aᵀ, C_f their
   neighbourhood: what the catalogue lacks.
 
-φ, τ and v_f maximise the restricted likelihood, σ² profiled. The serial noise is proved where it
-gains more than chance beside all K_f; it stays in doubt where it gains so alone, but neither it nor
-the K_f gain beside the other. Large campaigns are judged by some of their runs.
+φ, τ and v_f maximise the restricted likelihood, σ² profiled: tests do not depend on a noise that is
+misjudged as a whole. Little but the stated covariance tells a long correlation of large noise from
+a short one of small noise: the estimate is that with σ² = 1, unless the readings speak against it.
+
+The serial noise is proved where it
+gains more than chance beside all K_f. Where it does not, but gains so alone, the K_f explain the
+readings instead, as those of a drift; if these are not better by 20 : 1, it stays in doubt. Large
+campaigns are judged by some of their runs.
 
 Source: Patterson and Thompson, Biometrika 58 (1971) 545-554.
 """
@@ -30,7 +35,7 @@ from scipy.linalg import block_diag, solve_triangular
 
 from hilcal.data.reading_groups import Group, arrival_groups, deflection_groups, runs
 from hilcal.data.serial_noise import Clock, SerialNoise
-from hilcal.diagnose.effect_ranking import candidates
+from hilcal.diagnose.effect_ranking import SAME_EVIDENCE, candidates
 from hilcal.identify.effect_columns import columns_of_each
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.wide_suspects import WideColumns
@@ -41,6 +46,9 @@ from hilcal.types import Floats, Ints
 CHANCE = 8.0
 """Gain of the restricted log likelihood that is more than chance, p = 0.0002 by the mixture of χ²
 with one and two degrees of freedom (Self and Liang, JASA 82 (1987) 605), on two clocks."""
+AGAINST = 6.0
+"""Gain of the restricted log likelihood by another σ² than 1 that speaks against it: that of
+`noise_verdict.MISFIT_ALARM`."""
 FEWEST = 12
 """Readings below which nothing is estimated; a choice."""
 MOST_ROWS = 450
@@ -49,42 +57,42 @@ PIECE = 50
 """Measurements in each of the runs that are used of a large campaign; a choice."""
 LEAST, MOST = np.exp(-12.0), np.exp(12.0)
 """Bounds of v_f: none, and far more than noise."""
-MOST_SHARE = 0.98
+MOST_SHARE = 0.999
 """Bound of φ; with it every covariance has an inverse."""
+MOST_NAMED = 2
+"""Rivals that are named."""
+SOME = 0.01
+"""Mean variance, in that of the noise, from which on a rival is named; a choice."""
+SHARE_STEP, LENGTH_STEP = 0.02, 0.05
+"""Steps of φ and log τ by which the curvature is taken."""
 STARTS = (0.3, 0.8, 0.97)
 """Values of ρ from which the likelihood is climbed."""
 
 
-def with_serial_noise(found: Fit) -> Fit:
+def with_serial_noise(white: Fit, prior: Floats | None = None) -> Fit:
     """Return a fit with the correlation of its noise in the covariance, where there is some.
 
-    Estimated anew where the covariance has it already.
+    Args:
+        white: a fit of white noise.
+        prior: standard deviations (P,) that it was given.
     """
-    before = found.readings.serial
-    white = found
-    if before is not None:
-        white = _refitted(found, None)
     noise = serial_noise(white)
     if noise is None:
         return white
-    after = _refitted(found, noise)
-    return _refitted(after, replace(noise, wider=_wider(white, after)))
+    readings = white.readings.with_serial(noise)
+    found = fit(white.model, readings, white.mode, white.scaling, white.theta, prior)
+    noise = replace(noise, wider=_wider(white, found))
+    return replace(found, readings=readings.with_serial(noise))
 
 
-def _refitted(found: Fit, noise: SerialNoise | None) -> Fit:
-    readings = found.readings.with_serial(noise)
-    if noise is not None and found.readings.serial is not None:
-        same = replace(noise, wider=found.readings.serial.wider)
-        if same == found.readings.serial:
-            return replace(found, readings=readings)
-    return fit(found.model, readings, found.mode, found.scaling, start=found.theta)
-
-
-def _wider(white: Fit, serial: Fit) -> float:
-    """Median ratio of the standard uncertainties of parameters that both determine."""
+def _wider(white: Fit, serial: Fit) -> tuple[float, float]:
+    """Least and largest ratio of the formal uncertainties of parameters that both determine."""
     a, b = white.uncertainty, serial.uncertainty
     both = a.identifiable & b.identifiable & (a.formal > 0)
-    return float(np.median(b.formal[both] / a.formal[both])) if both.any() else 1.0
+    if not both.any():
+        return 1.0, 1.0
+    ratio = b.formal[both] / a.formal[both]
+    return float(ratio.min()), float(ratio.max())
 
 
 def serial_noise(found: Fit) -> SerialNoise | None:
@@ -108,14 +116,19 @@ def serial_noise(found: Fit) -> SerialNoise | None:
     problem, alone = best
     if alone.value - problem.climbed(problem.none(), serial=False).value < CHANCE:
         return None
-    rivals = problem.rivals()
+    names, rivals = problem.rivals()
     effects = problem.climbed(rivals, serial=False)
     both = problem.climbed(rivals, serial=True, start=effects)
     gain = both.value - effects.value
-    if gain < CHANCE and both.value - alone.value >= CHANCE:
+    if gain >= CHANCE:
+        # Variances that are not needed take some of the noise for their own.
+        needed = both.value - alone.value >= CHANCE
+        return problem.noise(*((both, rivals) if needed else (alone, problem.none())), gain)
+    if effects.value - alone.value >= SAME_EVIDENCE:
         return None
-    proved = gain >= CHANCE
-    return problem.noise(both if proved else alone, gain, proved)
+    worst = np.argsort(-effects.v)[:MOST_NAMED]
+    instead = tuple(names[k] for k in worst if effects.v[k] > SOME)
+    return replace(problem.noise(alone, problem.none(), gain), proved=False, instead=instead)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -172,13 +185,12 @@ class _Problem:
         """No K_f (0, R, R)."""
         return np.zeros((0, len(self.y), len(self.y)))
 
-    def rivals(self) -> Floats:
-        """All K_f (F, R, R)."""
-        return np.stack(
-            [k * (len(k) / size) for k in self._rivals() if (size := np.trace(k)) > 0]
-        )
+    def rivals(self) -> tuple[list[str], Floats]:
+        """Names and K_f (F, R, R) of all."""
+        found = [(name, k * (len(k) / t)) for name, k in self._rivals() if (t := np.trace(k)) > 0]
+        return [name for name, _ in found], np.stack([k for _, k in found])
 
-    def _rivals(self) -> Iterator[Floats]:
+    def _rivals(self) -> Iterator[tuple[str, Floats]]:
         kept = self.fit.readings[~self.fit.outlier]
         s = self.fit.solution.prediction.situation
 
@@ -190,7 +202,7 @@ class _Problem:
             moved = of.of_readings
             if isinstance(moved, WideColumns):
                 moved = moved.readings(slice(None))
-            yield of_columns(moved[self.rows])
+            yield of.effect.name, of_columns(moved[self.rows])
         time = kept.states.time
         t = np.arange(len(kept), dtype=float) if time is None else time
         scaled = 2 * (t - t.min()) / max(float(np.ptp(t)), 1e-300) - 1
@@ -202,19 +214,31 @@ class _Problem:
         axes[:, :3] = p.observation.axes
         for motions in (moves.drives, axes):
             powers = [motions * scaled[:, None, None] ** k for k in (1, 2, 3)]
-            yield of_columns(np.concatenate(powers, axis=2)[self.rows])
+            yield "the time", of_columns(np.concatenate(powers, axis=2)[self.rows])
         pose = kept.pose[self.rows]
-        yield self.correlated((pose[:, None] == pose).astype(float))
+        yield "the pose", self.correlated((pose[:, None] == pose).astype(float))
         torque = s.torque[self.rows] / np.maximum(np.abs(s.torque).max(axis=0), 1e-300)
         angle = s.angle[self.rows]
         x = np.concatenate([np.cos(angle), np.sin(angle), torque], axis=1)
         square = np.sum((x[:, None] - x) ** 2, axis=2)
-        yield self.correlated(np.exp(-0.5 * square))
+        yield "angles and torques", self.correlated(np.exp(-0.5 * square))
 
     def climbed(
-        self, rivals: Floats, *, serial: bool, start: _Point | None = None
+        self,
+        rivals: Floats,
+        *,
+        serial: bool,
+        start: _Point | None = None,
+        stated: bool = False,
     ) -> _Point:
-        """Maximise the restricted likelihood, with or without serial noise."""
+        """Maximise the restricted likelihood, with or without serial noise.
+
+        Args:
+            rivals: the K_f.
+            serial: whether φ may be more than zero.
+            start: where to begin with v_f, and to begin at all where that has serial noise.
+            stated: whether σ² = 1.
+        """
         from scipy.optimize import minimize  # slow to import
 
         step, count = self.step, len(rivals)
@@ -236,10 +260,13 @@ class _Problem:
 
         def beside(x: Floats) -> tuple[float, Floats]:
             length = float(np.exp(x[1]))
-            value, slope = self._likelihood(rivals, float(x[0]), length, np.exp(x[2:]))
-            return -value, -slope * np.concatenate([[1.0, length], np.exp(x[2:])])
+            v = np.exp(x[2:])
+            value, slope = self._likelihood(rivals, float(x[0]), length, v, stated)
+            return -value, -slope * np.concatenate([[1.0, length], v])
 
         tried = [(0.5, np.log(-step / np.log(rho))) for rho in STARTS]
+        if start is not None and start.share > 0:
+            tried = [(start.share, np.log(start.length))]
         begin = min(tried, key=lambda s: beside(np.array([*s, *v]))[0])
         limits = [(0.0, MOST_SHARE), (float(lengths[0]), float(lengths[1])), *bounds]
         found = minimize(
@@ -249,7 +276,7 @@ class _Problem:
         return _Point(float(x[0]), float(np.exp(x[1])), np.exp(x[2:]), -float(found.fun))
 
     def _likelihood(
-        self, rivals: Floats, share: float, length: float, v: Floats
+        self, rivals: Floats, share: float, length: float, v: Floats, stated: bool = False
     ) -> tuple[float, Floats]:
         """ℓ and its slope by φ, τ and v (2 + F,)."""
         away = np.abs(self.t[:, None] - self.t)
@@ -273,8 +300,9 @@ class _Problem:
         square = float(self.y @ py)
         log_h = np.linalg.slogdet(h)[1]
         log_det = 2 * float(np.log(np.diag(lower)).sum()) + float(log_h)
-        value = -0.5 * (free * np.log(square / free) + log_det)
-        slope = -0.5 * (p - (free / square) * np.outer(py, py))
+        noise = 1.0 if stated else square / free
+        value = -0.5 * (free * np.log(noise) + square / noise + log_det)
+        slope = -0.5 * (p - np.outer(py, py) / noise)
         by_share = by_length = 0.0
         if serial is not None:
             by_share = float(np.vdot(slope, serial))
@@ -282,32 +310,33 @@ class _Problem:
         by_v = np.tensordot(rivals, slope, axes=2)
         return value, np.concatenate([[by_share, by_length], by_v])
 
-    def noise(self, at: _Point, gain: float, proved: bool) -> SerialNoise:
-        """The estimate, its uncertainties from the curvature of ℓ along φ and log τ."""
-        hessian = np.zeros((2, 2))
-        step = np.array([0.02, 0.05])
-        share = min(at.share, MOST_SHARE - step[0])
-        rivals = self.rivals() if len(at.v) else self.none()
+    def noise(self, free: _Point, rivals: Floats, gain: float) -> SerialNoise:
+        """Return the estimate; its uncertainties are by the curvature of ℓ."""
+        at = self.climbed(rivals, serial=True, start=free, stated=True)
+        stated = free.value - at.value < AGAINST
+        at = at if stated else free
+        share = min(at.share, MOST_SHARE - SHARE_STEP)
 
         def slopes(a: float, b: float) -> Floats:
             length = at.length * float(np.exp(b))
-            _, g = self._likelihood(rivals, max(share + a, 1e-3), length, at.v)
+            g = self._likelihood(rivals, max(share + a, 0.0), length, at.v, stated)[1]
             return np.array([g[0], g[1] * length])
 
-        hessian[0] = (slopes(step[0], 0) - slopes(-step[0], 0)) / (2 * step[0])
-        hessian[1] = (slopes(0, step[1]) - slopes(0, -step[1])) / (2 * step[1])
-        values, vectors = np.linalg.eigh(-(hessian + hessian.T) / 2)
-        error = np.sqrt(np.sum(vectors**2 / np.maximum(values, 1e-2), axis=1))
+        def curvature(a: float, b: float) -> Floats:
+            return (slopes(-a, -b) - slopes(a, b)) / (2 * (a + b))
+
+        h = np.stack([curvature(SHARE_STEP, 0.0), curvature(0.0, LENGTH_STEP)])
+        both = share == at.share and float(np.linalg.det(h)) > 0 and h[0, 0] > 0
+        c = np.linalg.inv(h) if both else np.diag(1.0 / np.maximum(np.diag(h), 1.0))
         rho = float(np.exp(-self.step / at.length))
         return SerialNoise(
             clock=self.clock,
             share=at.share,
-            share_error=float(min(error[0], 1.0)),
+            share_error=float(min(c[0, 0] ** 0.5, 1.0)),
             length=at.length,
             rho=rho,
-            rho_error=float(min(rho * self.step / at.length * error[1], 1.0)),
+            rho_error=float(min(rho * self.step / at.length * c[1, 1] ** 0.5, 1.0)),
             log_likelihood_ratio=gain,
-            proved=proved,
         )
 
 
