@@ -151,12 +151,15 @@ class Readings:
             self, serial=noise, along=self.states.time if noise.clock == "time" else order
         )
 
-    def instrument_root(self) -> Floats:
-        """(N, m, m) S of `serial_noise`: root of the covariance that is not known as the arm's."""
+    def instrument_root(self, m: int | None = None) -> Floats:
+        """(N, m, m) S of `serial_noise`: root of the covariance that is not known as the arm's.
+
+        Of the first m elements; of all where that is None.
+        """
         v = self.covariance if self.stated is None else self.stated
         if self.stated is None and self.common is not None:
             v = v - self.common @ np.swapaxes(self.common, 1, 2)
-        return symmetric_root(v)
+        return symmetric_root(v[:, :m, :m])
 
     @property
     def m(self) -> int:

@@ -21,8 +21,9 @@ a short one of small noise: the estimate is that with σ² = 1, unless the readi
 
 The serial noise is proved where it
 gains more than chance beside all K_f. Where it does not, but gains so alone, the K_f explain the
-readings instead, as those of a drift; if these are not better by 20 : 1, it stays in doubt. Large
-campaigns are judged by some of their runs.
+readings instead, as those of a drift; if these are not better by 20 : 1, it stays in doubt.
+Campaigns of more than `MOST_ROWS` are judged by some of their runs, those of more than
+`MOST_READINGS` not at all.
 
 Source: Patterson and Thompson, Biometrika 58 (1971) 545-554.
 """
@@ -51,8 +52,13 @@ AGAINST = 6.0
 `noise_verdict.MISFIT_ALARM`."""
 FEWEST = 12
 """Readings below which nothing is estimated; a choice."""
+MOST_READINGS = 600
+"""Measurements above which nothing is estimated; a choice by timing: effects with over a thousand
+columns, as a transmission error, are kept by factors (`wide_suspects`) where noise is white."""
+POSITION = 3
+"""Elements of a reading by which it is estimated: an attitude follows its position."""
 MOST_ROWS = 450
-"""Elements that are used at most, for speed; a choice: ρ of 150 readings is known to 0.05."""
+"""Rows that are used at most, for speed; a choice: ρ of 150 readings is known to 0.05."""
 PIECE = 50
 """Measurements in each of the runs that are used of a large campaign; a choice."""
 LEAST, MOST = np.exp(-12.0), np.exp(12.0)
@@ -100,7 +106,7 @@ def serial_noise(found: Fit) -> SerialNoise | None:
 
     It is returned with `proved` False where effects explain the readings as well as it does.
     """
-    if found.scaling != "gc" or len(found.raw) < FEWEST:
+    if found.scaling != "gc" or not FEWEST <= len(found.raw) <= MOST_READINGS:
         return None
     clocks: list[Clock] = ["order"] if found.readings.states.time is None else ["time", "order"]
     best: tuple[_Problem, _Point] | None = None
@@ -195,7 +201,7 @@ class _Problem:
         s = self.fit.solution.prediction.situation
 
         def of_columns(x: Floats) -> Floats:
-            white = self.difference @ x.reshape(-1, x.shape[2])
+            white = self.difference @ x[:, :POSITION].reshape(-1, x.shape[2])
             return np.asarray(white @ white.T)
 
         for of in columns_of_each(self.fit, candidates(self.fit)):
@@ -349,22 +355,21 @@ def _problem(found: Fit, clock: Clock) -> _Problem | None:
     if np.ptp(along.along) == 0:
         return None
     groups = (deflection_groups if found.mode == "deflection" else arrival_groups)(along)
-    chosen = _some(runs(along, groups, PIECE), found.whitening.m)
+    chosen = _some(runs(along, groups, PIECE))
     place = np.zeros(len(along), dtype=np.int64)
     place[found.whitening.reading] = np.arange(len(found.raw))
     loaded = np.concatenate([g[0][0] for g in chosen])
     reference = np.concatenate([g[1][0] for g in chosen])
     rows = np.concatenate([loaded, reference])
-    m = along.m
+    m = POSITION
     weights = block_diag(*(g[2] for g in chosen))
     difference = np.kron(np.concatenate([np.eye(len(loaded)), -weights], axis=1), np.eye(m))
     some = along[rows]
-    white = block_diag(*some.covariance)
+    white = block_diag(*some.covariance[:, :m, :m])
     if some.common is not None:
-        arrival = some.arrivals
-        flat = some.common.reshape(len(rows) * m, -1)
-        same = np.kron(arrival[:, None] == arrival, np.ones((m, m)))
-        white = np.where(white != 0, white, (flat @ flat.T) * same)
+        flat = some.common[:, :m].reshape(len(rows) * m, -1)
+        together = (some.arrivals[:, None] == some.arrivals) & ~np.eye(len(rows), dtype=bool)
+        white = white + (flat @ flat.T) * np.kron(together, np.ones((m, m)))
     v = difference @ white @ difference.T
     std = np.sqrt(np.diag(v))
     if not np.all(std > 0):
@@ -379,8 +384,8 @@ def _problem(found: Fit, clock: Clock) -> _Problem | None:
     live = np.flatnonzero(s.estimated)
     jacobian = found.model.jacobian(s.prediction, s.theta, m, live)[rows]
     columns = whitened @ (jacobian.reshape(-1, len(live)) @ s.transform[live])
-    y = inverse @ found.raw[place[loaded]].reshape(-1) + columns @ s.coordinates()
-    root = block_diag(*some.instrument_root())
+    y = inverse @ found.raw[place[loaded], :m].reshape(-1) + columns @ s.coordinates()
+    root = block_diag(*some.instrument_root(m))
     factor = (whitened @ root).reshape(len(y), len(rows), m)
     flat = factor.reshape(len(y), -1)
     ridge = s.equations.basis.prior_precision
@@ -389,8 +394,8 @@ def _problem(found: Fit, clock: Clock) -> _Problem | None:
     )
 
 
-def _some(pieces: list[Group], m: int) -> list[Group]:
+def _some(pieces: list[Group]) -> list[Group]:
     """All pieces of an order, or as many of them, evenly spaced, as have `MOST_ROWS`."""
-    size = m * sum(p[0].size for p in pieces)
+    size = POSITION * sum(p[0].size for p in pieces)
     count = max(int(len(pieces) * min(MOST_ROWS / size, 1.0)), 1)
     return [pieces[k] for k in np.linspace(0, len(pieces) - 1, count).astype(int)]
