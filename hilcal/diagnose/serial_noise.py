@@ -65,6 +65,8 @@ LEAST, MOST = np.exp(-12.0), np.exp(12.0)
 """Bounds of v_f: none, and far more than noise."""
 MOST_SHARE = 0.999
 """Bound of φ; with it every covariance has an inverse."""
+ROUNDING = 1e-9
+"""Least variance, in units of the noise, and least information, as a share of the mean."""
 MOST_NAMED = 2
 """Rivals that are named."""
 SOME = 0.01
@@ -79,10 +81,10 @@ def with_serial_noise(white: Fit, prior: Floats | None = None) -> Fit:
     """Return a fit with the correlation of its noise in the covariance, where there is some.
 
     Args:
-        white: a fit of white noise.
+        white: a fit; as it is where its covariance has the correlation.
         prior: standard deviations (P,) that it was given.
     """
-    noise = serial_noise(white)
+    noise = serial_noise(white) if white.readings.serial is None else None
     if noise is None:
         return white
     readings = white.readings.with_serial(noise)
@@ -213,12 +215,9 @@ class _Problem:
         t = np.arange(len(kept), dtype=float) if time is None else time
         scaled = 2 * (t - t.min()) / max(float(np.ptp(t)), 1e-300) - 1
         p = self.fit.solution.prediction
-        moves = motion(
-            self.fit.model.cell, p.observation, p.situation.chain, p.deviation, kept.m
-        )  # fmt: skip
-        axes = np.zeros((len(kept), kept.m, 3))
-        axes[:, :3] = p.observation.axes
-        for motions in (moves.drives, axes):
+        cell, m = self.fit.model.cell, POSITION
+        moves = motion(cell, p.observation, p.situation.chain, p.deviation, m)
+        for motions in (moves.drives, p.observation.axes):
             powers = [motions * scaled[:, None, None] ** k for k in (1, 2, 3)]
             yield "the time", of_columns(np.concatenate(powers, axis=2)[self.rows])
         pose = kept.pose[self.rows]
@@ -249,37 +248,27 @@ class _Problem:
 
         step, count = self.step, len(rivals)
         span = max(float(np.ptp(self.t)), step)
-        lengths = np.log([0.2 * step, 2.0 * span])
-        bounds = [(np.log(LEAST), np.log(MOST))] * count
-        v = np.full(count, -2.0) if start is None else np.log(start.v)
-        if not serial:
-            if not count:
-                value = self._likelihood(rivals, 0.0, step, np.zeros(0))[0]
-                return _Point(0.0, step, np.zeros(0), value)
 
-            def without(x: Floats) -> tuple[float, Floats]:
-                value, slope = self._likelihood(rivals, 0.0, step, np.exp(x))
-                return -value, -slope[2:] * np.exp(x)
-
-            found = minimize(without, v, jac=True, bounds=bounds, method="L-BFGS-B")
-            return _Point(0.0, step, np.exp(found.x), -float(found.fun))
-
-        def beside(x: Floats) -> tuple[float, Floats]:
-            length = float(np.exp(x[1]))
-            v = np.exp(x[2:])
+        def climb(x: Floats) -> tuple[float, Floats]:
+            length, v = float(np.exp(x[1])), np.exp(x[2:])
             value, slope = self._likelihood(rivals, float(x[0]), length, v, stated)
             return -value, -slope * np.concatenate([[1.0, length], v])
 
-        tried = [(0.5, np.log(-step / np.log(rho))) for rho in STARTS]
+        begin = [(0.0, np.log(step))]
         if start is not None and start.share > 0:
-            tried = [(start.share, np.log(start.length))]
-        begin = min(tried, key=lambda s: beside(np.array([*s, *v]))[0])
-        limits = [(0.0, MOST_SHARE), (float(lengths[0]), float(lengths[1])), *bounds]
-        found = minimize(
-            beside, np.array([*begin, *v]), jac=True, bounds=limits, method="L-BFGS-B"
-        )  # fmt: skip
-        x = found.x
-        return _Point(float(x[0]), float(np.exp(x[1])), np.exp(x[2:]), -float(found.fun))
+            begin = [(start.share, np.log(start.length))]
+        elif serial:
+            begin = [(0.5, np.log(-step / np.log(rho))) for rho in STARTS]
+        v = np.full(count, -2.0) if start is None else np.log(start.v)
+        x = min((np.array([*s, *v]) for s in begin), key=lambda x: climb(x)[0])
+        bounds = [
+            (0.0, MOST_SHARE if serial else 0.0),
+            (np.log(0.2 * step), np.log(2.0 * span)),
+            *[(np.log(LEAST), np.log(MOST))] * count,
+        ]
+        found = minimize(climb, x, jac=True, bounds=bounds, method="L-BFGS-B")
+        share, length = found.x[:2]
+        return _Point(float(share), float(np.exp(length)), np.exp(found.x[2:]), -float(found.fun))
 
     def _likelihood(
         self, rivals: Floats, share: float, length: float, v: Floats, stated: bool = False
@@ -292,12 +281,11 @@ class _Problem:
         if serial is not None:
             sigma += share * serial
         sigma += np.tensordot(v, rivals, axes=1)
-        lower = np.linalg.cholesky(sigma + 1e-9 * np.eye(len(sigma)))
-        inverse_lower = solve_triangular(
-            lower, np.eye(len(sigma)), lower=True, check_finite=False
-        )  # fmt: skip
+        lower = np.linalg.cholesky(sigma + ROUNDING * np.eye(len(sigma)))
+        inverse_lower = solve_triangular(lower, np.eye(len(sigma)), lower=True)
         b = inverse_lower @ self.columns
         h = b.T @ b + np.diag(self.ridge)
+        h += ROUNDING * float(np.trace(h)) / len(h) * np.eye(len(h))
         t = inverse_root(h)
         lifted = (inverse_lower.T @ b) @ t.T
         p = inverse_lower.T @ inverse_lower - lifted @ lifted.T
@@ -351,8 +339,8 @@ def _problem(found: Fit, clock: Clock) -> _Problem | None:
     every = found.readings
     t = every.states.time if clock == "time" else np.arange(len(every), dtype=float)
     assert t is not None  # noqa: S101 - the caller's condition
-    along = replace(every, along=t)[~found.outlier]
-    if np.ptp(along.along) == 0:
+    along, t = replace(every, along=t)[~found.outlier], t[~found.outlier]
+    if np.ptp(t) == 0:
         return None
     groups = (deflection_groups if found.mode == "deflection" else arrival_groups)(along)
     chosen = _some(runs(along, groups, PIECE))
@@ -389,9 +377,9 @@ def _problem(found: Fit, clock: Clock) -> _Problem | None:
     factor = (whitened @ root).reshape(len(y), len(rows), m)
     flat = factor.reshape(len(y), -1)
     ridge = s.equations.basis.prior_precision
-    return _Problem(
-        found, clock, rows, y, columns, ridge, factor, whitened, some.along, flat @ flat.T
-    )
+    if len(y) < 2 * np.sum(ridge == 0):
+        return None
+    return _Problem(found, clock, rows, y, columns, ridge, factor, whitened, t[rows], flat @ flat.T)
 
 
 def _some(pieces: list[Group]) -> list[Group]:
