@@ -87,12 +87,14 @@ def serial_case(
         asked: seed of everything random, ρ, and an effect that is hidden, or "".
         config: the cell; robot and loads are replaced.
         robot: name of the arm.
-        poses: how many, each without a load and under five.
+        poses: how many, each without a load and under five; twice as many where a drift is hidden.
     """
     seed, rho, hidden = asked
     mode: Mode = "deflection" if seed // 2 % 2 and not hidden else "absolute"
     names = (hidden,) if hidden else ()
-    case = study_case(config, robot, mode, names, STRENGTH, seed, n_poses=poses)
+    case = study_case(
+        config, robot, mode, names, STRENGTH, seed, n_poses=poses * (2 if hidden else 1)
+    )
     rng = np.random.default_rng([seed, 20261124])
     readings = serial_readings(case, rho, rng)
     if seed % 2 and not hidden:

@@ -26,7 +26,7 @@ DRIFT = "tracker_drift"
 
 def serial_noise(
     campaigns: Annotated[int, typer.Option("--campaigns", help="For each ρ.")] = 100,
-    drifts: Annotated[int, typer.Option("--drifts", help="With a drift of 2 σ, for each ρ.")] = 20,
+    drifts: Annotated[int, typer.Option("--drifts", help="With a drift of 2 σ, for each ρ.")] = 12,
     rhos: Annotated[str, typer.Option("--rho", help="ρ of successive readings.")] = "0,0.5,0.7,0.9",
     robot: Annotated[str, typer.Option("--robot", help="The arm.")] = "ur10e",
     poses: Annotated[int, typer.Option("--poses", help="Of six readings each.")] = 10,
@@ -70,7 +70,7 @@ def _figures(cases: Sequence[SerialCase], rhos: Sequence[float]) -> Iterator[Fig
         if drifts:
             named = [_share(drifts, lambda o: o.added == (DRIFT,), w) for w in (False, True)]
             yield Figure(
-                f"ρ = {rho:g}, a drift of 2 σ: it alone is named",
+                f"ρ = {rho:g}, a drift of 2 σ, twice the poses: it alone is named",
                 f"white {named[0]}, as it is {named[1]} of {len(drifts)}",
             )
 

@@ -19,11 +19,10 @@ are of readings. K_f, scaled to a mean variance of 1, is that
 misjudged as a whole. Little but the stated covariance tells a long correlation of large noise from
 a short one of small noise: the estimate is that with σ² = 1, unless the readings speak against it.
 
-The serial noise is proved where it
-gains more than chance beside all K_f. Where it does not, but gains so alone, the K_f explain the
-readings instead, as those of a drift; if these are not better by 20 : 1, it stays in doubt.
-Campaigns of more than `MOST_ROWS` are judged by some of their runs, those of more than
-`MOST_READINGS` not at all.
+The serial noise is proved where it gains more than chance beside all K_f, or alone, and is then
+better than all K_f by 20 : 1. Where these are better by as much, they explain the readings, as a
+drift does; else it stays in doubt. Campaigns of more than `MOST_ROWS` are judged by some of their
+runs, those of more than `MOST_READINGS` not at all.
 
 Source: Patterson and Thompson, Biometrika 58 (1971) 545-554.
 """
@@ -128,9 +127,9 @@ def serial_noise(found: Fit) -> SerialNoise | None:
     effects = problem.climbed(rivals, serial=False)
     both = problem.climbed(rivals, serial=True, start=effects)
     gain = both.value - effects.value
-    if gain >= CHANCE:
+    if gain >= CHANCE or alone.value - effects.value >= SAME_EVIDENCE:
         # Variances that are not needed take some of the noise for their own.
-        needed = both.value - alone.value >= CHANCE
+        needed = both.value - alone.value >= SAME_EVIDENCE
         return problem.noise(*((both, rivals) if needed else (alone, problem.none())), gain)
     if effects.value - alone.value >= SAME_EVIDENCE:
         return None
