@@ -19,6 +19,7 @@ from hilcal.data.revision import STORED, RevisionRecord
 from hilcal.data.robot_file import ROBOT_FILE, check_robot
 from hilcal.data.whitening import Mode, usual_mode
 from hilcal.diagnose.diagnosis import Diagnosis, History
+from hilcal.diagnose.serial_noise import with_serial_noise
 from hilcal.diagnose.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError
@@ -353,7 +354,7 @@ class Campaign:
         refuse_fitting(self.file)
         model = baseline(self.cell, self.readings, self.mode(), self.catalogue)
         say(f"fitting {' + '.join(model.names) or 'the nominal arm'}")
-        return None, fit(model, self.readings, self.mode())
+        return None, with_serial_noise(fit(model, self.readings, self.mode()))
 
     def chapters(self, say: Say = lambda text: None, revision: int | None = None) -> list[Chapter]:
         """Return the revision in use and those that it was made from, diagnosed; see `view`.

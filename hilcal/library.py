@@ -15,6 +15,7 @@ from hilcal.data.parquet_stream import open_stream
 from hilcal.data.readings import Readings
 from hilcal.data.schema import HEADER
 from hilcal.data.whitening import MODES, SCALINGS, Mode, usual_mode
+from hilcal.diagnose.serial_noise import with_serial_noise
 from hilcal.discover.proposal import LawSearch
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.options import Options
@@ -221,7 +222,8 @@ def fit(
     data = with_prior_scatter(model, data)
     for known in SCALINGS:
         if scaling == known:
-            return fits.fit(model, data, _mode(readings, data), known, prior=std)
+            found = fits.fit(model, data, _mode(readings, data), known, prior=std)
+            return with_serial_noise(found, std)
     raise InputError(f"scaling {scaling!r} is unknown; valid: {', '.join(SCALINGS)}")
 
 

@@ -11,6 +11,7 @@ from hilcal.diagnose.effect_ranking import LEAST_SHARE
 from hilcal.diagnose.evidence import Evidence
 from hilcal.diagnose.promise import LEAST_KEPT, kept_by_refit
 from hilcal.diagnose.residual_regression import Regressions
+from hilcal.diagnose.serial_noise import serial_noise, with_serial_noise
 from hilcal.diagnose.stepwise import Refits, add, exchange, predicts_better, remove
 from hilcal.diagnose.stepwise_alternatives import Alternative
 from hilcal.diagnose.verdict import NOTHING, judge
@@ -100,7 +101,8 @@ def refine(
     others replace better is exchanged for them. Effects that were tried or taken out enter the
     history by which `verdict.judge` judges each step. Where the arm's scatter is what is left, the
     last step is a fit with it in the covariance, so that weights, uncertainties and p-values have
-    it, too.
+    it, too. A correlation of the noise along the order of the readings is in all fits (see
+    `diagnose.serial_noise`): it would be taken for effects.
 
     Args:
         model: the starting model. Its effects are not taken out, but for those of a carried prior
@@ -120,8 +122,32 @@ def refine(
     """
     limits.check_judged(len(readings), readings.m)
     say(f"fitting {' + '.join(model.names) or 'the bare arm'}")
-    readings = with_prior_scatter(model, readings)
-    first = fit(model, readings, mode)
+    readings = with_prior_scatter(model, readings.with_serial(None))
+    first = with_serial_noise(fit(model, readings, mode))
+    found = refine_from(first, say, history, laws, seen)
+    last = found.fit
+    if last.model.names == first.model.names:
+        return found
+    # A misfit may have hidden the correlation of the noise, or have looked like one.
+    white = last
+    if last.readings.serial is not None:
+        white = fit(last.model, last.readings.with_serial(None), mode, start=last.theta)
+    noise = serial_noise(white)
+    if (noise is None) == (last.readings.serial is None):
+        return found
+    say("the noise is correlated along the order" if noise else "the noise is white after all")
+    first = fit(model, first.readings.with_serial(noise), mode)
+    return refine_from(first, say, history, laws, seen)
+
+
+def refine_from(
+    first: Fit,
+    say: Say = lambda text: None,
+    history: History = NOTHING,
+    laws: LawSearch | None = None,
+    seen: Callable[[Step], None] = lambda step: None,
+) -> Refinement:
+    """Refine a fit with its noise correlated as it is in its covariance; see `refine`."""
     with later() as ahead:
         # Its error on poses left out decides next; it is computed beside the refits that follow.
         path = Path(

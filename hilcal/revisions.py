@@ -14,6 +14,7 @@ from hilcal.data.arm_scatter import ArmScatter
 from hilcal.data.readings import Readings
 from hilcal.data.records import content_hash
 from hilcal.data.revision import STORED, RevisionRecord
+from hilcal.data.serial_noise import SerialNoise
 from hilcal.data.stored_priors import CARRIED
 from hilcal.data.whitening import MODES, SCALINGS, Mode, Scaling
 from hilcal.diagnose.diagnosis import History
@@ -31,6 +32,8 @@ _LARGEST = 1e9
 """No parameter and no length of a frame is as large, in SI units."""
 _WIDEST = 1e100
 """No prior is as wide: its square, times those of whitened rows, is within double precision."""
+SERIAL = "serial_noise"
+"""Key among the parameters of a revision: how its noise is correlated along the order."""
 SOURCES = "effects_from"
 """Key among the options of a revision: the files that its effects are from."""
 
@@ -55,7 +58,7 @@ def to_record(
         parent: number of the revision that it was made from, where that is not the one before.
     """
     effects, cell = found.model.effects, found.model.cell
-    scatter = found.readings.arm_scatter
+    scatter, serial = found.readings.arm_scatter, found.readings.serial
     result: dict[str, object] = {"identify": fit_document.to_json(found)}
     if diagnosis is not None:
         result["diagnose"] = fit_document.plain(diagnosis)
@@ -82,6 +85,7 @@ def to_record(
             **({} if cell.targets is None else {"targets": cell.targets.tolist()}),
             "outliers": np.flatnonzero(found.outlier).tolist(),
             **({} if scatter is None else {"arm_scatter": scatter.to_json()}),
+            **({} if serial is None else {SERIAL: serial.to_json()}),
             **({} if found.model.prior is None else {CARRIED: found.model.prior.to_json()}),
         },
         result_json=result,
@@ -119,6 +123,9 @@ def restore(
         scatter = record.parameters_json.get("arm_scatter")
         if scatter is not None:
             readings = with_arm_scatter(model.cell, readings, ArmScatter.from_json(scatter))
+        serial = record.parameters_json.get(SERIAL)
+        if serial is not None:
+            readings = readings.with_serial(SerialNoise.from_json(serial))
     return fit(model, readings, mode, scaling, theta, prior)
 
 

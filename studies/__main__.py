@@ -21,6 +21,7 @@ from studies.plans_command import plans
 from studies.real_command import real
 from studies.records import results
 from studies.scaling_command import scaling
+from studies.serial_noise_command import serial_noise
 
 
 def _group() -> None:
@@ -37,6 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     app.command("descriptions")(descriptions)
     app.command("gross-errors")(gross_errors)
     app.command("scaling")(scaling)
+    app.command("serial-noise")(serial_noise)
     app.command("real")(real)
     app.command("carry")(carry)
     app.command("carried-bands")(carried_bands)

@@ -15,6 +15,7 @@ from hilcal.cell import Cell
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode
 from hilcal.diagnose.diagnosis import Diagnosis
+from hilcal.diagnose.serial_noise import with_serial_noise
 from hilcal.diagnose.verdict import diagnose
 from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
@@ -227,7 +228,10 @@ def _run(asked: Asked, sample: Sample, more: More | None, refined: bool) -> Outc
         if diagnosis.history.rejected:  # what `diagnose` cannot know
             diagnosis = diagnose(diagnosis.fit)
     else:
-        diagnosis, result = diagnose(fit(model, sample.readings, asked.mode)), None
+        diagnosis, result = (
+            diagnose(with_serial_noise(fit(model, sample.readings, asked.mode))),
+            None,
+        )
     again = None
     if more is not None and asked.again:
         readings, later = more(asked, diagnosis), diagnosis

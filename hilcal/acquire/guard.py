@@ -76,7 +76,7 @@ class Guard:
 
     def _place(self, q: Floats, hanging: str) -> str | None:
         found = next(self._limits.findings(q[None], hanging), None)
-        return found and f"{found.at('arm')}; {HOW_ON}"
+        return None if found is None else f"{found.at('arm')}; {HOW_ON}"
 
     def _pull(self, felt: Floats | None) -> str | None:
         sensor = self.config.force_sensor

@@ -22,6 +22,7 @@ import numpy as np
 from hilcal import limits
 from hilcal.calibration.check_stored import check_numbers
 from hilcal.data.readings import Readings, States
+from hilcal.data.serial_noise import SerialNoise
 from hilcal.data.whitening import Mode, whitening
 from hilcal.identify.gauss_newton import whitened_jacobian
 from hilcal.model import Model
@@ -100,6 +101,9 @@ class Learnt:
             "states": {name: _packed(a) for name, a in given.items()},
             "covariance": _packed(cov),
             "common": None if r.common is None else _packed(r.common),
+            "serial_noise": None if r.serial is None else r.serial.to_json(),
+            "along": None if r.along is None else _packed(r.along),
+            "stated": None if r.stated is None else _packed(r.stated[:, upper[0], upper[1]]),
             "index": _packed(np.stack([r.pose, r.load, r.cycle])),
             "load_names": list(r.load_names),
             "poses": len(r.pose_names),
@@ -118,8 +122,18 @@ class Learnt:
         states = States(**{name: _unpacked(a) for name, a in content["states"].items()})
         pose, load, cycle = _unpacked(content["index"])
         i, j = np.triu_indices(m)
-        covariance = np.zeros((len(states), m, m))
-        covariance[:, i, j] = covariance[:, j, i] = _unpacked(content["covariance"])
+
+        def square(packed: Mapping[str, Any] | None) -> Floats | None:
+            if packed is None:
+                return None
+            full = np.zeros((len(states), m, m))
+            full[:, i, j] = full[:, j, i] = _unpacked(packed)
+            return full
+
+        covariance = square(content["covariance"])
+        if covariance is None:
+            raise ValueError("no covariance")
+        serial, along = content.get("serial_noise"), content.get("along")
         common = content["common"]
         readings = Readings(
             states=states,
@@ -132,6 +146,9 @@ class Learnt:
             pose_names=tuple(f"p{k + 1}" for k in range(min(int(content["poses"]), len(states)))),
             target_names=tuple(content["target_names"]),
             common=None if common is None else _unpacked(common),
+            stated=square(content.get("stated")),
+            serial=None if serial is None else SerialNoise.from_json(serial),
+            along=None if along is None else _unpacked(along),
         )
         prior = np.array(content["prior"], dtype=float)
         return cls(readings, prior, float(content["noise"]), float(content["factor"]))

@@ -10,6 +10,7 @@ from hilcal.campaign import Campaign
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import check_options, fit_of, wanted_effects
 from hilcal.cli.terminal import Json, Revision, Run, terminal
+from hilcal.diagnose.serial_noise import with_serial_noise
 from hilcal.discover.discovery import discover as search
 from hilcal.discover.discovery import rival_sources
 from hilcal.effects.catalogue import Catalogue
@@ -75,7 +76,7 @@ def discover(
                 else baseline(o.cell, o.readings, o.mode(), catalogue)
             )
             say(f"fitting {text.model_name(model.names)}")
-            found = fit(model, o.readings, o.mode())
+            found = with_serial_noise(fit(model, o.readings, o.mode()))
         d = search(found, say, name)
     document = {"revision": number, **to_json(d), "written": None}
     t.show(discovery_report(d))

@@ -23,6 +23,7 @@ from hilcal.cli.terminal import Json, Run, terminal
 from hilcal.data.purpose import purpose_of, refuse_fitting, release
 from hilcal.data.tabular import is_parquet
 from hilcal.data.whitening import Scaling
+from hilcal.diagnose.serial_noise import with_serial_noise
 from hilcal.effects.written import write_effect
 from hilcal.errors import InputError
 from hilcal.identify.arm_scatter import with_prior_scatter
@@ -122,7 +123,7 @@ def identify(
             fitted = with_prior_scatter(model, o.readings)
             for s in wanted:
                 say(f"fitting {text.model_name(titles(model, o.readings))}, scaling {s}")
-                fits[s] = fit(model, fitted, mode, s)
+                fits[s] = with_serial_noise(fit(model, fitted, mode, s))
                 finish(fits[s], say)
             kept = fits[wanted[-1]]
             number = o.store(kept, None, None)

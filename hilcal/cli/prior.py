@@ -8,6 +8,7 @@ import typer
 
 from hilcal.campaign import Campaign
 from hilcal.cli.files import chosen
+from hilcal.diagnose.serial_noise import with_serial_noise
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError
 from hilcal.identify.arm_scatter import with_prior_scatter
@@ -82,7 +83,7 @@ def fitted_with(prior: CarriedPrior, o: Campaign, found: Fit) -> Fit:
     more = [n for n in learnt if o.catalogue[n].computable(o.readings.states)]
     names = dict.fromkeys((*found.model.names, *more))
     model = with_effects(o.cell, o.readings, found.mode, names, chosen(found), o.catalogue, prior)
-    return fit(model, with_prior_scatter(model, found.readings), found.mode)
+    return with_serial_noise(fit(model, with_prior_scatter(model, found.readings), found.mode))
 
 
 def _drifts(text: str | None) -> dict[str, float]:

@@ -1,11 +1,13 @@
 """Which readings share an error: those of one arrival, and deflections from the same unloaded ones.
 
-Groups of equal shape are stacked.
+Groups of equal shape are stacked. Where noise is correlated along the order of the readings, a
+group is a run of them.
 """
 
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from hilcal.data.readings import Readings
 from hilcal.errors import InputError
@@ -73,6 +75,37 @@ def deflection_groups(readings: Readings) -> list[Group]:
             "readings = deflection: no target was read both loaded and unloaded in one pose and "
             "cycle; use absolute"
         )
+    return found
+
+
+def runs(readings: Readings, groups: Sequence[Group], most: int) -> list[Group]:
+    """Join groups to runs along `Readings.along`, each in its order.
+
+    Args:
+        readings: the readings.
+        groups: those that share another error; none is divided.
+        most: measurements in a run, but for its last group.
+    """
+    each = [
+        (loaded, reference, weights)
+        for of_shape, references, weights in groups
+        for loaded, reference in zip(of_shape, references, strict=True)
+    ]
+    t = np.arange(len(readings)) if readings.along is None else readings.along
+    first = np.argsort([t[loaded].min() for loaded, _, _ in each], kind="stable")
+    sizes = np.cumsum([len(each[k][0]) for k in first])
+    count = -(-int(sizes[-1]) // most)
+    of = (sizes - 1) * count // int(sizes[-1])
+    found = []
+    for run in range(count):
+        parts = [each[k] for k in first[of == run]]
+        if not parts:
+            continue
+        loaded = np.concatenate([p[0] for p in parts])
+        order = np.argsort(t[loaded], kind="stable")
+        weights = block_diag(*(p[2] for p in parts))[order]
+        reference = np.concatenate([p[1] for p in parts])
+        found.append((loaded[order][None], reference[None], weights))
     return found
 
 

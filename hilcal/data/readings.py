@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from hilcal.data.arm_scatter import ArmScatter
+from hilcal.data.serial_noise import SerialNoise, symmetric_root
 from hilcal.types import Bools, Floats, Ints
 
 
@@ -77,6 +78,9 @@ class Readings:
         stated: (N, m, m) the covariance without a scatter that was estimated; None where
             `covariance` has none.
         arm_scatter: the estimate that `covariance` includes beside `stated`.
+        serial: how the noise of the readings is correlated along their order, as estimated; None
+            for noise that is white.
+        along: (N,) t of `serial`: time, s, or number in the order of the campaign.
     """
 
     states: States
@@ -92,6 +96,8 @@ class Readings:
     scatter_stated: bool = True
     stated: Floats | None = None
     arm_scatter: ArmScatter | None = None
+    serial: SerialNoise | None = None
+    along: Floats | None = None
 
     def __len__(self) -> int:
         """Return the number of readings N."""
@@ -109,6 +115,7 @@ class Readings:
             covariance=self.covariance[rows],
             common=None if self.common is None else self.common[rows],
             stated=None if self.stated is None else self.stated[rows],
+            along=None if self.along is None else self.along[rows],
         )
 
     @staticmethod
@@ -125,6 +132,8 @@ class Readings:
             value=np.concatenate([p.value for p in parts]),
             covariance=np.concatenate([p.covariance for p in parts]),
             common=None,
+            serial=None,
+            along=None,
         )
 
     def as_stated(self) -> "Readings":
@@ -132,6 +141,25 @@ class Readings:
         if self.stated is None:
             return self
         return replace(self, covariance=self.stated, common=None, stated=None, arm_scatter=None)
+
+    def with_serial(self, noise: SerialNoise | None) -> "Readings":
+        """Return all readings of a campaign with noise that is correlated along their order."""
+        if noise is None:
+            return replace(self, serial=None, along=None)
+        order = np.arange(len(self), dtype=float)
+        return replace(
+            self, serial=noise, along=self.states.time if noise.clock == "time" else order
+        )
+
+    def instrument_root(self, m: int | None = None) -> Floats:
+        """(N, m, m) S of `serial_noise`: root of the covariance that is not known as the arm's.
+
+        Of the first m elements; of all where that is None.
+        """
+        v = self.covariance if self.stated is None else self.stated
+        if self.stated is None and self.common is not None:
+            v = v - self.common @ np.swapaxes(self.common, 1, 2)
+        return symmetric_root(v[:, :m, :m])
 
     @property
     def m(self) -> int:

@@ -5,7 +5,10 @@ independent, of unit spread, and pure numbers. G is block diagonal: one block pe
 (absolute) or per pose group (deflections of one pose share their unloaded reading). Where several
 targets were read in one arrival of the arm, they share its scatter F_i F_jᵀ (`Readings.common`):
 absolute readings have one block per arrival, deflections one per pose and cycle, all targets
-together. The blocks are kept stacked by size; nothing of size (readings)² exists.
+together. The blocks are kept stacked by size; nothing of size (readings)² exists. Noise that is
+correlated along the order of the readings (`Readings.serial`) makes blocks of runs of them, up to
+`RUN` measurements; what it has in common across the ends of a run is neglected. Their S is
+Cholesky's factor: the whitened rows of a measurement are what earlier ones do not predict of it.
 
     none   G = I
     gu     G = diag(1/M_ik), M_ik the standard deviation of element k of measurement i
@@ -18,9 +21,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from hilcal import limits
-from hilcal.data.reading_groups import arrival_groups, deflection_groups, has_unloaded
+from hilcal.data.reading_groups import arrival_groups, deflection_groups, has_unloaded, runs
 from hilcal.data.readings import Readings
 from hilcal.errors import InputError
 from hilcal.robot import se3
@@ -39,6 +43,10 @@ MANY = 1000
 """Blocks from which on Cholesky's factor takes the place of eigenvectors where the rule for
 rank-deficient blocks does not come into play: a fifth of the time for 100,000 blocks; a choice by
 timing."""
+
+RUN = 200
+"""Measurements in a run of correlated noise; a choice: a campaign of up to so many is exact, and of
+larger ones the whitening costs as much as predicting."""
 
 
 def inverse_root(covariance: Floats, scaling: Scaling = "gc") -> Floats:
@@ -261,16 +269,33 @@ def whitening(readings: Readings, mode: Mode, scaling: Scaling = "gc") -> Whiten
     v, m = readings.covariance, readings.m
     buckets = []
     rank = 0
-    groups = deflection_groups if mode == "deflection" else arrival_groups
-    for loaded, reference, weights in groups(readings):
+    groups = (deflection_groups if mode == "deflection" else arrival_groups)(readings)
+    serial = readings.serial is not None and scaling == "gc"
+    for loaded, reference, weights in runs(readings, groups, RUN) if serial else groups:
         limits.check_shared(loaded.shape[1], m, len(loaded))
         covariance = _group_covariance(readings, loaded, reference, weights)
-        factor = inverse_root(covariance, scaling)
+        factor = _innovations(covariance) if serial else inverse_root(covariance, scaling)
         rank += int(np.count_nonzero(factor.any(axis=-1)))
         buckets.append(Bucket(loaded, reference, np.ascontiguousarray(factor), weights))
     reading = np.concatenate([b.loaded.ravel() for b in buckets])
     own = np.concatenate([b.own_covariance(v).reshape(-1, m, m) for b in buckets])
     return Whitening(mode, scaling, m, tuple(buckets), reading, own, readings.pose[reading], rank)
+
+
+def _innovations(covariance: Floats) -> Floats:
+    """S⁻¹ (1, k, k) of a run, S = D L with C = L Lᵀ; a small share of C's diagonal for the rule.
+
+    The rule for rank-deficient V is kept for elements without variance; for directions without,
+    C has `RANK_TOLERANCE` more on its diagonal, in place of leaving out what has no row of its own.
+    """
+    std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    seen = std > 0
+    per = np.where(seen, 1.0, 0.0) / np.where(seen, std, 1.0)
+    c = covariance * per[:, :, None] * per[:, None, :]
+    c += np.where(seen, RANK_TOLERANCE, 1.0)[:, :, None] * np.eye(c.shape[1])
+    lower = np.linalg.cholesky(c)[0]
+    inverse = solve_triangular(lower, np.diag(per[0]), lower=True, check_finite=False)
+    return np.asarray(inverse[None])
 
 
 def measured(readings: Readings, w: Whitening) -> Floats:
@@ -319,7 +344,8 @@ def _blocks(count: int, size: int) -> Iterator[slice]:
 def _group_covariance(readings: Readings, loaded: Ints, reference: Ints, weights: Floats) -> Floats:
     """(G, L·m, L·m) covariance D C Dᵀ of the measurements of each group, D = [I, −weights].
 
-    C, of all its readings, has the blocks V_i, and F_i F_jᵀ for two readings of one arrival.
+    C, of all its readings, has the blocks V_i, and F_i F_jᵀ for two readings of one arrival; where
+    their noise is correlated, φ S_i C_ij S_jᵀ more, see `serial_noise`.
     """
     rows = np.concatenate([loaded, reference], axis=1)
     groups, count = rows.shape
@@ -330,6 +356,10 @@ def _group_covariance(readings: Readings, loaded: Ints, reference: Ints, weights
         together = (arrival[:, :, None] == arrival[:, None, :]).astype(float)
         np.einsum("gain,gbjn,gab->gaibj", f, f, together, out=c, optimize=True)
     each = np.arange(count)
+    if readings.serial is not None and readings.along is not None:
+        root = readings.instrument_root()[rows]
+        shared = readings.serial.share * readings.serial.correlation(readings.along[rows])
+        c += np.einsum("gaik,gab,gbjk->gaibj", root, shared, root, optimize=True)
     c[:, each, :, each, :] = np.moveaxis(readings.covariance[rows], 1, 0)
     if reference.shape[1]:
         d = np.concatenate([np.eye(len(weights)), -weights], axis=1)

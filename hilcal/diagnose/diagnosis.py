@@ -31,6 +31,7 @@ Reason = Literal[
     "arm_scatter",
     "pose_alone",
     "readings_disagree",
+    "serial_or_effect",
 ]
 VERDICTS: dict[Reason, Verdict] = {
     "residual_is_noise": "adequate",
@@ -43,6 +44,7 @@ VERDICTS: dict[Reason, Verdict] = {
     "arm_scatter": "adequate",
     "pose_alone": "ambiguous",
     "readings_disagree": "unknown_effect",
+    "serial_or_effect": "ambiguous",
 }
 """The verdict that each reason leads to."""
 

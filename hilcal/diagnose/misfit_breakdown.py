@@ -187,6 +187,8 @@ def _poses(p: Linearisation) -> list[MisfitShare]:
 def _axes(p: Linearisation) -> list[MisfitShare]:
     """Directions: towards the base axis, around it, and up."""
     fit, w = p.fit, p.fit.whitening
+    if fit.readings.serial is not None:
+        return []  # what readings have in common counts as one, not as many
     o = fit.solution.prediction.observation
     x = o.base_position[w.reading]
     across = np.maximum(np.hypot(x[:, 0], x[:, 1]), 1e-300)

@@ -212,10 +212,9 @@ def _block(groups: list[Group], number: Ints, m: int) -> Block | None:
         for k, each in enumerate(np.split(b.factor[g], len(rows), axis=1)):
             member[span, column[at + k]] += each
         at += len(rows)
-    member = member.reshape(len(member), -1)
     rows = (measured[:, None] * m + np.arange(m)).reshape(-1)
     seen = np.concatenate([np.any(b.factor[g] != 0, axis=1) for _, b, g in groups])
-    u, s, _ = np.linalg.svd(member[seen], full_matrices=False)
+    u, s, _ = np.linalg.svd(member.reshape(len(member), -1)[seen], full_matrices=False)
     rank = int(np.sum(s > ROUNDING * s.max(initial=0.0)))
     return None if rank == len(u) else Block(rows[seen], u[:, :rank])
 

@@ -31,6 +31,10 @@ Of several targets that are read in one arrival, where the arm's scatter is not 
 large, the rules hold for the fit with the estimated scatter in its covariance (see
 `Evidence.by_arrivals`), and 3 becomes 5b or 5c.
 
+Noise that is correlated along the order of the readings is in the covariance of the fit before it
+is judged (see `serial_noise`). Where it is not proved, since effects explain the readings as well,
+3 and 5c become `ambiguous`.
+
 A fit whose covariance has the estimated scatter in it (`Readings.arm_scatter`) is judged by the
 same rules, but that it may be smaller than its noise: the scatter is never negative, so that an
 instrument whose noise is stated too large, in some of its elements, shows only then. That is said.
@@ -175,6 +179,9 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
         else:
             in_doubt = any(a.inseparable for a in e.alternatives(history.added, history.removed))
             reason = "inseparable_addition" if in_doubt else "residual_is_noise"
+        serial = e.fit.readings.serial
+        if reason in ("residual_is_noise", "arm_scatter") and serial and not serial.proved:
+            reason = "serial_or_effect"
     alone = None
     if reason in ("misjudged_noise", "no_suspect") and e.misfit and not _predicted(e, regression):
         alone = e.pose_alone

@@ -114,7 +114,7 @@ class _Whitened:
         """Whitened covariance of each bucket (G, S, S) by a factor F (N, m, k)."""
         common = None if self.readings.common is None else factor
         covariance = factor @ np.swapaxes(factor, 1, 2)
-        of = replace(self.readings, covariance=covariance, common=common)
+        of = replace(self.readings, covariance=covariance, common=common, serial=None)
         parts = zip(self.w.buckets, covariance_blocks(of, self.w), strict=True)
         return [b.factor @ c @ np.swapaxes(b.factor, 1, 2) for b, c in parts]
 

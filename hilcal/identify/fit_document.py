@@ -21,6 +21,7 @@ def to_json(fit: Fit) -> dict[str, object]:
     there is nothing to condition.
     """
     basis, scatter = fit.solution.equations.basis, fit.readings.arm_scatter
+    serial = fit.readings.serial
     return {
         "model": list(fit.model.names),
         "readings": fit.mode,
@@ -48,6 +49,7 @@ def to_json(fit: Fit) -> dict[str, object]:
         "noise_floor_m": full_prediction(fit).noise_floor,
         "outliers": outliers(fit),
         "arm_scatter": None if scatter is None else scatter.to_json(),
+        "serial_noise": None if serial is None else serial.to_json(),
         "registration": frames_of_fit(fit)[0].tolist(),
         "frames": fit_to_json(fit),
         "notes": list(notes(fit)),

@@ -244,7 +244,7 @@ def paired(validation: Readings, corrected: Readings, mode: str) -> tuple[Readin
 
 def _plain(readings: Readings) -> Readings:
     """Return readings that share no error; of several targets only the first one is compared."""
-    return replace(readings, common=None, stated=None, arm_scatter=None)
+    return replace(readings, common=None, stated=None, arm_scatter=None, serial=None)
 
 
 def expected_of(plan: Plan) -> tuple[list[dict[str, Any]], list[tuple[str, str]]]:

@@ -62,9 +62,10 @@ def _by_cells(points: Floats, distance: float) -> tuple[Ints, Ints]:
             if own == other:
                 continue
             few, many = sorted((members[i], members[j]), key=len)
-            far, at = cKDTree(points[many]).query(
+            near_ones = cKDTree(points[many]).query(
                 points[few], p=np.inf, distance_upper_bound=float(np.nextafter(distance, np.inf))
             )
+            far, at = (np.atleast_1d(x) for x in near_ones)
             k = int(np.argmin(far))
             if far[k] <= distance:
                 joined.append(np.array([[few[k], many[at[k]]]]))

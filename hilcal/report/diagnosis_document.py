@@ -55,6 +55,7 @@ def to_json(d: Diagnosis) -> dict[str, object]:
         "needless": list(d.redundant),
         "carriers": carriers(d.dependences),
         "arm_scatter": None if d.scatter is None else d.scatter.to_json(),
+        "serial_noise": None if d.fit.readings.serial is None else d.fit.readings.serial.to_json(),
         "pure_error": None if d.pure_error is None else repeats(d.pure_error),
     }
 

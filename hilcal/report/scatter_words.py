@@ -1,6 +1,7 @@
-"""The arm's own scatter, in words."""
+"""The arm's own scatter, and noise that is correlated along the order, in words."""
 
 from hilcal.data.arm_scatter import ArmScatter
+from hilcal.data.serial_noise import SerialNoise
 from hilcal.diagnose.arm_repeatability import RP_PER_RMS, instrument_instead, separated
 from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.report import numbers
@@ -93,3 +94,20 @@ def _scatter(d: Diagnosis) -> ArmScatter:
     if d.scatter is None:
         raise ValueError("a diagnosis of the arm's scatter without an estimate of it")
     return d.scatter
+
+
+def correlated(n: SerialNoise) -> str:
+    """Say that the readings are correlated along their order, and what it does."""
+    rho, error = numbers.with_std(n.rho, n.rho_error)
+    unit = "s" if n.clock == "time" else "readings"
+    share = "" if n.share > 0.95 else f" in {100 * n.share:.0f} % of their variance"
+    doubt = ""
+    if not n.proved:
+        others = " and ".join(n.instead) or "effects of the catalogue"
+        doubt = f"; or not, since {others} would explain the readings as well: repeat them"
+    low, high = n.wider
+    return (
+        f"readings are correlated along their order{share}: ρ = {rho} ± {error} from one to the "
+        f"next, half-time {n.half:.2g} {unit}; standard uncertainties are {low:.2g} to {high:.2g} "
+        f"times as large for it{doubt}"
+    )

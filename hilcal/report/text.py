@@ -16,7 +16,7 @@ from hilcal.identify.fit_document import notes
 from hilcal.identify.full_prediction import FullPrediction, full_prediction
 from hilcal.identify.gross_errors import gross_errors
 from hilcal.report import numbers
-from hilcal.report.scatter_words import sigmas
+from hilcal.report.scatter_words import correlated, sigmas
 from hilcal.report.text_registration import fitted_lines
 from hilcal.report.word_table import WordTable
 from hilcal.types import Ints
@@ -177,6 +177,9 @@ def remarks(fit: Fit) -> Iterator[RenderableType]:
     scatter = fit.readings.arm_scatter
     if scatter is not None:
         yield f"The covariance has the arm's scatter as estimated: {sigmas(scatter)}."
+    serial = fit.readings.serial
+    if serial is not None:
+        yield f"{numbers.sentence(correlated(serial))}"
     yield scaling_remark(fit)
     null = fit.uncertainty.null
     if null:

@@ -9,11 +9,16 @@ from hilcal.diagnose.separability import Separability
 from hilcal.diagnose.stepwise_alternatives import Alternative
 from hilcal.identify.disagreement_words import disagreement_words
 from hilcal.report.numbers import p_equals, sizes
-from hilcal.report.scatter_words import left_to_the_arm, no_repeatability
+from hilcal.report.scatter_words import correlated, left_to_the_arm, no_repeatability
 
 
 def message(d: Diagnosis) -> str:
     """Return the verdict in a sentence; the effect that it names is the first suspect."""
+    serial = d.fit.readings.serial
+    return _verdict(d) if serial is None else f"{_verdict(d)}; {correlated(serial)}"
+
+
+def _verdict(d: Diagnosis) -> str:
     if d.reason == "one_suspect":
         return _missing(d.suspects[0])
     if d.reason == "inseparable_suspects":
@@ -36,7 +41,7 @@ def message(d: Diagnosis) -> str:
     )
     if d.scatter is not None:
         adequate = left_to_the_arm(d)
-    if d.reason == "residual_is_noise":
+    if d.reason in ("residual_is_noise", "serial_or_effect"):
         return adequate
     doubts = "; ".join(_alternative(a) for a in d.alternatives if a.inseparable)
     return f"{adequate}; but {doubts}: measure what separates them"

@@ -18,6 +18,7 @@ from hilcal.data.purpose import refuse_fitting
 from hilcal.data.revision import RevisionRecord
 from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.diagnose.distinguish import Difference, Recorded, distinguish, recorded_values
+from hilcal.diagnose.serial_noise import with_serial_noise
 from hilcal.diagnose.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.written import read_effects_text
@@ -144,7 +145,7 @@ class Session:
             names, prior = record.effects, carried_of(record)
             model = with_effects(o.cell, o.readings, mode, names, options, o.catalogue, prior)
             fitted = with_prior_scatter(model, o.readings)
-            found = diagnose(fit(model, fitted, mode), say=say)
+            found = diagnose(with_serial_noise(fit(model, fitted, mode)), say=say)
             number = self._store(o, found)
             if o.file.accepted() is not None:
                 o.accept(None)  # it cannot be used any more

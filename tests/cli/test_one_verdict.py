@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from hilcal.campaign import Campaign
@@ -24,6 +25,7 @@ from hilcal.report.diagnosis_document import to_json
 from hilcal.report.verdict_words import message
 from hilcal.robot.catalogue import configs_dir
 from studies.diagnosis import judgement
+from studies.serial_noise import serial_readings
 from studies.study_cases import study_case
 from tests.support.cli_cases import CELL, ok, run
 from tests.support.next_cases import SMALL, doubtful
@@ -47,6 +49,11 @@ def study(mode: Mode, *hidden: str, seed: int = 1, **options: Any) -> tuple[Cell
     return UR5E, c.readings
 
 
+def correlated() -> tuple[CellConfig, Readings]:
+    c = study_case(UR5E, "ur5e", "absolute", (), 1.0, 3, n_poses=12)
+    return UR5E, serial_readings(c, 0.9, np.random.default_rng(3))
+
+
 CASES = {
     "missing": ("deflection", lambda: study("deflection", "creep")),
     "ambiguous": (
@@ -57,6 +64,7 @@ CASES = {
     "unknown although tried": ("deflection", lambda: study("deflection", "relaxing bench", seed=0)),
     "adequate": ("deflection", lambda: study("deflection")),
     "noise": ("deflection", lambda: study("deflection", stated=0.5, cycles=2)),
+    "correlated": ("absolute", lambda: correlated()),
 }
 FIRST = {
     "missing": "missing_effect",
@@ -65,6 +73,7 @@ FIRST = {
     "unknown although tried": "unknown_effect",
     "adequate": "adequate",
     "noise": "noise_misjudged",
+    "correlated": "adequate",
 }
 
 

@@ -299,7 +299,9 @@ def parsers(bench: Bench) -> list[Parser]:
             lambda p: installed().with_file(p), ".py",
         ),
         _text(bench, "revision", stored_revision, document_damaged, _revision, ".json"),
-        _text(bench, "compensation", of_run("calibration"), document_damaged, _compensated, ".json"),
+        _text(
+            bench, "compensation", of_run("calibration"), document_damaged, _compensated, ".json"
+        ),
         _text(bench, "prior", of_run("posterior"), document_damaged, _carried(bench), ".json"),
         _text(bench, "cells", CELL.read_text, toml_damaged, hc.Cell.load, ".toml"),
         _mapped(bench),
