@@ -331,6 +331,15 @@ class Effect(ABC):
         """
         return np.zeros(len(self.parameters), dtype=np.int64)
 
+    def log_size(self, pool: int) -> tuple[float, float]:
+        """Mean and spread of log s for the parameters of a pool, s in ordinary magnitudes.
+
+        What arms are like before anything is measured: half of what is ordinary, and a factor of
+        20 either way. Wide on purpose: a spread of 3 predicted as well as 1.2 or better on five
+        arms' series.
+        """
+        return -0.7, 3.0
+
     def prior_std(self) -> Floats | None:
         """(P,) standard deviations of a fixed zero-mean prior, or None for a flat one."""
         return None

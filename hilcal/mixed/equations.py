@@ -1,0 +1,282 @@
+"""Henderson's mixed-model equations at given variances, and the restricted likelihood's slopes.
+
+With S the sizes s_f of the random columns (1 for the frames), L Lᵀ = R the noise, and rows
+T = L⁻¹ X S, t = L⁻¹ y,
+
+    C = Tᵀ T + E,    E = 1 for random columns, 0 for the frames
+    C c = Tᵀ t,      coordinates S c
+    P = 1 − T C⁻¹ Tᵀ,   e = P t
+    −2 ℓ = log det R + log det C + tᵀ e
+
+and, γ_f = Σ_i T_iᵀ P T_i over its columns the parameters that family f spends,
+
+    ∂ℓ/∂log s_f = c_fᵀ c_f − γ_f
+    ∂ℓ/∂η_k     = eᵀ W_k e − tr(P W_k),    W_k = L⁻¹ R_k L⁻ᵀ, R_k times its size
+    AI_ij       = ½ v_iᵀ P v_j,    v_f = 2 T_f c_f,    v_k = 2 W_k e
+
+P is formed by rows where they are fewer than the columns, P = N⁻¹ − B (Qᵀ N⁻¹ Q)⁻¹ Bᵀ with
+N = 1 + Z Zᵀ, B = N⁻¹ Q, Q and Z the frames' and the random columns of T; else by columns.
+
+Sources: Henderson, *Best linear unbiased estimation and prediction under a selection model*,
+Biometrics 31 (1975) 423; Gilmour, Thompson and Cullis, *Average information REML*, Biometrics 51
+(1995) 1440.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+
+from hilcal.mixed.problem import MixedProblem
+from hilcal.types import Floats
+
+
+class _ByColumns:
+    """P by Cholesky's factor of C (K, K)."""
+
+    def __init__(self, rows: Floats, flat: int) -> None:
+        self.rows = rows
+        c = rows.T @ rows
+        random = np.arange(flat, len(c))
+        c[random, random] += 1.0
+        self.factor = cho_factor(c, lower=True, overwrite_a=True)
+        self.log_det = 2.0 * float(np.log(np.diagonal(self.factor[0])).sum())
+
+    def project(self, v: Floats) -> Floats:
+        """P v."""
+        return np.asarray(v - self.rows @ cho_solve(self.factor, self.rows.T @ v))
+
+    @cached_property
+    def spent(self) -> Floats:
+        """(K,) T_iᵀ P T_i of random columns, which is 1 − (C⁻¹)_ii."""
+        root = solve_triangular(self.factor[0], np.eye(len(self.factor[0])), lower=True)
+        return np.asarray(1.0 - np.einsum("ij,ij->j", root, root))
+
+    @cached_property
+    def _lifted(self) -> Floats:
+        return np.asarray(solve_triangular(self.factor[0], self.rows.T, lower=True)).T
+
+    def blocks(self, rows: slice, shape: tuple[int, int]) -> Floats:
+        """(G, S, S) blocks of P on the diagonal."""
+        t = self._lifted[rows].reshape(*shape, -1)
+        return np.asarray(np.eye(shape[1]) - t @ np.swapaxes(t, 1, 2))
+
+
+class _ByRows:
+    """P (R, R) itself."""
+
+    def __init__(self, rows: Floats, flat: int) -> None:
+        self.rows, q, z = rows, rows[:, :flat], rows[:, flat:]
+        n = z @ z.T
+        n[np.diag_indices_from(n)] += 1.0
+        factor = cho_factor(n, lower=True, overwrite_a=True)
+        inverse = cho_solve(factor, np.eye(len(rows)))
+        self.log_det = 2.0 * float(np.log(np.diagonal(factor[0])).sum())
+        if flat:
+            b = inverse @ q
+            inner = cho_factor(q.T @ b, lower=True)
+            self.log_det += 2.0 * float(np.log(np.diagonal(inner[0])).sum())
+            inverse -= b @ cho_solve(inner, b.T)
+        self.p = inverse
+
+    def project(self, v: Floats) -> Floats:
+        """P v."""
+        return np.asarray(self.p @ v)
+
+    @cached_property
+    def spent(self) -> Floats:
+        """(K,) T_iᵀ P T_i."""
+        return np.asarray(np.einsum("ri,ri->i", self.rows, self.p @ self.rows))
+
+    def blocks(self, rows: slice, shape: tuple[int, int]) -> Floats:
+        """(G, S, S) blocks of P on the diagonal."""
+        g, s = shape
+        own = self.p[rows, rows].reshape(g, s, g, s)
+        return np.ascontiguousarray(np.moveaxis(np.diagonal(own, axis1=0, axis2=2), -1, 0))
+
+
+@dataclass(frozen=True, eq=False)
+class Equations:
+    """The equations of a problem at logarithms of the sizes.
+
+    Attributes:
+        problem: rows, columns and noise.
+        log_size: (F + N,) log s of the families, η of the noise.
+        rows: (R, K) T.
+        target: (R,) t.
+        roots: (G, S, S) L of each run of rows.
+        projection: P.
+    """
+
+    problem: MixedProblem
+    log_size: Floats
+    rows: Floats
+    target: Floats
+    roots: tuple[Floats, ...]
+    projection: _ByColumns | _ByRows
+
+    @property
+    def _count(self) -> int:
+        """Number of families."""
+        return len(self.problem.families.random)
+
+    @cached_property
+    def scale(self) -> Floats:
+        """(K,) S."""
+        p = self.problem
+        return np.concatenate([np.ones(p.flat), np.exp(self.log_size)[p.family]])
+
+    @cached_property
+    def residual(self) -> Floats:
+        """(R,) e."""
+        return self.projection.project(self.target)
+
+    @cached_property
+    def c(self) -> Floats:
+        """(K,) solution, in sizes."""
+        q, z = self.rows[:, : self.problem.flat], self.rows[:, self.problem.flat :]
+        random = z.T @ self.residual
+        frames = np.linalg.lstsq(q, self.target - z @ random, rcond=None)[0]
+        return np.concatenate([frames, random])
+
+    @cached_property
+    def log_likelihood(self) -> float:
+        """ℓ, the restricted log likelihood, without its constant."""
+        det_r = sum(np.log(np.diagonal(r, axis1=1, axis2=2)).sum() for r in self.roots)
+        square = float(self.target @ self.residual)
+        return -float(det_r) - 0.5 * (self.projection.log_det + square)
+
+    @cached_property
+    def spent(self) -> Floats:
+        """(F,) γ_f, parameters that each family spends."""
+        p = self.problem
+        return np.bincount(p.family, self.projection.spent[p.flat :], minlength=self._count)
+
+    @cached_property
+    def slope(self) -> Floats:
+        """(F + N,) ∂ℓ by log s and η."""
+        p = self.problem
+        square = np.bincount(p.family, self.c[p.flat :] ** 2, minlength=self._count)
+        return np.concatenate([square - self.spent, self._noise_slope()])
+
+    def _noise_slope(self) -> Floats:
+        if len(self.problem.noise) == 1:  # W = 1, tr P = R − k − Σ γ
+            count = len(self.target) - self.problem.flat - self.spent.sum()
+            return np.array([float(self.residual @ self.residual) - count])
+        out = np.zeros(len(self.problem.noise))
+        for rows, shape, white in self._white_noise:
+            left, e = self.projection.blocks(rows, shape), self.residual[rows].reshape(shape)
+            for k, w in enumerate(white):
+                out[k] += np.einsum("gi,gij,gj->", e, w, e) - np.einsum("gij,gji->", left, w)
+        return out
+
+    @cached_property
+    def _white_noise(self) -> list[tuple[slice, tuple[int, int], list[Floats]]]:
+        """Rows, shape (G, S) and W_k (G, S, S), by runs."""
+        out, start = [], 0
+        for run, (shape, root) in enumerate(zip(self.problem.shape, self.roots, strict=True)):
+            stop = start + shape[0] * shape[1]
+            white = []
+            for n, eta in zip(self.problem.noise, self.log_size[self._count :], strict=True):
+                inner = np.eye(shape[1]) if n.blocks is None else n.blocks[run]
+                half = np.linalg.solve(root, np.broadcast_to(inner, root.shape))
+                w = np.linalg.solve(root, np.swapaxes(half, 1, 2))
+                white.append(np.exp(2 * eta) * w)
+            out.append((slice(start, stop), shape, white))
+            start = stop
+        return out
+
+    @cached_property
+    def working(self) -> Floats:
+        """(R, F + N) v."""
+        p, first = self.problem, self._count
+        out = np.zeros((len(self.target), len(self.log_size)))
+        for f in range(first):
+            own = np.flatnonzero(p.family == f) + p.flat
+            out[:, f] = 2.0 * (self.rows[:, own] @ self.c[own])
+        if len(p.noise) == 1:
+            out[:, first] = 2.0 * self.residual
+            return out
+        for rows, shape, white in self._white_noise:
+            e = self.residual[rows].reshape(*shape, 1)
+            for k, w in enumerate(white):
+                out[rows, first + k] = 2.0 * (w @ e).reshape(-1)
+        return out
+
+    @cached_property
+    def information(self) -> Floats:
+        """(F + N, F + N) AI, the average information on log s and η."""
+        return np.asarray(0.5 * self.working.T @ self.projection.project(self.working))
+
+    @cached_property
+    def _columns(self) -> _ByColumns:
+        if isinstance(self.projection, _ByColumns):
+            return self.projection
+        return _ByColumns(self.rows, self.problem.flat)
+
+    @property
+    def coordinates(self) -> Floats:
+        """(K,) S c: frames' coordinates and u in ordinary magnitudes."""
+        return self.scale * self.c
+
+    @cached_property
+    def covariance(self) -> Floats:
+        """(K, K) covariance of the coordinates' errors at the given variances."""
+        inverse = cho_solve(self._columns.factor, np.eye(len(self.scale)))
+        return self.scale[:, None] * inverse * self.scale
+
+    @cached_property
+    def sensitivity(self) -> Floats:
+        """(K, F + N) derivative of the coordinates by log s and η."""
+        p, first = self.problem, self._count
+        rhs = np.zeros((len(self.c), len(self.log_size)))
+        rhs[p.flat + np.arange(len(p.family)), p.family] = 2.0 * self.c[p.flat :]
+        rhs[:, first:] = -self.rows.T @ self.working[:, first:]
+        return np.asarray(self.scale[:, None] * cho_solve(self._columns.factor, rhs))
+
+    def score(self, columns: Floats) -> tuple[Floats, Floats]:
+        """Return Zᵀ P Z (q, q) and Zᵀ P y (q,) of columns Z (R, q) that are not in the problem."""
+        white = whitened_rows(columns, self.problem.shape, self.roots)
+        return np.asarray(white.T @ self.projection.project(white)), white.T @ self.residual
+
+
+def equations(problem: MixedProblem, log_size: Floats) -> Equations:
+    """Return the equations at log s and η (F + N,).
+
+    Raises:
+        numpy.linalg.LinAlgError: sizes so different that a matrix has no factor.
+    """
+    eta = log_size[len(problem.families.random) :]
+    if len(problem.noise) == 1:
+        root = float(np.exp(eta[0]))
+        roots = tuple(np.broadcast_to(np.eye(s) * root, (g, s, s)) for g, s in problem.shape)
+        rows, target = problem.x / root, problem.y / root
+    else:
+        roots = tuple(_noise_roots(problem, eta, run) for run in range(len(problem.shape)))
+        rows = whitened_rows(problem.x, problem.shape, roots)
+        target = whitened_rows(problem.y, problem.shape, roots)
+    rows[:, problem.flat :] *= np.exp(log_size)[problem.family]
+    form = _ByRows if rows.shape[0] < rows.shape[1] else _ByColumns
+    return Equations(problem, log_size, rows, target, roots, form(rows, problem.flat))
+
+
+def _noise_roots(problem: MixedProblem, eta: Floats, run: int) -> Floats:
+    groups, size = problem.shape[run]
+    total = np.zeros((groups, size, size))
+    for n, e in zip(problem.noise, eta, strict=True):
+        total += np.exp(2 * e) * (np.eye(size) if n.blocks is None else n.blocks[run])
+    return np.asarray(np.linalg.cholesky(total))
+
+
+def whitened_rows(
+    x: Floats, shape: tuple[tuple[int, int], ...], roots: tuple[Floats, ...]
+) -> Floats:
+    """L⁻¹ X (R, ...) by runs of blocks."""
+    out, start = np.empty_like(x), 0
+    for (groups, size), root in zip(shape, roots, strict=True):
+        stop = start + groups * size
+        block = x[start:stop].reshape(groups, size, -1)
+        out[start:stop] = np.linalg.solve(root, block).reshape(x[start:stop].shape)
+        start = stop
+    return out

@@ -1,0 +1,92 @@
+"""Families: the parameters of a model that share one size."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilcal.effects.protocol import FRAME_ROLES, Effect
+from hilcal.model import Model
+from hilcal.types import Floats, Ints
+
+
+@dataclass(frozen=True, slots=True)
+class LogSize:
+    """What is known of the logarithm of a size before it is estimated: normal.
+
+    Attributes:
+        mean: of log s, s in ordinary magnitudes.
+        spread: its standard deviation.
+    """
+
+    mean: float
+    spread: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Family:
+    """Parameters u ~ N(0, s² D) of one effect.
+
+    Attributes:
+        name: the effect's, with what sets the family apart where the effect has several.
+        effect: name of the effect.
+        parameters: (q,) indices of the parameters in the model.
+        magnitude: (q,) root of D's diagonal: ordinary magnitudes, SI.
+        size: what is known of log s.
+    """
+
+    name: str
+    effect: str
+    parameters: Ints
+    magnitude: Floats
+    size: LogSize
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Families:
+    """All parameters of a model.
+
+    Attributes:
+        frames: (F,) indices of those without a prior: registration and target.
+        random: the families.
+    """
+
+    frames: Ints
+    random: tuple[Family, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the families."""
+        return tuple(f.name for f in self.random)
+
+
+def families_of(model: Model) -> Families:
+    """Return the families of a model.
+
+    Parameters of one effect with the same unit make a family, in an effect with pools (as the
+    octaves of harmonics) each pool one.
+    """
+    frames: list[Ints] = []
+    random: list[Family] = []
+    for effect, mine in zip(model.effects, model.slices(), strict=True):
+        index = np.arange(mine.start, mine.stop)
+        if effect.role in FRAME_ROLES:
+            frames.append(index)
+        else:
+            random += _of_effect(effect, index)
+    return Families(np.concatenate([np.zeros(0, dtype=np.int64), *frames]), tuple(random))
+
+
+def _of_effect(effect: Effect, index: Ints) -> list[Family]:
+    units = [p.unit for p in effect.parameters]
+    pools = effect.pools()
+    keys = list(zip(units, pools.tolist(), strict=True))
+    several_units, several_pools = len(set(units)) > 1, len(set(pools.tolist())) > 1
+    out = []
+    for key in dict.fromkeys(keys):
+        own = np.array([k == key for k in keys])
+        unit, pool = key
+        parts = [unit] * several_units + [str(pool)] * several_pools
+        name = f"{effect.name}[{', '.join(parts)}]" if parts else effect.name
+        size = effect.log_size(pool)
+        out.append(Family(name, effect.name, index[own], effect.magnitudes[own], LogSize(*size)))
+    return out

@@ -1,0 +1,144 @@
+"""The linear problem of a mixed model: rows, columns by family, and blocks of the noise.
+
+    y = A b + Σ_f Z_f u_f + e,    e ~ N(0, Σ_k exp(2 η_k) R_k)
+
+The rows are whitened by the stated covariance, so that R_0 = 1 is the instrument; the other R_k,
+as the arm's scatter, are block diagonal. Columns are kept in ordinary magnitudes, X = [Q | Z D^½]
+with Q an orthonormal basis of the frames' columns.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilcal.mixed.families import Families, LogSize
+from hilcal.types import Floats, Ints
+
+FRAMES_TOLERANCE = 1e-9
+"""Share of the largest singular value of the frames' columns, scaled to unit length, below which a
+direction counts as not moved by the readings (the gauge of base and target)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Noise:
+    """One component of the noise: its size exp(η) times what has the blocks R_k.
+
+    Attributes:
+        name: of it.
+        blocks: one array (G, S, S) for each run of rows, G blocks of S rows; None for the identity.
+        size: what is known of η.
+    """
+
+    name: str
+    blocks: tuple[Floats, ...] | None
+    size: LogSize
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MixedProblem:
+    """Rows, columns and noise at a linearisation.
+
+    Attributes:
+        y: (R,) measured minus what the model predicts without frames and families.
+        x: (R, K) columns [Q | Z D^½].
+        frames: (F, k) b of the first k coordinates: b = frames @ coordinates.
+        families: of the other columns.
+        family: (K − k,) family of each of them.
+        noise: components, that of the instrument first.
+        shape: blocks of the rows, runs of (G, S).
+    """
+
+    y: Floats
+    x: Floats
+    frames: Floats
+    families: Families
+    family: Ints
+    noise: tuple[Noise, ...]
+    shape: tuple[tuple[int, int], ...]
+
+    @property
+    def flat(self) -> int:
+        """Number k of coordinates without a prior."""
+        return int(self.frames.shape[1])
+
+    @property
+    def sizes(self) -> tuple[LogSize, ...]:
+        """What is known of each log s and η, families first."""
+        return (*(f.size for f in self.families.random), *(n.size for n in self.noise))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of families and components of the noise."""
+        return (*self.families.names, *(n.name for n in self.noise))
+
+    def coordinates(self, jacobian: Floats) -> Floats:
+        """Return columns (..., K) from derivatives (..., P) by the model's parameters."""
+        random = self.families.random
+        parts = [jacobian[..., self.families.frames] @ self.frames]
+        parts += [jacobian[..., f.parameters] * f.magnitude for f in random]
+        return np.concatenate(parts, axis=-1)
+
+    def parameters(self, c: Floats, size: int) -> Floats:
+        """Return parameters (size, ...) of the model from coordinates (K, ...)."""
+        theta = np.zeros((size, *c.shape[1:]))
+        theta[self.families.frames] = self.frames @ c[: self.flat]
+        start = self.flat
+        for f in self.families.random:
+            stop = start + len(f.parameters)
+            theta[f.parameters] = (c[start:stop].T * f.magnitude).T
+            start = stop
+        return theta
+
+    def without(self, family: int) -> "MixedProblem":
+        """Return the problem without the columns of a family."""
+        random = tuple(f for k, f in enumerate(self.families.random) if k != family)
+        kept = self.family != family
+        x = np.hstack([self.x[:, : self.flat], self.x[:, self.flat :][:, kept]])
+        number = self.family[kept]
+        return MixedProblem(
+            self.y, x, self.frames, Families(self.families.frames, random),
+            number - (number > family), self.noise, self.shape,
+        )  # fmt: skip
+
+    def columns_of(self, family: int) -> Floats:
+        """(R, q) columns of a family."""
+        return self.x[:, self.flat :][:, self.family == family]
+
+
+def mixed_problem(
+    y: Floats,
+    jacobian: Floats,
+    families: Families,
+    noise: Sequence[Noise],
+    shape: Sequence[tuple[int, int]] | None = None,
+) -> MixedProblem:
+    """Build the problem from whitened rows.
+
+    Args:
+        y: (R,) as in `MixedProblem`.
+        jacobian: (R, P) whitened derivative by all parameters of the model.
+        families: of the model.
+        noise: components, that of the instrument first.
+        shape: blocks of the rows; one for each row unless given.
+    """
+    frames = _frame_basis(jacobian[:, families.frames])
+    random = families.random
+    counts = [len(f.parameters) for f in random]
+    problem = MixedProblem(
+        y, jacobian, frames, families, np.repeat(np.arange(len(random)), counts), tuple(noise),
+        tuple(shape) if shape is not None else ((len(y), 1),),
+    )  # fmt: skip
+    x = problem.coordinates(jacobian)
+    return MixedProblem(y, x, frames, families, problem.family, problem.noise, problem.shape)
+
+
+def _frame_basis(a: Floats) -> Floats:
+    """(F, k) such that the columns of A @ basis are orthonormal and span those of A."""
+    if not a.shape[1]:
+        return np.zeros((0, 0))
+    length = np.linalg.norm(a, axis=0)
+    scale = np.where(length > 0, length, 1.0)
+    _, values, v = np.linalg.svd(a / scale, full_matrices=False)
+    kept = values > FRAMES_TOLERANCE * values[0]
+    return np.asarray((v[kept].T / values[kept]) / scale[:, None])

@@ -1,0 +1,220 @@
+"""The mixed model against dense formulas, finite differences, and its own sampling spread."""
+
+import numpy as np
+import pytest
+from scipy.stats import kstest
+
+from hilcal.mixed.equations import _ByColumns, _ByRows, equations
+from hilcal.mixed.evidence import evidence
+from hilcal.mixed.families import Families, Family, LogSize
+from hilcal.mixed.prediction import predict
+from hilcal.mixed.problem import MixedProblem, Noise, mixed_problem
+from hilcal.mixed.sizes import averaged_coordinates, walk
+from hilcal.mixed.variances import estimate_variances, log_posterior
+from hilcal.types import Floats
+
+FLAT = LogSize(0.0, 3.0)
+
+
+def family(name: str, start: int, count: int, size: LogSize = FLAT) -> Family:
+    return Family(name, name, np.arange(start, start + count), np.linspace(0.5, 2.0, count), size)
+
+
+def problem(
+    rng: np.random.Generator, groups: int = 12, *, scatter: bool = True, over: int = 0
+) -> MixedProblem:
+    """A small problem: frames of four columns of which three count, families of 3 and 5 + over."""
+    rows = 3 * groups
+    jacobian = rng.standard_normal((rows, 12 + over))
+    jacobian[:, 3] = jacobian[:, 0] + jacobian[:, 1]
+    families = Families(np.arange(4), (family("a", 4, 3), family("b", 7, 5 + over)))
+    noise = [Noise("instrument", None, LogSize(0.0, 1.5))]
+    if scatter:
+        half = rng.standard_normal((groups, 3, 2))
+        noise.append(Noise("scatter", (half @ np.swapaxes(half, 1, 2),), LogSize(0.0, 1.5)))
+    y = rng.standard_normal(rows) * 2 + jacobian @ rng.standard_normal(12 + over)
+    return mixed_problem(y, jacobian, families, noise, [(groups, 3)])
+
+
+def dense(p: MixedProblem, x: Floats) -> tuple[float, Floats, Floats]:
+    """ℓ from V = Σ s² Z D Zᵀ + R itself, BLUP coordinates, and P."""
+    q, z = p.x[:, : p.flat], p.x[:, p.flat :]
+    scale = np.exp(x)[p.family]
+    r = np.zeros((len(p.y), len(p.y)))
+    for n, eta in zip(p.noise, x[len(p.families.random) :], strict=True):
+        groups, size = p.shape[0]
+        blocks = np.tile(np.eye(size), (groups, 1, 1)) if n.blocks is None else n.blocks[0]
+        for g in range(groups):
+            own = slice(g * size, (g + 1) * size)
+            r[own, own] += np.exp(2 * eta) * blocks[g]
+    v = r + (z * scale**2) @ z.T
+    vi = np.linalg.inv(v)
+    inner = q.T @ vi @ q
+    left = vi - vi @ q @ np.linalg.solve(inner, q.T @ vi)
+    ll = -0.5 * (np.linalg.slogdet(v)[1] + np.linalg.slogdet(inner)[1] + p.y @ left @ p.y)
+    b = np.linalg.solve(inner, q.T @ vi @ p.y)
+    return ll, np.concatenate([b, scale**2 * (z.T @ left @ p.y)]), left
+
+
+@pytest.mark.parametrize(("over", "form"), [(0, _ByColumns), (60, _ByRows)])
+@pytest.mark.parametrize("scatter", [True, False])
+def test_they_are_those_of_the_whole_covariance(scatter: bool, over: int, form: type) -> None:
+    rng = np.random.default_rng(1)
+    p = problem(rng, scatter=scatter, over=over)
+    at = [0.3 * rng.standard_normal(len(p.sizes)) for _ in range(3)]
+    first, *others = (equations(p, x) for x in at)
+    assert isinstance(first.projection, form)
+    ll, coordinates, left = dense(p, at[0])
+    np.testing.assert_allclose(first.coordinates, coordinates, rtol=1e-9, atol=1e-9)
+    for e, x in zip(others, at[1:], strict=True):  # up to the constant
+        gain = e.log_likelihood - first.log_likelihood
+        assert gain == pytest.approx(dense(p, x)[0] - ll, rel=1e-9)
+    columns = rng.standard_normal((len(p.y), 2))
+    inner, score = first.score(columns)
+    np.testing.assert_allclose(inner, columns.T @ left @ columns, rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(score, columns.T @ left @ p.y, rtol=1e-8, atol=1e-10)
+
+
+@pytest.mark.parametrize("over", [0, 60])
+@pytest.mark.parametrize("scatter", [True, False])
+def test_slopes_are_finite_differences(scatter: bool, over: int) -> None:
+    rng = np.random.default_rng(2)
+    p = problem(rng, scatter=scatter, over=over)
+    x, step = 0.3 * rng.standard_normal(len(p.sizes)), 1e-5
+
+    def along(value: str) -> list[Floats]:
+        out = []
+        for k in range(len(x)):
+            ends = []
+            for sign in (1, -1):
+                moved = x.copy()
+                moved[k] += sign * step
+                ends.append(np.asarray(getattr(equations(p, moved), value)))
+            out.append((ends[0] - ends[1]) / (2 * step))
+        return out
+
+    e = equations(p, x)
+    np.testing.assert_allclose(e.slope, along("log_likelihood"), rtol=1e-5, atol=1e-6)
+    moved = np.stack(along("coordinates"), axis=1)
+    np.testing.assert_allclose(e.sensitivity, moved, rtol=1e-4, atol=1e-6)
+
+
+def test_the_average_information_is_the_mean_of_observed_and_expected() -> None:
+    rng = np.random.default_rng(3)
+    p = problem(rng, over=0)
+    x = 0.3 * rng.standard_normal(len(p.sizes))
+    left = dense(p, x)[2]
+    z = p.x[:, p.flat :]
+    parts = [np.exp(2 * x[f]) * z[:, p.family == f] @ z[:, p.family == f].T for f in range(2)]
+    y = left @ p.y
+    for i in range(2):
+        for j in range(2):
+            expected = 2.0 * y @ parts[i] @ left @ parts[j] @ y
+            assert equations(p, x).information[i, j] == pytest.approx(expected, rel=1e-8)
+
+
+def drawn(
+    rng: np.random.Generator,
+    sizes: tuple[float, float],
+    noise: float,
+    groups: int,
+    size: LogSize = FLAT,
+    *,
+    turned: bool = False,
+) -> tuple[MixedProblem, Floats, Floats]:
+    """A problem with families of true sizes, fresh rows, and what they truly are."""
+    rows = rng.standard_normal((3 * groups + 40, 27))
+    rows[:, 3] = rows[:, 0] + rows[:, 1]
+    both = (family("a", 4, 3, size), family("b", 7, 20, size))
+    families = Families(np.arange(4), both[::-1] if turned else both)
+    u = 5.0 * rng.standard_normal(27)
+    for f, s in zip(both, sizes, strict=True):
+        u[f.parameters] = s * f.magnitude * rng.standard_normal(len(f.parameters))
+    true = rows @ u
+    measured, fresh = rows[:-40], rows[-40:, None]
+    y = true[:-40] + noise * rng.standard_normal(len(measured))
+    instrument = Noise("instrument", None, LogSize(0.0, 1.5))
+    made = mixed_problem(y, measured, families, [instrument], [(groups, 3)])
+    return made, fresh, true[-40:, None]
+
+
+def test_sizes_are_found_where_the_rows_tell_them() -> None:
+    rng = np.random.default_rng(4)
+    found = np.array(
+        [estimate_variances(drawn(rng, (1.0, 0.5), 0.3, 60)[0]).log_size for _ in range(40)]
+    )
+    true = np.log([1.0, 0.5, 0.3])
+    spread = found.std(axis=0) / np.sqrt(len(found))
+    assert np.all(np.abs(found.mean(axis=0) - true) < 4 * spread + 0.1 * np.array([3, 1, 0]))
+    # the family of three is skewed downwards: half a third of a χ² with three degrees of freedom
+
+
+@pytest.mark.parametrize("groups", [8, 12])
+def test_bands_hold_what_they_say_with_few_rows(groups: int) -> None:
+    rng = np.random.default_rng(5)
+    inside = total = 0
+    for _ in range(60):
+        made, fresh, true = drawn(rng, (1.0, 0.3), 0.3, groups)
+        mean, covariance = predict(estimate_variances(made), fresh)
+        off = np.abs(mean - true) / np.sqrt(covariance[..., 0, 0])[:, None]
+        inside, total = inside + int(np.sum(off < 1.96)), total + off.size
+    assert 0.92 < inside / total < 0.98
+
+
+def test_p_values_are_uniform_where_nothing_is_there_and_small_where_it_is() -> None:
+    rng = np.random.default_rng(6)
+    null = [evidence(drawn(rng, (1.0, 0.0), 0.3, 20)[0], 1, rng).p_value for _ in range(100)]
+    there = [evidence(drawn(rng, (1.0, 0.5), 0.3, 20)[0], 1, rng).p_value for _ in range(5)]
+    assert max(there) < 0.01
+    below = np.array([p for p in null if p < 0.4])  # above it there is the mass at ratio zero
+    assert kstest(below / 0.4, "uniform").pvalue > 0.01
+    assert abs(len(below) / len(null) - 0.4) < 0.13
+
+
+def test_a_family_that_others_span_has_no_evidence_of_its_own() -> None:
+    rng = np.random.default_rng(7)
+    p = problem(rng, scatter=False)
+    jacobian = np.hstack([p.x, p.x[:, :2]])
+    families = Families(np.arange(2), (family("a", 2, 9), family("same as frames", 11, 2)))
+    again = mixed_problem(p.y, jacobian, families, p.noise, p.shape)
+    assert evidence(again, 1, rng) == evidence(again, 1, rng)
+    assert (evidence(again, 1, rng).ratio, evidence(again, 1, rng).rank) == (0.0, 0)
+
+
+def test_the_outcome_does_not_depend_on_the_order_of_families() -> None:
+    (one, fresh, _), (two, _, _) = (
+        drawn(np.random.default_rng(8), (1.0, 0.5), 0.3, 15, turned=t) for t in (False, True)
+    )
+    first, second = estimate_variances(one), estimate_variances(two)
+    np.testing.assert_allclose(first.log_size[[1, 0, 2]], second.log_size, atol=0.01)
+    for mean, other in zip(predict(first, fresh), predict(second, fresh), strict=True):
+        np.testing.assert_allclose(mean, other, rtol=0.01, atol=0.01)
+
+
+def test_coordinates_are_averaged_over_what_the_sizes_may_be() -> None:
+    """Against a sum over a grid, with rows that hardly tell the size."""
+    rng = np.random.default_rng(9)
+    jacobian = rng.standard_normal((9, 4))
+    families = Families(np.arange(2), (family("a", 2, 2, LogSize(0.0, 1.5)),))
+    p = mixed_problem(
+        rng.standard_normal(9), jacobian, families, [Noise("instrument", None, LogSize(0.0, 1.0))]
+    )
+    grid = np.linspace(-5.0, 5.0, 41)
+    all_of_them = [equations(p, np.array([s, eta])) for s in grid for eta in grid]
+    weight = np.exp([log_posterior(e) for e in all_of_them])
+    mean = weight @ np.array([e.coordinates for e in all_of_them]) / weight.sum()
+    found = estimate_variances(p)
+    averaged = averaged_coordinates(found, np.random.default_rng(0), steps=6000)
+    np.testing.assert_allclose(averaged, mean, atol=0.03)
+    assert np.abs(found.equations.coordinates - mean).max() > 0.06
+
+
+def test_sizes_are_drawn_from_their_posterior() -> None:
+    """Rows that tell the sizes well: a posterior as Laplace says."""
+    made, *_ = drawn(np.random.default_rng(10), (1.0, 0.5), 0.3, 60)
+    found = estimate_variances(made)
+    drawn_sizes = [e.log_size for e in walk(found, np.random.default_rng(0), 3000)]
+    off = np.mean(drawn_sizes, axis=0) - found.log_size
+    std = np.sqrt(np.diag(found.covariance))
+    assert np.all(np.abs(off) < 0.5 * std)
+    np.testing.assert_allclose(np.std(drawn_sizes, axis=0), std, rtol=0.35)
