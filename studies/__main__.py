@@ -16,6 +16,7 @@ from studies.descriptions_command import descriptions
 from studies.diagnosis_command import diagnosis
 from studies.discover_command import discover
 from studies.discover_real_command import discover_real
+from studies.few_poses_command import few_poses
 from studies.gross_errors_command import gross_errors
 from studies.plans_command import plans
 from studies.real_command import real
@@ -37,6 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     app.command("plans")(plans)
     app.command("descriptions")(descriptions)
     app.command("gross-errors")(gross_errors)
+    app.command("few-poses")(few_poses)
     app.command("scaling")(scaling)
     app.command("serial-noise")(serial_noise)
     app.command("real")(real)

@@ -121,6 +121,10 @@ class Equations:
         """Number of families."""
         return len(self.problem.families.random)
 
+    @property
+    def _instrument_alone(self) -> bool:
+        return len(self.problem.noise) == 1 and self.problem.noise[0].blocks is None
+
     @cached_property
     def scale(self) -> Floats:
         """(K,) S."""
@@ -151,7 +155,8 @@ class Equations:
     def spent(self) -> Floats:
         """(F,) γ_f, parameters that each family spends."""
         p = self.problem
-        return np.bincount(p.family, self.projection.spent[p.flat :], minlength=self._count)
+        own = self.projection.spent[p.flat :]
+        return np.bincount(p.family, own, minlength=self._count).astype(np.float64)
 
     @cached_property
     def slope(self) -> Floats:
@@ -161,7 +166,7 @@ class Equations:
         return np.concatenate([square - self.spent, self._noise_slope()])
 
     def _noise_slope(self) -> Floats:
-        if len(self.problem.noise) == 1:  # W = 1, tr P = R − k − Σ γ
+        if self._instrument_alone:  # W = 1, tr P = R − k − Σ γ
             count = len(self.target) - self.problem.flat - self.spent.sum()
             return np.array([float(self.residual @ self.residual) - count])
         out = np.zeros(len(self.problem.noise))
@@ -195,7 +200,7 @@ class Equations:
         for f in range(first):
             own = np.flatnonzero(p.family == f) + p.flat
             out[:, f] = 2.0 * (self.rows[:, own] @ self.c[own])
-        if len(p.noise) == 1:
+        if self._instrument_alone:
             out[:, first] = 2.0 * self.residual
             return out
         for rows, shape, white in self._white_noise:
@@ -248,7 +253,7 @@ def equations(problem: MixedProblem, log_size: Floats) -> Equations:
         numpy.linalg.LinAlgError: sizes so different that a matrix has no factor.
     """
     eta = log_size[len(problem.families.random) :]
-    if len(problem.noise) == 1:
+    if len(problem.noise) == 1 and problem.noise[0].blocks is None:
         root = float(np.exp(eta[0]))
         roots = tuple(np.broadcast_to(np.eye(s) * root, (g, s, s)) for g, s in problem.shape)
         rows, target = problem.x / root, problem.y / root
@@ -266,6 +271,8 @@ def _noise_roots(problem: MixedProblem, eta: Floats, run: int) -> Floats:
     total = np.zeros((groups, size, size))
     for n, e in zip(problem.noise, eta, strict=True):
         total += np.exp(2 * e) * (np.eye(size) if n.blocks is None else n.blocks[run])
+    each = np.arange(size)  # a row without noise is one that carries no information
+    total[:, each, each] += total[:, each, each] == 0.0
     return np.asarray(np.linalg.cholesky(total))
 
 

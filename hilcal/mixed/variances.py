@@ -85,7 +85,7 @@ def estimate_variances(problem: MixedProblem, start: Floats | None = None) -> Va
         here, best, damping = there, best + gain, 0.1 * damping if damping > 1e-3 else 0.0
         if gain < CONVERGED:
             break
-    covariance = np.linalg.inv(here.information + np.diag(precision))
+    covariance = np.asarray(np.linalg.inv(here.information + np.diag(precision)))
     return Variances(here, covariance, best)
 
 

@@ -1,0 +1,167 @@
+"""The mixed model of all effects, fitted to readings.
+
+Every effect of the catalogue that the readings allow takes part, each of its families with a size
+of its own (see `hilcal.mixed`). The rows are linearised at the joint optimum: at the parameters
+that the mixed model predicts, again until they stay.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hilcal.data.readings import Readings, States
+from hilcal.data.whitening import Mode, Whitening, covariance_blocks, whitening
+from hilcal.effects.protocol import FRAME_ROLES
+from hilcal.effects.spec import EffectSpec
+from hilcal.identify.full_covariance import joint_factors
+from hilcal.identify.residual import residual
+from hilcal.mixed.families import LogSize, families_of
+from hilcal.mixed.prediction import coordinates_covariance
+from hilcal.mixed.problem import MixedProblem, Noise, mixed_problem
+from hilcal.mixed.sizes import averaged_coordinates
+from hilcal.mixed.variances import Variances, estimate_variances
+from hilcal.model import Model
+from hilcal.types import Floats
+
+HARMONICS = 64
+"""Harmonics of a transmission error, whatever the number of poses: those that few poses cannot
+resolve are there all the same, and act as scatter. A choice: teeth of strain wave gears err once a
+turn of the motor, 100 and more times a turn of the joint, by less than any tracker sees."""
+ROUNDS = 5
+"""Most linearisations; a choice, three are usual."""
+CONVERGED = 0.02
+"""Change of the predicted readings, in units of their noise, at which the linearisation stays."""
+SCATTER_RAD = 3e-5
+"""Ordinary scatter of a joint, rad: 30 µm at 1 m, as makers state it; η of it is about zero."""
+NOISE_SPREAD = 1.5
+"""Of the log of the noise: a factor of 4.5 either way; a choice."""
+FEW_ROWS = 300
+"""Rows up to which the sizes are averaged over; beyond, their estimate is as good and each step of
+the walk costs its cube. A choice."""
+WALK = 600
+"""Steps of the walk; a choice: twice as many change errors by less than 1 %."""
+
+
+@dataclass(frozen=True, eq=False)
+class MixedFit:
+    """All effects at once, fitted to readings.
+
+    Attributes:
+        model: with all effects.
+        readings: that it was fitted to.
+        w: their whitening, by the stated covariance.
+        theta: (P,) parameters.
+        variances: sizes of the families and of the noise, at the last linearisation.
+        covariance: (K, K) of the errors of the coordinates.
+    """
+
+    model: Model
+    readings: Readings
+    w: Whitening
+    theta: Floats
+    variances: Variances
+    covariance: Floats
+
+    @property
+    def problem(self) -> MixedProblem:
+        """The linear problem at the last linearisation."""
+        return self.variances.equations.problem
+
+    def size(self, name: str) -> float:
+        """Return the estimated size of a family or of a component of the noise."""
+        return float(np.exp(self.variances.log_size[self.problem.names.index(name)]))
+
+    def predict(self, states: States, m: int) -> tuple[Floats, Floats]:
+        """Predict what the sensor reads in N states.
+
+        Args:
+            states: joints, wrenches and what else the effects need.
+            m: 3 for positions, 6 for poses (the last three are the errors' rotation vector).
+
+        Returns:
+            (N, 3) positions, and (N, m, m) covariance of the prediction, without that of the
+            reading's noise.
+        """
+        prediction = self.model.predict(states, self.theta)
+        x = self.problem.coordinates(self.model.jacobian(prediction, self.theta, m))
+        spread = x @ self.covariance @ np.swapaxes(x, 1, 2)
+        return prediction.observation.position, spread
+
+    def noise(self, readings: Readings) -> Floats:
+        """(N, m, m) covariance of absolute readings by instrument and arm, as estimated."""
+        total = self.size("instrument") ** 2 * readings.covariance
+        if "arm's scatter" in self.problem.names:
+            f = _scatter_factors(self.model, readings)
+            total = total + self.size("arm's scatter") ** 2 * (f @ np.swapaxes(f, 1, 2))
+        return np.asarray(total)
+
+
+def with_all_effects(model: Model, states: States) -> Model:
+    """Return a model with every effect of its catalogue that the states allow."""
+    for kind in model.catalogue.effects:
+        if kind.name in model.names or kind.role in FRAME_ROLES or not kind.computable(states):
+            continue
+        fine = {"harmonics": HARMONICS} if "harmonics" in kind.option_help else {}
+        model = model + EffectSpec(kind.name, fine)
+    return model
+
+
+def mixed_fit(model: Model, readings: Readings, mode: Mode, rng: np.random.Generator) -> MixedFit:
+    """Fit all effects at once.
+
+    Args:
+        model: frames, and effects that have to be in it.
+        readings: without gross errors.
+        mode: "absolute" or "deflection".
+        rng: for the average over what the sizes may be.
+
+    Raises:
+        CannotAnswerError: no static equilibrium, or no likelihood.
+    """
+    model = with_all_effects(model, readings.states)
+    families, w = families_of(model), whitening(readings, mode, "gc")
+    noise = _noise(model, readings, w)
+    shape = [(len(b.loaded), b.factor.shape[-1]) for b in w.buckets]
+    theta, white = np.zeros(model.size), np.full(w.m * len(w), np.inf)
+    start: Floats | None = None
+    rounds = 0
+    while True:
+        prediction = model.predict(readings.states, theta)
+        now = w.whiten(residual(readings, prediction, w)).reshape(-1)
+        jacobian = w.whiten_readings(model.jacobian(prediction, theta, w.m))
+        problem = mixed_problem(now + jacobian @ theta, jacobian, families, noise, shape)
+        found = estimate_variances(problem, start)
+        theta = problem.parameters(found.equations.coordinates, model.size)
+        rounds, start = rounds + 1, found.log_size
+        if rounds == ROUNDS or np.sqrt(np.mean((now - white) ** 2)) < CONVERGED:
+            break
+        white = now
+    if len(problem.y) <= FEW_ROWS:
+        mean = averaged_coordinates(found, rng, WALK)
+        theta = problem.parameters(mean, model.size)
+    return MixedFit(model, readings, w, theta, found, coordinates_covariance(found))
+
+
+def _noise(model: Model, readings: Readings, w: Whitening) -> list[Noise]:
+    """Components: the instrument's, and the arm's scatter where the readings do not state it."""
+    seen = tuple(
+        np.any(b.factor != 0, axis=2)[:, :, None] * np.eye(b.factor.shape[-1]) for b in w.buckets
+    )
+    whole = all(bool(s.any(axis=2).all()) for s in seen)
+    instrument = Noise("instrument", None if whole else seen, LogSize(0.0, NOISE_SPREAD))
+    if readings.scatter_stated:
+        return [instrument]
+    f = _scatter_factors(model, readings)
+    common = None if readings.states.target is None else f
+    of = replace(readings, covariance=f @ np.swapaxes(f, 1, 2), common=common, serial=None)
+    blocks = tuple(
+        b.factor @ c @ np.swapaxes(b.factor, 1, 2)
+        for b, c in zip(w.buckets, covariance_blocks(of, w), strict=True)
+    )
+    return [instrument, Noise("arm's scatter", blocks, LogSize(0.0, NOISE_SPREAD))]
+
+
+def _scatter_factors(model: Model, readings: Readings) -> Floats:
+    """(N, m, n) F of the arm's scatter by joints of `SCATTER_RAD` each."""
+    n = model.cell.arm.n
+    return joint_factors(model.cell, readings, np.full(n, SCATTER_RAD))
