@@ -51,7 +51,7 @@ def program_ended(reading: Reading, late: float) -> str:
             "it lives"
         )
     word = states.runtime_word(reading.runtime)
-    return f"its program is {word}: stopped on the pendant, by another program, or by its watchdog"
+    return f"its program is {word}: stopped by another program, on the pendant, or by its watchdog"
 
 
 def not_commanded(error: WorkerError) -> str:
