@@ -61,7 +61,7 @@ LEANING = Fault(
     act("world", "push", wrench=NOBODY),
     ("asked 3 times", "touch the tool|hangs|pulls|felt"),
 )
-FOREIGN = "another program|left the straight way|did not take|by its watchdog"
+FOREIGN = "another program"
 MOTION = (
     switch("joint angles stand still", "arm", "freeze", "stood still|its angle is old", fast=True),
     Fault("another program", another_program, nothing, (FOREIGN,)),
