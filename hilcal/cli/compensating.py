@@ -201,6 +201,8 @@ def _task(path: Path, calibration: Calibration, tool: str | None, leave: bool) -
                     f"{path}: {name} is a pose of a tool centre point that the program does not "
                     'set; give --tool "X Y Z RX RY RZ" as the installation has it'
                 )
+        if own is not None and given is not None and not np.allclose(own, given, atol=1e-9):
+            raise InputError(f"{path}: set_tcp is another tool than --tool; leave out one of them")
         return _Task(points, given if own is None else own, program, every)
     if leave:
         raise InputError(f"{path}: --leave is for waypoints of a program; valid: without it")
