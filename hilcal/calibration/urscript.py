@@ -32,6 +32,7 @@ from hilcal.robot import se3
 from hilcal.types import Floats
 
 JOINTS = 6
+STRAIGHT = ("movel", "movep")
 MOVES = {"movej": 4, "movel": 4, "movep": 3, "servoj": None}
 """Functions that move to a waypoint, and which of their arguments is the blend radius."""
 NAMED = 5
@@ -96,6 +97,8 @@ class Waypoint:
         tool: (4, 4) T_flange_tool that was set; None where none was.
         blend_m: radius within which the arm passes it without a stop, m.
         left: why it is left as it is; empty where it is understood.
+        straight: whether the tool moves to it on a straight line.
+        follows: whether the waypoint before it in the text always comes right before it.
     """
 
     line: int
@@ -106,6 +109,8 @@ class Waypoint:
     tool: Floats | None = None
     blend_m: float = 0.0
     left: str = ""
+    straight: bool = False
+    follows: bool = False
 
 
 def waypoints(program: str) -> tuple[Waypoint, ...]:
@@ -349,9 +354,11 @@ def _waypoints(p: _Program) -> tuple[Waypoint, ...]:
         elif name in moving:
             found = _waypoint(p, k, setup)
             again = "while" in s.kinds or s.kinds.count("def") > wrapped
-            known = stands == s.blocks or (begins and not again)
-            if found.pose is not None and found.q is None and (side_by_side or not known):
+            follows = stands == s.blocks and not side_by_side
+            known = follows or (begins and not again and not side_by_side)
+            if found.pose is not None and found.q is None and not known:
                 found = replace(found, left=_NO_BRANCH)
+            found = replace(found, straight=name in STRAIGHT, follows=follows)
             # servoj ends after its time, wherever the arm is then
             stands, begins = None if found.left or name == "servoj" else s.blocks, False
             out.append(found)
