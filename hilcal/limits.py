@@ -16,7 +16,15 @@ from hilcal.errors import InputError
 SETTINGS = 1 << 19
 """Bytes of a TOML file."""
 PROGRAM = 1 << 24
-"""Bytes of a robot's description, a program of the robot, a file of effects."""
+"""Bytes of a robot's description, a file of effects."""
+SCRIPT = 1 << 21
+"""Bytes of a program of the robot."""
+STATEMENTS = 100_000
+"""Statements of it."""
+STATEMENT = 10_000
+"""Characters of one."""
+BLOCKS = 100
+"""Blocks in each other in which one stands."""
 DOCUMENT = 1 << 25
 """Bytes of a JSON document: plan, calibration, prior."""
 TABLE = 1 << 27

@@ -22,6 +22,7 @@ from hilcal.data.revision import RevisionRecord, fitted_to, from_text, to_text, 
 from hilcal.data.robot_file import robot_file_of
 from hilcal.data.stored_priors import join, split
 from hilcal.errors import HilcalError, InputError, MovedFileError
+from hilcal.names import quoted
 
 _TARGETS = "targets"
 ACCEPTED = "accepted {}"
@@ -113,7 +114,9 @@ class CampaignFile:
                 schema.check_file(connection, path)
                 file = cls(path, connection)
                 if check_revisions and (bad := file.bad_revision()) is not None:
-                    raise InputError(f"{path}: {bad[1]}; set it aside: hilcal repair {path}")
+                    raise InputError(
+                        f"{path}: {bad[1]}; set it aside: hilcal repair {quoted(path)}"
+                    )
                 return file
             except BaseException:
                 connection.close()
@@ -320,7 +323,9 @@ class CampaignFile:
         """
         records, damaged = self._sound_revisions()
         if damaged is not None:
-            raise InputError(f"{self.path}: {damaged[1]}; set it aside: hilcal repair {self.path}")
+            raise InputError(
+                f"{self.path}: {damaged[1]}; set it aside: hilcal repair {quoted(self.path)}"
+            )
         return records
 
     def _sound_revisions(self) -> tuple[tuple[RevisionRecord, ...], tuple[int, str] | None]:
