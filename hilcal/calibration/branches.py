@@ -26,9 +26,7 @@ SAME = 1e-6
 """Joint values that are the same solution, rad: far above the residual of one, far below what is
 between two."""
 NEAREST = "another branch of the arm is as near; joint values in place of the pose say which"
-STRAIGHT = (
-    "a straight motion from the waypoint before ends on another branch of the arm; movej does not"
-)
+STRAIGHT = "a straight motion from the waypoint before ends on another branch of the arm; use movej"
 UNKNOWN = "the branch of the waypoint before it is not known"
 
 
@@ -105,7 +103,7 @@ def _straight(arm: Arm, tool: Floats, begin: Floats, q: Floats) -> Bools:
         found = invert(arm, lambda x, _: _poses(arm, tool, x), at, rotation, p0 + share * (p1 - p0))
         out &= found.solved & (np.abs(found.q - at).max(axis=1) < LARGEST_STEP)
         at = found.q
-    return out & (np.abs(_turn(at - q)).max(axis=1) < SAME)
+    return np.asarray(out & (np.abs(_turn(at - q)).max(axis=1) < SAME))
 
 
 def _poses(arm: Arm, tool: Floats, q: Floats) -> Pose:
