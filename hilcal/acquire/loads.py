@@ -202,12 +202,13 @@ class Hook:
         """What seems to hang still: a load that fits better than nothing does.
 
         By the zero of an earlier session, since the sensor's own may have changed meanwhile.
-        Without one it is the sensor's own, which may be far off: then it is checked once only, and
-        the operator's answer is accepted.
+        Without one it is the sensor's own, which may be far off: then a second answer that nothing
+        hangs is believed, and said to be.
         """
-        if self._meter is None or (self._doubted and not np.any(self._meter.zero)):
+        if self._meter is None:
             return ""
-        self._doubted = True
+        known = bool(np.any(self._meter.zero))
+        believed, self._doubted = self._doubted and not known, True
         sample = self._mover.look()
         tared = self._meter.tared(self._meter.average(), sample.q)
         force = self._meter.load_wrench(tared)[:3]
@@ -216,7 +217,14 @@ class Hook:
             return ""
         for load in self._config.loads:
             if np.linalg.norm(force - load.wrench(self._cell.gravity)[:3]) < felt:
-                known = np.any(self._meter.zero)
+                if believed:
+                    self._watcher.notify(
+                        Remark(
+                            f"the force sensor's own zero is taken to be off by {felt:.1f} N: it "
+                            "was answered twice that nothing hangs"
+                        )
+                    )
+                    return ""
                 since = "in the unloaded readings so far" if known else "the tool weighs"
                 return (
                     f"the force sensor feels {felt:.1f} N more than {since}; {load.name} seems to "

@@ -200,9 +200,14 @@ class Soak:
         return "load falls"
 
     def wrong_weights(self) -> str:
-        """The person hangs another weight than asked for, once or every time."""
+        """The person hangs another weight than asked for, once or every time.
+
+        Once where nothing is measured yet: by the sensor's own zero a load that nobody took off
+        cannot be told, and the second answer is believed until gravity turns in the sensor.
+        """
+        begun = self.path.exists()
         run = self._run()
-        times = self.rng.choice((1, 3))
+        times = self.rng.choice((1, 3)) if begun else 1
         for _ in range(times):
             wrong = self.rng.choice(self.site.config.loads)
             self.site.ask("world", "mistake", name=wrong.name)
