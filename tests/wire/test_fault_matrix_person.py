@@ -59,7 +59,7 @@ LEANING = Fault(
     "somebody leans on the tool",
     act("world", "push", wrench=HAND),
     act("world", "push", wrench=NOBODY),
-    ("asked 3 times", "touch the tool|hangs|pulls|felt"),
+    ("asked 3 times|max_moment_Nm|max_force_N", "touch the tool|hangs|pulls|felt|touches"),
 )
 FOREIGN = "another program"
 MOTION = (
