@@ -28,6 +28,12 @@ ACCEPTED = "accepted {}"
 """Keys of the acceptances, numbered from 1; the last one holds."""
 _MEANWHILE = 1000
 """Readings that were appended during a fit, at most; a choice: each takes a second."""
+_HASHED = 1_000_000
+"""Readings that are hashed, at most, to find how many they were; a choice: it takes seconds."""
+_OTHER_READINGS = (
+    "the readings were changed after revision {} had been fitted to them (their SHA-256 is another)"
+)
+_MEND = "valid: an untouched copy of it; or set the revision aside: hilcal repair {}"
 _META = ("config", "base_dir", "source", "created", "program_version")
 
 
@@ -113,7 +119,7 @@ class CampaignFile:
                 schema.check_file(connection, path)
                 file = cls(path, connection)
                 if check_revisions and (bad := file.bad_revision()) is not None:
-                    raise InputError(f"{path}: {bad[1]}; set it aside: hilcal repair {path}")
+                    raise InputError(f"{path}: {bad[1]}; {_MEND.format(path)}")
                 return file
             except BaseException:
                 connection.close()
@@ -320,7 +326,7 @@ class CampaignFile:
         """
         records, damaged = self._sound_revisions()
         if damaged is not None:
-            raise InputError(f"{self.path}: {damaged[1]}; set it aside: hilcal repair {self.path}")
+            raise InputError(f"{self.path}: {damaged[1]}; {_MEND.format(self.path)}")
         return records
 
     def _sound_revisions(self) -> tuple[tuple[RevisionRecord, ...], tuple[int, str] | None]:
@@ -368,15 +374,14 @@ class CampaignFile:
         for number, count, stored in fitted:
             assert readings is not None  # noqa: S101
             for n in range(count, min(len(readings), count + _MEANWHILE) + 1):
+                if n > count and sum(hashes) > _HASHED:
+                    return number, _OTHER_READINGS.format(number)
                 if n not in hashes:
                     hashes[n] = content_hash(readings[:n])
                 if hashes[n] == stored:
                     break
             else:
-                return number, (
-                    f"the readings were changed after revision {number} had been fitted to them "
-                    "(their SHA-256 is another); use an untouched copy of the file"
-                )
+                return number, _OTHER_READINGS.format(number)
         return damaged
 
     def _read_meta(self) -> dict[str, str]:
