@@ -15,7 +15,7 @@ from hilcal import __version__
 from hilcal.data import rows, schema
 from hilcal.data.command_line import typed_now
 from hilcal.data.in_place import identity, moved_to, rescued
-from hilcal.data.new_campaign import write_new
+from hilcal.data.new_campaign import new_campaign
 from hilcal.data.readings import Readings
 from hilcal.data.records import Layout, content_hash, layout_of, read_layout
 from hilcal.data.revision import RevisionRecord, fitted_to, from_text, to_text, utc_now
@@ -63,8 +63,9 @@ class CampaignFile:
         *,
         overwrite: bool = False,
         more: Mapping[str, str] | None = None,
+        readings: Readings | None = None,
     ) -> Self:
-        """Make an empty campaign; the file appears only when it is complete.
+        """Make a campaign; the file appears only when it is complete.
 
         Args:
             path: the file to make.
@@ -73,16 +74,20 @@ class CampaignFile:
             source: where the readings come from, in words.
             overwrite: replace an existing campaign (never a file of another kind).
             more: further texts about it, see `about`.
+            readings: the first ones; none unless given.
 
         Raises:
-            InputError: the file exists, or cannot be written.
+            InputError: the file exists, or cannot be written; see `append_readings`.
+            DeviceError: the disk is full or failed.
         """
         path = Path(path)
         meta = dict(
             zip(_META, (config_json, base_dir, source, utc_now(), __version__), strict=True)
         )
         meta |= {**typed_now(), **robot_file_of(config_json, base_dir), **(more or {})}
-        write_new(path, meta, overwrite)
+        with new_campaign(path, meta, overwrite) as connection:
+            if readings is not None:
+                cls(path, connection).insert(readings)
         return cls.open(path)
 
     @classmethod
