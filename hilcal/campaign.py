@@ -93,7 +93,7 @@ class Campaign:
         try:
             config = CellConfig.from_json(file.config_json)
             check_robot(file.path, file.config_json, file.about(ROBOT_FILE))
-            cell = cell_from_config(config, Path(file.base_dir), file.about(ROBOT_FILE))
+            cell = cell_from_config(config, None, file.about(ROBOT_FILE))
             readings = campaign_readings(file, cell, config)
         except BaseException:
             file.close()
