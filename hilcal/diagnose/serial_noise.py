@@ -19,8 +19,8 @@ are of readings. K_f, scaled to a mean variance of 1, is that
 misjudged as a whole. Little but the stated covariance tells a long correlation of large noise from
 a short one of small noise: the estimate is that with σ² = 1, unless the readings speak against it.
 
-All this is computed where the slope of ℓ by φ at white noise speaks for it, and no K_f alone explains
-the readings far better: that is to be in the model first.
+All this is computed where the slope of ℓ by φ at white noise speaks for it, and no K_f alone
+explains the readings far better: that is to be in the model first.
 
 The serial noise is proved where it gains more than chance beside all K_f, or alone, and is then
 better than all K_f by 20 : 1. Where these are better by as much, they explain the readings, as a
@@ -52,9 +52,9 @@ with one and two degrees of freedom (Self and Liang, JASA 82 (1987) 605), on two
 AGAINST = 6.0
 """Gain of the restricted log likelihood by another σ² than 1 that speaks against it: that of
 `noise_verdict.MISFIT_ALARM`."""
-SUSPECT = 2.0
-"""Gain that the slope of the likelihood at white noise must promise for more to be computed; a
-choice: of white noise it does in one of twenty fits."""
+SUSPECT = 0.5 * CHANCE
+"""Gain that slope and curvature at white noise must promise for more to be computed; a choice: it
+is as rough as a third."""
 SIZES = (1.0, 10.0, 100.0)
 """Variances of a rival that are tried, in that of the noise, and ..."""
 LEAD = 2.0
@@ -344,12 +344,26 @@ class _Problem:
         slope = 0.5 * (np.tensordot(rivals, np.outer(py, py), axes=2) / noise - trace)
         curvature = 0.5 * (np.sum(rivals**2, axis=(1, 2)) - trace**2 / free)
         k = int(np.argmax(np.maximum(slope, 0.0) ** 2 / np.maximum(curvature, ROUNDING)))
-        none, one, step = self.none(), rivals[k : k + 1], self.step
-        v = np.zeros(0)
-        white = self._likelihood(none, 0.0, step, v)[0]
-        serial = max(self._likelihood(none, 0.5, -step / np.log(r), v)[0] for r in STARTS)
-        other = max(self._likelihood(one, 0.0, step, np.array([x]))[0] for x in SIZES)
+        away, white = np.abs(self.t[:, None] - self.t) / self.step, self._value(None)
+        serial = max(self._value(0.5 * (self.correlated(r**away) - self.own)) for r in STARTS)
+        other = max(self._value(x * rivals[k]) for x in SIZES)
         return other - white >= LEAD * max(serial - white, 0.0) + CHANCE + SAME_EVIDENCE
+
+    def _value(self, more: Floats | None) -> float:
+        """ℓ with Σ = 1 and more (R, R); see `_likelihood`."""
+        both = np.column_stack([self.columns, self.y])
+        log_det = 0.0
+        if more is not None:
+            lower = np.linalg.cholesky((1.0 + ROUNDING) * np.eye(len(more)) + more)
+            both = solve_triangular(lower, both, lower=True)
+            log_det = 2 * float(np.log(np.diag(lower)).sum())
+        b, y = both[:, :-1], both[:, -1]
+        h = b.T @ b + np.diag(self.ridge)
+        h += ROUNDING * float(np.trace(h)) / len(h) * np.eye(len(h))
+        free = len(y) - int(np.sum(self.ridge == 0))
+        square = float(y @ y) - float(np.sum((inverse_root(h) @ (b.T @ y)) ** 2))
+        log_det += float(np.linalg.slogdet(h)[1])
+        return -0.5 * (free * np.log(square / free) + free + log_det)
 
     def noise(self, free: _Point, rivals: Floats, gain: float) -> SerialNoise:
         """Return the estimate; its uncertainties are by the curvature of ℓ."""

@@ -154,7 +154,9 @@ class Snooping:
             rest = ~np.isin(off, alike)
             unit = _units(self.readings.covariance[off[rest]])
             sites = at.sites[off[rest]] / unit[:, :, None]
-            law = off[rest][along_one_site(shift[rest] / unit, sites, of.group[off[rest]])]
+            law = off[rest][
+                along_one_site(shift[rest] / unit, sites, self.readings.pose[off[rest]])
+            ]
             if not len(law):
                 agree[alike] = True
                 found = Disagreement("alike", alike) if len(alike) else None
