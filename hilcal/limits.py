@@ -6,19 +6,25 @@ them are choices, far beyond the largest measured series; docs/reference/limits.
 """
 
 import resource
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import wraps
 from pathlib import Path
-from typing import Self, TextIO
+from typing import Concatenate, ParamSpec, Self, TextIO, TypeVar
 
 from hilcal.errors import InputError
 
 SETTINGS = 1 << 19
 """Bytes of a TOML file."""
-PROGRAM = 1 << 24
+PROGRAM = 1 << 22
 """Bytes of a robot's description, a program of the robot, a file of effects."""
+DOTS = 100
+"""Dots in a line of it: the time that its parser takes grows by the square of a key's parts."""
 DOCUMENT = 1 << 25
 """Bytes of a JSON document: plan, calibration, prior."""
+VALUES = 2_000_000
+"""Values of it: Python takes some 100 bytes for the three of an empty list."""
 TABLE = 1 << 27
 """Bytes of a table, as text or packed."""
 UNPACKED = 1 << 28
@@ -31,6 +37,8 @@ COLUMNS = 2000
 """Columns of a table."""
 CELLS = 5_000_000
 """Cells of a table."""
+SHEETS = 100
+"""Sheets of a workbook."""
 DESCRIBED = 500
 """Joints of a robot's description, fixed ones and those of grippers included."""
 MOVING = 100
@@ -45,8 +53,13 @@ SHARED = 1 << 24
 """Numbers of the joint covariances of readings that share an error, (L m)² for L of m elements."""
 JUDGED = 150_000
 """Readings, times elements, that are diagnosed or refined together."""
+PLANNED = 20_000
+"""Poses of a plan, and its steps: a week of measuring."""
 MEMORY = 3 << 28
 """Bytes that reading one file may take beyond what the process has."""
+_ONE = threading.RLock()
+"""The limit of memory is the whole process's, so that one thread at a time sets it."""
+P, Q, T = ParamSpec("P"), TypeVar("Q", bound=str | Path), TypeVar("T")
 STREAM = "a longer series is fitted as a stream (docs/how-to/fit-a-stream.md)"
 
 
@@ -72,6 +85,12 @@ def check_cells(what: str, rows: int, columns: int = 1) -> None:
         raise InputError(f"{what}: {columns} columns; valid: at most {COLUMNS}")
     if rows * columns > CELLS:
         raise InputError(f"{what}: more than {CELLS / 1e6:.0f} million cells; {STREAM}")
+
+
+def check_planned(what: str, of: str, count: int) -> None:
+    """Refuse a plan of so many poses or steps; raises as `check_size` does."""
+    if count > PLANNED:
+        raise InputError(f"{what}: {count} {of}; valid: at most {PLANNED} in a plan")
 
 
 class Lines:
@@ -168,20 +187,33 @@ def memory(what: str) -> Iterator[None]:
     Raises:
         InputError: it did.
     """
-    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-    try:
-        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
-    except OSError:  # no Linux
-        yield
-        return
-    most = pages * resource.getpagesize() + MEMORY
-    least = [limit for limit in (soft, hard, most) if limit != resource.RLIM_INFINITY]
-    resource.setrlimit(resource.RLIMIT_AS, (min(least), hard))
-    try:
-        yield
-    except MemoryError:
-        raise InputError(
-            f"{what}: reading it takes more than {MEMORY / 1e6:.0f} MB of memory; {STREAM}"
-        ) from None
-    finally:
-        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+    with _ONE:
+        soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+        try:
+            pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+        except OSError:  # no Linux
+            yield
+            return
+        most = pages * resource.getpagesize() + MEMORY
+        least = [limit for limit in (soft, hard, most) if limit != resource.RLIM_INFINITY]
+        resource.setrlimit(resource.RLIMIT_AS, (min(least), hard))
+        try:
+            yield
+        except MemoryError:
+            raise InputError(
+                f"{what}: reading it takes more than {MEMORY / 1e6:.0f} MB of memory; valid: a "
+                "smaller file"
+            ) from None
+        finally:
+            resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
+def bounded(read: Callable[Concatenate[Q, P], T]) -> Callable[Concatenate[Q, P], T]:
+    """Let a function that reads the file it is given first take no more than `memory` allows."""
+
+    @wraps(read)
+    def within(path: Q, /, *args: P.args, **kwargs: P.kwargs) -> T:
+        with memory(str(path)):
+            return read(path, *args, **kwargs)
+
+    return within

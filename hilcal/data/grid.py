@@ -318,13 +318,16 @@ def unique(names: Sequence[str]) -> tuple[str, ...]:
 
     A column without a name is called by its number.
     """
-    out: list[str] = []
+    out: dict[str, None] = {}
+    counts: dict[str, int] = {}
     for k, given in enumerate(names, start=1):
-        name, count = given or str(k), 1
+        first = name = given or str(k)
+        count = counts.get(first, 1)
         while name in out:
             count += 1
-            name = f"{given or k} ({count})"
-        out.append(name)
+            name = f"{first} ({count})"
+        counts[first] = count
+        out[name] = None
     return tuple(out)
 
 

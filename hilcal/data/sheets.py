@@ -66,6 +66,7 @@ def open_tables(path: str | Path, mapping: Mapping, second: Path | None = None) 
     return joined(first, open_grid(other, mapping.second_file), mapping.second_file.match)
 
 
+@limits.bounded
 def open_grid(path: str | Path, how: FileFormat) -> Grid:
     """Open one file as a table of cells.
 
@@ -97,7 +98,7 @@ def _undamaged(path: str, what: str) -> Iterator[None]:
     """Say in one line what a reader makes of a damaged file, which is not documented."""
     try:
         yield
-    except InputError:
+    except (InputError, MemoryError):
         raise
     except Exception as e:
         raise InputError(f"{path}: damaged, or not {what} ({_short(e)})") from e
@@ -152,7 +153,10 @@ def sheet_names(path: str, content: bytes) -> list[str]:
         InputError: no XLSX file, or openpyxl is not installed.
     """
     with _undamaged(path, "an XLSX file"):
-        return list(_book(path, content).sheetnames)
+        names = list(_book(path, content).sheetnames)
+    if len(names) > limits.SHEETS:
+        raise InputError(f"{path}: {len(names)} sheets; valid: at most {limits.SHEETS}")
+    return names
 
 
 def sheet_rows(
