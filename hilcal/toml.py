@@ -136,15 +136,21 @@ def parse_json(text: str) -> Any:
     """Return what a JSON document holds.
 
     Raises:
-        ValueError: not JSON, nested too deeply, or a whole number of thousands of digits.
-        ValueError: more than `limits.VALUES` values.
+        ValueError: not JSON, nested too deeply, more than `limits.VALUES` values, or a whole number
+            of so many digits that it is no float.
     """
     if sum(map(text.count, ",:[{")) > limits.VALUES:
         raise ValueError(f"more than {limits.VALUES / 1e6:.0f} million values")
     try:
-        return json.loads(text)
+        return json.loads(text, parse_int=_whole)
     except RecursionError:
         raise ValueError("nested too deeply") from None
+
+
+def _whole(digits: str) -> int:
+    if len(digits) > _SHORT:
+        raise ValueError(f"a whole number of {len(digits)} digits")
+    return int(digits)
 
 
 def suggest(name: str, valid: Sequence[str]) -> str:

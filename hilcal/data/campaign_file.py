@@ -231,6 +231,7 @@ class CampaignFile:
         if len(readings):
             self._claim_layout(layout_of(readings))
             readings = self._numbered_targets(readings)
+            limits.check_fitted(self.n_readings + len(readings), readings.m, f"{self.path}: ")
         rows.check_poses(self._connection, self.path, readings)
         return rows.insert_readings(self._connection, readings)
 

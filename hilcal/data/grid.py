@@ -61,7 +61,8 @@ class Grid:
     units: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Refuse names of columns that no name may be."""
+        """Refuse too many columns, and names of columns that no name may be."""
+        limits.check_cells(self.path, len(self.rows), len(self.names))
         check_names(self.names, f"{self.path}: column")
 
     def at(self, index: int, column: str) -> str:

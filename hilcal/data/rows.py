@@ -118,7 +118,7 @@ def fetch_readings(
     if not count:
         raise InputError(f"{path}: the campaign file is damaged (its readings are gone)")
     width = sum(width for _, width in layout)
-    limits.check_numbers(f"{path}: {count} readings", count * width)
+    limits.check_fitted(count, dict(layout)["value"], f"{path}: ")
     with limits.memory(str(path)):
         return _fetched(connection, path, layout, target_names, count, width)
 
