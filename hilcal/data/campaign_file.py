@@ -11,7 +11,7 @@ from typing import Self
 
 import numpy as np
 
-from hilcal import __version__
+from hilcal import __version__, limits
 from hilcal.data import rows, schema
 from hilcal.data.command_line import typed_now
 from hilcal.data.in_place import identity, moved_to, rescued
@@ -242,6 +242,7 @@ class CampaignFile:
         if len(readings):
             self._claim_layout(layout_of(readings))
             readings = self._numbered_targets(readings)
+            limits.check_fitted(self.n_readings + len(readings), readings.m, f"{self.path}: ")
         rows.check_poses(self._connection, self.path, readings)
         return rows.insert_readings(self._connection, readings)
 
@@ -337,7 +338,7 @@ class CampaignFile:
     def _sound_revisions(self) -> tuple[tuple[RevisionRecord, ...], tuple[int, str] | None]:
         """Return the revisions before the first damaged one; and its number, and what it is."""
         records: list[RevisionRecord] = []
-        with schema.sqlite_errors(self.path):
+        with schema.sqlite_errors(self.path), limits.memory(str(self.path)):
             stored = self._connection.execute("SELECT id, content, crc FROM revisions ORDER BY id")
             meta = self._read_meta()
             for expected, (number, text, crc) in enumerate(stored.fetchall(), start=1):
