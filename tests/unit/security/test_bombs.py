@@ -12,6 +12,7 @@ import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import openpyxl
@@ -20,6 +21,7 @@ import pytest
 import hilcal as hc
 from hilcal import limits
 from hilcal.cli import main
+from hilcal.data import parquet_stream
 from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.covariance import INSTRUMENT
 from hilcal.data.grid import Grid, unique
@@ -268,3 +270,14 @@ def test_many_repeats_of_one_unloaded_reading_make_no_matrix(
     monkeypatch.setattr(limits, "SHARED", (shared * readings.m) ** 2 - 1)
     with pytest.raises(InputError, match=f"{shared} loaded readings share one unloaded"):
         deflection_groups(many)
+
+
+def test_a_row_group_that_holds_less_than_it_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As damaged pages make it: pyarrow yields nothing, and says nothing."""
+    group = SimpleNamespace(num_rows=3)
+    file = SimpleNamespace(
+        metadata=SimpleNamespace(row_group=lambda _: group), iter_batches=lambda *_, **__: iter(())
+    )
+    monkeypatch.setattr(parquet_stream, "_opened", lambda _: file)
+    with pytest.raises(InputError, match=r"row group 1 \(3 rows are missing\)"):
+        next(parquet_stream._tables(Path("s.parquet"), 0, ("x_m",)))
