@@ -414,7 +414,7 @@ def _problem(found: Fit, clock: Clock) -> _Problem | None:
     weights = block_diag(*(g[2] for g in chosen))
     difference = np.kron(np.concatenate([np.eye(len(loaded)), -weights], axis=1), np.eye(m))
     some = along[rows]
-    white = block_diag(*some.covariance[:, :m, :m])
+    white = _diagonal(some.covariance[:, :m, :m])
     if some.common is not None:
         flat = some.common[:, :m].reshape(len(rows) * m, -1)
         together = (some.arrivals[:, None] == some.arrivals) & ~np.eye(len(rows), dtype=bool)
@@ -434,8 +434,8 @@ def _problem(found: Fit, clock: Clock) -> _Problem | None:
     jacobian = found.model.jacobian(s.prediction, s.theta, m, live)[rows]
     columns = whitened @ (jacobian.reshape(-1, len(live)) @ s.transform[live])
     y = inverse @ found.raw[place[loaded], :m].reshape(-1) + columns @ s.coordinates()
-    root = block_diag(*some.instrument_root(m))
-    factor = (whitened @ root).reshape(len(y), len(rows), m)
+    each = whitened.reshape(len(y), len(rows), m)
+    factor = np.einsum("rni,nij->rnj", each, some.instrument_root(m))
     flat = factor.reshape(len(y), -1)
     ridge = s.equations.basis.prior_precision
     if len(y) < 2 * np.sum(ridge == 0):
@@ -448,6 +448,14 @@ def _inverse(lower: Floats) -> Floats:
     half, _ = lapack.dpotri(lower, lower=1)
     out = np.tril(half)
     return np.asarray(out + np.tril(out, -1).T)
+
+
+def _diagonal(blocks: Floats) -> Floats:
+    """(N·m, N·m) matrix of blocks (N, m, m)."""
+    n, m = blocks.shape[:2]
+    out = np.zeros((n, m, n, m))
+    out[np.arange(n), :, np.arange(n)] = blocks
+    return out.reshape(n * m, n * m)
 
 
 def _some(pieces: list[Group]) -> list[Group]:
