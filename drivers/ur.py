@@ -231,6 +231,7 @@ class UrArm:
             return
         halt = self._brakes.halt(self._control, self._brake)
         self._control = self._motion = None
+        self._fault = "its program was ended to stop it"
         if not halt.stands:
             why = f" ({halt.lost})" if halt.lost else ""
             raise failure(self._host, f"it was told to stop{why}", HOLD_ON)
