@@ -291,7 +291,7 @@ class _Problem:
         if serial is not None:
             sigma += share * serial
         sigma += np.tensordot(v, rivals, axes=1)
-        lower = np.asarray(np.linalg.cholesky(sigma + ROUNDING * np.eye(len(sigma))))
+        lower = np.asarray(np.linalg.cholesky(sigma + ROUNDING * np.eye(len(sigma))), dtype=float)
         inverse = _inverse(lower)
         b = inverse @ self.columns
         h = self.columns.T @ b + np.diag(self.ridge)
@@ -363,7 +363,7 @@ class _Problem:
         free = len(y) - int(np.sum(self.ridge == 0))
         square = float(y @ y) - float(np.sum((inverse_root(h) @ (b.T @ y)) ** 2))
         log_det += float(np.linalg.slogdet(h)[1])
-        return -0.5 * float(free * np.log(square / free) + free + log_det)
+        return -0.5 * (free * float(np.log(square / free)) + free + log_det)
 
     def noise(self, free: _Point, rivals: Floats, gain: float) -> SerialNoise:
         """Return the estimate; its uncertainties are by the curvature of ℓ."""

@@ -139,14 +139,14 @@ class Snooping:
             used, t2, scale = self._snooped(of, used | kept, kept)
             agree = used | ~of.tested
             off = np.flatnonzero(~agree)
-            if not len(off):
-                return Screened(agree, every, misfit, None)
             if self._accident(of, off):
                 return Screened(every, every, misfit, None)
             size = np.sqrt(scale * np.mean(np.trace(self.readings.covariance[:, :3, :3], 0, 1, 2)))
             if len(off) > MOST * count or (scale > MISFIT[1] and size > ROUGH_M):
                 off = np.flatnonzero((t2 > limit(of.m, count)) & of.tested)
                 return Screened(every, every, misfit, Disagreement("many", off))
+            if not len(off):
+                return Screened(agree, every, misfit, None)
             white = of.residuals(used)[off, :, None]
             shift = (np.linalg.pinv(of.root[off]) @ white)[:, :, 0]
             axes = self.model.predict(self.readings.states[off], self.solution.theta).observation
@@ -158,9 +158,9 @@ class Snooping:
                 along_one_site(shift[rest] / unit, sites, self.readings.pose[off[rest]])
             ]
             if not len(law):
-                agree[alike] = True
+                fitted = agree | np.isin(np.arange(len(agree)), alike)
                 found = Disagreement("alike", alike) if len(alike) else None
-                return Screened(agree, self._fittable(of, agree), misfit, found)
+                return Screened(agree, self._fittable(of, fitted), misfit, found)
             kept[law] = True
             left = at.linear.residuals(used | kept)[used | kept]
             misfit = max(misfit, float(np.mean(left**2)))
