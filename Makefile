@@ -1,6 +1,6 @@
-# Needs Python 3.11 or later, pip and make; every target sets up what it needs, once.
+# Needs Python 3.11 or later with venv, and make; every target sets up what it needs, once.
 # 3.11 and 3.12 have all packages; later ones lack ur-rtde, the link to UR arms, and come last.
-having = $(foreach p,$(2),$(shell $(p) -c 'import sys; $(1) and print("$(p)")' 2>/dev/null))
+having = $(foreach p,$(2),$(shell $(p) -c 'import ensurepip, sys; $(1) and print("$(p)")' 2>/dev/null))
 PYTHON ?= $(firstword $(call having,10 < sys.version_info.minor < 13,python3 python3.11 python3.12) \
   $(call having,12 < sys.version_info.minor,python3.14 python3.13 python3))
 BIN := .venv/bin
@@ -26,7 +26,7 @@ help:
 setup: $(STAMP)
 
 $(STAMP): requirements.lock pyproject.toml setup.py
-	@test -n "$(PYTHON)" || { echo "make: no Python 3.11 or later found; set PYTHON=..." >&2; exit 1; }
+	@test -n "$(PYTHON)" || { echo "make: no Python 3.11 or later with venv found; set PYTHON=..." >&2; exit 1; }
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary :all: \
 	  --require-hashes --requirement requirements.lock

@@ -155,11 +155,9 @@ class UrArm:
             if abs(sample.payload - mass) <= _MASS_KG and np.abs(told - com).max() <= _COM_M:
                 return
             if time.monotonic() > end:
-                raise failure(
-                    self._host,
+                self._fail(
                     f"it says {sample.payload:g} kg at {np.round(told, 4).tolist()} m after a "
-                    f"payload of {mass:g} kg at {np.round(com, 4).tolist()} m was set",
-                    "look at the payload on the pendant",
+                    f"payload of {mass:g} kg at {np.round(com, 4).tolist()} m was set"
                 )
 
     def start_move(self, q: Floats, speed: float, acceleration: float) -> None:
@@ -233,6 +231,7 @@ class UrArm:
             return
         halt = self._brakes.halt(self._control, self._brake)
         self._control = self._motion = None
+        self._fault = "its program was ended to stop it"
         if not halt.stands:
             why = f" ({halt.lost})" if halt.lost else ""
             raise failure(self._host, f"it was told to stop{why}", HOLD_ON)

@@ -33,6 +33,7 @@ from hilcal.identify.full_covariance import (
 from hilcal.identify.posterior import Posterior, Source
 from hilcal.identify.predictive import Predictive
 from hilcal.model import Model
+from hilcal.names import quoted
 from hilcal.refine import Refinement
 from hilcal.report.build_story import Chapter
 from hilcal.report.diagnosis_document import to_json
@@ -92,7 +93,7 @@ class Campaign:
         try:
             config = CellConfig.from_json(file.config_json)
             check_robot(file.path, file.config_json, file.about(ROBOT_FILE))
-            cell = cell_from_config(config, Path(file.base_dir), file.about(ROBOT_FILE))
+            cell = cell_from_config(config, None, file.about(ROBOT_FILE))
             readings = campaign_readings(file, cell, config)
         except BaseException:
             file.close()
@@ -202,7 +203,7 @@ class Campaign:
         except InputError as error:
             if record.number != self.file.accepted():
                 raise
-            on = f"it is the accepted one: hilcal accept {self.path} N accepts another"
+            on = f"it is the accepted one: hilcal accept {quoted(self.path)} N accepts another"
             raise InputError(f"{error}; {on}") from None
 
     def fitted_readings(self, record: RevisionRecord) -> Readings:

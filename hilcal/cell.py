@@ -31,6 +31,7 @@ class Cell:
         target_known: False where the target's offset has to be estimated.
         config: the configuration that the cell was made from: instruments, loads, limits; None
             for a cell that was made from numbers alone.
+        base_dir: directory that relative paths in `config` refer to.
         targets: (T, 4, 4) T_flange_target of several targets, in the order of `target_names`;
             `target` is the first of them. None where the tool carries one.
         target_names: their names.
@@ -47,6 +48,7 @@ class Cell:
     registration_known: bool
     target_known: bool
     config: CellConfig | None = None
+    base_dir: Path = Path()
     targets: Floats | None = None
     target_names: tuple[str, ...] = ()
     targets_known: tuple[bool, ...] = ()
@@ -149,6 +151,7 @@ def cell_from_config(
         registration_known=tracker.frame == "base" or tracker.base_xyz_m is not None,
         target_known=all(known),
         config=config,
+        base_dir=base_dir or Path(),
         targets=poses if len(poses) > 1 else None,
         target_names=tuple(t.name for t in tool.targets),
         targets_known=known if len(poses) > 1 else (),

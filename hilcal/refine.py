@@ -120,7 +120,7 @@ def refine(
     Raises:
         InputError: too many readings.
     """
-    limits.check_judged(len(readings), readings.m)
+    limits.check_fitted(len(readings), readings.m)
     say(f"fitting {' + '.join(model.names) or 'the bare arm'}")
     readings = with_prior_scatter(model, readings.with_serial(None))
     first = with_serial_noise(fit(model, readings, mode))

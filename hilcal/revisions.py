@@ -26,6 +26,7 @@ from hilcal.identify.carried import CarriedPrior
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.predictive import Predictive, predictive
 from hilcal.model import Model
+from hilcal.names import quoted
 from hilcal.types import Floats
 
 _LARGEST = 1e9
@@ -328,7 +329,7 @@ def check_sources(record: RevisionRecord, run: Path, catalogue: Catalogue) -> No
                 )
             raise InputError(
                 f"{run}: revision {record.number} has the effect {name}, which is not in the "
-                f"catalogue{known}; give the file that defines it: --effects-from {where}"
+                f"catalogue{known}; give the file that defines it: --effects-from {quoted(where)}"
             )
         if then and now and then["sha256"] != now.sha256:
             raise InputError(

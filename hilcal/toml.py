@@ -5,6 +5,7 @@ import json
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -18,6 +19,8 @@ from hilcal.names import check_names
 Number = Annotated[float, Strict()]
 NonNegative = Annotated[float, Strict(), Field(ge=0)]
 Positive = Annotated[float, Strict(), Field(gt=0)]
+_WHOLE = 1 << 63
+_SHORT = 100
 Vector3 = tuple[Number, Number, Number]
 
 
@@ -56,14 +59,40 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: not UTF-8 text (byte {error.start}); expected TOML") from None
+    for number, line in enumerate(text.split("\n"), start=1):
+        if line.count(".") > limits.DOTS:
+            raise InputError(
+                f"{path.name}: line {number} has more than {limits.DOTS} dots; valid: TOML with "
+                "sections"
+            )
     try:
-        return tomllib.loads(text)
+        found = tomllib.loads(text)
     except RecursionError:
         raise InputError(f"{path.name}: nested too deeply; valid: TOML with sections") from None
     except tomllib.TOMLDecodeError as error:
         where = f"(at line {max(1, len(text.splitlines()))}, end of document)"
         message = str(error).replace("(at end of document)", where)
         raise InputError(f"{path.name}: TOML syntax error: {message}") from None
+    except ValueError as error:  # a whole number of thousands of digits
+        raise InputError(f"{path.name}: not TOML: {error}") from None
+    _check_whole(found, path.name)
+    return found
+
+
+def _check_whole(data: dict[str, Any], where: str) -> None:
+    """Refuse whole numbers that TOML does not have; Python reads them from hexadecimal ones.
+
+    Raises:
+        InputError: one of more than 64 bits.
+    """
+    pending: list[Any] = [data]
+    while pending:
+        inner = pending.pop()
+        if isinstance(inner, int) and not -_WHOLE <= inner < _WHOLE:
+            raise InputError(f"{where}: a whole number of {inner.bit_length()} bits; valid: of 64")
+        pending += (
+            inner.values() if isinstance(inner, dict) else inner if isinstance(inner, list) else ()
+        )
 
 
 def check_section(data: object, section: type[S], where: str) -> S:
@@ -107,17 +136,31 @@ def parse_json(text: str) -> Any:
     """Return what a JSON document holds.
 
     Raises:
-        ValueError: not JSON, nested too deeply, or a whole number of thousands of digits.
+        ValueError: not JSON, nested too deeply, more than `limits.VALUES` values, or a whole number
+            of so many digits that it is no float.
     """
+    if sum(map(text.count, ",:[{")) > limits.VALUES:
+        raise ValueError(f"more than {limits.VALUES / 1e6:.0f} million values")
     try:
-        return json.loads(text)
+        return json.loads(text, parse_int=_whole)
     except RecursionError:
         raise ValueError("nested too deeply") from None
 
 
+def _whole(digits: str) -> int:
+    if len(digits) > _SHORT:
+        raise ValueError(f"a whole number of {len(digits)} digits")
+    return int(digits)
+
+
 def suggest(name: str, valid: Sequence[str]) -> str:
-    """Return ' (did you mean "x"?)' for a name close to a valid one, else nothing."""
-    close = difflib.get_close_matches(name, valid, n=1)
+    """Return ' (did you mean "x"?)' for a name close to one of the valid ones, else nothing.
+
+    Long names and those beyond the first thousand are not compared, which takes the square of
+    their length.
+    """
+    near = [v for v in islice(valid, 1000) if len(v) <= _SHORT]
+    close = difflib.get_close_matches(name, near, n=1) if len(name) <= _SHORT else ()
     return f' (did you mean "{close[0]}"?)' if close else ""
 
 

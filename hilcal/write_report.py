@@ -18,6 +18,7 @@ from hilcal.data.whitening import SCALINGS, Scaling
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.fleet.fleet import Fleet
 from hilcal.identify.fit import Fit, fit
+from hilcal.names import quoted
 from hilcal.procedure.state import IMPROVED, Files
 from hilcal.report.build_story import Chapter, build_story
 from hilcal.report.html.content import ReportContent, Tested
@@ -142,9 +143,10 @@ def content_of(
     chapters = run.chapters(say, revision)
     last = chapters[-1].fit
     say("preparing the story")
-    commands = [f"hilcal info {run.path.name}"]
+    name = quoted(run.path.name)
+    commands = [f"hilcal info {quoted(run.path.name)}"]
     number = "" if record is None else f" --revision {record.number}"
-    commands += [f"hilcal {c} {run.path.name}{number}" for c in ("compare", "diagnose")]
+    commands += [f"hilcal {c} {name}{number}" for c in ("compare", "diagnose")]
     tested = None
     if validation is not None:
         found = validate(run, validation, record, limit_m, say=say)
@@ -156,7 +158,7 @@ def content_of(
             found.beyond,
             found.shares,
         )
-        commands.append(f"hilcal validate {run.path.name} {validation.path.name}{number}")
+        commands.append(f"hilcal validate {name} {quoted(validation.path.name)}{number}")
     return ReportContent(
         name=run.path.name,
         sha256=_sha256(run.path),

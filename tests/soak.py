@@ -59,6 +59,7 @@ def main() -> int:
         "faults": s.counts["faults"],
         "starved": s.starved,
         "findings": s.findings,
+        "slowest_stop_s": s.slowest,
         "counts": dict(sorted(s.counts.items())),
     }
     if asked.out is not None:

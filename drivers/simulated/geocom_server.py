@@ -5,13 +5,14 @@
 
 Admin operations besides those of the line (`pty_port.FAULTS`): `beam {on}` blocks it, `hide
 {targets}` covers reflectors by number, `lock_lost`, `freeze {on}` repeats the last measurement,
-`stray {on}` follows a reflector at rest where the target is now,
+`stray {on}` follows a reflector at rest 0.2 m behind the target,
 `dist_error {on}`, `warn {code}` (1283 or 1284, 0 is none), `busy {on}`, `delay {rpc, seconds,
 count}` in real time, `wrong_trid {count}`, `meas_s {seconds}` of world time, `log`, `state`.
 """
 
 import argparse
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,8 @@ from drivers.simulated.pty_port import PtyPort
 
 LONGEST_LINE = 1024
 WARNINGS = (0, 1283, 1284)
+BEHIND_M = 0.2
+"""Two reflectors are at two places."""
 
 
 def respond(station: Station, line: str) -> bytes:
@@ -64,7 +67,8 @@ def operate(station: Station, port: PtyPort, op: str, arguments: dict[str, Any])
         case "freeze":
             station.stuck = station.seen if arguments["on"] else None
         case "stray":
-            station.stray = station.target() if arguments["on"] else None
+            seen = station.target() if arguments["on"] else None
+            station.stray = seen and replace(seen, distance=seen.distance + BEHIND_M)
         case "dist_error":
             station.dist_error = bool(arguments["on"])
         case "warn":

@@ -4,6 +4,7 @@ import contextlib
 
 from drivers.ur_link import dashboard, states
 from drivers.ur_link.brakes import ASK_S, Halt
+from drivers.ur_link.control_worker import WATCHDOG_HZ
 from drivers.ur_link.failure import CHECK_LINK, RESUME
 from drivers.ur_link.lines import LinkError
 from drivers.ur_link.reading import Reading
@@ -45,13 +46,15 @@ def program_ended(reading: Reading, late: float) -> str:
         reading: without a playing program.
         late: the longest pause in the signs of life to the robot's watchdog, s; 0 for none.
     """
-    if late > 0.0:
-        return (
-            f"its watchdog stopped it: this computer was too busy for {late:.2f} s to show that "
-            "it lives"
-        )
+    busy = f"this computer was too busy for {late:.2f} s to show that it lives"
+    if late > 1.0 / WATCHDOG_HZ:
+        return f"its watchdog stopped it: {busy}"
     word = states.runtime_word(reading.runtime)
-    return f"its program is {word}: stopped on the pendant, by another program, or by its watchdog"
+    told = f" ({busy})" if late > 0.0 else ""
+    return (
+        f"its program is {word}: stopped by another program, on the pendant, or by its "
+        f"watchdog{told}"
+    )
 
 
 def not_commanded(error: WorkerError) -> str:

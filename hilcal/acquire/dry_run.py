@@ -57,7 +57,7 @@ def dry_run(cell: Cell, config: CellConfig, plan: Plan) -> DryRun:
         wrong = f"the plan has {width} joint angles per pose; {cell.arm.name} has {n} joints"
         return DryRun((wrong, *problems), (), 0.0, 0, 0)
     stops = route(plan, cell.arm, config.limits.joint_margin_rad)
-    problems += _on_route(limits, stops)
+    problems += on_route(limits, stops)
     moves = [(a, b) for a, b in pairwise(stops) if not np.array_equal(a.q, b.q)]
     changes = sum(stop.change_to is not None for stop in stops)
     return DryRun(
@@ -102,11 +102,14 @@ def _load_problems(limits: Feasibility, plan: Plan) -> list[str]:
 
 def route_problems(cell: Cell, config: CellConfig, stops: tuple[Stop, ...]) -> list[str]:
     """Return what is wrong with stops and with the paths between them, one line each."""
-    return _on_route(Feasibility(cell, config), stops)
+    return on_route(Feasibility(cell, config), stops)
 
 
-def _on_route(limits: Feasibility, stops: tuple[Stop, ...]) -> list[str]:
-    """What a path and one of its ends break alike is told of the end."""
+def on_route(limits: Feasibility, stops: tuple[Stop, ...]) -> list[str]:
+    """Return what is wrong with stops and with the paths between them, one line each.
+
+    What a path and one of its ends break alike is told of the end.
+    """
     lines, at_stops = [], []
     for stop in stops:
         where, loads = f"pose {stop.name}", {stop.hanging: None, stop.change_to: None}

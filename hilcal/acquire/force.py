@@ -91,6 +91,7 @@ class ForceMeter:
         self._axes = se3.rotation(np.array(settings.rotvec_rad))
         self._com = self._axes.T @ (cell.tool_com - self._origin)
         self.identified = False
+        self._tared_down: Floats | None = None
         nothing = np.zeros((PARAMETERS, PARAMETERS))
         moment = cell.tool_mass * self._com
         self.tool = ToolLoad(np.zeros(6), cell.tool_mass, moment, nothing, cell.gravity, 0.0, 0, 0)
@@ -139,11 +140,23 @@ class ForceMeter:
     def set_zero(self, sample: WrenchSample, q: Floats) -> None:
         """Take a mean wrench without load, at joint angles (n,), as the zero."""
         cell, rotation = self._cell, self.frame(q).rotation
+        self._tared_down = rotation.T @ cell.gravity
         covariance = sample.covariance / max(sample.frames, 1) + _FLOOR
         zero = tare(sample.wrench, covariance, rotation, cell.gravity, cell.tool_mass, self._com)
         self.zero = zero.bias
         if not self.identified:
             self.tool = replace(zero, bias=np.zeros(6))
+
+    def turned(self, q: Floats) -> float:
+        """Return how far gravity has turned in the sensor's axes since the tare, m/s².
+
+        At joint angles (n,); |R(q)ᵀ g - R_tareᵀ g|, by which each kg is felt that [tool] does not
+        say. Before any tare it is twice gravity, the most that it can be.
+        """
+        gravity = self._cell.gravity
+        if self._tared_down is None:
+            return 2.0 * float(np.linalg.norm(gravity))
+        return float(np.linalg.norm(self.frame(q).rotation.T @ gravity - self._tared_down))
 
     def identify(self, unloaded: list[TaredWrench], tolerance_N: float) -> tuple[int, ...] | None:
         """Find the real tool from unloaded readings.

@@ -9,7 +9,7 @@ from hilcal.cell import Cell
 from hilcal.config import CellConfig, Load
 from hilcal.types import Floats
 
-# Choices, no study set them; tests/unit/acquire/test_load_watch.py shows what they find.
+# Choices, no study set them; tests/unit/acquire/test_run_watched.py shows what they find.
 ALLOWED = 2.0
 """A hung load may differ by so many times what it may when it is hung: a sensor's zero drifts."""
 SWING = 0.3
@@ -30,11 +30,13 @@ class LoadWatch:
     d = |R (f - f_tool) - f_load| with f the force felt, sensor axes, f_tool that of the tool and R
     the sensor's orientation. A load that is a moment alone is compared by its moment, acting at
     `MOMENT_LEVER_M`. The limit is `ALLOWED` times the one of `[operator]` when a load is hung, and
-    more for a pull (`PULL`), for a tool that is not weighed yet (`UNKNOWN_KG`), and in motion for
-    what swings (`SWING`) and is accelerated.
+    more for a pull (`PULL`) and in motion for what swings (`SWING`) and is accelerated. A tool that
+    is not weighed yet may differ from [tool] by `UNKNOWN_KG`: the tare holds that at its pose, so
+    the limit grows by how far the sensor has turned against gravity since.
 
     Attributes:
         watching: whether anything is compared now.
+        differed: how many looks have found a difference so far.
     """
 
     def __init__(self, meter: ForceMeter, cell: Cell, config: CellConfig) -> None:
@@ -42,6 +44,7 @@ class LoadWatch:
         self._meter, self._cell, self._config = meter, cell, config
         self._load: Load | None = None
         self.watching = False
+        self.differed = 0
         self._since: tuple[int, int] | None = None
 
     def expect(self, load: Load | None) -> None:
@@ -70,6 +73,7 @@ class LoadWatch:
         if difference <= limit:
             self._since = None
             return
+        self.differed += 1
         first, count = self._since or (sample.host_ns, 0)
         self._since = first, count + 1
         if count + 1 >= LOOKS and sample.host_ns - first >= HOLD_S * 1e9:
@@ -77,6 +81,8 @@ class LoadWatch:
 
     def wrong(self, tared: TaredWrench) -> str:
         """Return in one line why a mean wrench is not that of what should hang, or nothing."""
+        if not self.watching:
+            return ""
         difference, limit = self._compared(tared, moving=False)
         noise = 3.0 * float(np.sqrt(np.linalg.eigvalsh(tared.covariance[:3, :3]).max()))
         return self._words(tared) if difference - noise > limit else ""
@@ -96,7 +102,7 @@ class LoadWatch:
         mass = cell.tool_mass + (0.0 if load is None else load.mass_kg)
         if not self._meter.identified:
             unweighed = max(UNKNOWN_KG, 0.5 * cell.tool_mass)
-            limit += 2.0 * unweighed * float(np.linalg.norm(cell.gravity))
+            limit += unweighed * self._meter.turned(tared.q)
         if moving:
             motion = self._config.motion
             brief = motion.speed_rad_s < HOLD_S * motion.acceleration_rad_s2

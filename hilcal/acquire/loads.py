@@ -78,8 +78,8 @@ class Hook:
     def change(self, name: str) -> None:
         """Have another load hung, at the present pose.
 
-        A heavier payload is set in the controller before it is hung, a lighter one after the
-        heavier has been taken off.
+        A heavier payload is set in the controller before it is hung, a lighter one as soon as it is
+        said that the heavier has been taken off, before anything moves.
 
         Raises:
             DeviceError: the person gives up.
@@ -88,17 +88,16 @@ class Hook:
         new, old = self.load(name), self.load(self.hanging)
         heavier = payload(self._cell, new)[0] > payload(self._cell, old)[0]
         if heavier:
-            self._arm.set_payload(*payload(self._cell, new))
+            self._carry(new)
         self._suspend(self.hanging, name)
-        self._ask(new, lambda: self._differs(new))
-        if not heavier:
-            self._arm.set_payload(*payload(self._cell, new))
+        self._ask(new, lambda: self._differs(new), answered=None if heavier else self._carry)
         self._hangs(name)
 
     def restore(self, why: str) -> None:
         """Have what should hang put right, where the arm stands, after it was found wrong.
 
-        The controller is told at once if nothing hangs any more.
+        The controller is told at once if nothing hangs any more, and that it hangs again as soon as
+        that is answered.
 
         Raises:
             DeviceError: the person gives up.
@@ -107,8 +106,8 @@ class Hook:
         name, load = self.hanging, self.load(self.hanging)
         self._suspend(UNLOADED, name)
         if load is not None and not self._differs(None):
-            self._arm.set_payload(*payload(self._cell, None))
-        self._ask(load, lambda: self._differs(load), why)
+            self._carry(None)
+        self._ask(load, lambda: self._differs(load), why, self._carry)
         self._hangs(name)
 
     def confirm(self, question: str) -> None:
@@ -124,6 +123,10 @@ class Hook:
             self._watcher.notify(Remark(question))
         self._watcher.notify(Phase("waiting for the operator to look at the arm"))
         self._asked(partial(operator.confirm, question))
+
+    def _carry(self, load: Load | None) -> None:
+        """Tell the controller what it carries."""
+        self._arm.set_payload(*payload(self._cell, load))
 
     def _suspend(self, *hanging: str) -> None:
         """Take note that one of some loads hangs, and do not watch it."""
@@ -147,13 +150,20 @@ class Hook:
         if person:
             self._watcher.notify(Answered())
 
-    def _ask(self, load: Load | None, wrong: Wrong, why: str = "") -> None:
+    def _ask(
+        self,
+        load: Load | None,
+        wrong: Wrong,
+        why: str = "",
+        answered: Callable[[Load | None], None] | None = None,
+    ) -> None:
         """Ask until nothing is wrong, `TRIES` times; an arm moved meanwhile is put back.
 
         Args:
             load: what to hang.
             wrong: what is wrong after the answer.
             why: why it is asked for, empty at the first time.
+            answered: told what hangs after each answer, before anything moves.
         """
         what = "take everything off" if load is None else f"hang {load.name}"
         person = isinstance(self._operator, TerminalPerson) and self._operator.at_terminal
@@ -161,6 +171,8 @@ class Hook:
             self._watcher.notify(Phase(f"waiting for the operator to {what}"))
             self._asked(partial(self._operator.hang, load, why))
             self._watcher.notify(Phase("checking what hangs"))
+            if answered is not None:
+                answered(load)
             self._mover.put_back(self.confirm)
             self._mover.look()
             why = wrong()
@@ -168,6 +180,8 @@ class Hook:
                 return
             if not person:  # a person is told with the next question
                 self._watcher.notify(Remark(f"asked to {what}: {why}"))
+        if load is None:
+            why += ". If nothing does, the tool was touched while the sensor was tared"
         raise WrongLoadError(f"operator: asked {TRIES} times to {what}; {why}")
 
     def _differs(self, load: Load | None) -> str:
@@ -188,12 +202,13 @@ class Hook:
         """What seems to hang still: a load that fits better than nothing does.
 
         By the zero of an earlier session, since the sensor's own may have changed meanwhile.
-        Without one it is the sensor's own, which may be far off: then it is checked once only, and
-        the operator's answer is accepted.
+        Without one it is the sensor's own, which may be far off: then a second answer that nothing
+        hangs is believed, and said to be.
         """
-        if self._meter is None or (self._doubted and not np.any(self._meter.zero)):
+        if self._meter is None:
             return ""
-        self._doubted = True
+        known = bool(np.any(self._meter.zero))
+        believed, self._doubted = self._doubted and not known, True
         sample = self._mover.look()
         tared = self._meter.tared(self._meter.average(), sample.q)
         force = self._meter.load_wrench(tared)[:3]
@@ -202,7 +217,14 @@ class Hook:
             return ""
         for load in self._config.loads:
             if np.linalg.norm(force - load.wrench(self._cell.gravity)[:3]) < felt:
-                known = np.any(self._meter.zero)
+                if believed:
+                    self._watcher.notify(
+                        Remark(
+                            f"the force sensor's own zero is taken to be off by {felt:.1f} N: it "
+                            "was answered twice that nothing hangs"
+                        )
+                    )
+                    return ""
                 since = "in the unloaded readings so far" if known else "the tool weighs"
                 return (
                     f"the force sensor feels {felt:.1f} N more than {since}; {load.name} seems to "

@@ -138,7 +138,7 @@ class Measurer:
         self, settling: float, remarks: tuple[str, ...], force: WrenchSample | None
     ) -> tuple[Measured | None, str]:
         """Average over the window; None and the reason where that cannot be a reading."""
-        before = self._mover.look()
+        differed, before = self._mover.differed, self._mover.look()
         tracker: list[TrackerSample] = []
         angles = [before.q]
         for _ in range(self._config.acquire.samples):
@@ -150,6 +150,11 @@ class Measurer:
         why = self._mover.check_still(before, after)
         if why is not None:
             return None, why
+        if self._mover.differed != differed and not self._wrong(force, after):
+            return None, (
+                "the force sensor felt something else than what hangs for a moment: was the tool "
+                "touched?"
+            )
         if len({sample.value.tobytes() for sample in tracker}) == 1:
             return None, (
                 f"tracker: {len(tracker)} measurements are the same to the last digit: it repeats "
@@ -164,6 +169,13 @@ class Measurer:
         q = np.mean([*angles, after.q], axis=0)
         said = (*remarks, *mean.warnings)
         return Measured(mean, q, before, after, tuple(tracker), force, settling, said), ""
+
+    def _wrong(self, force: WrenchSample | None, at: ArmSample) -> bool:
+        """Whether the mean wrench is not that of what hangs either: such a reading is kept."""
+        watch, meter = self._mover.watch, self._meter
+        if watch is None or meter is None or force is None:
+            return False
+        return bool(watch.wrong(meter.tared(force, at.q)))
 
     def _search(
         self, error: TargetLostError, name: str, searches: int, find: Callable[[], None]

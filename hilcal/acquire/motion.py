@@ -7,7 +7,8 @@ import numpy as np
 
 from hilcal.acquire.clock import Clock
 from hilcal.acquire.devices import ArmDevice, ArmSample
-from hilcal.acquire.dry_run import route_problems
+from hilcal.acquire.dry_run import on_route
+from hilcal.acquire.feasibility import Feasibility
 from hilcal.acquire.force import ForceMeter
 from hilcal.acquire.guard import HOW_ON, NORMAL, Guard
 from hilcal.acquire.load_watch import LoadWatch
@@ -66,7 +67,8 @@ class Mover:
         self.hanging: tuple[str, ...] = (UNLOADED,)
         self.side = np.zeros(guard.cell.arm.n)
         self.watch = None if meter is None else LoadWatch(meter, guard.cell, config)
-        self._arm, self._meter, self._guard, self._config = arm, meter, guard, config
+        self._arm, self._meter, self._guard = arm, meter, guard
+        self._limits = Feasibility(guard.cell, config)
         self._motion, self._clock, self._passed = config.motion, clock, passed
         self._under_way = False
         self._ticked: tuple[float, int] = (-1.0, 0)
@@ -177,7 +179,7 @@ class Mover:
         """
         for load in self.hanging:
             stops = Stop("where the arm stands", start, load), Stop(name, goal, load)
-            problems = route_problems(self._guard.cell, self._config, stops)
+            problems = on_route(self._limits, stops)
             if problems:
                 raise DeviceError(
                     f"arm: it cannot go to {name} from where it stands: {problems[0]}; {HOW_ON}"
@@ -298,6 +300,11 @@ class Mover:
         goal = sample.q if self.goal is None else self.goal
         there = np.abs(sample.q - goal).max() <= self._motion.arrival_rad
         return bool(there and np.abs(sample.qd).max() <= self._motion.speed_rad_s / 50)
+
+    @property
+    def differed(self) -> int:
+        """How many looks so far have felt something else than what should hang."""
+        return 0 if self.watch is None else self.watch.differed
 
     def check_still(self, before: ArmSample, after: ArmSample) -> str | None:
         """Return in one line why a reading between two samples is void, or None."""

@@ -1,16 +1,17 @@
 """One session of a campaign: from connected devices to the last missing reading."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict
-from typing import Any
+from functools import partial
+from typing import Any, TypeVar
 
 import numpy as np
 
 from hilcal.acquire.arrival import ArrivalReader, TargetReading
 from hilcal.acquire.clock import Clock
-from hilcal.acquire.devices import LoadChangedError, TargetLostError
+from hilcal.acquire.devices import LoadChangedError, TargetLostError, WrenchSample
 from hilcal.acquire.drift import Shift
 from hilcal.acquire.eta import Eta
 from hilcal.acquire.force import ForceMeter, TaredWrench
@@ -33,6 +34,7 @@ from hilcal.data.readings import Readings
 from hilcal.errors import DeviceError, HilcalError
 from hilcal.types import Floats
 
+Done = TypeVar("Done")
 LiveModel = Callable[[Readings], LiveResidual]
 """Returns the last reading against a model fitted to those before it."""
 
@@ -78,6 +80,7 @@ class Session:
         self._identified = 0
         self._temperatures: bool | None = None
         self._done = 0
+        self._tared = False
         now = wall()
         self._epoch = now if epoch is None else epoch
         self._begun, self._elapsed = clock.now(), (now - self._epoch) * clock.scale
@@ -140,15 +143,27 @@ class Session:
         self._finish()
 
     def _visit(self, stop: Stop) -> tuple[Readings, float] | None:
-        """Go to a stop, change the load, measure; again after what hangs has been put right."""
+        """Go to a stop, change the load, tare, measure."""
+
+        def visit() -> tuple[Readings, float] | None:
+            self._move(stop)
+            change = None if stop.change_to == self._hook.hanging else stop.change_to
+            if change is not None:
+                self._pace.arrived()
+                self._change(change)
+            if not self._tared:
+                self._tare()
+            if change is not None:
+                self._pace.changed()
+            return None if stop.step is None else self._reading(stop, stop.step)
+
+        return self._watched(visit)
+
+    def _watched(self, do: Callable[[], Done]) -> Done:
+        """Do something; again after what hangs was found wrong and has been put right."""
         for left in reversed(range(TRIES)):
             try:
-                self._move(stop)
-                if stop.change_to not in (None, self._hook.hanging):
-                    self._pace.arrived()
-                    self._change(stop.change_to)
-                    self._pace.changed()
-                return None if stop.step is None else self._reading(stop, stop.step)
+                return do()
             except LoadChangedError as error:
                 self._rig.arm.stop()
                 if not left:
@@ -158,11 +173,12 @@ class Session:
                 self._watcher.notify(Remark(f"{error} The arm stands"))
                 self._hook.restore(str(error))
                 self._event("load", {"hanging": self._hook.hanging})
-        return None
+        raise AssertionError("unreachable")
 
     def _begin(self, start: tuple[Stop, ...]) -> None:
         """Check where the arm stands, have the load taken off, go to the reference, tare.
 
+        The force sensor is tared before the first motion, too, so that it is watched from then on.
         What is checked is checked again after every question and, by the mover, before each motion:
         the arm may be moved by hand meanwhile. In a campaign that goes on, people are asked where
         it does not stand where it was read last.
@@ -180,13 +196,14 @@ class Session:
         self._mover.goal = self._mover.agreed(first.q, first.name, left, self._hook.confirm)
         self.in_control = True
         self._rig.arm.take_control(*payload(self._cell, None))
+        self._watched(self._zero)
         seen = []
         for stop in start:
-            self._move(stop)
+            self._watched(partial(self._move, stop))
             with suppress(TargetLostError):  # it is searched for when it is to be read
                 seen.append((stop.q, self._rig.tracker.measure().value[:3]))
         self._check_tracker(seen)
-        self._tare()
+        self._watched(self._tare)
 
     def _check_tracker(self, seen: list[tuple[Floats, Floats]]) -> None:
         """Refuse a tracker whose target did not move with the arm."""
@@ -203,25 +220,42 @@ class Session:
             self._mover.move(stop.q, stop.name)
 
     def _tare(self) -> None:
-        """Set the force sensor's zero at the present pose, with nothing on the hook."""
-        if self._meter is None:
-            return
+        """Set the force sensor's zero at the reference pose, and store it."""
+        found = self._zero()
+        self._tared = True
+        if found is not None:
+            sample, q = found
+            self._event("tare", {"force": sample_json(sample), "q": q.tolist()})
+
+    def _zero(self) -> tuple[WrenchSample, Floats] | None:
+        """Set the force sensor's zero at the present pose, with nothing on the hook.
+
+        Returns:
+            the mean wrench and the joint angles (n,), rad; None without a sensor.
+
+        Raises:
+            LoadChangedError: by the zero so far, something hangs or touches the tool.
+        """
+        meter, watch = self._meter, self._mover.watch
+        if meter is None or watch is None:
+            return None
         self._watcher.notify(Phase("taring the force sensor"))
         self._mover.wait(self._config.acquire.settle_s)
-        sample = self._meter.average()
+        sample = meter.average()
         q = self._mover.look().q
-        self._meter.set_zero(sample, q)
-        if self._mover.watch is not None:
-            self._mover.watch.expect(None)
-        self._event("tare", {"force": sample_json(sample), "q": q.tolist()})
+        wrong = watch.wrong(meter.tared(sample, q))
+        if wrong:
+            raise LoadChangedError(wrong)
+        meter.set_zero(sample, q)
+        watch.expect(None)
+        return sample, q
 
     def _change(self, name: str) -> None:
         if name != UNLOADED and len(self._state.tared_wrenches) > self._identified:
             self._identify()
         self._hook.change(name)
         self._event("load", {"hanging": name})
-        if name == UNLOADED:
-            self._tare()
+        self._tared = name != UNLOADED
 
     def _identify(self) -> None:
         """Find the tool from all unloaded readings so far."""
@@ -265,12 +299,9 @@ class Session:
         """Measure and store all targets; the arm has arrived. Returns the first one's reading."""
         self._watcher.notify(Phase(f"measuring {step}"))
         found = self._reader.read(stop.q, stop.name)
-        rows, details = [], []
-        for one in found:
-            reading, told = self._row(stop, step, one)
-            self._check(one, told)
-            rows.append(reading)
-            details.append(told)
+        pairs = [self._row(stop, step, one) for one in found]
+        rows, details = [reading for reading, _ in pairs], [told for _, told in pairs]
+        self._check(found, details)
         first = rows[0]
         self._store.record(Readings.joined(rows), step, details[0], *details[1:])
         self._done += 1
@@ -279,7 +310,7 @@ class Session:
             name = f"{step}" if one.target is None else f"{step}, {self._name(one.target)}"
             for text in measured.remarks:
                 self._watcher.notify(Remark(f"{name}: {text}"))
-            tared = None if one.target else self._tared(measured)
+            tared = None if one.target else self._tared_wrench(measured)
             shift = self._state.add(
                 step, measured.q, mean.value, mean.covariance, tared, one.target or 0
             )
@@ -287,30 +318,35 @@ class Session:
                 self._tell_drift(step, shift)
         return first, sum(one.measured.settling for one in found)
 
-    def _check(self, one: TargetReading, told: dict[str, Any]) -> None:
-        """Refuse a reading of another target or another load; it is kept as doubted.
+    def _check(self, found: Sequence[TargetReading], details: list[dict[str, Any]]) -> None:
+        """Refuse the readings of an arrival of another target or another load.
+
+        They are kept as doubted.
 
         Raises:
             LoadChangedError: what hangs is not what should hang.
-            DeviceError: it cannot be the target's.
+            DeviceError: one cannot be its target's.
         """
+        wrong = next(filter(None, map(self._doubt, found)), None)
+        if wrong is not None:
+            for told in details:
+                self._event("doubted", {"why": str(wrong), "reading": told})
+            raise wrong
+
+    def _doubt(self, one: TargetReading) -> DeviceError | None:
+        """Why a reading cannot be of its target under its load, or None."""
         measured, watch = one.measured, self._mover.watch
         position = measured.mean.value[:3]
-        wrong = self._state.registration.implausible(measured.q, position, one.target or 0)
-        if wrong is not None:
-            self._event("doubted", {"why": wrong, "reading": told})
-            raise DeviceError(wrong)
-        tared = self._tared(measured)
-        if watch is None or tared is None or not watch.watching:
-            return
-        wrong = watch.wrong(tared)
-        if wrong:
-            self._event("doubted", {"why": wrong, "reading": told})
-            raise LoadChangedError(wrong)
+        stray = self._state.registration.implausible(measured.q, position, one.target or 0)
+        if stray is not None:
+            return DeviceError(stray)
+        tared = self._tared_wrench(measured)
+        wrong = "" if watch is None or tared is None else watch.wrong(tared)
+        return LoadChangedError(wrong) if wrong else None
 
     def _row(self, stop: Stop, step: Step, one: TargetReading) -> tuple[Readings, dict[str, Any]]:
         """One reading, and what is stored with it."""
-        measured, tared = one.measured, self._tared(one.measured)
+        measured, tared = one.measured, self._tared_wrench(one.measured)
         elapsed = self._elapsed + one.ended - self._begun
         reading = reading_of(
             step,
@@ -339,7 +375,7 @@ class Session:
     def _name(self, target: int) -> str:
         return self._cell.target_names[target]
 
-    def _tared(self, measured: Measured) -> TaredWrench | None:
+    def _tared_wrench(self, measured: Measured) -> TaredWrench | None:
         if self._meter is None or measured.force is None:
             return None
         return self._meter.tared(measured.force, measured.q)

@@ -54,6 +54,7 @@ def write(c: Calibration, path: Path) -> None:
     replace_file(path, content + "\n")
 
 
+@limits.bounded
 def read(path: Path, catalogue: Catalogue | None = None) -> Calibration:
     """Read a calibration from a file.
 

@@ -32,8 +32,11 @@ from hilcal.robot import se3
 from hilcal.types import Floats
 
 JOINTS = 6
+STRAIGHT = ("movel", "movep")
 MOVES = {"movej": 4, "movel": 4, "movep": 3, "servoj": None}
 """Functions that move to a waypoint, and which of their arguments is the blend radius."""
+NAMED = 5
+"""Lines that an error names."""
 _OTHER_MOVES = ("movec", "servoc", "speedj", "speedl")
 """Functions that move otherwise; they are left as they are."""
 _STOPS = ("stopj", "stopl")
@@ -43,7 +46,7 @@ _SETUP = (_TOOL, *_PAYLOAD, "set_gravity")
 _HARMLESS = re.compile(
     r"a?(cos|sin|tan)|atan2|ceil|floor|d2r|r2d|log|pow|sqrt|norm|random|length|get_list_length"
     r"|(integer|binary_list)_to_(binary_list|integer)|rotvec2rpy|rpy2rotvec|inv|size|transpose"
-    r"|pose_(add|sub|dist|inv|trans)|point_dist|interpolate_pose|wrench_trans"
+    r"|normalize|pose_(add|sub|dist|inv|trans)|point_dist|interpolate_pose|wrench_trans"
     r"|to_(num|str)|str_(at|cat|empty|find|len|sub)|sleep|sync|textmsg|popup|time|powerdown"
     r"|(get|set)_(standard_|configurable_|tool_)?(digital|analog)_(in|out)|set_tool_voltage"
     r"|set_(standard_|configurable_|tool_)?(digital|analog)_(in|out)put_?(action|domain|mode|range)"
@@ -74,6 +77,9 @@ _ARITHMETIC: dict[type[ast.operator], Callable[[float, float], float]] = {
 }
 """Without division, of which it is not known whether whole numbers stay whole."""
 
+_LARGEST = 2.0**31
+"""Whole numbers of a controller end here, what is beyond is not the sum that it should be."""
+
 Value = float | tuple[str, tuple[float, ...]]
 """A number, or a list ("") or pose ("p") of numbers."""
 
@@ -91,6 +97,8 @@ class Waypoint:
         tool: (4, 4) T_flange_tool that was set; None where none was.
         blend_m: radius within which the arm passes it without a stop, m.
         left: why it is left as it is; empty where it is understood.
+        straight: whether the tool moves to it on a straight line.
+        follows: whether the waypoint before it in the text always comes right before it.
     """
 
     line: int
@@ -101,6 +109,8 @@ class Waypoint:
     tool: Floats | None = None
     blend_m: float = 0.0
     left: str = ""
+    straight: bool = False
+    follows: bool = False
 
 
 def waypoints(program: str) -> tuple[Waypoint, ...]:
@@ -132,7 +142,7 @@ def program_points(
     """
     try:
         # ends of lines stay as they are
-        program = limits.read_bytes(path, limits.PROGRAM).decode("utf-8-sig")
+        program = limits.read_bytes(path, limits.SCRIPT).decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read as a program: {error}") from None
     try:
@@ -221,7 +231,7 @@ class _Program:
                 bound.setdefault(name, []).append((k, value))
         aliased = any(
             (value is None and not isinstance(found[k].node, ast.Assign))
-            or (value is not None and not isinstance(value, ast.List | ast.Subscript))
+            or (value is not None and not isinstance(value, ast.List) and not _is_pose(value))
             for name in elements
             for k, value in bound[name]
         )  # fmt: skip
@@ -233,12 +243,12 @@ class _Program:
             case ast.Constant(value=bool()):
                 return None
             case ast.Constant(value=int() | float() as number):
-                return float(number) if abs(number) < 1e100 else None
+                return float(number) if abs(number) < _LARGEST else None
             case ast.Name(name):
                 return self._variable(name, k)
             case ast.List(elts=parts):
                 return self._vector("", parts, k)
-            case ast.Subscript(value=ast.Name("p"), slice=ast.Tuple(elts=parts)):
+            case ast.Subscript(slice=ast.Tuple(elts=parts)) if _is_pose(node):
                 return self._vector("p", parts, k)
             case ast.UnaryOp(op=ast.USub() | ast.UAdd() as sign, operand=inner):
                 x = self.value(inner, k)
@@ -247,7 +257,8 @@ class _Program:
             case ast.BinOp(left=a, op=op, right=b) if type(op) in _ARITHMETIC:
                 x, y = self.value(a, k), self.value(b, k)
                 if isinstance(x, float) and isinstance(y, float):
-                    return _ARITHMETIC[type(op)](x, y)
+                    z = _ARITHMETIC[type(op)](x, y)
+                    return z if abs(z) < _LARGEST else None
             case ast.Call(func=ast.Name("d2r"), args=[inner], keywords=[]):
                 x = self.value(inner, k)
                 return math.radians(x) if isinstance(x, float) else None
@@ -297,9 +308,11 @@ class _Program:
         """Say why a target is not understood."""
         what = f"the waypoint '{s.written(node)[:40]}' is computed while the program runs"
         if isinstance(node, ast.Name) and node.id in self.bound:
-            lines = sorted({self.statements[k].line for k, _ in self.bound[node.id]})
-            many = f"lines {', '.join(map(str, lines))}" if len(lines) > 1 else f"line {lines[0]}"
-            what += f" ('{node.id}' has its value from {many})"
+            given = self.bound[node.id]  # of those in one line, a parameter's, the line comes once
+            lines = list(dict.fromkeys(str(self.statements[k].line) for k, _ in given[:NAMED]))
+            more = f" and {len(given) - NAMED} more" if len(given) > NAMED else ""
+            many = f"line{'s' * (len(lines) > 1)} {', '.join(lines)}{more}"
+            what += f" ('{node.id[:40]}' has its value from {many})"
         return what
 
 
@@ -311,6 +324,7 @@ def _waypoints(p: _Program) -> tuple[Waypoint, ...]:
     """
     out: list[Waypoint] = []
     stands: tuple[int, ...] | None = None  # blocks of the waypoint at which the arm stands
+    begins = True  # it stands where the program found it
     setup: dict[str, tuple[int, list[Value | None]]] = {}
     moving = {*MOVES, *_OTHER_MOVES}
     called = {name for s in p.statements for name in s.called.values()}
@@ -320,23 +334,33 @@ def _waypoints(p: _Program) -> tuple[Waypoint, ...]:
         and head.name not in called
         and all(s.blocks for s in p.statements[1:])
     )
+    moved_by = {*moving, *_STOPS, *p.functions}
     side_by_side = any(
-        {"thread", "sec"} & set(s.kinds) and moving & set(s.called.values()) for s in p.statements
+        {"thread", "sec"} & set(s.kinds) and moved_by & set(s.called.values()) for s in p.statements
     )
+    idle = {  # blocks of functions within another that nothing calls
+        s.number
+        for s in p.statements
+        if isinstance(s.node, ast.FunctionDef) and s.blocks and s.node.name not in called
+    }
     for k, s in enumerate(p.statements):
-        _check_calls(p, s)
+        if idle.isdisjoint(s.blocks):
+            _check_calls(p, s)
         name = "" if s.call is None else s.called[s.call]
         if p.functions & set(s.called.values()) or name in _STOPS:
-            stands = None
+            stands, begins = None, False
         if name in _SETUP:
             _set_up(p, k, setup, moved=bool(out))
         elif name in moving:
             found = _waypoint(p, k, setup)
             again = "while" in s.kinds or s.kinds.count("def") > wrapped
-            known = stands == s.blocks or (not out and not again)
-            if found.pose is not None and found.q is None and (side_by_side or not known):
+            follows = stands == s.blocks and not side_by_side
+            known = follows or (begins and not again and not side_by_side)
+            if found.pose is not None and found.q is None and not known:
                 found = replace(found, left=_NO_BRANCH)
-            stands = None if found.left else s.blocks
+            found = replace(found, straight=name in STRAIGHT, follows=follows)
+            # servoj ends after its time, wherever the arm is then
+            stands, begins = None if found.left or name == "servoj" else s.blocks, False
             out.append(found)
     return tuple(out)
 
@@ -350,9 +374,10 @@ def _waypoint(p: _Program, k: int, setup: Mapping[str, tuple[int, list[Value | N
     s = p.statements[k]
     assert s.call is not None  # noqa: S101 - see `_check_calls`
     name, named = s.called[s.call], {n.arg: n.value for n in s.call.keywords}
-    target = s.call.args[0] if s.call.args else named.get("q", named.get("pose"))
-    if name in _OTHER_MOVES or target is None:
+    targets = [*s.call.args[:1], *(named[n] for n in ("q", "pose") if n in named)]
+    if name in _OTHER_MOVES or len(targets) != 1:
         return Waypoint(s.line, 0, 0, left=f"{name} is not corrected")
+    (target,) = targets
     out = Waypoint(s.line, *s.place(target))
     if (at := MOVES[name]) is not None:
         radius = named.get("r", s.call.args[at] if len(s.call.args) > at else None)
@@ -432,6 +457,11 @@ def _of_urscript(name: str) -> bool:
     """Whether a name has a meaning that a program must not change."""
     words = ("p", *MOVES, *_OTHER_MOVES, *_STOPS, *_SETUP)
     return name in words or bool(_HARMLESS.fullmatch(name) or _WHERE.fullmatch(name))
+
+
+def _is_pose(node: ast.expr) -> bool:
+    """Whether it is p[…]; `_known` has no other subscript of several parts."""
+    return isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Tuple)
 
 
 def _is_six(value: Value | None, kind: str) -> bool:

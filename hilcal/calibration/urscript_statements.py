@@ -10,6 +10,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from hilcal import limits
 from hilcal.errors import InputError
 from hilcal.names import check_name
 
@@ -36,6 +37,7 @@ class Statement:
 
     Attributes:
         line: of the program, from 1.
+        number: of the block that it opens, where it opens one.
         begin: where in the program the text begins that `node` is of.
         text: that text.
         node: as parsed; of `if`, `while` and `def` only the head.
@@ -45,6 +47,7 @@ class Statement:
     """
 
     line: int
+    number: int
     begin: int
     text: str
     node: ast.stmt
@@ -87,6 +90,12 @@ def statements(program: str) -> tuple[Statement, ...]:
         at += len(whole) + 1
         if not body or body.startswith("#") or _MARK.fullmatch(body):
             continue
+        if len(body) > limits.STATEMENT:
+            raise _refused(number, f"{len(body)} characters, at most {limits.STATEMENT} are read")
+        if len(out) == limits.STATEMENTS:
+            raise _refused(number, f"more than {limits.STATEMENTS} statements before it")
+        if len(open_blocks) > limits.BLOCKS:
+            raise _refused(number, f"it stands in more than {limits.BLOCKS} blocks")
         found = _WORD.match(body)
         word = found[0] if found else ""
         plain = _STRING_OR_COMMENT.sub("", body).strip()
@@ -109,7 +118,7 @@ def statements(program: str) -> tuple[Statement, ...]:
             continue
         text, shift = _as_python(body, word)
         node = _parsed(text, number, word)
-        out.append(Statement(number, begin + shift, text, node, blocks, kinds, _called(node)))
+        out.append(Statement(number, made, begin + shift, text, node, blocks, kinds, _called(node)))
     if open_blocks:
         raise _refused(number, f"the program ends inside of {open_blocks[-1][0]}")
     return tuple(out)

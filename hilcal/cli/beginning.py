@@ -21,6 +21,7 @@ from hilcal.config.planning import WITHOUT_LOADS
 from hilcal.config.template import cell_text
 from hilcal.effects.catalogue import installed
 from hilcal.errors import InputError, StoppedError
+from hilcal.names import quoted
 from hilcal.plan.nominal_model import check_effects
 from hilcal.report import text
 from hilcal.robot.catalogue import load_arm, robot_names
@@ -320,9 +321,9 @@ def init(
     t.show(text.heading(f"Written: {cell}"))
     t.show(
         "Look it over: what was not answered stands there as an example. Then, without any "
-        f"device:\n  hilcal plan {cell} -o plan.json\n"
-        f"  hilcal run {cell} --plan plan.json --rehearse -o rehearsal.hilcal\n"
-        f"and with the devices{_lacking(draft)}:\n  hilcal check {cell} --plan plan.json"
+        f"device:\n  hilcal plan {quoted(cell)} -o plan.json\n"
+        f"  hilcal run {quoted(cell)} --plan plan.json --rehearse -o rehearsal.hilcal\n"
+        f"and with the devices{_lacking(draft)}:\n  hilcal check {quoted(cell)} --plan plan.json"
     )
     t.document({"cell": str(cell), "config": draft.data})
 

@@ -36,6 +36,7 @@ from hilcal.errors import (
     MovedFileError,
     StoppedError,
 )
+from hilcal.names import quoted
 from hilcal.plan.nominal_model import check_effects
 from hilcal.procedure.procedure import Procedure, continued
 from hilcal.procedure.state import DECIDED, REFINED, VALIDATED, Settings, Step
@@ -130,7 +131,7 @@ def calibrate(
     if kept is not None and prior is None and Path(kept).parent != output.absolute().parent:
         raise InputError(
             f"{output}: its prior is {kept!r}, and no file elsewhere is read because a campaign "
-            f"names it; give it yourself: --prior {kept}"
+            f"names it; give it yourself: --prior {quoted(kept)}"
         )
     if p.settings.prior is not None and p.next().kind in FITTED_LATER:
         known = PriorOptions(Path(p.settings.prior), "arm", None).load(catalogue)

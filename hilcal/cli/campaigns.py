@@ -14,6 +14,7 @@ from hilcal.data.repair import repair as repaired
 from hilcal.data.revision import RevisionRecord
 from hilcal.errors import InputError
 from hilcal.identify.full_covariance import covariance_parts
+from hilcal.names import quoted
 from hilcal.report import text
 from hilcal.report.covariance_words import covariance_words
 from hilcal.report.text_info import info_report, to_json
@@ -54,7 +55,7 @@ def accept(
     else:
         t.show(
             f"Accepted: {_named(chosen)}. Every command uses it unless --revision names "
-            f"another; take it back with: hilcal accept {run} --release"
+            f"another; take it back with: hilcal accept {quoted(run)} --release"
         )
     used = records[-1] if chosen is None else chosen
     t.document(
@@ -95,7 +96,7 @@ def repair(
         f"{run}: {done.why}. Set aside: revision{'s' * (len(done.revisions) > 1)} {numbers}. All "
         f"readings are there; the file as it was is {done.original}. Fit again with:"
     )
-    t.command(f"hilcal identify {run}")
+    t.command(f"hilcal identify {quoted(run)}")
     t.document({"set_aside": list(done.revisions), "original": str(done.original), "robot": put})
 
 

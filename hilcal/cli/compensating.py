@@ -10,6 +10,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from hilcal.calibration.branches import doubts
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.compensated import Compensation
 from hilcal.calibration.points import Points, on_branch, read_points
@@ -31,7 +32,7 @@ from hilcal.names import csv_text
 from hilcal.report import text_compensate
 from hilcal.report.progress import working
 from hilcal.robot import se3
-from hilcal.types import Floats
+from hilcal.types import Bools, Floats
 from hilcal.whole_file import replace_file
 
 PROGRAMS = (".script", ".urscript")
@@ -129,7 +130,10 @@ def compensate(
         given = _wrench(task.points, calibration, load, wrench)
         start = None if near is None else np.radians(_numbers(near, arm.n, "--near"))
         say(f"compensating {len(task.points.names)} points")
-        q = on_branch(task.points, arm, calibration.tool_pose(task.tool), start)
+        on_flange = calibration.tool_pose(task.tool)
+        q = on_branch(task.points, arm, on_flange, start)
+        understood = [w for w in task.waypoints if not w.left]
+        uncertain = doubts(arm, on_flange, understood, q, start) or [""] * len(q)
         sensed = task.points.sensed
         acting = given if sensed is None else calibration.load_wrench(q, sensed)
         found = calibration.compensate(q, acting, tool=task.tool, recorded=task.points.recorded)
@@ -139,10 +143,11 @@ def compensate(
             f"note: {', '.join(slow)} has no compiled form: a point takes 25 to 60 ms, not 0.1 ms"
         )
     refused = text_compensate.refusals(found, outside)
+    refused = ["; ".join(filter(None, both)) for both in zip(uncertain, refused, strict=True)]
     fates = text_compensate.fates(task.waypoints, refused)
     kept = [k for k, why in enumerate(refused) if not why]
     if not leave or not kept:
-        _refuse(points, task.points.names, refused, found)
+        _refuse(points, task.points.names, refused, _unreachable(found) | np.array(uncertain, bool))
     elif any(refused):
         q, task = q[kept], _only(task, kept, refused)
         found = calibration.compensate(q, acting, tool=task.tool)
@@ -201,6 +206,8 @@ def _task(path: Path, calibration: Calibration, tool: str | None, leave: bool) -
                     f"{path}: {name} is a pose of a tool centre point that the program does not "
                     'set; give --tool "X Y Z RX RY RZ" as the installation has it'
                 )
+        if own is not None and given is not None and not np.allclose(own, given, atol=1e-9):
+            raise InputError(f"{path}: set_tcp is another tool than --tool; leave out one of them")
         return _Task(points, given if own is None else own, program, every)
     if leave:
         raise InputError(f"{path}: --leave is for waypoints of a program; valid: without it")
@@ -258,12 +265,17 @@ def _numbers(written: str, count: int, option: str) -> Floats:
     return values
 
 
-def _refuse(path: Path, names: tuple[str, ...], refused: list[str], found: Compensation) -> None:
+def _unreachable(found: Compensation) -> Bools:
+    """(N,) points at which the arm cannot be put."""
+    return np.asarray(~found.inverse.solved | found.singular | found.limits.any(axis=1))
+
+
+def _refuse(path: Path, names: tuple[str, ...], refused: list[str], wrong: Bools) -> None:
     """Refuse the whole table where points are refused.
 
     Raises:
         CannotAnswerError: points lie outside of what was measured.
-        InputError: points cannot be reached.
+        InputError: points cannot be reached, or on more than one branch.
     """
     bad = [k for k, why in enumerate(refused) if why]
     if not bad:
@@ -271,8 +283,7 @@ def _refuse(path: Path, names: tuple[str, ...], refused: list[str], found: Compe
     named = "; ".join(f"{names[k]}: {refused[k]}" for k in bad[:NAMED])
     more = f"; and {len(bad) - NAMED} more" if len(bad) > NAMED else ""
     words = f"{path}: {len(bad)} of {len(names)} points are refused: {named}{more}"
-    lost = ~found.inverse.solved | found.singular | found.limits.any(axis=1)
-    if lost[bad].any():
+    if wrong[bad].any():
         raise InputError(words)
     raise CannotAnswerError(f"{words}; measure there, or give --allow-outside")
 

@@ -40,6 +40,7 @@ from hilcal.discover.proposal import LawSearch
 from hilcal.discover.search import SAME
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.baseline import baseline
+from hilcal.names import quoted
 from hilcal.procedure.procedure import Measure, Procedure
 from hilcal.procedure.state import Files, Settings
 from hilcal.refine import Refinement
@@ -163,10 +164,10 @@ def demo(
     ]
     record_story(t, chapters, record)
     files_given = [*(effects_from or ()), *(() if laws is None else laws.files.values())]
-    more = "".join(f" --effects-from {path}" for path in files_given)
-    t.show(f"\nThe campaign is in {output}. Go on with: hilcal view {output}{more}")
+    more = "".join(f" --effects-from {quoted(path)}" for path in files_given)
+    t.show(f"\nThe campaign is in {output}. Go on with: hilcal view {quoted(output)}{more}")
     t.show("As one HTML page, with a certificate first:")
-    t.command(f"hilcal report {output}{more}")
+    t.command(f"hilcal report {quoted(output)}{more}")
     t.document(
         {
             "campaign": str(output),

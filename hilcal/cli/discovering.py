@@ -19,6 +19,7 @@ from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.baseline import baseline, with_effects
 from hilcal.identify.fit import fit
+from hilcal.names import quoted
 from hilcal.report import text
 from hilcal.report.progress import working
 from hilcal.report.text_discover import discovery_report, silence, to_json
@@ -90,14 +91,14 @@ def discover(
     t.show(
         f"\n{output} has the first law as the effect {name}. Add it, and judge the model with it:"
     )
-    t.command(f"hilcal add {run} {name} --effects-from {output}")
-    t.command(f"hilcal diagnose {run} --effects-from {output}")
+    t.command(f"hilcal add {quoted(run)} {name} --effects-from {quoted(output)}")
+    t.command(f"hilcal diagnose {quoted(run)} --effects-from {quoted(output)}")
     if alternatives and not rivals:
         t.show("No other law explains these readings as well.")
     if rivals:
         t.show("Plan the measurements that separate it from what explains these readings as well:")
-        files = " ".join(f"--effects-from {places[own]}" for own in written)
-        t.command(f"hilcal next {run} -o PLAN.json --suspects {','.join(written)} {files}")
+        files = " ".join(f"--effects-from {quoted(places[own])}" for own in written)
+        t.command(f"hilcal next {quoted(run)} -o PLAN.json --suspects {','.join(written)} {files}")
     others = [{"name": own, "written": str(places[own])} for own in rivals]
     t.document({**document, "written": str(output), "alternatives": others})
 

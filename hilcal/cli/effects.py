@@ -20,6 +20,7 @@ from hilcal.effects.protocol import Effect
 from hilcal.effects.written import option_defaults, written
 from hilcal.errors import InputError
 from hilcal.identify.fit_document import plain
+from hilcal.names import quoted
 from hilcal.report import text
 from hilcal.whole_file import replace_file
 
@@ -119,8 +120,8 @@ def new(
     replace_file(path, template_of(name), must_be_new=True)
     t.show(
         f"{path} has the effect {name}: change its law, then try it with:\n"
-        f"  hilcal effects --effects-from {path}\n"
-        f"  hilcal diagnose RUN.hilcal --effects-from {path}"
+        f"  hilcal effects --effects-from {quoted(path)}\n"
+        f"  hilcal diagnose RUN.hilcal --effects-from {quoted(path)}"
     )
     t.document({"written": str(path), "effect": name})
 

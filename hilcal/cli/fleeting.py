@@ -15,6 +15,7 @@ from hilcal.fleet.document import to_json
 from hilcal.fleet.fleet import fleet as pool_fleet
 from hilcal.fleet.members import entries
 from hilcal.identify.posterior_document import write
+from hilcal.names import quoted
 from hilcal.report.progress import counting
 from hilcal.report.text_fleet import fleet_report
 from hilcal.write_report import write_fleet_report
@@ -47,7 +48,7 @@ def fleet(
         path = out if len(found.types) == 1 else out.with_stem(f"{out.stem}-{of.type}")
         write(of.prior, path)
         written[of.type] = str(path)
-        t.show(f"\n{path}: what to expect of another {of.type}, for --prior {path}")
+        t.show(f"\n{path}: what to expect of another {of.type}, for --prior {quoted(path)}")
     document = to_json(found, written)
     if report is not None:
         write_fleet_report(found, directory, report)

@@ -17,6 +17,7 @@ from hilcal.diagnose.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError
 from hilcal.identify.carried import CarriedPrior
+from hilcal.names import quoted
 from hilcal.plan.next import Next
 from hilcal.procedure.next_plan import doubt_to_settle, next_plan
 from hilcal.procedure.separate import Doubt, without
@@ -75,7 +76,10 @@ def next_(
     t.show(report(found, made.summary.poses, made.summary.readings))
     t.show(plan_report(made.summary))
     t.show(f"The plan is in {output}. Measure it into the same campaign with:")
-    t.show(f"  hilcal run {cell or 'CELL.toml'} -o {run} --append --plan {output}")
+    t.show(
+        f"  hilcal run {quoted(cell or 'CELL.toml')} -o {quoted(run)} --append "
+        f"--plan {quoted(output)}"
+    )
     t.document(
         {
             **made.to_dict(),

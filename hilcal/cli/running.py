@@ -47,6 +47,7 @@ from hilcal.errors import (
     MovedFileError,
     StoppedError,
 )
+from hilcal.names import quoted
 from hilcal.plan.checked_plan import refuse
 from hilcal.plan.goal_rule import GoalRule
 from hilcal.report.goal_words import full_words, missed_words
@@ -149,10 +150,10 @@ def run(
         if goal.status.met:
             t.show(f'The goal "{goal.goal.text}" is met: {full_words(goal.status)}.')
     of = "" if measured == planned else f" of {planned}"
-    t.show(f"{measured}{of} readings are in {output}. Go on with: hilcal refine {output}")
+    t.show(f"{measured}{of} readings are in {output}. Go on with: hilcal refine {quoted(output)}")
     missed: CannotAnswerError | None = None
     if goal is not None and not goal.status.met:
-        on = f"hilcal plan {cell} -o more.json --after {output}"
+        on = f"hilcal plan {quoted(cell)} -o more.json --after {quoted(output)}"
         words = f"{missed_words(goal.status, measured)}; plan on with: {on}"
         missed = CannotAnswerError(words)
     t.document(document, missed)

@@ -81,15 +81,15 @@ def import_(
         notes = (*found.notes, covariance_words(parts), *cell.arm.notes)
         say(f"writing {output}")
         source = f"{table.name} ({Path(kind).name})"
-        with CampaignFile.create(
+        CampaignFile.create(
             output,
             settings.to_json(),
             str(base_dir),
             source,
             overwrite=force,
             more={COVERS: found.covers},
-        ) as campaign:
-            campaign.append_readings(readings)
+            readings=readings,
+        ).close()
     loads = [readings.load_names[k] for k in np.unique(readings.load)]
     poses = len(np.unique(readings.pose))
     t.show(text.heading(f"{len(readings)} readings of {poses} poses"))

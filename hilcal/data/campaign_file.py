@@ -11,23 +11,29 @@ from typing import Self
 
 import numpy as np
 
-from hilcal import __version__
+from hilcal import __version__, limits
 from hilcal.data import rows, schema
 from hilcal.data.command_line import typed_now
 from hilcal.data.in_place import identity, moved_to, rescued
-from hilcal.data.new_campaign import write_new
+from hilcal.data.new_campaign import new_campaign
 from hilcal.data.readings import Readings
 from hilcal.data.records import Layout, content_hash, layout_of, read_layout
 from hilcal.data.revision import RevisionRecord, fitted_to, from_text, to_text, utc_now
 from hilcal.data.robot_file import robot_file_of
 from hilcal.data.stored_priors import join, split
 from hilcal.errors import HilcalError, InputError, MovedFileError
+from hilcal.names import quoted
 
 _TARGETS = "targets"
 ACCEPTED = "accepted {}"
 """Keys of the acceptances, numbered from 1; the last one holds."""
 _MEANWHILE = 1000
 """Readings that were appended during a fit, at most; a choice: each takes a second."""
+_HASHED = 1_000_000
+"""Readings that are hashed, at most, to find how many they were; a choice: it takes seconds."""
+_OTHER_READINGS = (
+    "the readings were changed after revision {} had been fitted to them (their SHA-256 is another)"
+)
 _META = ("config", "base_dir", "source", "created", "program_version")
 
 
@@ -57,8 +63,9 @@ class CampaignFile:
         *,
         overwrite: bool = False,
         more: Mapping[str, str] | None = None,
+        readings: Readings | None = None,
     ) -> Self:
-        """Make an empty campaign; the file appears only when it is complete.
+        """Make a campaign; the file appears only when it is complete.
 
         Args:
             path: the file to make.
@@ -67,16 +74,20 @@ class CampaignFile:
             source: where the readings come from, in words.
             overwrite: replace an existing campaign (never a file of another kind).
             more: further texts about it, see `about`.
+            readings: the first ones; none unless given.
 
         Raises:
-            InputError: the file exists, or cannot be written.
+            InputError: the file exists, or cannot be written; see `append_readings`.
+            DeviceError: the disk is full or failed.
         """
         path = Path(path)
         meta = dict(
             zip(_META, (config_json, base_dir, source, utc_now(), __version__), strict=True)
         )
         meta |= {**typed_now(), **robot_file_of(config_json, base_dir), **(more or {})}
-        write_new(path, meta, overwrite)
+        with new_campaign(path, meta, overwrite) as connection:
+            if readings is not None:
+                cls(path, connection).insert(readings)
         return cls.open(path)
 
     @classmethod
@@ -113,7 +124,7 @@ class CampaignFile:
                 schema.check_file(connection, path)
                 file = cls(path, connection)
                 if check_revisions and (bad := file.bad_revision()) is not None:
-                    raise InputError(f"{path}: {bad[1]}; set it aside: hilcal repair {path}")
+                    raise InputError(f"{path}: {bad[1]}; {_mend(path)}")
                 return file
             except BaseException:
                 connection.close()
@@ -231,6 +242,7 @@ class CampaignFile:
         if len(readings):
             self._claim_layout(layout_of(readings))
             readings = self._numbered_targets(readings)
+            limits.check_fitted(self.n_readings + len(readings), readings.m, f"{self.path}: ")
         rows.check_poses(self._connection, self.path, readings)
         return rows.insert_readings(self._connection, readings)
 
@@ -320,13 +332,13 @@ class CampaignFile:
         """
         records, damaged = self._sound_revisions()
         if damaged is not None:
-            raise InputError(f"{self.path}: {damaged[1]}; set it aside: hilcal repair {self.path}")
+            raise InputError(f"{self.path}: {damaged[1]}; {_mend(self.path)}")
         return records
 
     def _sound_revisions(self) -> tuple[tuple[RevisionRecord, ...], tuple[int, str] | None]:
         """Return the revisions before the first damaged one; and its number, and what it is."""
         records: list[RevisionRecord] = []
-        with schema.sqlite_errors(self.path):
+        with schema.sqlite_errors(self.path), limits.memory(str(self.path)):
             stored = self._connection.execute("SELECT id, content, crc FROM revisions ORDER BY id")
             meta = self._read_meta()
             for expected, (number, text, crc) in enumerate(stored.fetchall(), start=1):
@@ -368,15 +380,14 @@ class CampaignFile:
         for number, count, stored in fitted:
             assert readings is not None  # noqa: S101
             for n in range(count, min(len(readings), count + _MEANWHILE) + 1):
+                if n > count and sum(hashes) > _HASHED:
+                    return number, _OTHER_READINGS.format(number)
                 if n not in hashes:
                     hashes[n] = content_hash(readings[:n])
                 if hashes[n] == stored:
                     break
             else:
-                return number, (
-                    f"the readings were changed after revision {number} had been fitted to them "
-                    "(their SHA-256 is another); use an untouched copy of the file"
-                )
+                return number, _OTHER_READINGS.format(number)
         return damaged
 
     def _read_meta(self) -> dict[str, str]:
@@ -432,3 +443,7 @@ class CampaignFile:
         number = np.array([names.index(name) for name in readings.target_names])
         states = replace(readings.states, target=number[readings.target])
         return replace(readings, states=states, target_names=tuple(names))
+
+
+def _mend(path: Path) -> str:
+    return f"valid: an untouched copy; or set the revision aside: hilcal repair {quoted(path)}"

@@ -82,6 +82,7 @@ class CsvTable:
             raise InputError(f"{self.at(i, names[j])}: {what(value)}")
 
 
+@limits.bounded
 def read_columns(
     path: str | Path,
     choose: Callable[[list[str]], tuple[Sequence[str], Sequence[str]]],

@@ -61,7 +61,8 @@ class Grid:
     units: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Refuse names of columns that no name may be."""
+        """Refuse too many columns, and names of columns that no name may be."""
+        limits.check_cells(self.path, len(self.rows), len(self.names))
         check_names(self.names, f"{self.path}: column")
 
     def at(self, index: int, column: str) -> str:
@@ -318,13 +319,16 @@ def unique(names: Sequence[str]) -> tuple[str, ...]:
 
     A column without a name is called by its number.
     """
-    out: list[str] = []
+    out: dict[str, None] = {}
+    counts: dict[str, int] = {}
     for k, given in enumerate(names, start=1):
-        name, count = given or str(k), 1
+        first = name = given or str(k)
+        count = counts.get(first, 1)
         while name in out:
             count += 1
-            name = f"{given or k} ({count})"
-        out.append(name)
+            name = f"{first} ({count})"
+        counts[first] = count
+        out[name] = None
     return tuple(out)
 
 

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from hilcal import limits
 from hilcal.config import CellConfig
 from hilcal.data.covariance import WHOLE, tracker_noise
 from hilcal.data.imported import ImportResult
@@ -51,6 +52,7 @@ def import_readings(
     else:
         gravity = config.robot.gravity_m_s2
         result = import_mapped(path, mapping, arm, noise, station, gravity, second, targets)
+    limits.check_fitted(len(result.readings), result.readings.m, f"{path}: ")
     where = "" if tracker.frame == "tracker" or station else ", as if it stood at the arm's base"
     notes = tuple(note + where * (note == FROM_TRACKER) for note in result.notes)
     stated = FROM_TRACKER not in result.notes

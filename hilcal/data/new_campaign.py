@@ -1,6 +1,9 @@
 """Make an empty campaign file: whole or not at all, and never in place of another kind of file."""
 
 import os
+import sqlite3
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 from hilcal.data import rows, schema
@@ -8,8 +11,11 @@ from hilcal.errors import InputError
 from hilcal.whole_file import replacing
 
 
-def write_new(path: Path, about: dict[str, str], overwrite: bool) -> None:
-    """Write an empty campaign file; it appears only when it is complete.
+@contextmanager
+def new_campaign(
+    path: Path, about: Mapping[str, str], overwrite: bool
+) -> Iterator[sqlite3.Connection]:
+    """Give an empty campaign to the block; the file appears when the block has filled it.
 
     Args:
         path: the file to make.
@@ -18,11 +24,23 @@ def write_new(path: Path, about: dict[str, str], overwrite: bool) -> None:
 
     Raises:
         InputError: as for `may_write`, or it cannot be written.
+        DeviceError: the disk is full or failed.
     """
     may_write(path, overwrite)
     with replacing(path) as new:
         try:
-            _fill(new, about)
+            with schema.sqlite_errors(path):
+                connection = schema.connect(new)
+                try:
+                    connection.execute("PRAGMA journal_mode = DELETE")
+                    with schema.transaction(connection):
+                        for statement in schema.statements():
+                            connection.execute(statement)
+                        for key, value in about.items():
+                            rows.insert_meta(connection, key, value)
+                        yield connection
+                finally:
+                    connection.close()
         except BaseException:
             _without_sidecars(new)
             raise
@@ -47,17 +65,3 @@ def _without_sidecars(path: Path) -> None:
     """Remove what would be rolled back into a new file of this name."""
     for end in ("-journal", "-wal", "-shm"):
         path.with_name(path.name + end).unlink(missing_ok=True)
-
-
-def _fill(path: Path, about: dict[str, str]) -> None:
-    with schema.sqlite_errors(path):
-        connection = schema.connect(path)
-        try:
-            connection.execute("PRAGMA journal_mode = DELETE")
-            with schema.transaction(connection):
-                for statement in schema.statements():
-                    connection.execute(statement)
-                for key, value in about.items():
-                    rows.insert_meta(connection, key, value)
-        finally:
-            connection.close()

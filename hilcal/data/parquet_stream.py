@@ -159,8 +159,10 @@ def _opened(path: Path) -> Any:
 
 
 def _tables(path: Path, group: int, names: tuple[str, ...], count: int = CHUNK) -> Iterator[Any]:
-    batches = _opened(path).iter_batches(count, row_groups=[group], columns=list(names))
-    while True:
+    file = _opened(path)
+    left = file.metadata.row_group(group).num_rows
+    batches = file.iter_batches(count, row_groups=[group], columns=list(names))
+    while left > 0:
         try:
             with limits.memory(str(path)):
                 batch = next(batches, None)
@@ -169,7 +171,8 @@ def _tables(path: Path, group: int, names: tuple[str, ...], count: int = CHUNK) 
         except Exception as e:  # as above
             raise InputError(f"{path}: damaged in row group {group + 1} ({_words(e)})") from e
         if batch is None:
-            return
+            raise InputError(f"{path}: damaged in row group {group + 1} ({left} rows are missing)")
+        left -= batch.num_rows
         yield batch.select(list(names))
 
 

@@ -81,6 +81,7 @@ class Plan:
         return json.dumps({**head, **self.about, "poses": poses, "steps": steps}, indent=1)
 
 
+@limits.bounded
 def load_plan(path: Path) -> Plan:
     """Read a plan file.
 
@@ -119,7 +120,8 @@ def _poses(data: object, where: str) -> tuple[tuple[str, ...], Floats]:
     """Names and joint angles of the poses."""
     if not isinstance(data, list) or not data:
         raise InputError(f'{where}: "poses" must be a list of at least one pose')
-    names: list[str] = []
+    limits.check_planned(where, "poses", len(data))
+    names: dict[str, None] = {}
     rows: list[list[float]] = []
     for k, pose in enumerate(data, start=1):
         if not isinstance(pose, dict) or set(pose) != {"name", "q_rad"}:
@@ -138,7 +140,7 @@ def _poses(data: object, where: str) -> tuple[tuple[str, ...], Floats]:
                 f"{where}: pose {name!r}: q_rad must be a list of {count}finite numbers, rad, "
                 f"below {LARGEST:g}"
             )
-        names.append(name)
+        names[name] = None
         rows.append([float(x) for x in q])
     return tuple(names), np.array(rows)
 
@@ -147,7 +149,9 @@ def _steps(data: object, names: tuple[str, ...], where: str) -> tuple[Step, ...]
     """Steps in order."""
     if not isinstance(data, list) or not data:
         raise InputError(f'{where}: "steps" must be a list of at least one step')
+    limits.check_planned(where, "steps", len(data))
     steps: dict[Step, int] = {}
+    known = frozenset(names)
     for k, step in enumerate(data, start=1):
         if not isinstance(step, dict) or not {"pose", "load"} <= set(step) <= {
             "pose",
@@ -156,7 +160,7 @@ def _steps(data: object, names: tuple[str, ...], where: str) -> tuple[Step, ...]
         }:
             raise InputError(f'{where}: step {k} must have "pose" and "load", and may have "cycle"')
         pose, load, cycle = step["pose"], step["load"], step.get("cycle", 0)
-        if pose not in names:
+        if not isinstance(pose, str) or pose not in known:
             hint = suggest(str(pose), names)
             raise InputError(f"{where}: step {k}: there is no pose {pose!r}{hint}")
         if not isinstance(load, str) or not load:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from hilcal import limits
 from hilcal.data.grid import Grid, joined
 from hilcal.data.guess import guess
 from hilcal.data.proposal import Proposal
@@ -21,6 +22,7 @@ class Proposed:
     proposal: Proposal
 
 
+@limits.bounded
 def propose(path: Path, second: Path | None = None, joints: int | None = None) -> Proposed:
     """Look at a table and propose a mapping.
 

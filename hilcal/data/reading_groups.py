@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.linalg import block_diag
 
+from hilcal import limits
 from hilcal.data.readings import Readings
 from hilcal.errors import InputError
 from hilcal.types import Bools, Floats, Ints
@@ -29,6 +30,7 @@ def arrival_groups(readings: Readings) -> list[Group]:
     found = []
     for size in np.unique(sizes):
         rows = order[starts[sizes == size][:, None] + np.arange(size)]
+        limits.check_shared(int(size), readings.m, len(rows))
         none = np.empty((len(rows), 0), dtype=np.int64)
         found.append((rows, none, np.zeros((size, 0))))
     return found
@@ -41,7 +43,8 @@ def deflection_groups(readings: Readings) -> list[Group]:
     of several, was not read unloaded in its pose and cycle makes no deflection.
 
     Raises:
-        InputError: a pose without unloaded reading, or no loaded reading at all.
+        InputError: a pose without unloaded reading, no loaded reading at all, or more readings that
+            share one than `limits.SHARED` allows.
     """
     if len(readings) and readings.unloaded.all():
         raise InputError("readings = deflection: there is no loaded reading; use absolute")
@@ -68,6 +71,8 @@ def deflection_groups(readings: Readings) -> list[Group]:
         if size == u:
             continue
         at = order[starts[np.all(shapes == shape, axis=1)][:, None] + np.arange(size)]
+        limits.check_shared(size - u, readings.m, len(at))
+        limits.check_numbers(f"{size - u} loaded times {u} unloaded readings", (size - u) * u)
         same = target[at[0, u:], None] == target[at[0, :u]]
         found.append((rows[at[:, u:]], rows[at[:, :u]], same / same.sum(axis=1, keepdims=True)))
     if not found:

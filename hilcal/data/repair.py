@@ -51,7 +51,9 @@ def repair(path: Path) -> Repaired | None:
         with file.transaction() as connection:
             original = _free(path)
             replace_file(original, connection.serialize(), must_be_new=True)
-            found = connection.execute("SELECT id FROM revisions WHERE id >= ?", (first,))
+            found = connection.execute(
+                "SELECT id FROM revisions WHERE id >= ? OR id < 1 ORDER BY id", (first,)
+            )
             numbers = tuple(int(number) for (number,) in found.fetchall())
             _delete(connection, "revisions", "id", numbers)
             _delete(connection, "meta", "key", _naming(file, first))

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from hilcal import limits
 from hilcal.errors import InputError
+from hilcal.names import quoted
 
 ROBOT_FILE = "robot_file"
 """Its key in the campaign."""
@@ -43,7 +44,8 @@ def check_robot(path: Path, config_json: str, kept: str | None) -> None:
     if kept is None and Path(model).suffix.lower() in _KINDS:
         raise InputError(
             f"{path}: its robot is in a file that it does not hold, {model!r}, and which is not "
-            f"read; give that file yourself: hilcal repair {path} --robot FILE{Path(model).suffix}"
+            f"read; give that file yourself: hilcal repair {quoted(path)} "
+            f"--robot FILE{Path(model).suffix}"
         )
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from hilcal import limits
 from hilcal.data.checks import SAME_POSE, is_covariance
 from hilcal.data.readings import Readings
 from hilcal.data.records import Layout, pack, unpack
@@ -58,7 +59,8 @@ def fetch_meta(connection: sqlite3.Connection, path: Path) -> dict[str, str]:
     Raises:
         InputError: one is damaged.
     """
-    rows = connection.execute("SELECT key, value, crc FROM meta").fetchall()
+    with limits.memory(str(path)):
+        rows = connection.execute("SELECT key, value, crc FROM meta").fetchall()
     meta = {str(key): str(value) for key, value, _ in rows}
     if any(text_crc(str(key), str(value)) != crc for key, value, crc in rows):
         raise InputError(f"{path}: the campaign file is damaged (its description)")
@@ -112,26 +114,42 @@ def fetch_readings(
     Raises:
         InputError: one is missing or damaged, or a name of a pose, load or target is none.
     """
-    rows = connection.execute(
-        "SELECT id, pose, load, cycle, record, crc FROM readings ORDER BY id"
-    ).fetchall()
-    if not rows:
+    (count,) = connection.execute("SELECT count(*) FROM readings").fetchone()
+    if not count:
         raise InputError(f"{path}: the campaign file is damaged (its readings are gone)")
+    width = sum(width for _, width in layout)
+    limits.check_fitted(count, dict(layout)["value"], f"{path}: ")
+    with limits.memory(str(path)):
+        return _fetched(connection, path, layout, target_names, count, width)
+
+
+def _fetched(
+    connection: sqlite3.Connection,
+    path: Path,
+    layout: Layout,
+    target_names: Sequence[str],
+    count: int,
+    width: int,
+) -> Readings:
+    """Return the first `count` readings of records of `width` numbers."""
     names = [fetch_names(connection, table) for table in ("poses", "loads")]
     check_names([*names, target_names], f"{path}: name")
-    size = 8 * sum(width for _, width in layout)
+    rows = connection.execute(
+        "SELECT id, pose, load, cycle, record, crc FROM readings ORDER BY id LIMIT ?", (count,)
+    )
+    records, index = np.empty((count, width)), np.empty((count, 3), dtype=np.int64)
     for number, (key, *where, record, crc) in enumerate(rows, start=1):
         try:
-            whole = key == number and len(record) == size
+            whole = key == number and len(record) == 8 * width
             whole = whole and _reading_crc(key, where, record) == crc
         except (TypeError, ValueError, OverflowError):
             whole = False
         if not whole:
             raise InputError(f"{path}: the campaign file is damaged at reading {number}")
-    records = np.frombuffer(b"".join(row[4] for row in rows), dtype="<f8").reshape(len(rows), -1)
+        records[number - 1] = np.frombuffer(record, "<f8")
+        index[number - 1] = where
     if bad := np.flatnonzero(~(np.abs(records) < LARGEST).all(axis=1))[:1].tolist():
         raise InputError(f"{path}: the campaign file is damaged at reading {bad[0] + 1}")
-    index = np.array([row[1:4] for row in rows], dtype=np.int64)
     if index[:, :2].min() < 0 or np.any(index[:, :2].max(axis=0) >= [len(n) for n in names]):
         raise InputError(f"{path}: the campaign file is damaged (names are missing)")
     readings = unpack(records, layout, index, names[0], names[1], target_names)
@@ -153,7 +171,8 @@ def stored_json(path: Path, text: str, check: Callable[[object], None] | None = 
         InputError: it is none.
     """
     try:
-        content = parse_json(text)
+        with limits.memory(str(path)):
+            content = parse_json(text)
         if check is not None:
             check(content)
         return content

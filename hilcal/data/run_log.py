@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from hilcal import limits
 from hilcal.config import CellConfig
 from hilcal.data import rows, schema
 from hilcal.data.appended import joined, with_new_names
@@ -256,7 +257,8 @@ class RunLog:
         return found[0], found[1], found[2]
 
     def _select(self, statement: str) -> list[Any]:
-        with schema.sqlite_errors(self._campaign.path):
+        path = self._campaign.path
+        with schema.sqlite_errors(path), limits.memory(str(path)):
             return self._campaign.connection.execute(statement).fetchall()
 
 

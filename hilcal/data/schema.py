@@ -8,6 +8,7 @@ documentation, "Atomic Commit In SQLite" and "PRAGMA synchronous".
 
 import os
 import sqlite3
+import stat
 import sys
 import time
 from collections.abc import Iterator
@@ -30,6 +31,7 @@ SEVERAL_TARGETS = 3
 """Version of a file whose readings are of several targets; all others stay at `ONE_TARGET`."""
 ONE_TARGET = 2
 HEADER = b"SQLite format 3\x00"
+_JOURNAL = bytes.fromhex("d9d505f920a163d7")  # begins a journal, and ends one that ends in a name
 
 _TABLES = """
 CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL, crc INTEGER NOT NULL) WITHOUT ROWID;
@@ -133,20 +135,71 @@ def connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
         read_only: write nothing, neither to the file nor beside it. A journal beside the file is
             what a killed program left unfinished; SQLite has to undo that before anybody can
             read, and then the file is opened for writing all the same.
+
+    Raises:
+        InputError: it has a journal that no hilcal made, or a write-ahead log.
     """
-    unfinished = Path(f"{os.path.realpath(path)}-journal").exists()  # beside a link's file
+    _refuse_log(path)
+    unfinished = _journal(path)
     mode = "ro" if read_only and not unfinished else "rw"
     connection = sqlite3.connect(
         f"{path.absolute().as_uri()}?mode={mode}", uri=True, isolation_level=None, timeout=5.0
     )
-    connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, limits.DOCUMENT)
-    for pragma in ("synchronous = EXTRA", "foreign_keys = ON", "trusted_schema = OFF"):
-        connection.execute(f"PRAGMA {pragma}")
-    connection.execute("PRAGMA cell_size_check = ON")
-    connection.setlimit(sqlite3.SQLITE_LIMIT_ATTACHED, 0)
-    if sys.version_info >= (3, 12):
-        connection.setconfig(sqlite3.SQLITE_DBCONFIG_DEFENSIVE, True)
+    try:
+        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, limits.DOCUMENT)
+        for pragma in ("synchronous = EXTRA", "foreign_keys = ON", "trusted_schema = OFF"):
+            connection.execute(f"PRAGMA {pragma}")
+        connection.execute("PRAGMA cell_size_check = ON")
+        connection.setlimit(sqlite3.SQLITE_LIMIT_ATTACHED, 0)
+        if sys.version_info >= (3, 12):
+            connection.setconfig(sqlite3.SQLITE_DBCONFIG_DEFENSIVE, True)
+    except BaseException:
+        connection.close()
+        raise
     return connection
+
+
+def _journal(path: Path) -> bool:
+    """Whether a journal lies beside a file; SQLite obeys it, whoever wrote it.
+
+    One that ends in a name belongs to a transaction over several files, and SQLite deletes the file
+    of that name: any file. Through a link it would write elsewhere. Source: SQLite documentation,
+    "Database File Format", section 3, "The Rollback Journal", and pager.c, `pager_delsuper`.
+
+    Raises:
+        InputError: it is such a one.
+    """
+    journal = Path(f"{os.path.realpath(path)}-journal")  # beside a link's file
+    try:
+        ours = stat.S_ISREG(journal.lstat().st_mode) and not _ends_in_name(journal)
+    except FileNotFoundError:
+        return False
+    if not ours:
+        raise InputError(
+            f"{journal}: a journal that no hilcal made, by which opening {path} would change other "
+            "files; delete it, or take the campaign without it"
+        )
+    return True
+
+
+def _ends_in_name(journal: Path) -> bool:
+    with journal.open("rb") as stream:
+        stream.seek(-min(len(_JOURNAL), journal.stat().st_size), os.SEEK_END)
+        return stream.read() == _JOURNAL
+
+
+def _refuse_log(path: Path) -> None:
+    """Refuse a file with a write-ahead log, before SQLite writes anything beside it.
+
+    Raises:
+        InputError: its header says so.
+    """
+    with path.open("rb") as stream:
+        if 2 in stream.read(20)[18:]:  # versions of the format, to write and to read
+            raise InputError(
+                f"{path}: another program has put its changes into a write-ahead log beside it, "
+                "which no hilcal does; valid: the file as hilcal wrote it"
+            )
 
 
 @contextmanager
@@ -190,6 +243,7 @@ def _check_file(connection: sqlite3.Connection, path: Path) -> None:
         raise InputError(
             f"{path}: made by a newer hilcal (schema {version}, this one reads up to {VERSION})"
         )
+    _refuse_log(path)  # an unfinished journal may have brought it
     _check_schema(connection, path, version)
     (pages,) = connection.execute("PRAGMA page_count").fetchone()
     (page_size,) = connection.execute("PRAGMA page_size").fetchone()
@@ -210,17 +264,12 @@ def _check_schema(connection: sqlite3.Connection, path: Path, version: int) -> N
     if extra := sorted(found - wanted):
         kind, name, *_ = extra[0]
         raise InputError(
-            f"{path}: has a {kind} {name!r} that no hilcal made; a campaign that another program "
-            "has changed is not opened; valid: the file as hilcal wrote it"
+            f"{path}: has the {kind} {name[:60]!r}, which no hilcal made; a campaign that another "
+            "program has changed is not opened; valid: the file as hilcal wrote it"
         )
     if missing := sorted(wanted - found):
         kind, name, *_ = missing[0]
         raise InputError(f"{path}: the campaign file is damaged (no {kind} '{name}')")
-    if connection.execute("PRAGMA journal_mode").fetchone() == ("wal",):
-        raise InputError(
-            f"{path}: another program has put its changes into a write-ahead log beside it, which "
-            "no hilcal does; valid: the file as hilcal wrote it"
-        )
 
 
 def _schema(connection: sqlite3.Connection) -> set[tuple[str, str, str, str]]:

@@ -7,10 +7,11 @@ the value that is stored with them, macros, links and pickles are not read.
 import io
 import zipfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import date, datetime, time
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
+from xml.parsers import expat
 
 import numpy as np
 
@@ -66,6 +67,7 @@ def open_tables(path: str | Path, mapping: Mapping, second: Path | None = None) 
     return joined(first, open_grid(other, mapping.second_file), mapping.second_file.match)
 
 
+@limits.bounded
 def open_grid(path: str | Path, how: FileFormat) -> Grid:
     """Open one file as a table of cells.
 
@@ -97,7 +99,7 @@ def _undamaged(path: str, what: str) -> Iterator[None]:
     """Say in one line what a reader makes of a damaged file, which is not documented."""
     try:
         yield
-    except InputError:
+    except (InputError, MemoryError):
         raise
     except Exception as e:
         raise InputError(f"{path}: damaged, or not {what} ({_short(e)})") from e
@@ -139,10 +141,57 @@ def _book(path: str, content: bytes) -> Any:
         if "xl/workbook.xml" not in [m.filename for m in members]:
             raise InputError(f"{path}: a zip archive that is no XLSX; unpack it, or save as XLSX")
         limits.check_size(f"{path}: unpacked", sum(m.file_size for m in members), limits.UNPACKED)
+        for member in members:
+            with archive.open(member) as stream, suppress(expat.ExpatError):  # pictures
+                _check_xml(path, member.filename, stream)
     openpyxl = _package(path, "openpyxl", "XLSX")
     return openpyxl.load_workbook(
         io.BytesIO(content), read_only=True, data_only=True, keep_links=False
     )
+
+
+def _check_xml(path: str, name: str, stream: IO[bytes]) -> None:
+    """Count the elements of a part of a workbook, of which openpyxl keeps more than it is long.
+
+    Of a sheet it keeps a row, of other parts all.
+
+    Raises:
+        InputError: too many, too deep, or one that is too long.
+    """
+    where, sheet = f"{path}: {name}", name.startswith("xl/worksheets/")
+    most = limits.COLUMNS * 10 if sheet else limits.ELEMENTS
+    depth = elements = rows = cells = 0
+
+    def start(tag: str, _: dict[str, str]) -> None:
+        nonlocal depth, elements, rows, cells
+        depth += 1
+        elements += 1
+        tag = tag.rpartition(":")[2]
+        if sheet and tag == "row":
+            rows, elements = rows + 1, 0
+            limits.check_rows(where, rows)
+        cells += sheet and tag == "c"
+        if depth > limits.DEEP or elements > most:
+            what = (
+                f"{depth} elements in each other" if depth > limits.DEEP else f"{elements} elements"
+            )
+            raise InputError(
+                f"{where}: {what}{' in a row' if sheet else ''}; valid: a workbook of readings"
+            )
+
+    def end(_: str) -> None:
+        nonlocal depth
+        depth -= 1
+
+    parser = expat.ParserCreate()
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    fed = 0
+    while piece := stream.read(1 << 16):
+        parser.Parse(piece)
+        fed += len(piece)
+        limits.check_cells(where, cells)
+        limits.check_size(f"{where}: a tag", fed - parser.CurrentByteIndex, limits.LINE)
+    parser.Parse(b"", True)
 
 
 def sheet_names(path: str, content: bytes) -> list[str]:
@@ -152,7 +201,10 @@ def sheet_names(path: str, content: bytes) -> list[str]:
         InputError: no XLSX file, or openpyxl is not installed.
     """
     with _undamaged(path, "an XLSX file"):
-        return list(_book(path, content).sheetnames)
+        names = list(_book(path, content).sheetnames)
+    if len(names) > limits.SHEETS:
+        raise InputError(f"{path}: {len(names)} sheets; valid: at most {limits.SHEETS}")
+    return names
 
 
 def sheet_rows(

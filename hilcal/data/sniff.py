@@ -18,6 +18,7 @@ from hilcal.data.grid import (
     decoded,
     number,
     records,
+    table,
 )
 from hilcal.data.mapping_sections import FileFormat
 from hilcal.data.sheets import REFUSED, open_grid, sheet_names, sheet_rows
@@ -233,4 +234,5 @@ def _spreadsheet(path: str, content: bytes) -> Sniffed:
         how["sheet"] = best[1]
     if how["header_row"] == 1:
         del how["header_row"]
-    return Sniffed(how, open_grid(path, FileFormat(**how)), doubts)
+    form = FileFormat(**how)
+    return Sniffed(how, table(path, best[2], form), doubts)

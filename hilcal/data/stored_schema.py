@@ -78,6 +78,14 @@ class Detail(_Document):
     tracker_covariance: Matrix | None = None
 
 
+class _Doubtful(Detail):
+    """A reading that was measured and not used."""
+
+    pose: Text
+    load: Text
+    target: Text | None = None
+
+
 class _Happened(_Document):
     kind: Text
     utc: Text
@@ -122,7 +130,13 @@ class _Repeatability(_Happened):
 
 
 class _Load(_Happened):
-    hanging: Text
+    hanging: Text | None  # None while that is being put right
+    why: Text = ""
+
+
+class _Doubted(_Happened):
+    why: Text
+    reading: _Doubtful
 
 
 class _Start(_Happened):
@@ -140,6 +154,7 @@ _EVENTS: Mapping[str, type[_Happened]] = {
     "tool": _Tool,
     "repeatability": _Repeatability,
     "load": _Load,
+    "doubted": _Doubted,
     "start": _Start,
     "finished": _Finished,
 }

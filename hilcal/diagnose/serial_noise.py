@@ -19,6 +19,9 @@ are of readings. K_f, scaled to a mean variance of 1, is that
 misjudged as a whole. Little but the stated covariance tells a long correlation of large noise from
 a short one of small noise: the estimate is that with σ² = 1, unless the readings speak against it.
 
+All this is computed where the slope of ℓ by φ at white noise speaks for it, and no K_f alone
+explains the readings far better: that is to be in the model first.
+
 The serial noise is proved where it gains more than chance beside all K_f, or alone, and is then
 better than all K_f by 20 : 1. Where these are better by as much, they explain the readings, as a
 drift does; else it stays in doubt. Campaigns of more than `MOST_ROWS` are judged by some of their
@@ -31,7 +34,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import block_diag, solve_triangular
+from scipy.linalg import block_diag, lapack, solve_triangular
 
 from hilcal.data.reading_groups import Group, arrival_groups, deflection_groups, runs
 from hilcal.data.serial_noise import Clock, SerialNoise
@@ -49,6 +52,14 @@ with one and two degrees of freedom (Self and Liang, JASA 82 (1987) 605), on two
 AGAINST = 6.0
 """Gain of the restricted log likelihood by another σ² than 1 that speaks against it: that of
 `noise_verdict.MISFIT_ALARM`."""
+SUSPECT = 0.5 * CHANCE
+"""Gain that slope and curvature at white noise must promise for more to be computed; a choice: it
+is as rough as a third."""
+SIZES = (1.0, 10.0, 100.0)
+"""Variances of a rival that are tried, in that of the noise, and ..."""
+LEAD = 2.0
+"""... factor by which its gain exceeds that of serial noise at `STARTS` where it explains the
+readings far better; choices, rough but for little computing."""
 FEWEST = 12
 """Readings below which nothing is estimated; a choice."""
 MOST_READINGS = 600
@@ -109,21 +120,21 @@ def serial_noise(found: Fit) -> SerialNoise | None:
     """
     if found.scaling != "gc" or not FEWEST <= len(found.raw) <= MOST_READINGS:
         return None
-    clocks: list[Clock] = ["order"] if found.readings.states.time is None else ["time", "order"]
-    best: tuple[_Problem, _Point] | None = None
-    for clock in clocks:
-        problem = _problem(found, clock)
-        if problem is None:
-            continue
-        alone = problem.climbed(problem.none(), serial=True)
-        if best is None or alone.value > best[1].value:
-            best = problem, alone
-    if best is None:
+    by_order = _problem(found, "order")
+    if by_order is None or by_order.promise() < SUSPECT:
         return None
-    problem, alone = best
+    names, rivals = by_order.rivals()
+    if by_order.outdone(rivals):
+        return None
+    problem, alone = by_order, by_order.climbed(by_order.none(), serial=True)
+    timed = None if found.readings.states.time is None else _problem(found, "time")
+    if timed is not None:
+        other = timed.climbed(timed.none(), serial=True)
+        if other.value >= alone.value:
+            problem, alone = timed, other
+            names, rivals = problem.rivals()
     if alone.value - problem.climbed(problem.none(), serial=False).value < CHANCE:
         return None
-    names, rivals = problem.rivals()
     effects = problem.climbed(rivals, serial=False)
     both = problem.climbed(rivals, serial=True, start=effects)
     gain = both.value - effects.value
@@ -280,14 +291,13 @@ class _Problem:
         if serial is not None:
             sigma += share * serial
         sigma += np.tensordot(v, rivals, axes=1)
-        lower = np.linalg.cholesky(sigma + ROUNDING * np.eye(len(sigma)))
-        inverse_lower = solve_triangular(lower, np.eye(len(sigma)), lower=True)
-        b = inverse_lower @ self.columns
-        h = b.T @ b + np.diag(self.ridge)
+        lower = np.asarray(np.linalg.cholesky(sigma + ROUNDING * np.eye(len(sigma))), dtype=float)
+        inverse = _inverse(lower)
+        b = inverse @ self.columns
+        h = self.columns.T @ b + np.diag(self.ridge)
         h += ROUNDING * float(np.trace(h)) / len(h) * np.eye(len(h))
-        t = inverse_root(h)
-        lifted = (inverse_lower.T @ b) @ t.T
-        p = inverse_lower.T @ inverse_lower - lifted @ lifted.T
+        lifted = b @ inverse_root(h).T
+        p = inverse - lifted @ lifted.T
         py = p @ self.y
         free = len(self.y) - int(np.sum(self.ridge == 0))
         square = float(self.y @ py)
@@ -302,6 +312,58 @@ class _Problem:
             by_length = float(np.vdot(slope, share * self.correlated(c * away / length**2)))
         by_v = np.tensordot(rivals, slope, axes=2)
         return value, np.concatenate([[by_share, by_length], by_v])
+
+    def _white(self) -> tuple[Floats, Floats, float, int]:
+        """P (R, R) and P y of white noise, σ² there, and degrees of freedom."""
+        h = self.columns.T @ self.columns + np.diag(self.ridge)
+        h += ROUNDING * float(np.trace(h)) / len(h) * np.eye(len(h))
+        q = self.columns @ inverse_root(h).T
+        p = np.eye(len(self.y)) - q @ q.T
+        py = p @ self.y
+        free = len(self.y) - int(np.sum(self.ridge == 0))
+        return p, py, max(float(self.y @ py) / free, 1e-300), free
+
+    def promise(self) -> float:
+        """Gain of ℓ by serial noise as its slope and curvature at white noise let expect."""
+        p, py, noise, free = self._white()
+        away, found = np.abs(self.t[:, None] - self.t), 0.0
+        for rho in STARTS:
+            k = self.correlated(rho ** (away / self.step)) - self.own
+            pk = p @ k
+            trace = float(np.trace(pk))
+            slope = 0.5 * (float(py @ k @ py) / noise - trace)
+            curvature = 0.5 * (float(np.sum(pk * pk.T)) - trace**2 / free)
+            if slope > 0 and curvature > 0:
+                found = max(found, 0.5 * slope**2 / curvature)
+        return found
+
+    def outdone(self, rivals: Floats) -> bool:
+        """Whether that of the rivals which ℓ rises most for explains far more than serial noise."""
+        p, py, noise, free = self._white()
+        trace = np.tensordot(rivals, p, axes=2)
+        slope = 0.5 * (np.tensordot(rivals, np.outer(py, py), axes=2) / noise - trace)
+        curvature = 0.5 * (np.sum(rivals**2, axis=(1, 2)) - trace**2 / free)
+        k = int(np.argmax(np.maximum(slope, 0.0) ** 2 / np.maximum(curvature, ROUNDING)))
+        away, white = np.abs(self.t[:, None] - self.t) / self.step, self._value(None)
+        serial = max(self._value(0.5 * (self.correlated(r**away) - self.own)) for r in STARTS)
+        other = max(self._value(x * rivals[k]) for x in SIZES)
+        return other - white >= LEAD * max(serial - white, 0.0) + CHANCE + SAME_EVIDENCE
+
+    def _value(self, more: Floats | None) -> float:
+        """ℓ with Σ = 1 and more (R, R); see `_likelihood`."""
+        both = np.column_stack([self.columns, self.y])
+        log_det = 0.0
+        if more is not None:
+            lower = np.linalg.cholesky((1.0 + ROUNDING) * np.eye(len(more)) + more)
+            both = solve_triangular(lower, both, lower=True)
+            log_det = 2 * float(np.log(np.diag(lower)).sum())
+        b, y = both[:, :-1], both[:, -1]
+        h = b.T @ b + np.diag(self.ridge)
+        h += ROUNDING * float(np.trace(h)) / len(h) * np.eye(len(h))
+        free = len(y) - int(np.sum(self.ridge == 0))
+        square = float(y @ y) - float(np.sum((inverse_root(h) @ (b.T @ y)) ** 2))
+        log_det += float(np.linalg.slogdet(h)[1])
+        return -0.5 * (free * float(np.log(square / free)) + free + log_det)
 
     def noise(self, free: _Point, rivals: Floats, gain: float) -> SerialNoise:
         """Return the estimate; its uncertainties are by the curvature of ℓ."""
@@ -352,7 +414,7 @@ def _problem(found: Fit, clock: Clock) -> _Problem | None:
     weights = block_diag(*(g[2] for g in chosen))
     difference = np.kron(np.concatenate([np.eye(len(loaded)), -weights], axis=1), np.eye(m))
     some = along[rows]
-    white = block_diag(*some.covariance[:, :m, :m])
+    white = _diagonal(some.covariance[:, :m, :m])
     if some.common is not None:
         flat = some.common[:, :m].reshape(len(rows) * m, -1)
         together = (some.arrivals[:, None] == some.arrivals) & ~np.eye(len(rows), dtype=bool)
@@ -372,13 +434,28 @@ def _problem(found: Fit, clock: Clock) -> _Problem | None:
     jacobian = found.model.jacobian(s.prediction, s.theta, m, live)[rows]
     columns = whitened @ (jacobian.reshape(-1, len(live)) @ s.transform[live])
     y = inverse @ found.raw[place[loaded], :m].reshape(-1) + columns @ s.coordinates()
-    root = block_diag(*some.instrument_root(m))
-    factor = (whitened @ root).reshape(len(y), len(rows), m)
+    each = whitened.reshape(len(y), len(rows), m)
+    factor = np.einsum("rni,nij->rnj", each, some.instrument_root(m))
     flat = factor.reshape(len(y), -1)
     ridge = s.equations.basis.prior_precision
     if len(y) < 2 * np.sum(ridge == 0):
         return None
     return _Problem(found, clock, rows, y, columns, ridge, factor, whitened, t[rows], flat @ flat.T)
+
+
+def _inverse(lower: Floats) -> Floats:
+    """Return the inverse of L Lᵀ."""
+    half, _ = lapack.dpotri(lower, lower=1)
+    out = np.tril(half)
+    return np.asarray(out + np.tril(out, -1).T)
+
+
+def _diagonal(blocks: Floats) -> Floats:
+    """(N·m, N·m) matrix of blocks (N, m, m)."""
+    n, m = blocks.shape[:2]
+    out = np.zeros((n, m, n, m))
+    out[np.arange(n), :, np.arange(n)] = blocks
+    return out.reshape(n * m, n * m)
 
 
 def _some(pieces: list[Group]) -> list[Group]:

@@ -86,7 +86,7 @@ def diagnose(
     Raises:
         InputError: for a fit whose residual is not whitened, or of too many readings.
     """
-    limits.check_judged(len(fit.readings), fit.readings.m)
+    limits.check_fitted(len(fit.readings), fit.readings.m)
     return judge(Evidence(fit, say=say), history)
 
 

@@ -11,7 +11,7 @@ from hilcal.discover.law import LETTERS, Coefficient, Form, Part
 from hilcal.effects.check import NAME
 from hilcal.effects.protocol import Effect
 from hilcal.errors import InputError
-from hilcal.names import escaped
+from hilcal.names import escaped, quoted
 
 USUAL = 1e-4
 """Ordinary magnitude of a coefficient that nothing is known of, SI; a choice."""
@@ -111,7 +111,7 @@ def source_of_form(
     source = _HEAD.format(
         name=name,
         formula=form.text(),
-        file=_in_docstring(file),
+        file=_in_docstring(quoted(file)),
         evidence="\n".join(map(_in_docstring, evidence.split("\n"))),
         imports=", Response" if form.elastic else "",
         class_name=class_name(name),

@@ -112,7 +112,7 @@ class Processes:
         for worker in workers:
             worker.process.join()
             worker.line.close()
-            self._all.remove(worker)
+            self._all.discard(worker)  # results that are given up later end theirs again
 
 
 class _Worker:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hilcal import limits
 from hilcal.campaign import Campaign
 from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.overview import overview
@@ -104,6 +105,7 @@ def entries(directory: Path) -> tuple[Entry, ...]:
     return tuple(Entry(p, name, *listed.get(name, ("", ""))) for name, p in names.items())
 
 
+@limits.bounded
 def _listed(path: Path) -> Mapping[str, tuple[str, str]]:
     """Arm and date by campaign."""
     if not path.exists():
@@ -111,10 +113,13 @@ def _listed(path: Path) -> Mapping[str, tuple[str, str]]:
     found = {}
     try:
         with path.open(encoding="utf-8-sig", newline="") as stream:
-            rows = csv.DictReader(stream, strict=True)
+            lines = limits.Lines(str(path), stream)
+            rows = csv.DictReader(lines, strict=True)
             if not {"campaign", "arm"} <= set(rows.fieldnames or ()):
                 raise InputError(f"{path}: valid: columns campaign, arm and, where known, date")
+            lines.row(len(rows.fieldnames or ()))
             for k, row in enumerate(rows, start=2):
+                lines.row(len(row))
                 check_names(dict(row), f"{path}: row {k}")
                 date = (row.get("date") or "").strip()
                 if date:

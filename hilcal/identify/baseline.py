@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
+from hilcal import limits
 from hilcal.cell import Cell
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode
@@ -86,6 +87,7 @@ def with_effects(
             effect needs, or a prior of another arm or of these very readings.
         CannotAnswerError: the readings do not determine an unknown frame.
     """
+    limits.check_fitted(len(readings), readings.m)
     known, given = catalogue or installed(), options or {}
     learnt: dict[str, Options] = {}
     if prior is not None:

@@ -9,6 +9,7 @@ Source: Baarda, *A testing procedure for use in geodetic networks* (1968).
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -22,6 +23,7 @@ from hilcal.identify.outliers import MISFIT, bulk, limit
 from hilcal.identify.priors import scales_of
 from hilcal.identify.reading_model import ReadingModel
 from hilcal.identify.robust_start import MOST, nearest, robust_start, variance
+from hilcal.identify.single_site import along_one_site, site_columns
 from hilcal.identify.smooth_nuisance import smooth_nuisance_columns
 from hilcal.model import Model, Prediction
 from hilcal.regression.distributions import binom, chi2
@@ -116,7 +118,7 @@ class Snooping:
                 break
             used = now
         core = float(chi2.ppf(CORE, of.m)) * variance(of, t2, centre)
-        return self._screened(of, (t2 <= core) | centre, misfit)
+        return self._screened(at, (t2 <= core) | centre, misfit)
 
     def _all_noise(self) -> bool:
         """Whether smooth functions beside the model leave noise of each reading: none is off."""
@@ -127,43 +129,68 @@ class Snooping:
 
     def again(self, before: Screened) -> Screened:
         """Test them from the readings that agreed before, whose solution this is."""
-        of = _linearised(self, self.y).with_nuisance(before.misfit)
-        return self._screened(of, before.agree, before.misfit)
+        return self._screened(_linearised(self, self.y), before.agree, before.misfit)
 
-    def _screened(self, of: ReadingModel, used: Bools, misfit: float) -> Screened:
+    def _screened(self, at: "_Linearised", used: Bools, misfit: float) -> Screened:
+        every, kept = np.ones_like(used), np.zeros_like(used)
+        count = int(np.count_nonzero(at.linear.tested))
+        while True:
+            of = at.with_nuisance(misfit)
+            used, t2, scale = self._snooped(of, used | kept, kept)
+            agree = used | ~of.tested
+            off = np.flatnonzero(~agree)
+            if self._accident(of, off):
+                return Screened(every, every, misfit, None)
+            size = np.sqrt(scale * np.mean(np.trace(self.readings.covariance[:, :3, :3], 0, 1, 2)))
+            if len(off) > MOST * count or (scale > MISFIT[1] and size > ROUGH_M):
+                off = np.flatnonzero((t2 > limit(of.m, count)) & of.tested)
+                return Screened(every, every, misfit, Disagreement("many", off))
+            if not len(off):
+                return Screened(agree, every, misfit, None)
+            white = of.residuals(used)[off, :, None]
+            shift = (np.linalg.pinv(of.root[off]) @ white)[:, :, 0]
+            axes = self.model.predict(self.readings.states[off], self.solution.theta).observation
+            alike = off_alike(self.readings, of.tested, off, shift[:, :3], axes.rotation)
+            rest = ~np.isin(off, alike)
+            unit = _units(self.readings.covariance[off[rest]])
+            sites = at.sites[off[rest]] / unit[:, :, None]
+            law = off[rest][
+                along_one_site(shift[rest] / unit, sites, self.readings.pose[off[rest]])
+            ]
+            if not len(law):
+                fitted = agree | np.isin(np.arange(len(agree)), alike)
+                found = Disagreement("alike", alike) if len(alike) else None
+                return Screened(agree, self._fittable(of, fitted), misfit, found)
+            kept[law] = True
+            left = at.linear.residuals(used | kept)[used | kept]
+            misfit = max(misfit, float(np.mean(left**2)))
+
+    def _snooped(self, of: ReadingModel, used: Bools, kept: Bools) -> tuple[Bools, Floats, float]:
+        """Readings (N,) that are not off, t² (N,) from the fit to them, and the scale of its bulk.
+
+        Args:
+            of: the linear model.
+            used: (N,) those to begin with.
+            kept: (N,) of these, those that stay.
+        """
         count = int(np.count_nonzero(of.tested))
         for _ in range(ROUNDS):
             t2, centre = _tested(of, used)
             judged = t2[used & (t2 > 0)]
             scale = bulk(judged, of.m) if len(judged) else 1.0
             far = max(limit(of.m, count, scale), SMALLEST * float(t2[used].max()))
-            now = of.with_lone_centres((t2 <= far) & of.tested, centre)
+            now = of.with_lone_centres(((t2 <= far) & of.tested) | kept, centre)
             if np.array_equal(now, used):
                 break
             used = now
-        agree = used | ~of.tested
-        every, off = np.ones(len(agree), dtype=np.bool_), np.flatnonzero(~agree)
+        return used, t2, scale
+
+    def _accident(self, of: ReadingModel, off: Ints) -> bool:
+        """Whether unloaded readings that deflections share are too many of those that are off."""
         shared = self.readings.unloaded & of.tested & (of.group >= 0)
         unloaded = int(np.count_nonzero(shared[off]))
         share = float(np.mean(shared[of.tested]))
-        if unloaded and binom.sf(unloaded - 1, len(off), share) < ACCIDENT:
-            return Screened(every, every, misfit, None)
-        size = np.sqrt(scale * np.mean(np.trace(self.readings.covariance[:, :3, :3], 0, 1, 2)))
-        if len(off) > MOST * count or (scale > MISFIT[1] and size > ROUGH_M):
-            off = np.flatnonzero((t2 > limit(of.m, count)) & of.tested)
-            return Screened(every, every, misfit, Disagreement("many", off))
-        if not len(off):
-            return Screened(agree, every, misfit, None)
-        white = of.residuals(used)[off, :, None]
-        shift = (np.linalg.pinv(of.root[off]) @ white)[:, :3, 0]
-        axes = self.model.predict(self.readings.states[off], self.solution.theta).observation
-        alike = off_alike(self.readings, of.tested, off, shift, axes.rotation)
-        if not len(alike):
-            return Screened(agree, self._fittable(of, agree), misfit, None)
-        kept = agree.copy()
-        kept[alike] = True
-        found = Disagreement("alike", alike)
-        return Screened(agree, self._fittable(of, kept), misfit, found)
+        return unloaded > 0 and float(binom.sf(unloaded - 1, len(off), share)) < ACCIDENT
 
     def _fittable(self, of: ReadingModel, agree: Bools) -> Bools:
         """(N,) readings without deflections of which the loaded or all unloaded ones are off."""
@@ -204,6 +231,12 @@ class _Linearised:
         y = self.y.copy()
         y[self.live] += self.scale * delta
         return _linearised(self.of, y)
+
+    @cached_property
+    def sites(self) -> Floats:
+        """(N, m, P) changes of the readings by each site of a law."""
+        theta = self.of.solution.space.theta(self.y)
+        return site_columns(self.of.model, theta, self.prediction, self.of.readings)
 
     def with_nuisance(self, misfit: float) -> ReadingModel:
         """Return the linear model with smooth nuisance columns of some variance above the noise."""
@@ -267,6 +300,13 @@ def _covariance(readings: Readings, members: Ints) -> Floats:
     g, s = np.nonzero(members >= 0)
     out[members[g, s]] += EXACT * mean[g]
     return out
+
+
+def _units(covariance: Floats) -> Floats:
+    """(F, m) standard deviations of a reading, the same for all directions."""
+    m = covariance.shape[1]
+    variance = np.diagonal(covariance, axis1=1, axis2=2).reshape(len(covariance), m // 3, 3)
+    return np.asarray(np.repeat(np.sqrt(variance.mean(axis=2)), 3, axis=1))
 
 
 def _off(readings: Readings, prediction: Prediction, members: Ints) -> Floats:

@@ -5,6 +5,7 @@ from typing import Literal
 
 import numpy as np
 
+from hilcal import limits
 from hilcal.data.readings import Readings, States
 from hilcal.data.whitening import Mode, Scaling, Whitening, inverse_root, whitening
 from hilcal.errors import CannotAnswerError, InputError
@@ -192,8 +193,10 @@ def fit(
 
     Raises:
         CannotAnswerError: fewer measured elements than identifiable parameters.
-        InputError: from `whitening`, where a deflection lacks its unloaded reading.
+        InputError: from `whitening`, where a deflection lacks its unloaded reading; or too many
+            readings.
     """
+    limits.check_fitted(len(readings), readings.m)
     given = model.prior
     if given is not None and prior is None:
         model = replace(model, prior=given.with_drift(None))

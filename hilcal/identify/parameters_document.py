@@ -129,6 +129,7 @@ def from_json(content: Mapping[str, Any]) -> Parameters:
     )
 
 
+@limits.bounded
 def read(path: str | Path) -> Parameters:
     """Read the document from a file.
 

@@ -66,6 +66,7 @@ def from_json(content: Mapping[str, Any]) -> Posterior:
         raise InputError(f"a damaged prior: {error!r}") from None
 
 
+@limits.bounded
 def read(path: Path) -> Posterior:
     """Read a posterior from a JSON file.
 

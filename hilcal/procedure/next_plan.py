@@ -11,6 +11,7 @@ from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.diagnose.doubt import in_doubt
 from hilcal.diagnose.effect_ranking import Suspect
 from hilcal.errors import CannotAnswerError
+from hilcal.names import quoted
 from hilcal.plan.checked_plan import CheckedPlan, checked
 from hilcal.plan.next import Next
 from hilcal.plan.summary import summarise
@@ -93,19 +94,20 @@ def _settled(o: Campaign, d: Diagnosis) -> str:
     if d.verdict == "adequate":
         return (
             f"{head} the model is adequate; to sharpen it, plan on with: hilcal plan CELL.toml "
-            f"--after {o.path}, or separate named effects with --suspects A,B"
+            f"--after {quoted(o.path)}, or separate named effects with --suspects A,B"
         )
     if d.verdict == "noise_misjudged":
         return (
-            f"{head} the noise is misjudged, see hilcal diagnose {o.path}; repeat some readings, "
-            "or state the covariance anew"
+            f"{head} the noise is misjudged, see hilcal diagnose {quoted(o.path)}; repeat "
+            "some readings, or state the covariance anew"
         )
     if d.verdict == "missing_effect":
         lead = d.suspects[0]
         if lead.coarse:
             return f"{head} {_differ(o, lead)}"
         return (
-            f"{head} {lead.effect} alone is missing; add it with: hilcal add {o.path} {lead.effect}"
+            f"{head} {lead.effect} alone is missing; add it with: "
+            f"hilcal add {quoted(o.path)} {quoted(lead.effect)}"
         )
     why = "no effect of the catalogue explains the misfit"
     if d.reason == "insufficient_catalogue":
@@ -114,7 +116,7 @@ def _settled(o: Campaign, d: Diagnosis) -> str:
             f"{d.suspects[0].effect} may only resemble the missing effect"
         )
     return (
-        f"{head} {why}; see hilcal diagnose {o.path}, or give an effect of your own by "
+        f"{head} {why}; see hilcal diagnose {quoted(o.path)}, or give an effect of your own by "
         "--effects-from"
     )
 
@@ -123,5 +125,5 @@ def _differ(o: Campaign, s: Suspect) -> str:
     """Say how to let joints differ, where the readings ask for it."""
     return (
         f"the model has one {s.coarse} for several joints; let them differ, and diagnose again: "
-        f'hilcal add {o.path} "{s.effect}"'
+        f"hilcal add {quoted(o.path)} {quoted(s.effect)}"
     )

@@ -90,7 +90,7 @@ class Procedure(ValidationSteps):
             return replace(there, settings=replace(there.settings, **asked))
         readings = config.planning.readings if config.loads else "absolute"
         usual = Settings(seed=config.simulation.seed, readings=readings)
-        return cls(path, cell, config, Path.cwd(), known, replace(usual, **asked))
+        return cls(path, cell, config, cell.base_dir.absolute(), known, replace(usual, **asked))
 
     def next(self) -> Step:
         """Return the next step."""
@@ -273,6 +273,6 @@ def continued(run: Path, cell: Cell, config: CellConfig, catalogue: Catalogue) -
         InputError: the campaign is of another cell, or not of a calibration.
     """
     with CampaignFile.open(run, read_only=True) as campaign:
-        settings, base_dir = settings_of(campaign), Path(campaign.base_dir)
+        settings, base_dir = settings_of(campaign), cell.base_dir.absolute()
         check_same_cell(campaign, config, base_dir)
     return Procedure(run, cell, config, base_dir, catalogue, settings)

@@ -68,6 +68,15 @@ class f:  # noqa: N801
             return _value(b / a * (1.0 / special.betaincinv(b / 2.0, a / 2.0, p) - 1.0))
 
 
+class beta:  # noqa: N801
+    """Beta distribution."""
+
+    @staticmethod
+    def cdf(x: Numbers, a: Numbers, b: Numbers) -> Floats:
+        """P(X ≤ x)."""
+        return _value(special.betainc(a, b, x))
+
+
 class norm:  # noqa: N801
     """Normal distribution of zero mean and unit variance."""
 

@@ -10,6 +10,7 @@ from hilcal.diagnose.change_candidates import Candidate
 from hilcal.diagnose.change_found import Change, Limit, Size
 from hilcal.diagnose.comparison import Comparison
 from hilcal.identify.parameter_differences import Differences
+from hilcal.names import quoted
 from hilcal.report import numbers, text
 
 MOST_PARAMETERS = 6
@@ -62,7 +63,7 @@ def _setup(c: Comparison, earlier: str, later: str) -> Iterator[str]:
     if c.lacked:
         yield (
             f"The model of {earlier} lacks {numbers.names(c.lacked)} by its own readings; added "
-            f"for this comparison alone (hilcal refine {earlier} keeps it)."
+            f"for this comparison alone (hilcal refine {quoted(earlier)} keeps it)."
         )
     if c.anew:
         yield (
@@ -275,10 +276,10 @@ def next_step(c: Comparison, earlier: str) -> str:
 def next_command(c: Comparison, earlier: str, later: str) -> str | None:
     """Return the command line for the next step; None where there is none."""
     if c.another_arm:
-        return f"hilcal refine {later}"
+        return f"hilcal refine {quoted(later)}"
     arm = [x for x in c.changes.found if x.candidate.of_arm]
     changed = bool(arm) or not c.changes.explained
-    return f"hilcal refine {later} --prior {earlier}" if changed else None
+    return f"hilcal refine {quoted(later)} --prior {quoted(earlier)}" if changed else None
 
 
 def to_json(c: Comparison, earlier: str, later: str) -> dict[str, object]:

@@ -12,7 +12,7 @@ from hilcal.data.overview import Overview
 from hilcal.data.revision import RevisionRecord, change
 from hilcal.report import numbers, text
 
-SHOWN = ("start", "load", "goal", "interrupted", "failed", "finished")
+SHOWN = ("start", "load", "doubted", "goal", "interrupted", "failed", "finished")
 """Kinds of events that are listed; drift is where it is over its limit."""
 MOST_EVENTS = 30
 
@@ -137,7 +137,13 @@ def event_words(e: Mapping[str, Any]) -> str:
     if kind == "start":
         return f"began, {e['missing']} readings missing"
     if kind == "load":
+        if e["hanging"] is None:
+            return str(e.get("why", "")) or "another load hangs than should"
         return "nothing hangs" if e["hanging"] == "none" else f"load {e['hanging']}"
+    if kind == "doubted":
+        r = e["reading"]
+        of = f", {r['target']}" if r.get("target") else ""
+        return f"reading of {r['pose']}, {r['load']}{of} kept as doubted: {e['why']}"
     if kind == "finished":
         return f"finished, {e['readings']} readings"
     if kind == "goal":

@@ -199,6 +199,7 @@ def _only_leaf(model: pin.Model, path: Path) -> str:
     return leaves[0]
 
 
+@limits.bounded
 def _read(path: Path) -> pin.Model:
     joints = moving = 0
 

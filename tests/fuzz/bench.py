@@ -30,6 +30,7 @@ EVENTS: dict[str, dict[str, Any]] = {
     },
     "tare": {"force": {"wrench": [0.1] * 6}, "q": [0.0] * 6},
     "load": {"hanging": "5kg"},
+    "doubted": {"why": "it fell", "reading": {"pose": "a", "load": "5kg", "q_actual": [0.0] * 6}},
     "tool": {"mass_kg": 1.2, "com_m": [0.0, 0.0, 0.1]},
     "drift": {"cycle": 0, "shift_m": [1e-5, 0.0, 0.0], "sigma": 1.0, "over": True},
     "repeatability": {

@@ -12,13 +12,14 @@ NUMBERS: tuple[object, ...] = (
     1e300, -1e300, 1.7976931348623157e308, float("nan"), float("inf"), float("-inf"),
 )  # fmt: skip
 ODD: tuple[object, ...] = (
-    *NUMBERS, None, True, False, "", "x", "nan", "1e999", "../../x", "/etc/passwd",
-    "\x00", "\ud800",
+    *NUMBERS, 1 << 70, 10**400, None, True, False, "", "x", "nan", "1e999", "../../x",
+    "/etc/passwd", "\x00", "\ud800",
     "a" * 300, [], {}, [[]], [None], {"": None}, [0.0] * 6, [0.0] * 37, "é\u202e",
 )  # fmt: skip
 WORDS = (
     "nan", "inf", "-inf", "1e308", "-1e308", "1e999", "1e-320", "0", "-1", "0x10", "99999999999999",
     "", " ", "\x00", "\"", "'", ",", ";", "\t", "\n", "\r\n", "=", "[", "]", "[[", "{", "}", "#",
+    "9" * 5000, "0x" + "f" * 5000,
     "null", "true", "é", "１", "1_0", "../../x", "$(x)", "<!ENTITY a 'b'>", "&a;", "<", ">", "/",
 )  # fmt: skip
 
@@ -80,18 +81,17 @@ def words_damaged(text: str, rng: Random) -> str:
     return text
 
 
-def _places(node: Any) -> list[tuple[Any, Any]]:
-    """Every (container, key) in a document."""
-    out: list[tuple[Any, Any]] = []
-    stack = [node]
-    while stack:
-        now = stack.pop()
-        keys = list(now) if isinstance(now, dict) else range(len(now))
-        for key in keys:
-            out.append((now, key))
-            if isinstance(now[key], dict | list) and now[key]:
-                stack.append(now[key])
-    return out
+def _place(root: list[Any], rng: Random) -> tuple[Any, Any]:
+    """A (container, key) in a document, each depth as likely as the others."""
+    holder: Any = root
+    while True:
+        key = rng.choice(list(holder)) if isinstance(holder, dict) else rng.randrange(len(holder))
+        inner = holder[key]
+        if not (isinstance(inner, dict | list) and inner) or (
+            holder is not root and rng.random() < 0.25
+        ):
+            return holder, key
+        holder = inner
 
 
 def document_damaged(document: str, rng: Random) -> bytes:
@@ -130,15 +130,18 @@ def _toml(value: Any) -> str:
         return "{" + ", ".join(f"{json.dumps(k)} = {_toml(v)}" for k, v in value.items()) + "}"
     if isinstance(value, list):
         return "[" + ", ".join(map(_toml, value)) + "]"
-    return repr(value) if isinstance(value, float) else json.dumps(value or "")
+    if isinstance(value, float):
+        return repr(value)
+    if isinstance(value, int) and abs(value) >= 1 << 63:
+        return f"0x{abs(value) << 20_000:x}"
+    return json.dumps("" if value is None else value)
 
 
 def tree_damaged(document: Any, rng: Random) -> Any:
     """A document with values, types, lengths and keys changed; None where all of it went."""
     root = [document]
     for _ in range(1 if rng.random() < 0.6 else rng.randint(2, 5)):
-        places = _places(root)
-        holder, key = rng.choice(places)
+        holder, key = _place(root, rng)
         value = holder[key]
         match rng.randrange(8):
             case 0 if isinstance(holder, dict):
@@ -151,12 +154,11 @@ def tree_damaged(document: Any, rng: Random) -> Any:
                 value.append(deepcopy(value[rng.randrange(len(value))]))
             case 4 if isinstance(value, list) and value:
                 _all_to(value, rng.choice(NUMBERS))
-            case 5 if isinstance(value, int | float) and not isinstance(value, bool):
+            case 5 if isinstance(value, int | float) and abs(value) < 1e300:
                 holder[key] = value * rng.choice((-1, 0, 1e6, 1e-6, 1e200))
             case 6:
-                other, name = rng.choice(places)
-                if name in other if isinstance(other, dict) else name < len(other):
-                    holder[key] = deepcopy(other[name])
+                other, name = _place(root, rng)
+                holder[key] = deepcopy(other[name])
             case _:
                 holder[key] = deepcopy(rng.choice(ODD))
         if not isinstance(root, list) or not root:

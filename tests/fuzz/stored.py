@@ -43,17 +43,49 @@ from tests.fuzz.damage import (
 from tests.fuzz.harness import Accepted, Parser
 from tests.support.unguarded import unguarded
 
-PROGRAM = """def part():
+PROGRAM = """# encoding: utf-8
+def part():
+  set_payload(2.0, [0, 0, 0.05])
   set_tcp(p[0, 0, 0.1, 0, 0, 0])
-  home = [0.1, -1.5, 1.0, 0, 0.3, 0]
-  movej(home, a=1.4, v=1.05)
-  movel(p[0.4, -0.2, 0.3, 0, 3.14, 0], a=1.2, v=0.25)
-  movej([0.2, -1.4, 1.1, 0.1, 0.3, 0.2])  # a comment
-  if digital_in(1):
-    movep(p[0.5, 0.1, 0.3, 0, 3.1, 0], r=0.05)
+  global home = [0.1, -1.5, d2r(60) + 0.1, 0, 0.3, 0]
+  global start_p=p[0.4, -0.2, 0.3, 0, 3.14, 0]
+  local n = 0
+  thread counter():
+    while (True):
+      n = n + 1
+      sync()
+    end
   end
+  def grip(width, strength=10):
+    set_standard_digital_out(1, width > 0.05 and not (strength >= 20))
+    return width * 2
+  end
+  watch = run counter()
+  $ 1 "Robot Program" "breakAfter"
+  movej(home, a=1.4, v=1.05)
+  movel(start_p, a=1.2, v=0.25, r=0.01)
+  while get_standard_digital_in(7) == False:
+    movej(get_inverse_kin(start_p, qnear=home), a=1.4)
+    if (grip(0.1) < 0.3):  # a comment
+      movep([0.2, -1.4, 1.1, 0.1, 0.3, 0.2], r=0.05)
+    elif n == 3:
+      servoj([0.2, -1.4, -(1.1), .1, 3e-1, 0.2], t=0.1)
+    else:
+      textmsg("none # é", 1)
+    end
+  end
+  kill watch
+  halt
 end
 """
+LEFT = """q = [0.1, -1.5, 1.0, 0, 0.3, 0]
+q[0] = 1.57
+movej(q)
+movec(p[0.4, -0.2, 0.3, 0, 3.14, 0], p[0.4, -0.1, 0.3, 0, 3.14, 0], 1, 1)
+movel(pose_add(start, p[0, 0, 0.1, 0, 0, 0]))
+movej([0.2, -1.4, 1.1, 0.1, 0.3, 0.2])
+"""
+"""With waypoints that only `--leave` lets pass."""
 
 
 def _told(file: CampaignFile) -> None:
@@ -172,12 +204,22 @@ def _damaged_text(text: str, by: Random) -> bytes:
 
 
 def _program(path: Path) -> None:
-    program, _, points, _ = program_points(path)
+    """Read a program as it is, else as with `--leave`, and put other joint values in."""
+    leave = False
+    try:
+        program, every, points, _ = program_points(path)
+    except hc.InputError:
+        leave = True
+        program, every, points, _ = program_points(path, leave)
     if not np.all(np.isfinite(points.q[~np.isnan(points.q).all(axis=1)])):
         raise Accepted("a program: joints that are not finite")
-    _, found, _, _ = program_points(path)
-    kept = [w for w in found if not w.left]
-    with_joints(program, kept, np.zeros((len(kept), 6)))
+    kept = [w for w in every if not w.left]
+    path.write_text(with_joints(program, kept, np.ones((len(kept), 6))), "utf-8", newline="")
+    _, again, points, _ = program_points(path, leave)
+    if [(w.line, w.left) for w in again] != [(w.line, w.left) for w in every]:
+        raise Accepted("a program: other waypoints than before")
+    if not np.array_equal(points.q, np.ones((len(kept), 6))):
+        raise Accepted("a program: other joint values than were put in")
 
 
 def _fleet(path: Path) -> None:
@@ -293,6 +335,7 @@ def parsers(bench: Bench) -> list[Parser]:
         _campaigns(bench, "campaign", lambda: bench.run),
         _campaigns(bench, "measured", lambda: bench.measured),
         _text(bench, "program", lambda: PROGRAM, _damaged_text, _program, ".script"),
+        _text(bench, "program_left", lambda: LEFT, _damaged_text, _program, ".script"),
         _text(bench, "fleet", lambda: listed, _damaged_text, _fleet, ".csv"),
         _text(
             bench, "discovered", lambda: effect, lambda s, by: bytes_damaged(s.encode(), by),

@@ -20,10 +20,11 @@ from tests.support.paths import ROOT
 
 
 def again(x: Readings, rng: np.random.Generator, cycle: int) -> Readings:
-    """One pose of those that are there, all its loads, measured again."""
-    rows = np.flatnonzero((x.pose == rng.choice(x.pose)) & (x.cycle == 0))
-    one = x[rows]
-    value = one.value + rng.normal(0.0, 1e-6, one.value.shape)
+    """One deflection of those that are there, measured again."""
+    of = np.flatnonzero((x.pose == rng.choice(x.pose)) & (x.cycle == 0))
+    one = x[np.append(of[x.unloaded[of]][:1], rng.choice(of[~x.unloaded[of]]))]
+    std = np.sqrt(np.diagonal(one.covariance, axis1=1, axis2=2))
+    value = one.value + rng.normal(0.0, std)  # so that no noise along the order is estimated
     return replace(one, value=value, cycle=np.full(len(one), cycle))
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from hilcal.data.plan import Step
 from hilcal.data.readings import Readings
+from hilcal.data.stored_schema import Detail, check, check_event
 from hilcal.errors import DeviceError
 from tests.support.fake_world import World
 
@@ -27,12 +28,14 @@ class MemoryStore:
             raise DeviceError("run.hilcal: the disk is full")
         assert len(reading) == 1
         assert not self.world.is_moving, "stored in motion"
-        self.rows.append((step, reading, json.dumps(detail, allow_nan=False)))
+        text = json.dumps(detail, allow_nan=False)
+        check(Detail, json.loads(text))
+        self.rows.append((step, reading, text))
         self.world.call("store.recorded")
 
     def event(self, kind: str, content: dict[str, Any]) -> None:
         self.world.call("store.event")
-        json.dumps(content, allow_nan=False)
+        check_event(json.loads(json.dumps({"kind": kind, "utc": "now", **content})))
         self.events.append((kind, content))
 
     def done(self) -> frozenset[Step]:

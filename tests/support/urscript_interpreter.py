@@ -36,8 +36,9 @@ class Pose(list):
 
 @dataclass
 class Told:
-    """What a motion was told: its line, target, and the tool that was set."""
+    """What a motion was told: its name, line, target, and the tool that was set."""
 
+    kind: str
     line: int
     target: object
     tool: object
@@ -46,7 +47,8 @@ class Told:
 class Machine:
     """A controller; digital inputs read the same for the same seed.
 
-    Lists are shared by assignments and arguments with `by_reference`, else copied.
+    Lists are shared by assignments and arguments with `by_reference`, else copied. A thread runs
+    between any two statements of the others, at once to its end.
     """
 
     def __init__(self, seed: int, by_reference: bool) -> None:
@@ -55,6 +57,7 @@ class Machine:
         self.told: list[Told] = []
         self.tool: object = None
         self.fuel = 400
+        self.threads: list[tuple[str, list, int]] = []
 
     def run(self, program: str) -> list[Told]:
         """Run a program until it ends or fails; returns its motions."""
@@ -104,6 +107,8 @@ class Machine:
             self.fuel -= 1
             if self.fuel < 0:
                 raise Stopped
+            if self.threads and self.inputs.random() < 0.5:
+                self._evaluate(*self.threads.pop(0))
             if kind == "def":
                 scopes[-1][rest[0]] = (rest[1], rest[2], scopes)
             elif kind == "if":
@@ -125,7 +130,10 @@ class Machine:
             raise Broken
         if text.startswith("return"):
             raise Returned(self._evaluate(text[6:], scopes, line) if text[6:].strip() else None)
-        text = re.sub(r"\brun\s+", "", text)
+        head, runs, thread = text.partition("run ")
+        if runs and re.fullmatch(r"(\w+\s*=\s*)?", head):
+            self.threads.append((thread, scopes, line))
+            text = f"{head}0"
         found = re.fullmatch(
             r"(?:(global|local)\s+)?([A-Za-z_]\w*)\s*(?:\[([^\]]*)\])?\s*=(?!=)(.*)", text
         )
@@ -165,7 +173,7 @@ class Machine:
             target = given[0] if given else named.get("q", named.get("pose"))
             if isinstance(target, list):
                 target = type(target)(target)
-            self.told.append(Told(line, target, self.tool))
+            self.told.append(Told(name, line, target, self.tool))
             return None
         match name:
             case "d2r":
@@ -178,6 +186,8 @@ class Machine:
             case "get_inverse_kin":
                 return ("inverse", *given, *named.values())
             case "pose_trans":
+                if not all(isinstance(x, list) and _numbers(x) for x in given):
+                    raise Stopped
                 return Pose([a + b for a, b in zip(*given, strict=True)])
             case "sleep" | "textmsg":
                 return None
@@ -194,6 +204,10 @@ class Machine:
         except Returned as found:
             return found.args[0]
         return None
+
+
+def _numbers(values):
+    return len(values) == 6 and all(isinstance(v, int | float) for v in values)
 
 
 @cache

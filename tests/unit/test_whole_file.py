@@ -16,6 +16,7 @@ STRAIGHT = {
     "hilcal/whole_file.py": "it is what all others use",
     "hilcal/robot/catalogue.py": "a file in a temporary folder",
     "hilcal/doctor/computer.py": "a file in a temporary folder",
+    "hilcal/workbench/server.py": "a file in a temporary folder",
     "hilcal/cli/__init__.py": "the null device",
     "hilcal/report/live_process.py": "a pipe",
     "hilcal/data/matfile.py": "a buffer in memory",

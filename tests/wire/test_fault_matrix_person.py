@@ -59,9 +59,9 @@ LEANING = Fault(
     "somebody leans on the tool",
     act("world", "push", wrench=HAND),
     act("world", "push", wrench=NOBODY),
-    ("asked 3 times", "touch the tool|hangs|pulls|felt"),
+    ("asked 3 times|max_moment_Nm|max_force_N", "touch the tool|hangs|pulls|felt|touches"),
 )
-FOREIGN = "another program|left the straight way|did not take|by its watchdog"
+FOREIGN = "another program"
 MOTION = (
     switch("joint angles stand still", "arm", "freeze", "stood still|its angle is old", fast=True),
     Fault("another program", another_program, nothing, (FOREIGN,)),

@@ -122,10 +122,24 @@ def test_payload_is_set_also_with_its_centre_at_the_flange(arm, sim):
             arm.set_payload(mass, com)
 
 
-def test_payload_that_the_controller_does_not_take_is_told(arm, sim, monkeypatch):
+@pytest.mark.parametrize(
+    ("op", "says"),
+    [
+        (None, r"it says 2\.5 kg at .* after a payload of 4 kg"),
+        ("local_mode", "it was switched to local mode; switch it to remote control"),
+    ],
+)
+def test_payload_that_the_controller_does_not_take_is_told_by_its_cause(
+    op, says, arm, sim, monkeypatch
+):
     monkeypatch.setattr(Control, "set_payload", lambda *_: True)
-    with pytest.raises(DeviceError, match=r"it says 2\.5 kg at .* after a payload of 4 kg"):
-        arm.set_payload(4.0, cases.COM)
+    if op is not None:
+        sim.admin(op)
+    try:
+        with pytest.raises(DeviceError, match=says):
+            arm.set_payload(4.0, cases.COM)
+    finally:
+        sim.admin("remote_mode")
     assert sim.admin()["payload"] == cases.MASS
 
 

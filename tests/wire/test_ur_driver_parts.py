@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from drivers.simulated.ur.motion import line
 from drivers.ur_link import states
+from drivers.ur_link.cause import program_ended
 from drivers.ur_link.motion import MARGIN_S, MotionInProgress, deceleration, duration
 from drivers.ur_link.reading import OUTPUTS, N, ReadingError, read
 from drivers.ur_link.survey import settled_rate
@@ -86,6 +87,14 @@ def test_motion_is_overdue_only_after_its_time_and_margin(monkeypatch):
     assert motion.arrived(there)
     assert not motion.arrived(reading(actual_qd=[0.0] * 6, actual_q=goal + 6e-4, target_q=goal))
     assert not motion.arrived(reading(actual_qd=[0.02] * 6, actual_q=goal, target_q=goal))
+
+
+def test_a_pause_that_the_watchdog_bears_does_not_hide_another_program():
+    stopped = reading(runtime_state=states.STOPPED)
+    for late in (0.0, 0.09):
+        assert "another program" in program_ended(stopped, late)
+    assert "too busy for 0.09 s" in program_ended(stopped, 0.09)
+    assert "another program" not in program_ended(stopped, 0.2)
 
 
 def test_worker_that_cannot_start_says_so():

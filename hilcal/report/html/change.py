@@ -2,6 +2,7 @@
 
 from hilcal.diagnose.change import LEVEL
 from hilcal.diagnose.comparison import Comparison
+from hilcal.names import quoted
 from hilcal.report import numbers
 from hilcal.report.charts.change import changes_chart, error_by_pose
 from hilcal.report.html.first_screen import Card, FirstScreen, mm
@@ -42,7 +43,7 @@ def page(c: Comparison, files: tuple[Named, Named], operator: str, made: str, ve
             ),
         ),
         Words("Commands that show the same", "heading"),
-        Words(f"hilcal compare {earlier} {later}", "code"),
+        Words(f"hilcal compare {quoted(earlier)} {quoted(later)}", "code"),
     )
     sections = (
         Section("changes", "What has changed", tuple(told)),

@@ -33,7 +33,7 @@ BALL_SIGMAS = float(np.sqrt(distributions.chi2.ppf(INSIDE_P, 3)))
 
 # Greek letters and these signs are in the viewer's fonts; a missing glyph ends the viewer.
 _SIGNS = "■●▲→µ²³±×√Δ✓✗⚠°"
-_UNSAFE = re.compile(rf"[^\n\x20-\x7e\u00a1-\u00ff\u0391-\u03a9\u03b1-\u03c9{_SIGNS}]")
+_UNSAFE = re.compile(rf"[^\n\x20-\x7e\u00a1-\u00ac\u00ae-\u00ff\u0391-\u03a9\u03b1-\u03c9{_SIGNS}]")
 _MARKDOWN = re.compile(r"([\\`*_\[\]<>|#~$])")
 
 

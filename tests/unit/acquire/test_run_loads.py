@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from hilcal.acquire.progress import Phase, Remark
+from hilcal.data.plan import Step
 from hilcal.errors import DeviceError
 from tests.support.fake_bench import POSES, Bench, plan_of, usual_plan
 from tests.support.fake_world import Killed
@@ -162,6 +163,16 @@ def test_a_load_that_still_hangs_at_a_resume_is_noticed() -> None:
     assert [name for name, _ in asked[:3]] == ["none", "none", "3kg"]
     assert "3kg seems to hang still" in asked[1][1]
     assert [s for s, _, _ in b.store.rows] == list(plan.steps)
+
+
+def test_a_load_left_on_at_the_very_beginning_is_asked_about_said_and_found_in_motion() -> None:
+    b = Bench()
+    b.world.load, b.world.wrong = "3kg", ["3kg", "3kg"]  # both answers are wrong
+    with pytest.raises(DeviceError, match="take everything off"):
+        measure(b)
+    assert any("answered twice that nothing hangs" in note.text for note in b.notes.of(Remark))
+    # where gravity has not turned in the sensor since its tare, a load is a zero
+    assert {step for step, *_ in b.store.rows} <= {Step("reference", "none", 0)}
 
 
 def test_a_finished_campaign_touches_nothing() -> None:

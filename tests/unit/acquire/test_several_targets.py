@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilcal.acquire.devices import TargetLostError, TrackerSample
+from hilcal.acquire.devices import TargetLostError, TrackerSample, WrenchSample
 from hilcal.acquire.progress import ReadingStored, Remark
 from hilcal.acquire.rig import Rig
 from hilcal.acquire.run import run
@@ -16,6 +16,7 @@ from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.readings import Readings
 from hilcal.data.run_log import RunLog, create_run
 from hilcal.errors import DeviceError, InputError
+from hilcal.report.text_info import event_words
 from hilcal.robot import chain as chains
 from hilcal.types import Floats
 from tests.support.fake_bench import Bench, usual_plan
@@ -139,6 +140,30 @@ def test_a_neighbour_is_not_taken_for_a_target(tmp_path: Path) -> None:
     assert any(
         "R2 is not read: tracker: it sees R1 in its place" in e.text for e in b.notes.of(Remark)
     )
+
+
+def test_all_targets_of_an_arrival_that_was_leaned_on_are_kept_as_doubted(tmp_path: Path) -> None:
+    b, _ = bench()
+    force = b.rig.force
+    assert force is not None
+    average, leaned = force.average, []
+
+    def leans(seconds: float) -> WrenchSample:
+        wanted = len(b.notes.of(ReadingStored)) == BOOTSTRAP and not leaned
+        leaned.extend([seconds] * wanted)
+        b.world.extra = np.array([0, 60.0 * wanted, 0, 0, 0, 0])
+        sample = average(seconds)
+        b.world.extra = np.zeros(6)
+        return sample
+
+    force.average = leans  # type: ignore[method-assign]
+    r = measure(b, tmp_path / "r.hilcal")
+    assert len(by_key(r)) == len(r) == BOOTSTRAP + 3 * (len(usual_plan().steps) - BOOTSTRAP)
+    with CampaignFile.open(tmp_path / "r.hilcal") as file:
+        doubted = [e for e in RunLog(file).events() if e["kind"] == "doubted"]
+    assert [e["reading"]["target"] for e in doubted] == list(NAMES)
+    words = event_words(doubted[0])
+    assert "reading of p4, none, R1 kept as doubted: the force sensor feels" in words
 
 
 @pytest.mark.parametrize("call", [("tracker.aim", 8), ("tracker.measure", 60)])

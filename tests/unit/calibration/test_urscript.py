@@ -4,14 +4,11 @@ Programs are run before and after by `urscript_interpreter`, with lists copied a
 shared, since the manual does not say which of them a controller does.
 """
 
-import contextlib
 import random
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from hilcal.calibration.urscript import movej_program, program_points, waypoints, with_joints
 from hilcal.errors import InputError
@@ -51,7 +48,7 @@ def check_understood(program: str, seeds: int = 4) -> int:
             before = Machine(seed, shared).run(program)
             after = Machine(seed, shared).run(again)
             assert [t.line for t in before] == [t.line for t in after]
-            at = None
+            at, servoed = None, False
             for old, now in zip(before, after, strict=True):
                 w = every[old.line]
                 assert (w.line in new) != (w.line in left)
@@ -76,11 +73,12 @@ def check_understood(program: str, seeds: int = 4) -> int:
                             k = order.index(w.line)
                             assert w.q is None
                             assert at == (order[k - 1] if k else None)
+                            assert not servoed
                     if w.tool is None:
                         assert old.tool is None
                     else:
                         np.testing.assert_allclose(w.tool, as_pose(old.tool))
-                at = old.line
+                at, servoed = old.line, old.kind == "servoj"
     return seen
 
 
@@ -124,6 +122,8 @@ end
         f"def f(x):\n  movej({SIX})\n  return x\nend\ny = f(1)\n"
         f"servoj({SIX}, t=0.1)\nmovep({SIX})\n",
         f'textmsg("é …", 1) # é\nmovej({SIX})\n',
+        f"def P():\n  def calc(f):\n    return pose_add(get_target_waypoint(), f)\n  end\n"
+        f"  movej({SIX})\nend\n",  # as PolyScope writes it into every program
     ],
 )
 def test_programs_that_are_understood_wholly(program: str) -> None:
@@ -164,6 +164,20 @@ def test_programs_that_are_understood_wholly(program: str) -> None:
         (f"movel(get_inverse_kin({POSE}, {SIX}, 0.1))\n", 1, "is computed"),
         (f"def f():\n  movel({POSE})\nend\nf()\nmovej({SIX})\nf()\n", 2, "without joint values"),
         (f"def f():\n  movel({POSE})\n  f()\nend\n", 2, "without joint values"),
+        (f"def P():\n f()\n movel({POSE})\n def f():\n  movej({SIX})\n end\nend\n", 3, "without"),
+        (f"servoj({SIX}, t=0.1)\nmovel({POSE})\n", 2, "without joint values"),
+        (
+            f"def f():\n  movej({SIX})\nend\nthread t():\n  f()\nend\nx = run t()\n"
+            f"movej({SIX})\nmovel({POSE})\n",
+            9,
+            "without joint values",
+        ),
+        (f"thread t():\n stopj(2)\nend\nrun t()\nmovej({SIX})\nmovel({POSE})\n", 6, "without"),
+        (f"movej({SIX}, q={SIX})\n", 1, "movej is not corrected"),
+        (f"movel(q={SIX}, pose={POSE})\n", 1, "movel is not corrected"),
+        (f"q={SIX}\nm = [q, q]\nb = m[0]\nb[0] = 1\nmovej(q)\n", 5, "computed"),
+        ("movej([2147483647 * 2 - 4294967293, 0, 0, 0, 0, 0])\n", 1, "computed"),
+        ("q = 1\n" * 9 + "movej(q)\n", 10, "from lines 1, 2, 3, 4, 5 and 4 more"),
     ],
 )
 def test_a_waypoint_that_is_not_understood_is_refused_by_line_or_left(
@@ -228,9 +242,11 @@ def test_a_waypoint_that_is_not_understood_is_refused_by_line_or_left(
         (f"movej({SIX})\nend\n", 2, "end without"),
         (f"else:\nmovej({SIX})\n", 1, "else without"),
         (f"if True:\nmovej({SIX})\n", 3, "ends inside of if"),
-        ("x = " + "(" * 5000 + ")" * 5000 + f"\nmovej({SIX})\n", 1, "not understood"),
-        ("x = " + "-" * 50000 + f"1\nmovej({SIX})\n", 1, "not understood"),
-        ("x = " + "+".join("1" * 50000) + f"\nmovej({SIX})\n", 1, "not understood"),
+        (f"movej({SIX})\nx = " + "+".join("1" * 6000), 2, "12003 characters, at most 10000"),
+        ("if x:\n" * 102 + "end\n" * 102, 102, "in more than 100 blocks"),
+        ("x = " + "(" * 4900 + ")" * 4900 + f"\nmovej({SIX})\n", 1, "not understood"),
+        ("x = " + "-" * 9000 + f"1\nmovej({SIX})\n", 1, "not understood"),
+        ("x = " + "+".join("1" * 4900) + f"\nmovej({SIX})\n", 1, "not understood"),
     ],
 )
 def test_what_could_change_a_waypoint_refuses_the_program_by_line(
@@ -314,7 +330,8 @@ class Writer:
             say(self.motion())
         elif kind == "bind":
             name = self.pick()
-            value = r.choice([self.vector()] * 6 + [self.pick(), f"pose_trans({name}, {name})"])
+            computed = [self.pick(), f"pose_trans({name}, {name})", f"[{name}, {self.pick()}]"]
+            value = r.choice([self.vector()] * 9 + [*computed, f"{self.pick()}[0]"])
             if r.random() < 0.1:
                 say(f"{name}[{r.randint(0, 5)}] = {self.number()}")
             elif r.random() < 0.1:
@@ -323,6 +340,7 @@ class Writer:
                 say(f"{where}{name} = {value}")
         elif kind == "rest":
             called = [f"{f}({', '.join(self.pick() for _ in range(n))})" for f, n in self.functions]
+            called += [f"{r.choice(['', 't = '])}run {call}" for call in called]
             say(r.choice([*called, "sleep(0.1)", 'textmsg("movej(a) # end")', "# end", '$ 3 "x"']))
         else:
             self.block(depth, indent, condition)
@@ -368,13 +386,6 @@ class Writer:
         return "\n".join(self.lines) + "\n"
 
 
-@settings(max_examples=80, deadline=None)
-@given(st.integers(0, 2**40))
-def test_every_target_of_a_random_program_is_corrected_or_left(seed: int) -> None:
-    with contextlib.suppress(InputError):  # how many, see the next test
-        check_understood(Writer(seed).program(), seeds=2)
-
-
 def met(seeds: range) -> list[int]:
     """How many programs have motions that were seen corrected, waypoints left, or are refused."""
     seen = left = refused = 0
@@ -388,9 +399,9 @@ def met(seeds: range) -> list[int]:
     return [seen, left, refused]
 
 
-def test_random_programs_are_not_all_refused() -> None:
-    """What the property is worth: corrected, left and refused ones are all met often."""
-    assert min(np.array(met(range(60))) / [10, 20, 3]) >= 1
+def test_every_target_of_a_random_program_is_corrected_or_left() -> None:
+    """Corrected, left and refused ones are all met often, so that the property says something."""
+    assert min(np.array(met(range(80))) / [10, 20, 3]) >= 1
 
 
 @pytest.mark.slow

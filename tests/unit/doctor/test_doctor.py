@@ -15,7 +15,7 @@ from hilcal.doctor.computer import clock, disk, load
 from hilcal.doctor.finding import Finding
 from hilcal.doctor.network import reachable
 from hilcal.doctor.ports import System, serial_ports
-from hilcal.doctor.program import packages
+from hilcal.doctor.program import NATIVE, packages
 
 
 def states(findings: tuple[Finding, ...] | list[Finding]) -> list[str]:
@@ -49,10 +49,10 @@ def test_packages_are_told_with_their_versions_and_those_that_lack() -> None:
 def test_a_package_that_does_not_load_is_a_problem(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "rtde_control.py").write_text("raise OSError('wrong processor')")
+    (tmp_path / "numba_of_another.py").write_text("raise OSError('wrong processor')")
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delitem(__import__("sys").modules, "rtde_control", raising=False)
-    _, broken = packages(["ur-rtde>=1.6"])
+    monkeypatch.setitem(NATIVE, "numba", "numba_of_another")
+    _, broken = packages(["numba>=0.61"])
     assert broken.state == "problem"
     assert "does not load: OSError: wrong processor" in broken.said
 

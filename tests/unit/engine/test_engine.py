@@ -60,12 +60,13 @@ def test_a_cluster_gives_the_same_bits_though_a_worker_is_killed() -> None:
 
 
 def test_workers_of_this_machine_give_the_same_bits_and_can_be_reached_by_nobody() -> None:
+    before = sockets()  # of what the tests before this one have left
     with open_engine(2) as engine:
         assert engine.map(singular_value, ITEMS, SEED) == here()
         going = engine.results(wait, range(2))
         assert next(going) == (0, 0)
         assert len(workers()) == 2
-        assert sockets() == []
+        assert set(sockets()) <= set(before)
         going.close()  # while a worker computes
         with pytest.raises(ValueError, match="item 3 is odd"):
             engine.map(refuse, range(6))

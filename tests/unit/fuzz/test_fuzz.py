@@ -8,6 +8,7 @@ from random import Random
 import numpy as np
 import pytest
 
+from hilcal.calibration.urscript import program_points
 from hilcal.config import CellConfig
 from hilcal.data.checks import is_covariance
 from hilcal.data.mapping import load_mapping
@@ -15,7 +16,7 @@ from hilcal.data.plan import read_plan
 from hilcal.errors import HilcalError, InputError
 from hilcal.identify import parameters_document, posterior_document
 from hilcal.identify.rigid_frames import inverse_roots
-from tests.fuzz import files, harness, wire
+from tests.fuzz import files, harness, stored, wire
 
 FEW = {
     "chain": 2,
@@ -38,6 +39,18 @@ def test_damage_ends_in_an_error_of_the_programs_own(name: str, tmp_path: Path) 
     assert out.inputs == FEW.get(name, 150)
     if not name.endswith("chain"):  # two inputs prove nothing of the following
         assert out.read > 0, "the harness never reaches the inside"
+
+
+def test_the_sample_programs_are_understood(tmp_path: Path) -> None:
+    """Damage to a program that is refused anyway reaches nothing."""
+    path = tmp_path / "a.script"
+    path.write_text(stored.PROGRAM, "utf-8")
+    _, every, points, tool = program_points(path)
+    assert (len(every), len(points.names), tool is None) == (5, 5, False)
+    path.write_text(stored.LEFT, "utf-8")
+    assert [bool(w.left) for w in program_points(path, leave=True)[1]] == [True, True, True, False]
+    assert PARSERS["program"].parse(stored.PROGRAM.encode())
+    assert PARSERS["program_left"].parse(stored.LEFT.encode())
 
 
 def test_an_interrupt_keeps_the_counts() -> None:
@@ -150,5 +163,5 @@ def test_a_plan_with_joints_that_are_none(value: object) -> None:
         "poses": [{"name": "a", "q_rad": [value]}],
         "steps": [{"pose": "a", "load": "none"}],
     }
-    with pytest.raises(HilcalError, match="finite numbers"):
+    with pytest.raises(HilcalError, match=r"finite numbers|a whole number of 401 digits"):
         read_plan(json.dumps(plan), "x")

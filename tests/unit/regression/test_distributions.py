@@ -47,6 +47,11 @@ def test_power_is_a_tail_of_the_noncentral(nc: float, dfn: int, dfd: int, p: flo
     assert distributions.ncf.sf(x, dfn, dfd, nc) == pytest.approx(theirs, rel=1e-9)
 
 
+@given(st.floats(0.0, 1.0), st.sampled_from([0.5, 1.0, 2.5]))
+def test_beta(x: float, a: float) -> None:
+    assert distributions.beta.cdf(x, a, 0.5) == pytest.approx(stats.beta.cdf(x, a, 0.5), rel=1e-12)
+
+
 def test_a_noncentrality_of_nothing_or_very_much() -> None:
     for nc, chance in ((0.0, 0.01), (1e7, 1.0)):
         assert distributions.ncx2.sf(stats.chi2.isf(0.01, 6), 6, nc) == pytest.approx(chance)

@@ -3,9 +3,9 @@
 The ways out, by format: URScript (`movej_program`), CSV (`write_columns` for tables, residuals and
 revisions, `plan_csv`, `compensate -o F.csv`, `export --parameters F.csv`, `--dh F.csv`), Parquet
 (`write_columns`), URDF, UR's YAML, TOML (`--dh F.toml`, the mapping of `--preview`, CELL.toml),
-JSON (plans, calibrations, `--json`), HTML (report, its charts, workbench), rerun (labels and
-markdown; entity paths hold no names), Python (`discover -o F.py`), the terminal (tables, progress,
-questions, errors).
+JSON (plans, calibrations, `--json`), command lines that people are told to run, HTML (report, its
+charts, workbench), rerun (labels and markdown; entity paths hold no names), Python (`discover -o
+F.py`), the terminal (tables, progress, questions, errors).
 """
 
 import ast
@@ -13,6 +13,7 @@ import csv
 import io
 import json
 import re
+import shlex
 import sqlite3
 import tomllib
 from contextlib import redirect_stderr
@@ -59,7 +60,7 @@ from hilcal.data.tabular import read_parquet, write_columns
 from hilcal.discover.write_effect import source_of_form
 from hilcal.errors import InputError
 from hilcal.identify import posterior_document
-from hilcal.names import check_name, check_names, csv_text, escaped, from_csv
+from hilcal.names import check_name, check_names, csv_text, escaped, from_csv, quoted
 from hilcal.report.charts import style as chart_style
 from hilcal.report.charts.readings_drawn import escaped as in_chart
 from hilcal.report.html import page
@@ -79,14 +80,28 @@ CELL = next((ROOT / "configs" / "cells").glob("*.toml"))
 EVIL = (
     *(chr(k) for k in (*range(0x20), *range(0x7F, 0xA0))),
     *"\u2028\u2029\u061c\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069",
-    *"\ud800\udfff\ufeff\uffff",
+    *"\ud800\udfff\ufeff\uffff\u00ad\u180e\u200b\u2060\ufffb\U000e0001\U000e0041",
 )
 PIECES = (
     *("P1", " ", "movej([0,0,0,0,0,0], a=10, v=3)", "#", "end", '"', "'", '"""', "\\", "\\u000a"),
-    *("=1+1", "+", "-", "@SUM(A1)", ",", ";", "<script>alert(1)</script>", "<b>", "&lt;", "-->"),
+    *(
+        "=1+1",
+        "+",
+        "-",
+        "@SUM(A1)",
+        ",",
+        ";",
+        ";=1+1",
+        "\uff1d1",
+        "<script>alert(1)</script>",
+        "<b>",
+        "&lt;",
+        "-->",
+    ),
     *("--", "]]>", "[red]", "[/]", "{x}", "{{ x }}", "%s", "é", "日本", "/", "*", "_", "x: y", "`"),
 )
 names = st.lists(st.sampled_from((*PIECES, *PIECES, *EVIL)), min_size=1, max_size=7).map("".join)
+FORMULA = tuple("=+-@\t\r\uff1d\uff0b\uff0d\uff20")
 few = settings(max_examples=40, deadline=None)
 
 
@@ -100,7 +115,7 @@ def test_each_such_character_is_refused_in_one_line_and_escaped(sign: str) -> No
     with pytest.raises(InputError) as error:
         check_name(f"P1{sign}x", "t.csv: row 2, column 'pose'")
     said = str(error.value)
-    code = f"\\u{ord(sign):04x}"
+    code = f"\\u{ord(sign):04x}" if ord(sign) < 0x10000 else f"\\U{ord(sign):08x}"
     assert said.startswith(f"t.csv: row 2, column 'pose': 'P1{code}x' holds the character {code};")
     assert "valid: " in said
     assert harmless(said)
@@ -142,7 +157,8 @@ def the_same_cells(text: str, wanted: list[list[str]]) -> None:
         for cell, name in zip(row, given_, strict=True):
             if name is not None:
                 assert from_csv(cell) == escaped(name)
-                assert not cell.startswith(("=", "+", "-", "@", "\t", "\r"))
+                for begun in (cell, *cell.split(";")):  # as spreadsheets of some countries do
+                    assert not begun.strip(' "').startswith(FORMULA)
 
 
 @few
@@ -212,6 +228,51 @@ def test_toml(name: str) -> None:
     cell = cell_text({"robot": {"model": "ur10e"}}, name)
     assert harmless(cell)
     assert tomllib.loads(cell) == tomllib.loads(cell_text({"robot": {"model": "ur10e"}}, "a"))
+
+
+@few
+@given(names)
+def test_command_lines(name: str) -> None:
+    line = f"hilcal refine {quoted(name)} --prior a"
+    assert harmless(line)
+    assert shlex.split(line) == ["hilcal", "refine", escaped(name), "--prior", "a"]
+
+
+COMMANDS = (
+    "accept|add|check|compare|diagnose|export|identify|info|plan|refine|repair|report|run|view"
+)
+RUN_BY_PEOPLE = re.compile(
+    rf"hilcal ({COMMANDS}) $|hilcal .* -o $|\S.*--(effects-from|prior|after|plan) $", re.DOTALL
+)
+
+
+def unquoted(tree: ast.AST) -> list[int]:
+    """Lines in which a value stands as it is in a command line that people are told to run."""
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.JoinedStr):
+            text = ""
+            for part in node.values:
+                if isinstance(part, ast.Constant):
+                    text += part.value
+                    continue
+                called = getattr(getattr(part.value, "func", None), "id", "")
+                if RUN_BY_PEOPLE.search(text) and called != "quoted":
+                    found.append(node.lineno)
+                text += "X"
+    return found
+
+
+def test_values_in_command_lines_are_quoted() -> None:
+    texts = {p: p.read_text(encoding="utf-8") for p in (ROOT / "hilcal").rglob("*.py")}
+    found = {
+        path.relative_to(ROOT).as_posix(): lines
+        for path, text in texts.items()
+        if re.search(r"(hilcal|--\w).*\{", text) and (lines := unquoted(ast.parse(text)))
+    }
+    assert found == {}
+    assert unquoted(ast.parse('f"see hilcal refine {run}"')) == [1]
+    assert unquoted(ast.parse('f"give it: --effects-from {file}"')) == [1]
 
 
 @few
@@ -360,7 +421,7 @@ def refused_or(read, name: str, what: str = "") -> None:
         said = str(error)
     if kept is None:
         assert harmless(said)
-        assert escaped(name) == name or "holds the character \\u" in said, what
+        assert escaped(name) == name or "holds the character \\" in said, what
     else:
         assert kept == name.strip(), what  # no reader takes blanks around a name for a part of it
         assert harmless(kept), what

@@ -1,0 +1,283 @@
+"""Small files that would take much memory or time: refused in one line, before or within a limit.
+
+Limits are lowered where a file as large as the true ones allow would take seconds.
+"""
+
+import io
+import json
+import re
+import resource
+import threading
+import zipfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import openpyxl
+import pytest
+
+import hilcal as hc
+from hilcal import limits
+from hilcal.cli import main
+from hilcal.data import parquet_stream
+from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.covariance import INSTRUMENT
+from hilcal.data.grid import Grid, unique
+from hilcal.data.mapping_sections import FileFormat
+from hilcal.data.plan import Plan, Step, load_plan, read_plan
+from hilcal.data.propose import propose
+from hilcal.data.reading_groups import deflection_groups
+from hilcal.data.sheets import open_grid
+from hilcal.data.table import write_table
+from hilcal.errors import InputError
+from hilcal.fleet.members import LIST, entries
+from hilcal.identify import parameters_document
+from hilcal.toml import parse_json, read_toml, suggest
+from tests.support.campaigns import campaign, configuration
+
+HEAD = (
+    b'<?xml version="1.0"?><worksheet xmlns="http://schemas.openxmlformats.org/spreadsheetml/'
+    b'2006/main"><sheetData>'
+)
+END = b"</sheetData></worksheet>"
+SHEET = "xl/worksheets/sheet1.xml"
+
+
+def workbook(path: Path, part: str, change: Callable[[bytes], bytes]) -> Path:
+    """A workbook of two cells, with a part of it changed."""
+    book, out = openpyxl.Workbook(), io.BytesIO()
+    book.active.append([1.0, 2.0])
+    book.save(out)
+    with zipfile.ZipFile(out) as old, zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as new:
+        for name in old.namelist():
+            new.writestr(name, change(old.read(name)) if name == part else old.read(name))
+    return path
+
+
+def rows(text: bytes) -> Callable[[bytes], bytes]:
+    return lambda _: HEAD + text + END
+
+
+WORKBOOKS = {
+    "row 2,000,000,000": (SHEET, rows(b'<row r="2000000000"><c><v>1</v></c></row>'), "rows"),
+    "column XFD": (
+        SHEET,
+        rows(b'<row><c r="XFD1"><v>1</v></c></row>' * 400),
+        "cells|columns|elements",
+    ),
+    "many cells in a row": (SHEET, rows(b"<row>" + b"<c/>" * 30_000 + b"</row>"), "in a row"),
+    "elements in each other": (SHEET, rows(b"<a>" * 60 + b"</a>" * 60), "in each other"),
+    "a tag without end": (SHEET, rows(b"<a " + b"x" * 2_000_000), "a tag"),
+    "styles": (
+        "xl/styles.xml",
+        lambda text: text.replace(b"</cellXfs>", b"<xf/>" * 5000 + b"</cellXfs>"),
+        "elements",
+    ),
+    "sheets": (
+        "xl/workbook.xml",
+        lambda text: re.sub(b"(<sheet .*?/>)", rb"\1" * 200, text),
+        "sheets",
+    ),
+}
+
+
+@pytest.mark.parametrize("way", [lambda p: open_grid(p, FileFormat()), propose])
+@pytest.mark.parametrize("name", WORKBOOKS)
+def test_a_workbook_that_unpacks_to_much_more(
+    name: str, way: Callable[[Path], object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "ROWS", 1000)
+    monkeypatch.setattr(limits, "CELLS", 1_000_000)
+    monkeypatch.setattr(limits, "ELEMENTS", 2000)
+    part, change, words = WORKBOOKS[name]
+    path = workbook(tmp_path / "t.xlsx", part, change)
+    assert path.stat().st_size < 100_000
+    with pytest.raises(InputError, match=words) as told:
+        way(path)
+    assert "\n" not in str(told.value)
+
+
+def test_columns_of_any_table_are_counted() -> None:
+    """A MAT file of 1 MB has 20,000 matrices."""
+    names = tuple(map(str, range(limits.COLUMNS + 1)))
+    columns = tuple([1.0] for _ in names)
+    with pytest.raises(InputError, match="columns; valid: at most"):
+        Grid("t.mat", names, np.arange(1), columns, (FileFormat(),) * len(names))
+
+
+def test_memory_that_runs_out_is_one_line_and_the_limit_is_as_before(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of small objects: nothing is left for the next one."""
+    monkeypatch.setattr(limits, "MEMORY", 1 << 25)
+    before = resource.getrlimit(resource.RLIMIT_AS)
+
+    @limits.bounded
+    def read(path: str) -> list[list[int]]:
+        found: list[list[int]] = []
+        while len(found) < 10_000_000:
+            found.append([len(found)])
+        return found
+
+    with pytest.raises(InputError, match="table: reading it takes more than 34 MB of memory"):
+        read("table")
+    assert resource.getrlimit(resource.RLIMIT_AS) == before
+
+
+def test_two_threads_that_read_leave_the_limit_as_it_was() -> None:
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    first_in, first_out = threading.Event(), threading.Event()
+
+    def first() -> None:
+        with limits.memory("first"):
+            first_in.set()
+            first_out.wait(0.2)
+
+    def second() -> None:
+        first_in.wait()
+        with limits.memory("second"):
+            first_out.set()
+            other.join(0.2)
+
+    other, another = threading.Thread(target=first), threading.Thread(target=second)
+    other.start()
+    another.start()
+    other.join()
+    another.join()
+    assert resource.getrlimit(resource.RLIMIT_AS) == before
+
+
+SETTINGS = {
+    "dots": ("a." * 150 + "b = 1", "more than 100 dots"),
+    "digits": ("x = " + "9" * 5000, "not TOML"),
+    "hexadecimal": ("[tool]\nmass_kg = 0x" + "f" * 20_000, "80000 bits; valid: of 64"),
+    "of a list": ("x = [1, [0x8000000000000000]]", "64 bits; valid: of 64"),
+}
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_settings_of_thousands_of_digits_or_parts(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "cell.toml"
+    path.write_text(SETTINGS[name][0])
+    with pytest.raises(SystemExit) as ended:
+        main(["check", str(path)])
+    said = capsys.readouterr().err
+    assert ended.value.code == 2
+    assert said.count("\n") == 1
+    assert SETTINGS[name][1] in said
+
+
+def test_whole_numbers_of_settings_keep_64_bits(tmp_path: Path) -> None:
+    path = tmp_path / "x.toml"
+    path.write_text(f"x = [{-(1 << 63)}, {(1 << 63) - 1}]\ny = 1.{'0' * 90}\n")
+    assert read_toml(path)["x"] == [-(1 << 63), (1 << 63) - 1]
+
+
+def test_a_document_of_too_many_values_or_digits(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "VALUES", 1000)
+    assert parse_json("[" + "1," * 900 + "1]")[-1] == 1
+    for text in ("[" + "[]," * 999 + "[]]", "[" * 1001, '{"a":1,' * 500, f"[{10**100}]"):
+        with pytest.raises(ValueError, match=r"million values|digits"):
+            parse_json(text)
+
+
+def test_a_whole_number_that_is_no_float_in_a_file_of_parameters(tmp_path: Path) -> None:
+    path = tmp_path / "parameters.json"
+    path.write_text(json.dumps({"parameters": [{"value": 10**400}], "covariance": ""}))
+    with pytest.raises(InputError, match="401 digits"):
+        parameters_document.read(path)
+
+
+def plan(poses: int) -> Plan:
+    names = tuple(f"p{k}" for k in range(poses))
+    return Plan(names, np.zeros((poses, 6)), tuple(Step(p, "none", 0) for p in names))
+
+
+def test_a_plan_of_too_many_poses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "PLANNED", 50)
+    path = tmp_path / "plan.json"
+    path.write_text(plan(50).to_json())
+    assert len(load_plan(path).steps) == 50
+    path.write_text(plan(51).to_json())
+    with pytest.raises(InputError, match="51 poses; valid: at most 50"):
+        load_plan(path)
+
+
+@pytest.mark.parametrize("pose", [[], {}, None, 1])
+def test_a_step_of_a_pose_that_is_no_text(pose: object) -> None:
+    content = json.loads(plan(2).to_json())
+    content["steps"][0]["pose"] = pose
+    with pytest.raises(InputError, match="step 1: there is no pose"):
+        read_plan(json.dumps(content), "plan")
+
+
+def test_long_names_are_not_compared_with_the_valid_ones() -> None:
+    assert suggest("mass_kk", ["mass_kg"]) == ' (did you mean "mass_kg"?)'
+    assert suggest("m" * 1000, ["m" * 999]) == ""
+    assert suggest("mass_kk", [f"x{k}" for k in range(1000)] + ["mass_kg"]) == ""
+
+
+def test_columns_of_one_name_are_numbered_in_a_row() -> None:
+    names = unique(["a"] * 2000)
+    assert names[:3] == ("a", "a (2)", "a (3)")
+    assert len(set(names)) == 2000
+    assert unique(["a (2)", "a", "a", "", "2"]) == ("a (2)", "a", "a (3)", "4", "2")
+
+
+def test_a_line_of_the_list_of_a_fleet_that_never_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "LINE", 1000)
+    (tmp_path / "a.hilcal").touch()
+    (tmp_path / LIST).write_text("campaign,arm\n" + "a" * 2000)
+    with pytest.raises(InputError, match="row 2 is longer than 1000"):
+        entries(tmp_path)
+
+
+def test_readings_beyond_what_is_fitted_are_neither_stored_nor_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = campaign("joint_tilt_compliance", "deflection", 3, poses=4)
+    readings, path = made.readings, tmp_path / "run.hilcal"
+    with CampaignFile.create(path, configuration().to_json(), str(tmp_path), "test") as file:
+        file.append_readings(readings)
+        monkeypatch.setattr(limits, "FITTED", readings.m * len(readings))
+        assert len(file.readings()) == len(readings)
+        with pytest.raises(InputError, match=f"at most {len(readings)} in a campaign"):
+            file.append_readings(readings[:1])
+        monkeypatch.setattr(limits, "FITTED", readings.m * len(readings) - 1)
+        with pytest.raises(InputError, match=rf"run\.hilcal: {len(readings)} readings"):
+            file.readings()
+    with pytest.raises(InputError, match=f"{len(readings)} readings of 3 elements"):
+        hc.baseline(made.cell, readings)
+    write_table(readings, tmp_path / "t.csv", INSTRUMENT)
+    with pytest.raises(InputError, match=rf"t\.csv: {len(readings)} readings"):
+        hc.read_table(tmp_path / "t.csv", made.cell)
+
+
+def test_many_repeats_of_one_unloaded_reading_make_no_matrix(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    readings = campaign("joint_tilt_compliance", "deflection", 3, poses=4).readings
+    one = np.flatnonzero(readings.pose == 0)
+    many = readings[np.tile(one, 40)]
+    groups = deflection_groups(replace(many, common=None))
+    shared = groups[0][0].shape[1]
+    monkeypatch.setattr(limits, "SHARED", (shared * readings.m) ** 2 - 1)
+    with pytest.raises(InputError, match=f"{shared} loaded readings share one unloaded"):
+        deflection_groups(many)
+
+
+def test_a_row_group_that_holds_less_than_it_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As damaged pages make it: pyarrow yields nothing, and says nothing."""
+    group = SimpleNamespace(num_rows=3)
+    file = SimpleNamespace(
+        metadata=SimpleNamespace(row_group=lambda _: group), iter_batches=lambda *_, **__: iter(())
+    )
+    monkeypatch.setattr(parquet_stream, "_opened", lambda _: file)
+    with pytest.raises(InputError, match=r"row group 1 \(3 rows are missing\)"):
+        next(parquet_stream._tables(Path("s.parquet"), 0, ("x_m",)))
