@@ -13,6 +13,7 @@ from hilcal.data.readings import Readings, States
 from hilcal.data.whitening import Mode, Whitening, covariance_blocks, whitening
 from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.effects.spec import EffectSpec
+from hilcal.errors import InputError
 from hilcal.identify.full_covariance import joint_factors
 from hilcal.identify.residual import residual
 from hilcal.mixed.families import LogSize, families_of
@@ -112,12 +113,15 @@ def mixed_fit(model: Model, readings: Readings, mode: Mode, rng: np.random.Gener
     Args:
         model: frames, and effects that have to be in it.
         readings: without gross errors.
-        mode: "absolute" or "deflection".
+        mode: "absolute"; deflections are not fitted yet.
         rng: for the average over what the sizes may be.
 
     Raises:
         CannotAnswerError: no static equilibrium, or no likelihood.
+        InputError: deflections.
     """
+    if mode != "absolute":
+        raise InputError("all effects at once are fitted to absolute readings only")
     model = with_all_effects(model, readings.states)
     families, w = families_of(model), whitening(readings, mode, "gc")
     noise = _noise(model, readings, w)
