@@ -86,9 +86,9 @@ def _drawn(cell: Cell, readings: Readings, count: int, draw: int) -> Drawn:
     off = test.value[:, :3] - position
     total = spread + fit.noise(test)[:, :3, :3]
     square = np.einsum("ni,nij,nj->n", off, np.linalg.inv(total), off)
-    sizes = fit.variances.log_size
+    log_std = fit.variances.log_std
     found = {
-        name: evidence(fit.problem, k, rng, sizes).p_value
+        name: evidence(fit.problem, k, rng, log_std).p_value
         for k, name in enumerate(fit.problem.families.names)
     }
     return Drawn(

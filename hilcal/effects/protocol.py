@@ -331,8 +331,8 @@ class Effect(ABC):
         """
         return np.zeros(len(self.parameters), dtype=np.int64)
 
-    def log_size(self, pool: int) -> tuple[float, float]:
-        """Mean and spread of log s for the parameters of a pool, s in ordinary magnitudes.
+    def log_std_prior(self, pool: int) -> tuple[float, float]:
+        """Mean and spread of log s, s the standard deviation of a pool's parameters in magnitudes.
 
         What arms are like before anything is measured: half of what is ordinary, and a factor of
         20 either way. Wide on purpose: a spread of 3 predicted as well as 1.2 or better on five

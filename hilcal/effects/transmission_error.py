@@ -94,7 +94,7 @@ class TransmissionError(PerJoint):
         octave = np.floor(np.log2(self.harmonics)).astype(np.int64)
         return np.tile(np.repeat(octave, 2), len(self.shared.labels))
 
-    def log_size(self, pool: int) -> tuple[float, float]:
+    def log_std_prior(self, pool: int) -> tuple[float, float]:
         """Amplitudes of 0.16 mrad at the first harmonic, half of that with each octave."""
         return 1.2 - 0.7 * pool, 3.0
 

@@ -1,8 +1,8 @@
 """The mixed model of all effects, fitted to readings.
 
-Every effect of the catalogue that the readings allow takes part, each of its families with a size
-of its own (see `hilcal.mixed`). The rows are linearised at the joint optimum: at the parameters
-that the mixed model predicts, again until they stay.
+Every effect of the catalogue that the readings allow takes part, each of its families with a
+variance of its own (see `hilcal.mixed`). The rows are linearised at the joint optimum: at the
+parameters that the mixed model predicts, again until they stay.
 """
 
 from dataclasses import dataclass, replace
@@ -16,10 +16,10 @@ from hilcal.effects.spec import EffectSpec
 from hilcal.errors import InputError
 from hilcal.identify.full_covariance import joint_factors
 from hilcal.identify.residual import residual
-from hilcal.mixed.families import LogSize, families_of
+from hilcal.mixed.families import LogStdPrior, families_of
+from hilcal.mixed.posterior import averaged_coordinates
 from hilcal.mixed.prediction import coordinates_covariance
 from hilcal.mixed.problem import MixedProblem, Noise, mixed_problem
-from hilcal.mixed.sizes import averaged_coordinates
 from hilcal.mixed.variances import Variances, estimate_variances
 from hilcal.model import Model
 from hilcal.types import Floats
@@ -37,8 +37,8 @@ SCATTER_RAD = 3e-5
 NOISE_SPREAD = 1.5
 """Of the log of the noise: a factor of 4.5 either way; a choice."""
 FEW_ROWS = 300
-"""Rows up to which the sizes are averaged over; beyond, their estimate is as good and each step of
-the walk costs its cube. A choice."""
+"""Rows up to which the variances are averaged over; beyond, their estimate is as good, and a step of
+the walk costs the cube of the rows. A choice."""
 WALK = 600
 """Steps of the walk; a choice: twice as many change errors by less than 1 %."""
 
@@ -52,7 +52,7 @@ class MixedFit:
         readings: that it was fitted to.
         w: their whitening, by the stated covariance.
         theta: (P,) parameters.
-        variances: sizes of the families and of the noise, at the last linearisation.
+        variances: those of the families and of the noise, at the last linearisation.
         covariance: (K, K) of the errors of the coordinates.
     """
 
@@ -68,9 +68,9 @@ class MixedFit:
         """The linear problem at the last linearisation."""
         return self.variances.equations.problem
 
-    def size(self, name: str) -> float:
-        """Return the estimated size of a family or of a component of the noise."""
-        return float(np.exp(self.variances.log_size[self.problem.names.index(name)]))
+    def std(self, name: str) -> float:
+        """Return the estimated standard deviation of a family or of a component of the noise."""
+        return float(np.exp(self.variances.log_std[self.problem.names.index(name)]))
 
     def predict(self, states: States, m: int) -> tuple[Floats, Floats]:
         """Predict what the sensor reads in N states.
@@ -90,10 +90,10 @@ class MixedFit:
 
     def noise(self, readings: Readings) -> Floats:
         """(N, m, m) covariance of absolute readings by instrument and arm, as estimated."""
-        total = self.size("instrument") ** 2 * readings.covariance
+        total = self.std("instrument") ** 2 * readings.covariance
         if "arm's scatter" in self.problem.names:
             f = _scatter_factors(self.model, readings)
-            total = total + self.size("arm's scatter") ** 2 * (f @ np.swapaxes(f, 1, 2))
+            total = total + self.std("arm's scatter") ** 2 * (f @ np.swapaxes(f, 1, 2))
         return np.asarray(total)
 
 
@@ -114,7 +114,7 @@ def mixed_fit(model: Model, readings: Readings, mode: Mode, rng: np.random.Gener
         model: frames, and effects that have to be in it.
         readings: without gross errors.
         mode: "absolute"; deflections are not fitted yet.
-        rng: for the average over what the sizes may be.
+        rng: for the average over the posterior of the variances.
 
     Raises:
         CannotAnswerError: no static equilibrium, or no likelihood.
@@ -136,7 +136,7 @@ def mixed_fit(model: Model, readings: Readings, mode: Mode, rng: np.random.Gener
         problem = mixed_problem(now + jacobian @ theta, jacobian, families, noise, shape)
         found = estimate_variances(problem, start)
         theta = problem.parameters(found.equations.coordinates, model.size)
-        rounds, start = rounds + 1, found.log_size
+        rounds, start = rounds + 1, found.log_std
         if rounds == ROUNDS or np.sqrt(np.mean((now - white) ** 2)) < CONVERGED:
             break
         white = now
@@ -152,7 +152,7 @@ def _noise(model: Model, readings: Readings, w: Whitening) -> list[Noise]:
         np.any(b.factor != 0, axis=2)[:, :, None] * np.eye(b.factor.shape[-1]) for b in w.buckets
     )
     whole = all(bool(s.any(axis=2).all()) for s in seen)
-    instrument = Noise("instrument", None if whole else seen, LogSize(0.0, NOISE_SPREAD))
+    instrument = Noise("instrument", None if whole else seen, LogStdPrior(0.0, NOISE_SPREAD))
     if readings.scatter_stated:
         return [instrument]
     f = _scatter_factors(model, readings)
@@ -162,7 +162,7 @@ def _noise(model: Model, readings: Readings, w: Whitening) -> list[Noise]:
         b.factor @ c @ np.swapaxes(b.factor, 1, 2)
         for b, c in zip(w.buckets, covariance_blocks(of, w), strict=True)
     )
-    return [instrument, Noise("arm's scatter", blocks, LogSize(0.0, NOISE_SPREAD))]
+    return [instrument, Noise("arm's scatter", blocks, LogStdPrior(0.0, NOISE_SPREAD))]
 
 
 def _scatter_factors(model: Model, readings: Readings) -> Floats:

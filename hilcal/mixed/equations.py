@@ -1,7 +1,7 @@
 """Henderson's mixed-model equations at given variances, and the restricted likelihood's slopes.
 
-With S the sizes s_f of the random columns (1 for the frames), L Lᵀ = R the noise, and rows
-T = L⁻¹ X S, t = L⁻¹ y,
+With S the standard deviations s_f of the random columns (1 for the frames), L Lᵀ = R the noise,
+and rows T = L⁻¹ X S, t = L⁻¹ y,
 
     C = Tᵀ T + E,    E = 1 for random columns, 0 for the frames
     C c = Tᵀ t,      coordinates S c
@@ -11,7 +11,7 @@ T = L⁻¹ X S, t = L⁻¹ y,
 and, γ_f = Σ_i T_iᵀ P T_i over its columns the parameters that family f spends,
 
     ∂ℓ/∂log s_f = c_fᵀ c_f − γ_f
-    ∂ℓ/∂η_k     = eᵀ W_k e − tr(P W_k),    W_k = L⁻¹ R_k L⁻ᵀ, R_k times its size
+    ∂ℓ/∂η_k     = eᵀ W_k e − tr(P W_k),    W_k = L⁻¹ R_k L⁻ᵀ, R_k times its variance
     AI_ij       = ½ v_iᵀ P v_j,    v_f = 2 T_f c_f,    v_k = 2 W_k e
 
 P is formed by rows where they are fewer than the columns, P = N⁻¹ − B (Qᵀ N⁻¹ Q)⁻¹ Bᵀ with
@@ -98,11 +98,11 @@ class _ByRows:
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """The equations of a problem at logarithms of the sizes.
+    """The equations of a problem at logarithms of the standard deviations.
 
     Attributes:
         problem: rows, columns and noise.
-        log_size: (F + N,) log s of the families, η of the noise.
+        log_std: (F + N,) log s of the families, η of the noise.
         rows: (R, K) T.
         target: (R,) t.
         roots: (G, S, S) L of each run of rows.
@@ -110,7 +110,7 @@ class Equations:
     """
 
     problem: MixedProblem
-    log_size: Floats
+    log_std: Floats
     rows: Floats
     target: Floats
     roots: tuple[Floats, ...]
@@ -129,7 +129,7 @@ class Equations:
     def scale(self) -> Floats:
         """(K,) S."""
         p = self.problem
-        return np.concatenate([np.ones(p.flat), np.exp(self.log_size)[p.family]])
+        return np.concatenate([np.ones(p.flat), np.exp(self.log_std)[p.family]])
 
     @cached_property
     def residual(self) -> Floats:
@@ -138,7 +138,7 @@ class Equations:
 
     @cached_property
     def c(self) -> Floats:
-        """(K,) solution, in sizes."""
+        """(K,) solution, in standard deviations."""
         q, z = self.rows[:, : self.problem.flat], self.rows[:, self.problem.flat :]
         random = z.T @ self.residual
         frames = np.linalg.lstsq(q, self.target - z @ random, rcond=None)[0]
@@ -183,7 +183,7 @@ class Equations:
         for run, (shape, root) in enumerate(zip(self.problem.shape, self.roots, strict=True)):
             stop = start + shape[0] * shape[1]
             white = []
-            for n, eta in zip(self.problem.noise, self.log_size[self._count :], strict=True):
+            for n, eta in zip(self.problem.noise, self.log_std[self._count :], strict=True):
                 inner = np.eye(shape[1]) if n.blocks is None else n.blocks[run]
                 half = np.linalg.solve(root, np.broadcast_to(inner, root.shape))
                 w = np.linalg.solve(root, np.swapaxes(half, 1, 2))
@@ -196,7 +196,7 @@ class Equations:
     def working(self) -> Floats:
         """(R, F + N) v."""
         p, first = self.problem, self._count
-        out = np.zeros((len(self.target), len(self.log_size)))
+        out = np.zeros((len(self.target), len(self.log_std)))
         for f in range(first):
             own = np.flatnonzero(p.family == f) + p.flat
             out[:, f] = 2.0 * (self.rows[:, own] @ self.c[own])
@@ -235,7 +235,7 @@ class Equations:
     def sensitivity(self) -> Floats:
         """(K, F + N) derivative of the coordinates by log s and η."""
         p, first = self.problem, self._count
-        rhs = np.zeros((len(self.c), len(self.log_size)))
+        rhs = np.zeros((len(self.c), len(self.log_std)))
         rhs[p.flat + np.arange(len(p.family)), p.family] = 2.0 * self.c[p.flat :]
         rhs[:, first:] = -self.rows.T @ self.working[:, first:]
         return np.asarray(self.scale[:, None] * cho_solve(self._columns.factor, rhs))
@@ -246,13 +246,13 @@ class Equations:
         return np.asarray(white.T @ self.projection.project(white)), white.T @ self.residual
 
 
-def equations(problem: MixedProblem, log_size: Floats) -> Equations:
+def equations(problem: MixedProblem, log_std: Floats) -> Equations:
     """Return the equations at log s and η (F + N,).
 
     Raises:
-        numpy.linalg.LinAlgError: sizes so different that a matrix has no factor.
+        numpy.linalg.LinAlgError: standard deviations so different that a matrix has no factor.
     """
-    eta = log_size[len(problem.families.random) :]
+    eta = log_std[len(problem.families.random) :]
     if len(problem.noise) == 1 and problem.noise[0].blocks is None:
         root = float(np.exp(eta[0]))
         roots = tuple(np.broadcast_to(np.eye(s) * root, (g, s, s)) for g, s in problem.shape)
@@ -261,9 +261,9 @@ def equations(problem: MixedProblem, log_size: Floats) -> Equations:
         roots = tuple(_noise_roots(problem, eta, run) for run in range(len(problem.shape)))
         rows = whitened_rows(problem.x, problem.shape, roots)
         target = whitened_rows(problem.y, problem.shape, roots)
-    rows[:, problem.flat :] *= np.exp(log_size)[problem.family]
+    rows[:, problem.flat :] *= np.exp(log_std)[problem.family]
     form = _ByRows if rows.shape[0] < rows.shape[1] else _ByColumns
-    return Equations(problem, log_size, rows, target, roots, form(rows, problem.flat))
+    return Equations(problem, log_std, rows, target, roots, form(rows, problem.flat))
 
 
 def _noise_roots(problem: MixedProblem, eta: Floats, run: int) -> Floats:

@@ -1,6 +1,6 @@
 """Evidence for a family: the restricted likelihood ratio against s_f = 0, given all others.
 
-With the others' sizes as estimated without it, Z_fᵀ P Z_f = U diag(μ) Uᵀ and
+With the others' standard deviations as estimated without it, Z_fᵀ P Z_f = U diag(μ) Uᵀ and
 w_i = (Uᵀ Z_fᵀ P y)_i / √μ_i, which are N(0, 1) where the family is not there,
 
     T = max over λ ≥ 0 of  Σ_i [ w_i² λ μ_i / (1 + λ μ_i) − log(1 + λ μ_i) ],    λ = s_f²
@@ -50,7 +50,7 @@ def evidence(
         problem: with the family.
         family: its number.
         rng: draws the ratios.
-        start: (F + N,) log sizes of the whole problem; without it the priors' means.
+        start: (F + N,) log s and η of the whole problem; without it the priors' means.
     """
     without, own = problem.without(family), problem.columns_of(family)
     begun = None if start is None else np.delete(start, family)

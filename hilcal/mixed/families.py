@@ -1,4 +1,4 @@
-"""Families: the parameters of a model that share one size."""
+"""Families: the parameters of a model that share one standard deviation."""
 
 from dataclasses import dataclass
 
@@ -10,8 +10,8 @@ from hilcal.types import Floats, Ints
 
 
 @dataclass(frozen=True, slots=True)
-class LogSize:
-    """What is known of the logarithm of a size before it is estimated: normal.
+class LogStdPrior:
+    """What is known of the logarithm of a standard deviation before it is estimated: normal.
 
     Attributes:
         mean: of log s, s in ordinary magnitudes.
@@ -31,14 +31,14 @@ class Family:
         effect: name of the effect.
         parameters: (q,) indices of the parameters in the model.
         magnitude: (q,) root of D's diagonal: ordinary magnitudes, SI.
-        size: what is known of log s.
+        prior: what is known of log s.
     """
 
     name: str
     effect: str
     parameters: Ints
     magnitude: Floats
-    size: LogSize
+    prior: LogStdPrior
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,6 +87,8 @@ def _of_effect(effect: Effect, index: Ints) -> list[Family]:
         unit, pool = key
         parts = [unit] * several_units + [str(pool)] * several_pools
         name = f"{effect.name}[{', '.join(parts)}]" if parts else effect.name
-        size = effect.log_size(pool)
-        out.append(Family(name, effect.name, index[own], effect.magnitudes[own], LogSize(*size)))
+        prior = effect.log_std_prior(pool)
+        out.append(
+            Family(name, effect.name, index[own], effect.magnitudes[own], LogStdPrior(*prior))
+        )
     return out

@@ -2,7 +2,7 @@
 
     x* S c ± (x* (Cov + J Σ Jᵀ) x*ᵀ)^½
 
-Cov the covariance of the coordinates' errors at the estimated variances, Σ that of the log sizes, J
+Cov the covariance of the coordinates' errors at the estimated variances, Σ that of log s and η, J
 the sensitivity of the coordinates to them (Kackar and Harville, *Approximations for standard errors
 of estimators of fixed and random effects in mixed linear models*, JASA 79 (1984) 853).
 """

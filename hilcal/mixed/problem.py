@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.mixed.families import Families, LogSize
+from hilcal.mixed.families import Families, LogStdPrior
 from hilcal.types import Floats, Ints
 
 FRAMES_TOLERANCE = 1e-9
@@ -22,17 +22,17 @@ direction counts as not moved by the readings (the gauge of base and target)."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Noise:
-    """One component of the noise: its size exp(η) times what has the blocks R_k.
+    """One component of the noise: covariance exp(2 η) R_k.
 
     Attributes:
         name: of it.
         blocks: one array (G, S, S) for each run of rows, G blocks of S rows; None for the identity.
-        size: what is known of η.
+        prior: what is known of η.
     """
 
     name: str
     blocks: tuple[Floats, ...] | None
-    size: LogSize
+    prior: LogStdPrior
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,9 +63,9 @@ class MixedProblem:
         return int(self.frames.shape[1])
 
     @property
-    def sizes(self) -> tuple[LogSize, ...]:
+    def priors(self) -> tuple[LogStdPrior, ...]:
         """What is known of each log s and η, families first."""
-        return (*(f.size for f in self.families.random), *(n.size for n in self.noise))
+        return (*(f.prior for f in self.families.random), *(n.prior for n in self.noise))
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -1,9 +1,9 @@
-"""Variances by restricted maximum likelihood, under priors on the logarithms of the sizes.
+"""Variances by restricted maximum likelihood, under priors on log standard deviations.
 
     maximise  ℓ(log s, η) − ½ Σ ((log s_i − mean_i) / spread_i)²
 
 by Newton's method with the average information. The curvature at the maximum is the inverse
-covariance of the sizes (Laplace). Source: Patterson and Thompson, *Recovery of inter-block
+covariance of log s and η (Laplace). Source: Patterson and Thompson, *Recovery of inter-block
 information when block sizes are unequal*, Biometrika 58 (1971) 545.
 """
 
@@ -19,9 +19,9 @@ from hilcal.types import Floats
 STEPS = 100
 """Most Newton steps; a choice, 10 to 20 are usual."""
 LARGEST_STEP = 2.0
-"""Of a log size at a time: a factor of 7; a choice."""
+"""Of log s or η at a time: a factor of 7; a choice."""
 CONVERGED = 1e-4
-"""Gain of the log posterior that ends the iteration; a choice: sizes are then within 1 % of their
+"""Gain of the log posterior that ends the iteration; a choice: they are then within 1 % of their
 standard error."""
 DAMPINGS = 12
 """Most increases of the damping in one step, tenfold each; a choice."""
@@ -29,7 +29,7 @@ DAMPINGS = 12
 
 @dataclass(frozen=True, eq=False)
 class Variances:
-    """Sizes of all families and of the noise.
+    """Standard deviations of all families and of the noise.
 
     Attributes:
         equations: at the estimate.
@@ -42,13 +42,13 @@ class Variances:
     log_posterior: float
 
     @property
-    def log_size(self) -> Floats:
+    def log_std(self) -> Floats:
         """(F + N,) estimate of log s and η."""
-        return self.equations.log_size
+        return self.equations.log_std
 
 
 def estimate_variances(problem: MixedProblem, start: Floats | None = None) -> Variances:
-    """Estimate all sizes.
+    """Estimate all variances.
 
     Args:
         problem: rows, columns and noise.
@@ -65,7 +65,7 @@ def estimate_variances(problem: MixedProblem, start: Floats | None = None) -> Va
         raise CannotAnswerError("the mixed model's equations have no solution") from error
     damping = 0.0
     for _ in range(STEPS):
-        slope = here.slope - precision * (here.log_size - mean)
+        slope = here.slope - precision * (here.log_std - mean)
         curvature = here.information + np.diag(precision)
         gain = 0.0
         for _ in range(DAMPINGS):
@@ -73,7 +73,7 @@ def estimate_variances(problem: MixedProblem, start: Floats | None = None) -> Va
             step = np.linalg.solve(damped, slope)
             step *= min(1.0, LARGEST_STEP / float(np.abs(step).max(initial=1e-12)))
             try:
-                there = equations(problem, here.log_size + step)
+                there = equations(problem, here.log_std + step)
                 gain = log_posterior(there) - best
             except np.linalg.LinAlgError:
                 gain = -np.inf
@@ -92,11 +92,11 @@ def estimate_variances(problem: MixedProblem, start: Floats | None = None) -> Va
 def log_posterior(e: Equations) -> float:
     """ℓ and the prior's, without constants."""
     mean, precision = _prior(e.problem)
-    off = e.log_size - mean
+    off = e.log_std - mean
     return e.log_likelihood - 0.5 * float(off @ (precision * off))
 
 
 def _prior(problem: MixedProblem) -> tuple[Floats, Floats]:
     """Means and precisions (F + N,) of log s and η."""
-    sizes = problem.sizes
-    return np.array([s.mean for s in sizes]), np.array([s.spread for s in sizes]) ** -2.0
+    priors = problem.priors
+    return np.array([s.mean for s in priors]), np.array([s.spread for s in priors]) ** -2.0

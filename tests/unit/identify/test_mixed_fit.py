@@ -31,8 +31,8 @@ def test_a_hidden_effect_is_predicted_at_fresh_poses_and_has_the_evidence() -> N
     std = np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
     assert 0.85 < np.mean(np.abs(true - position) < 1.96 * std) <= 1.0
     k = found.problem.families.names.index(HIDDEN)
-    rng, sizes = np.random.default_rng(0), found.variances.log_size
-    assert evidence(found.problem, k, rng, sizes).p_value < 0.01
+    rng, log_std = np.random.default_rng(0), found.variances.log_std
+    assert evidence(found.problem, k, rng, log_std).p_value < 0.01
 
 
 def test_deflections_are_refused_in_words() -> None:

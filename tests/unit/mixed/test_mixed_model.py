@@ -6,18 +6,18 @@ from scipy.stats import kstest
 
 from hilcal.mixed.equations import _ByColumns, _ByRows, equations
 from hilcal.mixed.evidence import evidence
-from hilcal.mixed.families import Families, Family, LogSize
+from hilcal.mixed.families import Families, Family, LogStdPrior
+from hilcal.mixed.posterior import averaged_coordinates, walk
 from hilcal.mixed.prediction import predict
 from hilcal.mixed.problem import MixedProblem, Noise, mixed_problem
-from hilcal.mixed.sizes import averaged_coordinates, walk
 from hilcal.mixed.variances import estimate_variances, log_posterior
 from hilcal.types import Floats
 
-FLAT = LogSize(0.0, 3.0)
+FLAT = LogStdPrior(0.0, 3.0)
 
 
-def family(name: str, start: int, count: int, size: LogSize = FLAT) -> Family:
-    return Family(name, name, np.arange(start, start + count), np.linspace(0.5, 2.0, count), size)
+def family(name: str, start: int, count: int, prior: LogStdPrior = FLAT) -> Family:
+    return Family(name, name, np.arange(start, start + count), np.linspace(0.5, 2.0, count), prior)
 
 
 def problem(
@@ -28,10 +28,10 @@ def problem(
     jacobian = rng.standard_normal((rows, 12 + over))
     jacobian[:, 3] = jacobian[:, 0] + jacobian[:, 1]
     families = Families(np.arange(4), (family("a", 4, 3), family("b", 7, 5 + over)))
-    noise = [Noise("instrument", None, LogSize(0.0, 1.5))]
+    noise = [Noise("instrument", None, LogStdPrior(0.0, 1.5))]
     if scatter:
         half = rng.standard_normal((groups, 3, 2))
-        noise.append(Noise("scatter", (half @ np.swapaxes(half, 1, 2),), LogSize(0.0, 1.5)))
+        noise.append(Noise("scatter", (half @ np.swapaxes(half, 1, 2),), LogStdPrior(0.0, 1.5)))
     y = rng.standard_normal(rows) * 2 + jacobian @ rng.standard_normal(12 + over)
     return mixed_problem(y, jacobian, families, noise, [(groups, 3)])
 
@@ -61,7 +61,7 @@ def dense(p: MixedProblem, x: Floats) -> tuple[float, Floats, Floats]:
 def test_they_are_those_of_the_whole_covariance(scatter: bool, over: int, form: type) -> None:
     rng = np.random.default_rng(1)
     p = problem(rng, scatter=scatter, over=over)
-    at = [0.3 * rng.standard_normal(len(p.sizes)) for _ in range(3)]
+    at = [0.3 * rng.standard_normal(len(p.priors)) for _ in range(3)]
     first, *others = (equations(p, x) for x in at)
     assert isinstance(first.projection, form)
     ll, coordinates, left = dense(p, at[0])
@@ -80,7 +80,7 @@ def test_they_are_those_of_the_whole_covariance(scatter: bool, over: int, form: 
 def test_slopes_are_finite_differences(scatter: bool, over: int) -> None:
     rng = np.random.default_rng(2)
     p = problem(rng, scatter=scatter, over=over)
-    x, step = 0.3 * rng.standard_normal(len(p.sizes)), 1e-5
+    x, step = 0.3 * rng.standard_normal(len(p.priors)), 1e-5
 
     def along(value: str) -> list[Floats]:
         out = []
@@ -102,7 +102,7 @@ def test_slopes_are_finite_differences(scatter: bool, over: int) -> None:
 def test_the_average_information_is_the_mean_of_observed_and_expected() -> None:
     rng = np.random.default_rng(3)
     p = problem(rng, over=0)
-    x = 0.3 * rng.standard_normal(len(p.sizes))
+    x = 0.3 * rng.standard_normal(len(p.priors))
     left = dense(p, x)[2]
     z = p.x[:, p.flat :]
     parts = [np.exp(2 * x[f]) * z[:, p.family == f] @ z[:, p.family == f].T for f in range(2)]
@@ -115,33 +115,33 @@ def test_the_average_information_is_the_mean_of_observed_and_expected() -> None:
 
 def drawn(
     rng: np.random.Generator,
-    sizes: tuple[float, float],
+    stds: tuple[float, float],
     noise: float,
     groups: int,
-    size: LogSize = FLAT,
+    prior: LogStdPrior = FLAT,
     *,
     turned: bool = False,
 ) -> tuple[MixedProblem, Floats, Floats]:
-    """A problem with families of true sizes, fresh rows, and what they truly are."""
+    """A problem with families of known standard deviations, fresh rows, and what they truly are."""
     rows = rng.standard_normal((3 * groups + 40, 27))
     rows[:, 3] = rows[:, 0] + rows[:, 1]
-    both = (family("a", 4, 3, size), family("b", 7, 20, size))
+    both = (family("a", 4, 3, prior), family("b", 7, 20, prior))
     families = Families(np.arange(4), both[::-1] if turned else both)
     u = 5.0 * rng.standard_normal(27)
-    for f, s in zip(both, sizes, strict=True):
+    for f, s in zip(both, stds, strict=True):
         u[f.parameters] = s * f.magnitude * rng.standard_normal(len(f.parameters))
     true = rows @ u
     measured, fresh = rows[:-40], rows[-40:, None]
     y = true[:-40] + noise * rng.standard_normal(len(measured))
-    instrument = Noise("instrument", None, LogSize(0.0, 1.5))
+    instrument = Noise("instrument", None, LogStdPrior(0.0, 1.5))
     made = mixed_problem(y, measured, families, [instrument], [(groups, 3)])
     return made, fresh, true[-40:, None]
 
 
-def test_sizes_are_found_where_the_rows_tell_them() -> None:
+def test_standard_deviations_are_found_where_the_rows_tell_them() -> None:
     rng = np.random.default_rng(4)
     found = np.array(
-        [estimate_variances(drawn(rng, (1.0, 0.5), 0.3, 60)[0]).log_size for _ in range(40)]
+        [estimate_variances(drawn(rng, (1.0, 0.5), 0.3, 60)[0]).log_std for _ in range(40)]
     )
     true = np.log([1.0, 0.5, 0.3])
     spread = found.std(axis=0) / np.sqrt(len(found))
@@ -186,18 +186,21 @@ def test_the_outcome_does_not_depend_on_the_order_of_families() -> None:
         drawn(np.random.default_rng(8), (1.0, 0.5), 0.3, 15, turned=t) for t in (False, True)
     )
     first, second = estimate_variances(one), estimate_variances(two)
-    np.testing.assert_allclose(first.log_size[[1, 0, 2]], second.log_size, atol=0.01)
+    np.testing.assert_allclose(first.log_std[[1, 0, 2]], second.log_std, atol=0.01)
     for mean, other in zip(predict(first, fresh), predict(second, fresh), strict=True):
         np.testing.assert_allclose(mean, other, rtol=0.01, atol=0.01)
 
 
-def test_coordinates_are_averaged_over_what_the_sizes_may_be() -> None:
-    """Against a sum over a grid, with rows that hardly tell the size."""
+def test_coordinates_are_averaged_over_the_posterior() -> None:
+    """Against a sum over a grid, with rows that hardly tell the standard deviation."""
     rng = np.random.default_rng(9)
     jacobian = rng.standard_normal((9, 4))
-    families = Families(np.arange(2), (family("a", 2, 2, LogSize(0.0, 1.5)),))
+    families = Families(np.arange(2), (family("a", 2, 2, LogStdPrior(0.0, 1.5)),))
     p = mixed_problem(
-        rng.standard_normal(9), jacobian, families, [Noise("instrument", None, LogSize(0.0, 1.0))]
+        rng.standard_normal(9),
+        jacobian,
+        families,
+        [Noise("instrument", None, LogStdPrior(0.0, 1.0))],
     )
     grid = np.linspace(-5.0, 5.0, 41)
     all_of_them = [equations(p, np.array([s, eta])) for s in grid for eta in grid]
@@ -209,12 +212,12 @@ def test_coordinates_are_averaged_over_what_the_sizes_may_be() -> None:
     assert np.abs(found.equations.coordinates - mean).max() > 0.06
 
 
-def test_sizes_are_drawn_from_their_posterior() -> None:
-    """Rows that tell the sizes well: a posterior as Laplace says."""
+def test_standard_deviations_are_drawn_from_their_posterior() -> None:
+    """Rows that tell them well: a posterior as Laplace says."""
     made, *_ = drawn(np.random.default_rng(10), (1.0, 0.5), 0.3, 60)
     found = estimate_variances(made)
-    drawn_sizes = [e.log_size for e in walk(found, np.random.default_rng(0), 3000)]
-    off = np.mean(drawn_sizes, axis=0) - found.log_size
+    walked = [e.log_std for e in walk(found, np.random.default_rng(0), 3000)]
+    off = np.mean(walked, axis=0) - found.log_std
     std = np.sqrt(np.diag(found.covariance))
     assert np.all(np.abs(off) < 0.5 * std)
-    np.testing.assert_allclose(np.std(drawn_sizes, axis=0), std, rtol=0.35)
+    np.testing.assert_allclose(np.std(walked, axis=0), std, rtol=0.35)

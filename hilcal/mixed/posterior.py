@@ -1,9 +1,9 @@
-"""What the sizes may be beside their estimate, and predictions averaged over it.
+"""The posterior of the standard deviations, and predictions averaged over it.
 
-With few readings the likelihood hardly tells a size: its posterior is as wide as the prior, and not
-normal. The mean of the coordinates over it predicts better than those at its maximum (20 poses of a
-real arm: by 3 to 6 %). Drawn by a random walk (Metropolis, Rosenbluth, Rosenbluth, Teller and
-Teller, J. Chem. Phys. 21 (1953) 1087) with steps of the covariance at the maximum.
+With few readings the likelihood hardly tells a standard deviation: its posterior is as wide as the
+prior, and not normal. The mean of the coordinates over it predicts better than those at its maximum
+(20 poses of a real arm: by 3 to 6 %). Drawn by a random walk (Metropolis, Rosenbluth, Rosenbluth,
+Teller and Teller, J. Chem. Phys. 21 (1953) 1087) with steps of the covariance at the maximum.
 """
 
 from collections.abc import Iterator
@@ -24,10 +24,10 @@ Ann. Appl. Probab. 7 (1997) 110)."""
 def walk(found: Variances, rng: np.random.Generator, steps: int) -> Iterator[Equations]:
     """Yield the equations at so many steps of the walk, those of the burn-in left out."""
     here, best = found.equations, found.log_posterior
-    root = np.linalg.cholesky(found.covariance) * STEP / np.sqrt(len(found.log_size))
+    root = np.linalg.cholesky(found.covariance) * STEP / np.sqrt(len(found.log_std))
     for k in range(steps):
         try:
-            there = equations(here.problem, here.log_size + root @ rng.standard_normal(len(root)))
+            there = equations(here.problem, here.log_std + root @ rng.standard_normal(len(root)))
             value = log_posterior(there)
         except np.linalg.LinAlgError:
             value = -np.inf
@@ -38,7 +38,7 @@ def walk(found: Variances, rng: np.random.Generator, steps: int) -> Iterator[Equ
 
 
 def averaged_coordinates(found: Variances, rng: np.random.Generator, steps: int) -> Floats:
-    """(K,) mean of the coordinates over what the sizes may be."""
+    """(K,) mean of the coordinates over the posterior of the standard deviations."""
     total, count = np.zeros_like(found.equations.coordinates), 0
     for e in walk(found, rng, steps):
         total, count = total + e.coordinates, count + 1
