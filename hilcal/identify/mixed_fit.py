@@ -37,8 +37,8 @@ SCATTER_RAD = 3e-5
 NOISE_SPREAD = 1.5
 """Of the log of the noise: a factor of 4.5 either way; a choice."""
 FEW_ROWS = 300
-"""Rows up to which the variances are averaged over; beyond, their estimate is as good, and a step of
-the walk costs the cube of the rows. A choice."""
+"""Rows up to which the variances are averaged over; beyond, their estimate is as good, and a step
+of the walk costs the cube of the rows. A choice."""
 WALK = 600
 """Steps of the walk; a choice: twice as many change errors by less than 1 %."""
 
