@@ -30,6 +30,8 @@ from hilcal.types import Bools, Floats, Ints
 Field = Literal["dq", "twist", "base", "station", "target", "scale"]
 Role = Literal["registration", "target", "baseline", "effect"]
 FRAME_ROLES: tuple[Role, ...] = ("registration", "target")
+OWN_SPREAD = 0.7
+"""Of the logarithm of a pool's standard deviation, beside what is shared; a choice."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -334,11 +336,11 @@ class Effect(ABC):
     def log_std_prior(self, pool: int) -> tuple[float, float]:
         """Mean and spread of log s, s the standard deviation of a pool's parameters in magnitudes.
 
-        What arms are like before anything is measured: half of what is ordinary, and a factor of
-        20 either way. Wide on purpose: a spread of 3 predicted as well as 1.2 or better on five
-        arms' series.
+        What arms are like before anything is measured: half of what is ordinary, and a factor of 2
+        either way, beside what the pools of an effect and the effects of an arm share (see
+        `hilcal.mixed.priors`): a factor of 7 in all.
         """
-        return -0.7, 3.0
+        return -0.7, OWN_SPREAD
 
     def prior_std(self) -> Floats | None:
         """(P,) standard deviations of a fixed zero-mean prior, or None for a flat one."""

@@ -8,7 +8,7 @@ import numpy as np
 from hilcal.data.readings import States
 from hilcal.effects.changed import Changeable
 from hilcal.effects.per_joint import PerJoint
-from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
+from hilcal.effects.protocol import OWN_SPREAD, Columns, Effect, Parameter, Situation
 from hilcal.errors import InputError
 from hilcal.types import Floats, Ints
 
@@ -96,7 +96,7 @@ class TransmissionError(PerJoint):
 
     def log_std_prior(self, pool: int) -> tuple[float, float]:
         """Amplitudes of 0.16 mrad at the first harmonic, half of that with each octave."""
-        return 1.2 - 0.7 * pool, 3.0
+        return 1.2 - 0.7 * pool, OWN_SPREAD
 
     def fine(self, states: States) -> Effect | None:
         """As many harmonics as are scored at most, where the poses allow fewer."""

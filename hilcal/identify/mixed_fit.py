@@ -13,11 +13,10 @@ from hilcal.data.readings import Readings, States
 from hilcal.data.whitening import Mode, Whitening, covariance_blocks, whitening
 from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.effects.spec import EffectSpec
-from hilcal.errors import InputError
 from hilcal.identify.full_covariance import joint_factors
 from hilcal.identify.residual import residual
 from hilcal.mixed.families import LogStdPrior, families_of
-from hilcal.mixed.posterior import averaged_coordinates
+from hilcal.mixed.posterior import average
 from hilcal.mixed.prediction import coordinates_covariance
 from hilcal.mixed.problem import MixedProblem, Noise, mixed_problem
 from hilcal.mixed.variances import Variances, estimate_variances
@@ -113,15 +112,13 @@ def mixed_fit(model: Model, readings: Readings, mode: Mode, rng: np.random.Gener
     Args:
         model: frames, and effects that have to be in it.
         readings: without gross errors.
-        mode: "absolute"; deflections are not fitted yet.
+        mode: "deflection" or "absolute".
         rng: for the average over the posterior of the variances.
 
     Raises:
         CannotAnswerError: no static equilibrium, or no likelihood.
-        InputError: deflections.
+        InputError: a deflection without its unloaded reading.
     """
-    if mode != "absolute":
-        raise InputError("all effects at once are fitted to absolute readings only")
     model = with_all_effects(model, readings.states)
     families, w = families_of(model), whitening(readings, mode, "gc")
     noise = _noise(model, readings, w)
@@ -140,10 +137,11 @@ def mixed_fit(model: Model, readings: Readings, mode: Mode, rng: np.random.Gener
         if rounds == ROUNDS or np.sqrt(np.mean((now - white) ** 2)) < CONVERGED:
             break
         white = now
-    if len(problem.y) <= FEW_ROWS:
-        mean = averaged_coordinates(found, rng, WALK)
-        theta = problem.parameters(mean, model.size)
-    return MixedFit(model, readings, w, theta, found, coordinates_covariance(found))
+    if len(problem.y) > FEW_ROWS:
+        return MixedFit(model, readings, w, theta, found, coordinates_covariance(found))
+    mean = average(found, rng, WALK)
+    theta = problem.parameters(mean.coordinates, model.size)
+    return MixedFit(model, readings, w, theta, found, mean.covariance)
 
 
 def _noise(model: Model, readings: Readings, w: Whitening) -> list[Noise]:

@@ -54,6 +54,11 @@ class _ByColumns:
         return np.asarray(1.0 - np.einsum("ij,ij->j", root, root))
 
     @cached_property
+    def inverse(self) -> Floats:
+        """(K, K) C⁻¹."""
+        return np.asarray(cho_solve(self.factor, np.eye(len(self.factor[0]))))
+
+    @cached_property
     def _lifted(self) -> Floats:
         return np.asarray(solve_triangular(self.factor[0], self.rows.T, lower=True)).T
 
@@ -67,22 +72,34 @@ class _ByRows:
     """P (R, R) itself."""
 
     def __init__(self, rows: Floats, flat: int) -> None:
-        self.rows, q, z = rows, rows[:, :flat], rows[:, flat:]
+        self.rows, self.flat, q, z = rows, flat, rows[:, :flat], rows[:, flat:]
         n = z @ z.T
         n[np.diag_indices_from(n)] += 1.0
         factor = cho_factor(n, lower=True, overwrite_a=True)
         inverse = cho_solve(factor, np.eye(len(rows)))
         self.log_det = 2.0 * float(np.log(np.diagonal(factor[0])).sum())
+        self.b, self.frames = inverse @ q, np.zeros((flat, flat))
         if flat:
-            b = inverse @ q
-            inner = cho_factor(q.T @ b, lower=True)
+            inner = cho_factor(q.T @ self.b, lower=True)
             self.log_det += 2.0 * float(np.log(np.diagonal(inner[0])).sum())
-            inverse -= b @ cho_solve(inner, b.T)
+            self.frames = cho_solve(inner, np.eye(flat))
+            inverse -= self.b @ self.frames @ self.b.T
         self.p = inverse
 
     def project(self, v: Floats) -> Floats:
         """P v."""
         return np.asarray(self.p @ v)
+
+    @cached_property
+    def inverse(self) -> Floats:
+        """(K, K) C⁻¹ = [F, −F Bᵀ Z; −Zᵀ B F, 1 − Zᵀ P Z], F = (Qᵀ N⁻¹ Q)⁻¹."""
+        z, k = self.rows[:, self.flat :], self.flat
+        out = np.empty((self.rows.shape[1],) * 2)
+        out[:k, :k] = self.frames
+        out[k:, :k] = -z.T @ (self.b @ self.frames)
+        out[:k, k:] = out[k:, :k].T
+        out[k:, k:] = np.eye(z.shape[1]) - z.T @ (self.p @ z)
+        return out
 
     @cached_property
     def spent(self) -> Floats:
@@ -214,12 +231,6 @@ class Equations:
         """(F + N, F + N) AI, the average information on log s and η."""
         return np.asarray(0.5 * self.working.T @ self.projection.project(self.working))
 
-    @cached_property
-    def _columns(self) -> _ByColumns:
-        if isinstance(self.projection, _ByColumns):
-            return self.projection
-        return _ByColumns(self.rows, self.problem.flat)
-
     @property
     def coordinates(self) -> Floats:
         """(K,) S c: frames' coordinates and u in ordinary magnitudes."""
@@ -228,8 +239,7 @@ class Equations:
     @cached_property
     def covariance(self) -> Floats:
         """(K, K) covariance of the coordinates' errors at the given variances."""
-        inverse = cho_solve(self._columns.factor, np.eye(len(self.scale)))
-        return self.scale[:, None] * inverse * self.scale
+        return self.scale[:, None] * self.projection.inverse * self.scale
 
     @cached_property
     def sensitivity(self) -> Floats:
@@ -238,7 +248,7 @@ class Equations:
         rhs = np.zeros((len(self.c), len(self.log_std)))
         rhs[p.flat + np.arange(len(p.family)), p.family] = 2.0 * self.c[p.flat :]
         rhs[:, first:] = -self.rows.T @ self.working[:, first:]
-        return np.asarray(self.scale[:, None] * cho_solve(self._columns.factor, rhs))
+        return np.asarray(self.scale[:, None] * (self.projection.inverse @ rhs))
 
     def score(self, columns: Floats) -> tuple[Floats, Floats]:
         """Return Zᵀ P Z (q, q) and Zᵀ P y (q,) of columns Z (R, q) that are not in the problem."""

@@ -8,6 +8,9 @@ from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.model import Model
 from hilcal.types import Floats, Ints
 
+KNOWN = 1e-3
+"""Spread of the logarithm of a standard deviation that is known."""
+
 
 @dataclass(frozen=True, slots=True)
 class LogStdPrior:
@@ -15,7 +18,7 @@ class LogStdPrior:
 
     Attributes:
         mean: of log s, s in ordinary magnitudes.
-        spread: its standard deviation.
+        spread: standard deviation of what is its own; see `mixed.priors` for what families share.
     """
 
     mean: float
@@ -32,6 +35,7 @@ class Family:
         parameters: (q,) indices of the parameters in the model.
         magnitude: (q,) root of D's diagonal: ordinary magnitudes, SI.
         prior: what is known of log s.
+        known: whether s is known, and shares nothing with other families.
     """
 
     name: str
@@ -39,6 +43,7 @@ class Family:
     parameters: Ints
     magnitude: Floats
     prior: LogStdPrior
+    known: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,13 +68,18 @@ def families_of(model: Model) -> Families:
     """Return the families of a model.
 
     Parameters of one effect with the same unit make a family, in an effect with pools (as the
-    octaves of harmonics) each pool one.
+    octaves of harmonics) each pool one. A frame with a prior (`Effect.prior_std`), as deflections
+    need, is a family of known standard deviation.
     """
     frames: list[Ints] = []
     random: list[Family] = []
     for effect, mine in zip(model.effects, model.slices(), strict=True):
         index = np.arange(mine.start, mine.stop)
-        if effect.role in FRAME_ROLES:
+        std = effect.prior_std() if effect.role in FRAME_ROLES else None
+        if std is not None:
+            known = LogStdPrior(0.0, KNOWN)
+            random.append(Family(effect.name, effect.name, index, std, known, known=True))
+        elif effect.role in FRAME_ROLES:
             frames.append(index)
         else:
             random += _of_effect(effect, index)

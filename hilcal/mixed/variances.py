@@ -1,6 +1,6 @@
 """Variances by restricted maximum likelihood, under priors on log standard deviations.
 
-    maximise  ℓ(log s, η) − ½ Σ ((log s_i − mean_i) / spread_i)²
+    maximise  ℓ(x) − ½ (x − mean)ᵀ Λ (x − mean),    x = (log s, η), Λ of `mixed.priors`
 
 by Newton's method with the average information. The curvature at the maximum is the inverse
 covariance of log s and η (Laplace). Source: Patterson and Thompson, *Recovery of inter-block
@@ -13,6 +13,7 @@ import numpy as np
 
 from hilcal.errors import CannotAnswerError
 from hilcal.mixed.equations import Equations, equations
+from hilcal.mixed.priors import log_std_prior
 from hilcal.mixed.problem import MixedProblem
 from hilcal.types import Floats
 
@@ -57,7 +58,7 @@ def estimate_variances(problem: MixedProblem, start: Floats | None = None) -> Va
     Raises:
         CannotAnswerError: the likelihood cannot be computed at the start.
     """
-    mean, precision = _prior(problem)
+    mean, precision = log_std_prior(problem)
     try:
         here = equations(problem, mean if start is None else start)
         best = log_posterior(here)
@@ -65,8 +66,8 @@ def estimate_variances(problem: MixedProblem, start: Floats | None = None) -> Va
         raise CannotAnswerError("the mixed model's equations have no solution") from error
     damping = 0.0
     for _ in range(STEPS):
-        slope = here.slope - precision * (here.log_std - mean)
-        curvature = here.information + np.diag(precision)
+        slope = here.slope - precision @ (here.log_std - mean)
+        curvature = here.information + precision
         gain = 0.0
         for _ in range(DAMPINGS):
             damped = curvature + damping * np.diag(np.diagonal(curvature))
@@ -85,18 +86,12 @@ def estimate_variances(problem: MixedProblem, start: Floats | None = None) -> Va
         here, best, damping = there, best + gain, 0.1 * damping if damping > 1e-3 else 0.0
         if gain < CONVERGED:
             break
-    covariance = np.asarray(np.linalg.inv(here.information + np.diag(precision)))
+    covariance = np.asarray(np.linalg.inv(here.information + precision))
     return Variances(here, covariance, best)
 
 
 def log_posterior(e: Equations) -> float:
     """ℓ and the prior's, without constants."""
-    mean, precision = _prior(e.problem)
+    mean, precision = log_std_prior(e.problem)
     off = e.log_std - mean
-    return e.log_likelihood - 0.5 * float(off @ (precision * off))
-
-
-def _prior(problem: MixedProblem) -> tuple[Floats, Floats]:
-    """Means and precisions (F + N,) of log s and η."""
-    priors = problem.priors
-    return np.array([s.mean for s in priors]), np.array([s.spread for s in priors]) ** -2.0
+    return e.log_likelihood - 0.5 * float(off @ precision @ off)

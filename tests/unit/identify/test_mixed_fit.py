@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from hilcal.config import load_config
-from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import fit
 from hilcal.identify.mixed_fit import mixed_fit
@@ -35,8 +34,17 @@ def test_a_hidden_effect_is_predicted_at_fresh_poses_and_has_the_evidence() -> N
     assert evidence(found.problem, k, rng, log_std).p_value < 0.01
 
 
-def test_deflections_are_refused_in_words() -> None:
-    case = study_case(CONFIG, "ur10e", "deflection", (), 3.0, 1, n_poses=10)
+def test_a_hidden_effect_of_deflections_has_the_evidence() -> None:
+    case = study_case(CONFIG, "ur10e", "deflection", (HIDDEN,), 3.0, 1, n_poses=10)
     start = baseline(case.cell, case.readings, "deflection")
-    with pytest.raises(InputError, match="absolute readings only"):
-        mixed_fit(start, case.readings, "deflection", np.random.default_rng(0))
+    found = mixed_fit(start, case.readings, "deflection", np.random.default_rng(0))
+    names, log_std = found.problem.families.names, found.variances.log_std
+    p = {
+        name: evidence(found.problem, k, np.random.default_rng(0), log_std).p_value
+        for k, name in enumerate(names)
+        if name in (HIDDEN, "base_compliance", "link_compliance", "backlash", "creep")
+    }
+    assert p.pop(HIDDEN) < 0.001
+    assert min(p.values()) > 0.01
+    # the registration is known by its prior, and nothing else is of its size
+    assert found.std("base_frame") == pytest.approx(1.0, abs=0.01)

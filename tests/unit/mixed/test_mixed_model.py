@@ -7,7 +7,7 @@ from scipy.stats import kstest
 from hilcal.mixed.equations import _ByColumns, _ByRows, equations
 from hilcal.mixed.evidence import evidence
 from hilcal.mixed.families import Families, Family, LogStdPrior
-from hilcal.mixed.posterior import averaged_coordinates, walk
+from hilcal.mixed.posterior import average, walk
 from hilcal.mixed.prediction import predict
 from hilcal.mixed.problem import MixedProblem, Noise, mixed_problem
 from hilcal.mixed.variances import estimate_variances, log_posterior
@@ -36,8 +36,8 @@ def problem(
     return mixed_problem(y, jacobian, families, noise, [(groups, 3)])
 
 
-def dense(p: MixedProblem, x: Floats) -> tuple[float, Floats, Floats]:
-    """ℓ from V = Σ s² Z D Zᵀ + R itself, BLUP coordinates, and P."""
+def dense(p: MixedProblem, x: Floats) -> tuple[float, Floats, Floats, Floats]:
+    """ℓ from V = Σ s² Z D Zᵀ + R itself, BLUP coordinates, P, and their errors' covariance."""
     q, z = p.x[:, : p.flat], p.x[:, p.flat :]
     scale = np.exp(x)[p.family]
     r = np.zeros((len(p.y), len(p.y)))
@@ -53,7 +53,10 @@ def dense(p: MixedProblem, x: Floats) -> tuple[float, Floats, Floats]:
     left = vi - vi @ q @ np.linalg.solve(inner, q.T @ vi)
     ll = -0.5 * (np.linalg.slogdet(v)[1] + np.linalg.slogdet(inner)[1] + p.y @ left @ p.y)
     b = np.linalg.solve(inner, q.T @ vi @ p.y)
-    return ll, np.concatenate([b, scale**2 * (z.T @ left @ p.y)]), left
+    henderson = p.x.T @ np.linalg.solve(r, p.x)
+    henderson += np.diag(np.concatenate([np.zeros(p.flat), scale**-2.0]))
+    coordinates = np.concatenate([b, scale**2 * (z.T @ left @ p.y)])
+    return ll, coordinates, left, np.linalg.inv(henderson)
 
 
 @pytest.mark.parametrize(("over", "form"), [(0, _ByColumns), (60, _ByRows)])
@@ -64,8 +67,9 @@ def test_they_are_those_of_the_whole_covariance(scatter: bool, over: int, form: 
     at = [0.3 * rng.standard_normal(len(p.priors)) for _ in range(3)]
     first, *others = (equations(p, x) for x in at)
     assert isinstance(first.projection, form)
-    ll, coordinates, left = dense(p, at[0])
+    ll, coordinates, left, covariance = dense(p, at[0])
     np.testing.assert_allclose(first.coordinates, coordinates, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(first.covariance, covariance, rtol=1e-8, atol=1e-10)
     for e, x in zip(others, at[1:], strict=True):  # up to the constant
         gain = e.log_likelihood - first.log_likelihood
         assert gain == pytest.approx(dense(p, x)[0] - ll, rel=1e-9)
@@ -207,8 +211,12 @@ def test_coordinates_are_averaged_over_the_posterior() -> None:
     weight = np.exp([log_posterior(e) for e in all_of_them])
     mean = weight @ np.array([e.coordinates for e in all_of_them]) / weight.sum()
     found = estimate_variances(p)
-    averaged = averaged_coordinates(found, np.random.default_rng(0), steps=6000)
-    np.testing.assert_allclose(averaged, mean, atol=0.03)
+    averaged = average(found, np.random.default_rng(0), steps=6000)
+    np.testing.assert_allclose(averaged.coordinates, mean, atol=0.03)
+    off = np.array([e.coordinates for e in all_of_them]) - mean
+    covariance = np.einsum("g,gij->ij", weight, [e.covariance for e in all_of_them])
+    covariance = (covariance + (weight * off.T) @ off) / weight.sum()
+    np.testing.assert_allclose(averaged.covariance, covariance, rtol=0.1, atol=0.05)
     assert np.abs(found.equations.coordinates - mean).max() > 0.06
 
 
