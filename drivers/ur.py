@@ -142,11 +142,11 @@ class UrArm:
         try:
             control.set_payload(mass, com)
         except WorkerError as error:
-            self._fail(cause.not_commanded(error))
+            self._not_done(cause.not_commanded(error))
         end = time.monotonic() + _PAYLOAD_S
         while True:
-            sample = self._read().sample
-            told = sample.payload_com
+            reading = self._read()
+            sample, told = reading.sample, reading.sample.payload_com
             if told is None:
                 raise failure(
                     self._host,
@@ -154,6 +154,8 @@ class UrArm:
                 )
             if abs(sample.payload - mass) <= _MASS_KG and np.abs(told - com).max() <= _COM_M:
                 return
+            if reading.runtime != states.PLAYING:
+                self._not_done("it did not take the payload")
             if time.monotonic() > end:
                 self._fail(
                     f"it says {sample.payload:g} kg at {np.round(told, 4).tolist()} m after a "
@@ -187,12 +189,9 @@ class UrArm:
         try:
             taken = control.move(q, speed, acceleration, motion.brake)
         except WorkerError as error:
-            self._fail(cause.not_commanded(error))
+            self._not_done(cause.not_commanded(error))
         if not taken:
-            reading = self._read()
-            playing = reading.runtime == states.PLAYING
-            why = "" if playing else f": {cause.program_ended(reading, 0.0)}"
-            self._fail(f"it did not take the motion{why}")
+            self._not_done("it did not take the motion")
 
     def moving(self) -> bool:
         """Whether the motion is still going on; see `Arm.moving`."""
@@ -289,6 +288,14 @@ class UrArm:
         """Fail unless the robot is in a state to move."""
         if reading.sample.safety != states.NORMAL or reading.mode != states.RUNNING:
             self._fail("it is not ready to move")
+
+    def _not_done(self, noticed: str) -> NoReturn:
+        """Fail on a command without effect, which a program that does not play explains."""
+        with contextlib.suppress(LinkError):  # the stop finds it lost, too
+            reading = self._receiver.read(STALE_S)
+            if reading.runtime != states.PLAYING:
+                noticed = f"{noticed}: {cause.program_ended(reading, 0.0)}"
+        self._fail(noticed)
 
     def _fail(self, noticed: str, lost: str = "") -> NoReturn:
         """Stop the arm first, then find out the cause and raise it."""

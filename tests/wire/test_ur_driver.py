@@ -7,6 +7,7 @@ import pytest
 
 from drivers.ur import open_arm
 from drivers.ur_link.control import Control
+from drivers.ur_link.worker import WorkerError
 from hilcal.errors import DeviceError, InputError
 from tests.support import ur_driver_cases as cases
 
@@ -127,6 +128,7 @@ def test_payload_is_set_also_with_its_centre_at_the_flange(arm, sim):
     [
         (None, r"it says 2\.5 kg at .* after a payload of 4 kg"),
         ("local_mode", "it was switched to local mode; switch it to remote control"),
+        ("kill_script", "it did not take the payload: its program is stopped"),
     ],
 )
 def test_payload_that_the_controller_does_not_take_is_told_by_its_cause(
@@ -139,8 +141,39 @@ def test_payload_that_the_controller_does_not_take_is_told_by_its_cause(
         with pytest.raises(DeviceError, match=says):
             arm.set_payload(4.0, cases.COM)
     finally:
-        sim.admin("remote_mode")
+        cases.put_right(sim)
     assert sim.admin()["payload"] == cases.MASS
+
+
+def test_a_program_that_ends_while_a_payload_is_set_is_named(arm, sim, monkeypatch):
+    set_payload = Control.set_payload
+
+    def ended(control, mass, com):
+        sim.admin("kill_script")
+        return set_payload(control, mass, com)
+
+    monkeypatch.setattr(Control, "set_payload", ended)
+    with pytest.raises(DeviceError, match="did not take the payload: its program is stopped"):
+        arm.set_payload(4.0, cases.COM)
+    with pytest.raises(DeviceError, match=r"not under control.*its program is stopped"):
+        arm.start_move(arm.sample().q, 0.5, 0.5)
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_command_that_fails_since_the_program_has_ended_says_so(lost, arm, sim, monkeypatch):
+    def ended(*_):
+        sim.admin("kill_script")
+        raise WorkerError("no answer within 0.5 s", lost=lost)
+
+    for name, command in (
+        ("set_payload", lambda: arm.set_payload(4.0, cases.COM)),
+        ("move", lambda: arm.start_move(cases.away(arm, by=0.2), 0.5, 0.5)),
+    ):
+        arm.take_control(cases.MASS, cases.COM)
+        with monkeypatch.context() as patched:
+            patched.setattr(Control, name, ended)
+            with pytest.raises(DeviceError, match=r"\(no answer .*: its program is stopped"):
+                command()
 
 
 def test_stop_in_motion_keeps_control(arm, sim):
