@@ -202,12 +202,13 @@ class Soak:
     def wrong_weights(self) -> str:
         """The person hangs another weight than asked for, once or every time.
 
-        Once where nothing is measured yet: by the sensor's own zero a load that nobody took off
+        Once where no reading is stored yet: by the sensor's own zero a load that nobody took off
         cannot be told, and the second answer is believed until gravity turns in the sensor.
         """
-        begun = self.path.exists()
-        run = self._run()
-        times = self.rng.choice((1, 3)) if begun else 1
+        before = self.path
+        measured = self._count_stored() > 0
+        run = self._run()  # may begin another campaign
+        times = self.rng.choice((1, 3)) if measured and self.path == before else 1
         for _ in range(times):
             wrong = self.rng.choice(self.site.config.loads)
             self.site.ask("world", "mistake", name=wrong.name)
@@ -219,6 +220,8 @@ class Soak:
         else:
             run.interrupt()
             self._ended(run)
+        for _ in range(times + 1):  # mistakes that the run did not come to, and nothing at the end
+            self.site.ask("world", "hang", name=None)
         self._sound()
         return "wrong weights"
 
@@ -468,6 +471,13 @@ class Soak:
         assert len(steps) == len(set(steps)) == count, "a reading is lost or doubled"
         if count:
             right(self.site, self.path)
+
+    def _count_stored(self) -> int:
+        """Readings of the campaign that is measured now."""
+        if not self.path.exists():
+            return 0
+        with CampaignFile.open(self.path, read_only=True) as campaign:
+            return campaign.n_readings
 
     def _done(self) -> bool:
         with CampaignFile.open(self.path, read_only=True) as campaign:
