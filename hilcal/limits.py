@@ -30,6 +30,8 @@ STATEMENT = 10_000
 """Characters of one."""
 BLOCKS = 100
 """Blocks in each other in which one stands."""
+NESTED = 100
+"""Expressions in each other in one."""
 DOCUMENT = 1 << 25
 """Bytes of a JSON document: plan, calibration, prior."""
 VALUES = 2_000_000

@@ -57,7 +57,8 @@ def serial_noise(
     for f in figures:
         t.show(f"{f.what}: {f.measured}")
     t.document({"cases": [asdict(c) for c in cases]})
-    keep(keep_file, "Noise that is correlated along the order of the readings", figures)
+    title = f"Noise that is correlated along the order of the readings, ρ = {rhos}"
+    keep(keep_file, title, figures)
 
 
 def _figures(cases: Sequence[SerialCase], rhos: Sequence[float]) -> Iterator[Figure]:

@@ -45,7 +45,6 @@ class Margins:
         clear: between arm, obstacles and what hangs, m.
         itself: between parts of the arm, m.
         bear: share of the usable torque and of the force sensor's moment.
-        guessed: whether an arm of unknown shape is checked against itself by its guessed links.
     """
 
     joint: float = 0.0
@@ -53,7 +52,6 @@ class Margins:
     clear: float = 0.005
     itself: float = 0.005
     bear: float = 1.0
-    guessed: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +107,6 @@ class Feasibility:
         self.margins = Margins() if margins is None else margins
         self.shapes = clearance_of(cell, config)
         self.sight = sight_of(self.shapes)
-        self._itself = self.margins.guessed or is_known(cell.arm)
         low, high = config.limits.workspace_min_m, config.limits.workspace_max_m
         self._floor = low is None
         self._box = (low or (-np.inf, -np.inf, 0.0), high or (np.inf, np.inf, np.inf))
@@ -118,11 +115,9 @@ class Feasibility:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What is not checked, or is guessed."""
-        if is_known(self.cell.arm):
-            return ()
-        itself = "" if self._itself else "; whether it touches itself is not checked"
-        return (f"the shape of {self.cell.arm.name} is not known: its links are guessed{itself}",)
+        """What is guessed."""
+        guessed = self._guessed
+        return (guessed,) if guessed else ()
 
     # states
 
@@ -246,8 +241,8 @@ class Feasibility:
             yield self._torque(q, load)
         elif kind == SENSOR and self.config.force_sensor is not None:
             yield self._moment(q, load)
-        elif kind == ITSELF and self._itself:
-            yield _Touch(scene.itself, q, margins.itself, scene.itself.rates)
+        elif kind == ITSELF:
+            yield _Touch(scene.itself, q, margins.itself, scene.itself.rates, guessed=self._guessed)
         elif kind == OBSTACLE:
             yield _Touch(scene.around, q, margins.clear, scene.around.rates)
         elif kind == HANGING:
@@ -354,6 +349,12 @@ class Feasibility:
 
     # helpers
 
+    @property
+    def _guessed(self) -> str:
+        arm = self.cell.arm
+        known = is_known(arm)
+        return "" if known else f"the shape of {arm.name} is not known: its links are guessed"
+
     def _set_bodies(self) -> None:
         """Which capsules are held to which sides of the workspace, and how they move."""
         scene, arm = self.shapes.scene, self.cell.arm
@@ -448,6 +449,7 @@ class _Touch:
         margin: m.
         rates: (K, n) how fast each pair may near, m/rad.
         segment: what hangs in the N states, of `Scene.free`.
+        guessed: says that the shapes are; empty where they are known.
     """
 
     pairs: Pairs
@@ -455,6 +457,7 @@ class _Touch:
     margin: float
     rates: Floats
     segment: Segment | None = None
+    guessed: str = ""
 
     def beyond(self, rows: Ints, turn: Floats | None) -> Bools:
         """(R,) whether shapes are too close, or might come so within turns (R, n)."""
@@ -474,6 +477,7 @@ class _Touch:
                 text = f"they overlap by {-gap:.3g} m"
             else:
                 text = f"they are {gap:.3g} m apart, {self.margin:g} m are kept"
+            text += f" ({self.guessed})" if self.guessed else ""
             yield Finding(kind, f"{a} {b}", UNLOADED, f"{a} and {b} collide: {text}")
 
     def _of(self, rows: Ints) -> Segment | None:

@@ -147,6 +147,7 @@ def _parsed(text: str, number: int, word: str) -> ast.stmt:
     what, header = f"'{text[:40]}' is not understood", word in (*_OPENS, "elif")
     try:
         (node,) = ast.parse(text + "\n pass" * header).body
+        _check_depth(node)
         known = all(_known(n, text) for n in _parts(node))
     except (SyntaxError, ValueError, RecursionError, MemoryError):
         raise _refused(number, what) from None
@@ -155,6 +156,19 @@ def _parsed(text: str, number: int, word: str) -> ast.stmt:
     if not known or isinstance(node, ast.If | ast.While | ast.FunctionDef) != header:
         raise _refused(number, what)
     return node
+
+
+def _check_depth(node: ast.AST) -> None:
+    """Refuse an expression in expressions without end: how many Python itself reads varies.
+
+    Raises:
+        ValueError: it is nested too deeply.
+    """
+    level: list[ast.AST] = [node]
+    for _ in range(limits.NESTED):
+        level = [part for one in level for part in ast.iter_child_nodes(one)]
+    if level:
+        raise ValueError
 
 
 def _parts(node: ast.stmt) -> Iterator[ast.AST]:

@@ -3,6 +3,7 @@
 import errno
 import itertools
 import os
+import re
 import shlex
 import sys
 import threading
@@ -26,6 +27,7 @@ _BROKEN_PIPE = 141
 _INTERRUPTED = StoppedError.exit_code
 _USAGE = 2
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_LIBRARY = re.compile(r"(\S+): cannot open shared object file")
 _FRAMES = "⠋⠙⠹⠸⠼⠴⠦⠧⠇⠏"
 _FRAME_S = 0.2
 
@@ -222,6 +224,10 @@ def _run(
             words = f"{error.filename or 'a file'} cannot be written ({os.strerror(error.errno)})"
             hint = "make room on the disks of output, program and temporary files"
             return failures.tell(error, f"{words}: {hint}", DeviceError.exit_code)
+        if isinstance(error, ImportError) and (lacks := _LIBRARY.match(str(error))):
+            package = " (libgomp1 on Debian)" if lacks[1] == "libgomp.so.1" else ""
+            words = f"the system library {lacks[1]} is missing: install its package{package}"
+            return failures.tell(error, words, _USAGE)
         from hilcal.effects.failure import failure_of  # loads numpy, which takes a while
 
         if failed := failure_of(error):

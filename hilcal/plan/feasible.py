@@ -13,7 +13,7 @@ from hilcal.data.plan import UNLOADED
 from hilcal.robot.chain import evaluate, joint_jacobian
 from hilcal.types import Bools, Floats
 
-PLANNED = Margins(joint=1e-6, inside=0.02, clear=0.02, itself=0.01, bear=0.98, guessed=True)
+PLANNED = Margins(joint=1e-6, inside=0.02, clear=0.02, itself=0.01, bear=0.98)
 """What a planner keeps beyond the limits: choices, no study behind them."""
 
 REASONS = {

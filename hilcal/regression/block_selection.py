@@ -109,7 +109,8 @@ class BlockSelection:
             least: gain in log evidence that each needs.
             strengths: (T,) prior standard deviations that are tried.
         """
-        s = self._all.plus(self._of[f], -1)
+        # a sample of the rows need not have any of the last folds
+        s = self._all.plus(self._of[f], -1) if f < len(self._of) else self._all
         count, width = self._shape
         c = positive_solve(s.gram + np.diag(self._ridge), s.cross)
         e, by_ridge = s.cross[:, :-1], self._ridge[:, None] * c

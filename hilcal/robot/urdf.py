@@ -141,7 +141,8 @@ def _axes(model: pin.Model) -> list[Floats]:
     pin.computeJointJacobians(model, data, pin.neutral(model))
     frame = pin.ReferenceFrame.LOCAL
     return [
-        pin.getJointJacobian(model, data, joint, frame)[:, model.joints[joint].idx_v].copy()
+        # of a model with one degree of freedom Pinocchio returns (6,)
+        pin.getJointJacobian(model, data, joint, frame).reshape(6, -1)[:, model.joints[joint].idx_v]
         for joint in range(1, model.njoints)
     ]
 

@@ -123,5 +123,26 @@ def test_the_shape_of_an_unknown_arm_is_said_to_be_guessed() -> None:
     unknown = replace(cell_from_config(config), arm=arm_of(ODD))
     q = np.zeros((1, unknown.arm.n))
     dry = dry_run(unknown, config, Plan(("reference",), q, (Step("reference", UNLOADED),)))
-    assert any("whether it touches itself is not checked" in line for line in dry.remarks)
-    assert Space(unknown, config).remarks[-1].endswith("its links are guessed")
+    said = "the shape of odd is not known: its links are guessed"
+    assert said in dry.remarks
+    assert said in Space(unknown, config).remarks
+
+
+def test_guessed_links_are_held_to_each_other_by_planner_dry_run_and_guard() -> None:
+    """States of an arm of unknown shape in which it touches nothing but itself."""
+    config = cell(limits={"workspace_min_m": [-9.0, -9.0, -9.0]}, loads=[])
+    unknown = replace(cell_from_config(config), arm=arm_of(ODD))
+    space, guard = Space(unknown, config), Guard(unknown, config)
+    drawn = np.random.default_rng(0).uniform(-2.0, 2.0, (200, unknown.arm.n))
+    overlap = [q for q in drawn if space.shapes.scene.itself.distance(q) < 0.0]
+    assert len(overlap) > 20
+    for q in overlap[:20]:
+        assert not space.allowed(q[None], UNLOADED, ("self-collision",)).all()
+        plan = Plan(("reference",), q[None], (Step("reference", UNLOADED),))
+        found = [x for x in dry_run(unknown, config, plan).problems if "collide" in x]
+        assert found
+        assert all("its links are guessed" in x for x in found)
+        here = replace(Bench().rig.arm.sample(), q=q, qd=np.zeros(len(q)))
+        said = guard.check(here)
+        assert said is not None
+        assert "collide" in said

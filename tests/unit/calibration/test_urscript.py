@@ -247,6 +247,7 @@ def test_a_waypoint_that_is_not_understood_is_refused_by_line_or_left(
         ("x = " + "(" * 4900 + ")" * 4900 + f"\nmovej({SIX})\n", 1, "not understood"),
         ("x = " + "-" * 9000 + f"1\nmovej({SIX})\n", 1, "not understood"),
         ("x = " + "+".join("1" * 4900) + f"\nmovej({SIX})\n", 1, "not understood"),
+        ("x = " + "+".join("1" * 102) + f"\nmovej({SIX})\n", 1, "not understood"),
     ],
 )
 def test_what_could_change_a_waypoint_refuses_the_program_by_line(

@@ -55,3 +55,13 @@ def test_nothing_is_chosen_of_noise() -> None:
     y, fold = rng.normal(size=ROWS), np.arange(ROWS) % FOLDS
     selection = BlockSelection(own, np.full(MODEL, 1e-6), x, y, fold)
     assert [selection.without(f, 4, 8.0, STRENGTHS) for f in range(FOLDS)] == [[]] * FOLDS
+
+
+def test_a_fold_that_the_sample_has_no_row_of_is_left_out_of_nothing() -> None:
+    """As one pose read 12,000 times beside others: a sample of the rows misses whole poses."""
+    rng = np.random.default_rng(0)
+    own, x = rng.normal(size=(60, 2)), rng.normal(size=(60, 3, 2))
+    y = x[:, 1, 0] + 0.1 * rng.normal(size=60)
+    first = BlockSelection(own, np.ones(2), x, y, np.arange(60) % 3)
+    strengths = np.array([0.1, 1.0])
+    assert first.without(3, 2, 3.0, strengths) == first.without(7, 2, 3.0, strengths) == [1]

@@ -290,6 +290,23 @@ def test_part_of_a_urdf(tmp_path: Path) -> None:
     np.testing.assert_allclose(arm.masses.sum(), whole.masses[2:].sum(), rtol=1e-12)
 
 
+def test_an_arm_of_one_joint(tmp_path: Path) -> None:
+    path = tmp_path / "arm.urdf"
+    path.write_text(
+        '<robot name="r"><link name="a"/>' + _link("b", 2.0, np.array([0.0, 0.0, 0.1])) + "<joint "
+        'name="j" type="revolute"><origin xyz="0.1 0.2 0.3"/><parent link="a"/><child link="b"/>'
+        '<axis xyz="1 0 0"/><limit lower="-1" upper="1" effort="9" velocity="1"/></joint></robot>'
+    )
+    arm = arm_from_urdf(path)
+    assert arm.joint_names == ("j",)
+    turned = flange(arm, np.array([0.4])) @ np.linalg.inv(flange(arm, np.zeros(1)))
+    expected = np.eye(4)
+    expected[1:3, 1:3] = [[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]]
+    at = np.array([0.1, 0.2, 0.3])
+    expected[:3, 3] = at - expected[:3, :3] @ at
+    np.testing.assert_allclose(turned, expected, rtol=0, atol=1e-12)
+
+
 def test_mass_of_a_gripper_beyond_the_tip_is_kept(tmp_path: Path) -> None:
     whole = load_arm("ur5e")
     arm = arm_from_urdf(write(tmp_path, FINGER), tip_link="tool0")
