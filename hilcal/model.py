@@ -1,5 +1,6 @@
 """A model is a cell and a tuple of effects; `model + effect` is a new model."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING
@@ -85,6 +86,10 @@ class Model:
             model was made without.
         prior: what another campaign taught of the arm; None for nothing. It is of those parameters
             that have the same names.
+        random: by effect, the standard deviations (q,) of its parameters where they are random with
+            a mean of zero, SI (see `hilcal.mixed`).
+        background: names of effects that predict with all others, and that the readings do not
+            prove one by one. They are among `random`.
     """
 
     cell: Cell
@@ -92,6 +97,8 @@ class Model:
     catalogue: Catalogue = field(default_factory=installed)
     readings: Readings | None = None
     prior: "CarriedPrior | None" = None
+    random: Mapping[str, Floats] = field(default_factory=dict)
+    background: frozenset[str] = frozenset()
     _slices: tuple[slice, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -108,6 +115,11 @@ class Model:
     def names(self) -> tuple[str, ...]:
         """Names of the effects, in order."""
         return tuple(e.name for e in self.effects)
+
+    @property
+    def named(self) -> tuple[str, ...]:
+        """Names of the effects that people see as the model, in order; see `background`."""
+        return tuple(n for n in self.names if n not in self.background)
 
     @property
     def size(self) -> int:

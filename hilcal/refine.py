@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from hilcal import limits
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode
+from hilcal.diagnose.background_evidence import background_helps, proved
 from hilcal.diagnose.diagnosis import Diagnosis, History, Verdict
 from hilcal.diagnose.effect_ranking import LEAST_SHARE
 from hilcal.diagnose.evidence import Evidence
@@ -14,9 +15,10 @@ from hilcal.diagnose.residual_regression import Regressions
 from hilcal.diagnose.serial_noise import serial_noise, with_serial_noise
 from hilcal.diagnose.stepwise import Refits, add, exchange, predicts_better, remove
 from hilcal.diagnose.stepwise_alternatives import Alternative
-from hilcal.diagnose.verdict import NOTHING, judge
+from hilcal.diagnose.verdict import NOTHING, judge, with_one_named
 from hilcal.discover.proposal import LawSearch
 from hilcal.identify.arm_scatter import with_arm_scatter, with_prior_scatter
+from hilcal.identify.background import with_background
 from hilcal.identify.carried_evidence import carried_effects
 from hilcal.identify.fit import Fit, fit
 from hilcal.model import Model
@@ -27,6 +29,8 @@ __all__ = ["Refinement", "Step", "add", "predicts_better", "refine", "remove"]
 MOST_REVISIONS = 15
 MOST_SCATTERS = 2
 """Estimates of the arm's scatter at most: the first, and one more with what was added after it."""
+BACKGROUND = "background"
+"""What a step with a background has as its addition."""
 FAR = 0.1
 """Share of an effect's evidence by which others must be better while the model is not adequate;
 a guess."""
@@ -41,7 +45,7 @@ class Step:
     Attributes:
         fit: the fit.
         diagnosis: of it, with all that the refinement learnt of it.
-        added: the effect that was added to the revision before.
+        added: the effect that was added to the revision before, or `BACKGROUND`.
         removed: the effect that was removed from it.
     """
 
@@ -75,7 +79,7 @@ class Refinement:
     @property
     def names(self) -> tuple[str, ...]:
         """Effects of any of its models, each once."""
-        return tuple(dict.fromkeys(n for s in self.steps for n in s.fit.model.names))
+        return tuple(dict.fromkeys(n for s in self.steps for n in s.fit.model.named))
 
     @property
     def rejected(self) -> tuple[str, ...]:
@@ -98,11 +102,12 @@ def refine(
     linearisation promised (see `diagnose.promise`). Where the readings do not separate
     the first suspect from others it is added all the same, since any of them lowers the error.
     When no suspect is left, every addition is reconsidered: a redundant one is removed, one that
-    others replace better is exchanged for them. Effects that were tried or taken out enter the
-    history by which `verdict.judge` judges each step. Where the arm's scatter is what is left, the
-    last step is a fit with it in the covariance, so that weights, uncertainties and p-values have
-    it, too. A correlation of the noise along the order of the readings is in all fits (see
-    `diagnose.serial_noise`): it would be taken for effects.
+    others replace better is exchanged for them. Where more than noise is left then, all effects of
+    the catalogue are fitted together, see `Path.take_background`. Effects that were tried or taken
+    out enter the history by which `verdict.judge` judges each step. Where the arm's scatter is what
+    is left, the last step is a fit with it in the covariance, so that weights, uncertainties and
+    p-values have it, too. A correlation of the noise along the order of the readings is in all fits
+    (see `diagnose.serial_noise`): it would be taken for effects.
 
     Args:
         model: the starting model. Its effects are not taken out, but for those of a carried prior
@@ -156,7 +161,7 @@ def refine_from(
         changed = True
         while changed:
             path.extend()
-            changed = path.reconsider() or path.take_scatter()
+            changed = path.reconsider() or path.take_background() or path.take_scatter()
     return Refinement(tuple(path.steps))
 
 
@@ -183,10 +188,11 @@ class Path:
             likely: takes a fit that is most likely to be tried next.
         """
         self.steps: list[Step] = []
-        self._given, self._before, self._say = first.model.names, before, say
+        self._given, self._before, self._say = first.model.named, before, say
         self._laws, self._seen, self._likely = laws, seen, likely
         self._rejected, self._removed = [*before.rejected], [*before.removed]
         self._refits, self._regressions = Refits(), Regressions()
+        self._background_tried = False
         taken = first.readings.arm_scatter is not None
         self._scattered = [first.model.names] if taken else []
         say("diagnosing")
@@ -197,7 +203,7 @@ class Path:
         return len(self.steps) < MOST_REVISIONS
 
     def _history(self, of: Fit) -> History:
-        names = of.model.names
+        names = of.model.named
         return History(
             added=tuple(n for n in names if n not in self._given or n in self._before.added),
             removed=tuple(self._removed),
@@ -267,7 +273,9 @@ class Path:
     def reconsider(self) -> bool:
         """Judge every addition anew; returns whether one was removed or exchanged."""
         last = self.steps[-1]
-        added = [n for n in last.fit.model.names if n not in self._given]
+        if last.fit.model.background:  # what is named does not depend on what was added before
+            return False
+        added = [n for n in last.fit.model.named if n not in self._given]
         names = [*added, *carried_effects(last.fit.model)]
         if not names or not self._room:
             return False
@@ -285,6 +293,41 @@ class Path:
                 return True
         return False
 
+    def take_background(self) -> bool:
+        """Fit all other effects of the catalogue together, where the model leaves more than noise.
+
+        They stay as the background of the model where the readings prove effects together and the
+        error on poses left out falls; where the verdict is `unknown_effect`, by more than it
+        scatters from pose to pose, since effects of the catalogue may resemble one that it does not
+        have. Those that the readings prove beside all others are then named, in the order of their
+        evidence, whatever was added before.
+        Returns whether anything was changed.
+        """
+        last = self.steps[-1]
+        tried = self._background_tried or bool(last.fit.model.background)
+        if tried or not self._room or last.diagnosis.residual_is_noise:
+            return False
+        self._background_tried = True
+        self._say("fitting all effects of the catalogue together")
+        found = with_background(last.fit, self._given)
+        if found is None or not background_helps(last.fit, found):
+            return False
+        unknown = last.diagnosis.verdict == "unknown_effect"
+        if unknown and not predicts_better(last.fit, found):
+            return False
+        self._say("the background of all effects predicts better; diagnosing")
+        self.append(found, BACKGROUND)
+        judged = self.steps[-1].diagnosis
+        of = judged.background
+        for name in proved(of)[: MOST_REVISIONS - len(self.steps)]:
+            of = tuple(b for b in of if b.effect != name)
+            model = found.model
+            found = replace(found, model=replace(model, background=model.background - {name}))
+            diagnosis = with_one_named(judged, found, self._history(found), of)
+            self.steps.append(Step(found, diagnosis, name))
+            self._seen(self.steps[-1])
+        return True
+
     def take_scatter(self) -> bool:
         """Fit with the arm's scatter in the covariance; returns whether anything was changed.
 
@@ -292,6 +335,8 @@ class Path:
         """
         last = self.steps[-1]
         fitted, names = last.fit, last.fit.model.names
+        if fitted.model.background:  # the scatter is in its covariance
+            return False
         if not self._room or len(self._scattered) == MOST_SCATTERS or names in self._scattered:
             return False
         judged = last.diagnosis

@@ -19,6 +19,7 @@ from hilcal.data.stored_priors import CARRIED
 from hilcal.data.whitening import MODES, SCALINGS, Mode, Scaling
 from hilcal.diagnose.diagnosis import History
 from hilcal.effects.catalogue import Catalogue, installed
+from hilcal.effects.protocol import Effect
 from hilcal.errors import InputError
 from hilcal.identify import fit_document
 from hilcal.identify.arm_scatter import with_arm_scatter
@@ -35,6 +36,9 @@ _WIDEST = 1e100
 """No prior is as wide: its square, times those of whitened rows, is within double precision."""
 SERIAL = "serial_noise"
 """Key among the parameters of a revision: how its noise is correlated along the order."""
+RANDOM = "random"
+"""Key among the parameters of a revision: its random effects; those that are not among the effects
+of the revision are its background."""
 SOURCES = "effects_from"
 """Key among the options of a revision: the files that its effects are from."""
 
@@ -64,7 +68,7 @@ def to_record(
     if diagnosis is not None:
         result["diagnose"] = fit_document.plain(diagnosis)
     return RevisionRecord(
-        effects=found.model.names,
+        effects=found.model.named,
         added=added,
         removed=removed,
         parent=parent,
@@ -88,9 +92,18 @@ def to_record(
             **({} if scatter is None else {"arm_scatter": scatter.to_json()}),
             **({} if serial is None else {SERIAL: serial.to_json()}),
             **({} if found.model.prior is None else {CARRIED: found.model.prior.to_json()}),
+            **_random_to_json(found.model),
         },
         result_json=result,
     )
+
+
+def _random_to_json(model: Model) -> dict[str, object]:
+    """Key `random`: all effects in order, and the standard deviations of the random ones, SI."""
+    if not model.random:
+        return {}
+    std = {name: values.tolist() for name, values in model.random.items()}
+    return {RANDOM: {"effects": list(model.names), "std": std}}
 
 
 def restore(
@@ -208,18 +221,34 @@ def _restored(
         )
     cell = replace(cell.with_targets(targets), registration=registration)
     options, known = record.options["effects"], catalogue or installed()
-    effects = (known.make(e, cell, readings.states, options.get(e)) for e in record.effects)
-    model = Model(cell, tuple(effects), known, readings, carried_of(record))
-    names = [f"{e.name}.{p.name}" for e in model.effects for p in e.parameters]
-    if names != stored["names"]:
+    of_random = stored.get(RANDOM, {"effects": record.effects, "std": {}})
+    names = tuple(of_random["effects"])
+    effects = tuple(known.make(e, cell, readings.states, options.get(e)) for e in names)
+    random = _random(of_random["std"], effects)
+    background = frozenset(names) - frozenset(record.effects)
+    if not background <= random.keys() or not set(record.effects) <= set(names):
+        raise ValueError("a background that is not random")
+    model = Model(cell, effects, known, readings, carried_of(record), random, background)
+    parameters = [f"{e.name}.{p.name}" for e in model.effects for p in e.parameters]
+    if parameters != stored["names"]:
         raise InputError(
             f"revision {record.number} was made by hilcal {record.program_version}, whose effects "
             "have other parameters; run hilcal identify again"
         )
     theta = np.array(stored["theta"], dtype=float)
-    if theta.shape != (len(names),) or not np.all(np.abs(theta) < _LARGEST):
+    if theta.shape != (len(parameters),) or not np.all(np.abs(theta) < _LARGEST):
         raise ValueError("parameters that are none")
     return model, theta
+
+
+def _random(stored: Mapping[str, Any], effects: tuple[Effect, ...]) -> dict[str, Floats]:
+    """Standard deviations of the random effects."""
+    size = {e.name: len(e.magnitudes) for e in effects}
+    found = {name: np.array(values, dtype=float) for name, values in stored.items()}
+    for name, std in found.items():
+        if std.shape != (size.get(name),) or not np.all((std > 0) & (std < _LARGEST)):
+            raise ValueError("random effects with standard deviations that are none")
+    return found
 
 
 def _is_frame(frame: Floats) -> bool:
@@ -317,7 +346,8 @@ def check_sources(record: RevisionRecord, run: Path, catalogue: Catalogue) -> No
         InputError: an effect is not in the catalogue, or its file has changed since.
     """
     stored = record.options.get(SOURCES, {})
-    for name in record.effects:
+    every = record.parameters_json.get(RANDOM, {}).get("effects", record.effects)
+    for name in every:
         then, now = stored.get(name), catalogue.file_of(name)
         if name not in catalogue.names:
             where, known = "FILE.py", ""

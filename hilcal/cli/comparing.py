@@ -89,7 +89,7 @@ def _one(t: Terminal, run: Path, revision: int | None, catalogue: Catalogue) -> 
     t.document(
         {
             "revision": number,
-            "model": list(found.model.names),
+            "model": list(found.model.named),
             "readings": found.mode,
             "error": {"fit": found.error.to_json(), "holdout": found.holdout.to_json()},
             "variance_factor": found.variance_factor,

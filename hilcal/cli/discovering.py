@@ -76,7 +76,7 @@ def discover(
                 if wanted
                 else baseline(o.cell, o.readings, o.mode(), catalogue)
             )
-            say(f"fitting {text.model_name(model.names)}")
+            say(f"fitting {text.model_name(model.named)}")
             found = with_serial_noise(fit(model, o.readings, o.mode()))
         d = search(found, say, name)
     document = {"revision": number, **to_json(d), "written": None}

@@ -163,7 +163,7 @@ def doubted(
     suspects = left_open(d)
     if not suspects:
         return Doubted(found, d, *known, None, document)
-    t.show(text_demo.step_report(1, text.model_name(found.model.names), d))
+    t.show(text_demo.step_report(1, text.model_name(found.model.named), d))
     t.show(text.heading(f"Ambiguous between {numbers.names(suspects)}: what would settle it?"))
     with working(t.progress) as say:
         place = first.joints(REFERENCE) if REFERENCE in first.pose_names else None

@@ -25,7 +25,7 @@ def fit_of(t: Terminal, run: Campaign, say: Say, revision: int | None) -> tuple[
     number, found = run.fit_in_use(say, revision)
     if number is None:
         t.notice(
-            f"no revision yet: taking the baseline ({text.model_name(found.model.names)}; "
+            f"no revision yet: taking the baseline ({text.model_name(found.model.named)}; "
             f"{found.mode} readings); hilcal identify keeps it"
         )
     return number, found
@@ -48,7 +48,7 @@ def stored_fit(t: Terminal, run: Campaign, say: Say, revision: int | None) -> tu
         number = run.store(found)
         t.notice(
             f"no revision yet: made the baseline, revision {number} "
-            f"({text.model_name(found.model.names)}; {found.mode} readings)"
+            f"({text.model_name(found.model.named)}; {found.mode} readings)"
         )
     return number, found
 
@@ -149,14 +149,15 @@ def chosen(found: Fit) -> dict[str, dict[str, object]]:
 
 def chosen_of(model: Model, readings: Readings) -> dict[str, dict[str, object]]:
     """Options of the effects of a model that are not the usual ones for its readings, by name."""
-    options = {e.name: chosen_options(e, readings.states, readings.m) for e in model.effects}
+    named = (e for e in model.effects if e.name not in model.background)
+    options = {e.name: chosen_options(e, readings.states, readings.m) for e in named}
     return {name: given for name, given in options.items() if given}
 
 
 def titles(model: Model, readings: Readings) -> tuple[str, ...]:
     """Names of a model's effects, with the options that are not the usual ones."""
     given = chosen_of(model, readings)
-    return tuple(write_effect(name, given.get(name, {})) for name in model.names)
+    return tuple(write_effect(name, given.get(name, {})) for name in model.named)
 
 
 def check_record(path: Path | None) -> None:

@@ -34,6 +34,7 @@ from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.options import Options
 from hilcal.effects.written import read_effects_text, write_effect
 from hilcal.errors import InputError
+from hilcal.identify.background import background_of
 from hilcal.identify.baseline import baseline, with_effects
 from hilcal.identify.fit import Fit
 from hilcal.identify.fit_document import prior_to_json
@@ -301,6 +302,7 @@ def refine(
             "verdict": last.verdict,
             "message": message(last),
             "rejected": list(found.rejected),
+            "background": background_of(found.fit).to_json(),
             **({} if laws is None else laws_json(laws)),
             "frames": fit_to_json(found.fit),
             **prior_to_json(found.fit),
@@ -320,7 +322,7 @@ def revisions_json(rows: Sequence[Row]) -> list[dict[str, object]]:
     return [
         {
             "revision": r.number,
-            "model": list(r.fit.model.names),
+            "model": list(r.fit.model.named),
             "options": options_json(r.fit),
             "added": r.added,
             "removed": r.removed,

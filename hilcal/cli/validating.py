@@ -67,7 +67,7 @@ def validate(
     t.document(
         {
             "revision": judged.number,
-            "model": list(done.model.names),
+            "model": list(done.model.named),
             "readings": judged.mode,
             "registered": register,
             "n_readings": judged.readings,

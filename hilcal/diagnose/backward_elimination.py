@@ -37,7 +37,8 @@ def backward_elimination(
 ) -> tuple[Redundant, ...]:
     """Return the redundant effects of a fit, the least significant first.
 
-    Those with a carried prior are judged by `spoken_against`: other readings speak for them.
+    Those with a carried prior are judged by `spoken_against`: other readings speak for them; random
+    ones by `background_evidence`.
 
     Args:
         fit: the fit.
@@ -47,7 +48,7 @@ def backward_elimination(
     judged = [
         e.name
         for e, mine in zip(fit.model.effects, fit.model.slices(), strict=True)
-        if e.role == "effect" and not carried[mine].any()
+        if e.role == "effect" and e.name not in fit.model.random and not carried[mine].any()
     ]
     if not judged:
         return ()

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from hilcal.data.arm_scatter import ArmScatter
+from hilcal.diagnose.background_evidence import BackgroundEffect
 from hilcal.diagnose.catalogue_sufficiency import Insufficiency
 from hilcal.diagnose.effect_ranking import Suspect
 from hilcal.diagnose.misfit_breakdown import MisfitShare
@@ -32,6 +33,7 @@ Reason = Literal[
     "pose_alone",
     "readings_disagree",
     "serial_or_effect",
+    "background",
 ]
 VERDICTS: dict[Reason, Verdict] = {
     "residual_is_noise": "adequate",
@@ -45,6 +47,7 @@ VERDICTS: dict[Reason, Verdict] = {
     "pose_alone": "ambiguous",
     "readings_disagree": "unknown_effect",
     "serial_or_effect": "ambiguous",
+    "background": "ambiguous",
 }
 """The verdict that each reason leads to."""
 
@@ -94,6 +97,7 @@ class Diagnosis:
             covariance of the fit.
         pose_alone: the misfit where it is the same under every load of a pose, nothing predicts it
             on poses left out, and more poses would tell what it is.
+        background: the effects of the model's background, those with the smallest p-values first.
     """
 
     fit: Fit
@@ -112,6 +116,7 @@ class Diagnosis:
     alternatives: tuple[Alternative, ...]
     scatter: ArmScatter | None = None
     pose_alone: PoseAlone | None = None
+    background: tuple[BackgroundEffect, ...] = ()
 
     @property
     def verdict(self) -> Verdict:

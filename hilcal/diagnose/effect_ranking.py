@@ -168,7 +168,7 @@ def candidates(fit: Fit) -> tuple[Effect, ...]:
         if kind.name not in model.names and kind.computable(states):
             effect = model.catalogue.make(kind.name, model.cell, states, m=fit.whitening.m)
             out.append(effect.for_scoring(states))
-    finer = (e.refined(states) for e in model.effects)
+    finer = (e.refined(states) for e in model.effects if e.name not in model.random)
     return (*out, *(e for e in finer if e is not None))
 
 

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from hilcal import threads
 from hilcal.data.arm_scatter import ArmScatter
 from hilcal.diagnose.arm_repeatability import instrument_instead
+from hilcal.diagnose.background_evidence import BackgroundEffect, background_evidence
 from hilcal.diagnose.backward_elimination import backward_elimination, spoken_against
 from hilcal.diagnose.catalogue_sufficiency import Insufficiency, insufficiency
 from hilcal.diagnose.effect_ranking import (
@@ -98,6 +99,11 @@ class Evidence:
         return rank_suspects(
             self.linearisation, self.effects, refit=self._refit, likely=self._lead_likely
         )
+
+    @once
+    def background(self) -> tuple[BackgroundEffect, ...]:
+        """The effects of the model's background, each tested beside all others."""
+        return background_evidence(self.fit)
 
     @once
     def misfit_breakdown(self) -> tuple[MisfitShare, ...]:

@@ -20,7 +20,8 @@ def add(before: Fit, effect: str, options: Options | None = None) -> Fit:
     """Refit with one more effect, from where the fit stands.
 
     One that is finer than an effect of the model, as joint_compliance(joints=each) where the model
-    has one for all joints, takes its place.
+    has one for all joints, takes its place. One of the background becomes a named one, and keeps
+    its standard deviation.
 
     Args:
         before: the fit.
@@ -74,7 +75,9 @@ def _rest(model: Model, theta: Floats, effect: str) -> tuple[Model, Floats]:
         raise InputError(f"effect {effect} is not in the model: {', '.join(model.names)}")
     place = model.names.index(effect)
     rest = tuple(e for e in model.effects if e.name != effect)
-    return replace(model, effects=rest), np.delete(theta, model.slices()[place])
+    random = {name: std for name, std in model.random.items() if name != effect}
+    left = replace(model, effects=rest, random=random, background=model.background - {effect})
+    return left, np.delete(theta, model.slices()[place])
 
 
 def _grown(
@@ -83,6 +86,8 @@ def _grown(
     """Return the model with one more effect, or a finer one, and parameters to start from."""
     ((name, given),) = read_effects_text(effect, "effect", model.catalogue).items()
     given = {**given, **(options or {})}
+    if name in model.background and not given:
+        return replace(model, background=model.background - {name}), theta
     if name in model.names:
         present = model.effects[model.names.index(name)]
         made = present.with_options(readings.states, **given)

@@ -35,6 +35,10 @@ Noise that is correlated along the order of the readings is in the covariance of
 is judged (see `serial_noise`). Where it is not proved, since effects explain the readings as well,
 3 and 5c become `ambiguous`.
 
+Where the model has a background and its residual is noise, or the arm's scatter, effects of the
+catalogue are there that the readings do not prove one by one: 3 and 5c become `ambiguous`, and the
+suspects are those of the background.
+
 A fit whose covariance has the estimated scatter in it (`Readings.arm_scatter`) is judged by the
 same rules, but that it may be smaller than its noise: the scatter is never negative, so that an
 instrument whose noise is stated too large, in some of its elements, shows only then. That is said.
@@ -48,6 +52,7 @@ import numpy as np
 from hilcal import limits
 from hilcal.data.arm_scatter import ArmScatter
 from hilcal.diagnose.arm_repeatability import instrument_instead, of_repeatability_size
+from hilcal.diagnose.background_evidence import BackgroundEffect, as_suspects
 from hilcal.diagnose.diagnosis import Diagnosis, History, Reason
 from hilcal.diagnose.effect_ranking import FALSE_ALARM, LEAST_SHARE, ranked
 from hilcal.diagnose.evidence import Evidence
@@ -90,6 +95,23 @@ def diagnose(
     return judge(Evidence(fit, say=say), history)
 
 
+def with_one_named(
+    d: Diagnosis, fit: Fit, history: History, background: tuple[BackgroundEffect, ...]
+) -> Diagnosis:
+    """Return the judgement where an effect of the background is named: what is predicted stays.
+
+    Args:
+        d: of the model with the effect in its background.
+        fit: with it named.
+        history: of that model.
+        background: the effects of its background.
+    """
+    before = {b.effect for b in d.background}
+    others = tuple(s for s in d.suspects if s.effect not in before)
+    suspects = (*as_suspects(background), *others) if d.reason == "background" else d.suspects
+    return replace(d, fit=fit, history=history, suspects=suspects, background=background)
+
+
 def judge(e: Evidence, history: History) -> Diagnosis:
     """Combine the evidence of a fit with what is known of the way to its model."""
     found = _with_arrivals(e, history)
@@ -120,9 +142,10 @@ def _with_arrivals(e: Evidence, history: History) -> Diagnosis:
 
 def _judged(e: Evidence, history: History) -> Diagnosis:
     """Judge by the evidence as it is."""
+    added = tuple(n for n in history.added if n not in e.fit.model.random)
     with e.later() as ahead:
         ahead(lambda: e.misfit_breakdown)
-        ahead(lambda: (e.alternatives(history.added, history.removed), e.redundant))
+        ahead(lambda: (e.alternatives(added, history.removed), e.redundant))
         suspects = ranked(e.suspects, history.rejected)
         lead = suspects[0] if suspects and suspects[0].passes else None
         insufficiency = None
@@ -177,11 +200,13 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
         elif noise.off and not noise.misjudged:
             reason = "no_suspect"
         else:
-            in_doubt = any(a.inseparable for a in e.alternatives(history.added, history.removed))
+            in_doubt = any(a.inseparable for a in e.alternatives(added, history.removed))
             reason = "inseparable_addition" if in_doubt else "residual_is_noise"
         serial = e.fit.readings.serial
         if reason in ("residual_is_noise", "arm_scatter") and serial and not serial.proved:
             reason = "serial_or_effect"
+        if reason in ("residual_is_noise", "inseparable_addition", "arm_scatter") and e.background:
+            reason, suspects = "background", (*as_suspects(e.background), *suspects)
     alone = None
     if reason in ("misjudged_noise", "no_suspect") and e.misfit and not _predicted(e, regression):
         alone = e.pose_alone
@@ -200,9 +225,10 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
         redundant=e.redundant,
         separability=rivals,
         insufficiency=insufficiency,
-        alternatives=e.alternatives(history.added, history.removed),
+        alternatives=e.alternatives(added, history.removed),
         scatter=scatter,
         pose_alone=alone,
+        background=e.background,
     )
 
 

@@ -126,14 +126,19 @@ class Fit(WithVarianceFactor):
 
     @property
     def parameters(self) -> Estimates:
-        """The parameters with their standard uncertainties, those of dropped groups left out."""
-        u = self.uncertainty
-        return Estimates.of(self.model, self.theta, u.std, u.identifiable, self.solution.estimated)
+        """The parameters of the named effects with their standard uncertainties.
+
+        Those of dropped groups are left out.
+        """
+        u, kept = self.uncertainty, self.solution.estimated.copy()
+        for name, mine in zip(self.model.names, self.model.slices(), strict=True):
+            kept[mine] &= name not in self.model.background
+        return Estimates.of(self.model, self.theta, u.std, u.identifiable, kept)
 
     def summary(self) -> str:
         """Return the model, its errors and its parameters as plain text."""
         return summary(
-            self.model.names,
+            self.model.named,
             f"{len(self.raw)} {self.mode} readings, scaling {self.scaling}",
             self.parameters,
             (self.error, self.holdout),

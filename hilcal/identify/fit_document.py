@@ -5,6 +5,7 @@ from dataclasses import asdict
 
 import numpy as np
 
+from hilcal.identify.background import background_of
 from hilcal.identify.before import error_before
 from hilcal.identify.disagreement_words import disagreement_words
 from hilcal.identify.fit import Fit
@@ -23,7 +24,7 @@ def to_json(fit: Fit) -> dict[str, object]:
     basis, scatter = fit.solution.equations.basis, fit.readings.arm_scatter
     serial = fit.readings.serial
     return {
-        "model": list(fit.model.names),
+        "model": list(fit.model.named),
         "readings": fit.mode,
         "scaling": fit.scaling,
         "n_readings": len(fit.readings),
@@ -37,6 +38,7 @@ def to_json(fit: Fit) -> dict[str, object]:
             "scaled": finite(basis.condition_scaled),
         },
         "parameters": fit.parameters.to_dicts(),
+        "background": background_of(fit).to_json(),
         "unidentifiable": list(fit.uncertainty.null),
         "inflated": fit.uncertainty.inflated,
         "variance_factor": fit.variance_factor,

@@ -33,6 +33,8 @@ CONVERGED = 0.02
 """Change of the predicted readings, in units of their noise, at which the linearisation stays."""
 SCATTER_RAD = 3e-5
 """Ordinary scatter of a joint, rad: 30 µm at 1 m, as makers state it; η of it is about zero."""
+INSTRUMENT, SCATTER = "instrument", "arm's scatter"
+"""Names of the components of the noise."""
 NOISE_SPREAD = 1.5
 """Of the log of the noise: a factor of 4.5 either way; a choice."""
 FEW_ROWS = 300
@@ -71,6 +73,13 @@ class MixedFit:
         """Return the estimated standard deviation of a family or of a component of the noise."""
         return float(np.exp(self.variances.log_std[self.problem.names.index(name)]))
 
+    def prior_std(self) -> Floats:
+        """(P,) standard deviations of the parameters; infinite for frames."""
+        out = np.full(self.model.size, np.inf)
+        for f, log_std in zip(self.problem.families.random, self.variances.log_std, strict=False):
+            out[f.parameters] = np.exp(log_std) * f.magnitude
+        return out
+
     def predict(self, states: States, m: int) -> tuple[Floats, Floats]:
         """Predict what the sensor reads in N states.
 
@@ -89,15 +98,25 @@ class MixedFit:
 
     def noise(self, readings: Readings) -> Floats:
         """(N, m, m) covariance of absolute readings by instrument and arm, as estimated."""
-        total = self.std("instrument") ** 2 * readings.covariance
-        if "arm's scatter" in self.problem.names:
+        total = self.std(INSTRUMENT) ** 2 * readings.covariance
+        if SCATTER in self.problem.names:
             f = _scatter_factors(self.model, readings)
-            total = total + self.std("arm's scatter") ** 2 * (f @ np.swapaxes(f, 1, 2))
+            total = total + self.std(SCATTER) ** 2 * (f @ np.swapaxes(f, 1, 2))
         return np.asarray(total)
 
 
 def with_all_effects(model: Model, states: States) -> Model:
-    """Return a model with every effect of its catalogue that the states allow."""
+    """Return a model with every effect of its catalogue that the states allow.
+
+    Waves that few poses cannot resolve are there all the same; `HARMONICS` of them are kept.
+    """
+    finer = tuple(
+        e.with_options(states, harmonics=HARMONICS)
+        if "harmonics" in e.options and len(getattr(e, "harmonics", ())) < HARMONICS
+        else e
+        for e in model.effects
+    )
+    model = replace(model, effects=finer)
     for kind in model.catalogue.effects:
         if kind.name in model.names or kind.role in FRAME_ROLES or not kind.computable(states):
             continue
@@ -120,17 +139,12 @@ def mixed_fit(model: Model, readings: Readings, mode: Mode, rng: np.random.Gener
         InputError: a deflection without its unloaded reading.
     """
     model = with_all_effects(model, readings.states)
-    families, w = families_of(model), whitening(readings, mode, "gc")
-    noise = _noise(model, readings, w)
-    shape = [(len(b.loaded), b.factor.shape[-1]) for b in w.buckets]
+    w = whitening(readings, mode, "gc")
     theta, white = np.zeros(model.size), np.full(w.m * len(w), np.inf)
     start: Floats | None = None
     rounds = 0
     while True:
-        prediction = model.predict(readings.states, theta)
-        now = w.whiten(residual(readings, prediction, w)).reshape(-1)
-        jacobian = w.whiten_readings(model.jacobian(prediction, theta, w.m))
-        problem = mixed_problem(now + jacobian @ theta, jacobian, families, noise, shape)
+        problem, now = _linearised(model, readings, w, theta)
         found = estimate_variances(problem, start)
         theta = problem.parameters(found.equations.coordinates, model.size)
         rounds, start = rounds + 1, found.log_std
@@ -144,13 +158,39 @@ def mixed_fit(model: Model, readings: Readings, mode: Mode, rng: np.random.Gener
     return MixedFit(model, readings, w, theta, found, mean.covariance)
 
 
+def mixed_fit_at(model: Model, readings: Readings, mode: Mode, theta: Floats) -> Variances:
+    """Estimate the variances of a model's effects at parameters theta (P,), without moving them.
+
+    Args:
+        model: with all effects that take part.
+        readings: without gross errors, with their stated covariance.
+        mode: "deflection" or "absolute".
+        theta: where the model is linearised.
+    """
+    w = whitening(readings, mode, "gc")
+    return estimate_variances(_linearised(model, readings, w, theta)[0])
+
+
+def _linearised(
+    model: Model, readings: Readings, w: Whitening, theta: Floats
+) -> tuple[MixedProblem, Floats]:
+    """Return the linear problem at theta (P,), and the whitened residual (R,) there."""
+    prediction = model.predict(readings.states, theta)
+    now = w.whiten(residual(readings, prediction, w)).reshape(-1)
+    jacobian = w.whiten_readings(model.jacobian(prediction, theta, w.m))
+    shape = [(len(b.loaded), b.factor.shape[-1]) for b in w.buckets]
+    noise = _noise(model, readings, w)
+    y = now + jacobian @ theta
+    return mixed_problem(y, jacobian, families_of(model), noise, shape), now
+
+
 def _noise(model: Model, readings: Readings, w: Whitening) -> list[Noise]:
     """Components: the instrument's, and the arm's scatter where the readings do not state it."""
     seen = tuple(
         np.any(b.factor != 0, axis=2)[:, :, None] * np.eye(b.factor.shape[-1]) for b in w.buckets
     )
     whole = all(bool(s.any(axis=2).all()) for s in seen)
-    instrument = Noise("instrument", None if whole else seen, LogStdPrior(0.0, NOISE_SPREAD))
+    instrument = Noise(INSTRUMENT, None if whole else seen, LogStdPrior(0.0, NOISE_SPREAD))
     if readings.scatter_stated:
         return [instrument]
     f = _scatter_factors(model, readings)
@@ -160,7 +200,7 @@ def _noise(model: Model, readings: Readings, w: Whitening) -> list[Noise]:
         b.factor @ c @ np.swapaxes(b.factor, 1, 2)
         for b, c in zip(w.buckets, covariance_blocks(of, w), strict=True)
     )
-    return [instrument, Noise("arm's scatter", blocks, LogStdPrior(0.0, NOISE_SPREAD))]
+    return [instrument, Noise(SCATTER, blocks, LogStdPrior(0.0, NOISE_SPREAD))]
 
 
 def _scatter_factors(model: Model, readings: Readings) -> Floats:

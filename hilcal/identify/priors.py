@@ -12,12 +12,16 @@ FIRST_GUESS = 0.3
 def prior_of(model: Model) -> tuple[Floats, Ints]:
     """Starting prior (P,) of a model, and the shrinkage group (P,) of each parameter or −1.
 
+    Random effects have the standard deviations that the model states for them.
+
     Parameters with a carried prior have no other one, see `coordinates`.
     """
     prior, groups, used = [np.zeros(0)], [np.zeros(0, dtype=np.int64)], 0
     for e in model.effects:
         size = len(e.magnitudes)
         own, fixed = e.groups(), e.prior_std()
+        if e.name in model.random:
+            own, fixed = None, model.random[e.name]
         if own is not None:
             prior.append(FIRST_GUESS * e.magnitudes)
             groups.append(own + used)

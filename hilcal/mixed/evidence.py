@@ -1,4 +1,4 @@
-"""Evidence for a family: the restricted likelihood ratio against s_f = 0, given all others.
+"""Evidence for families: the restricted likelihood ratio against s_f = 0, given all others.
 
 With the others' standard deviations as estimated without it, Z_fᵀ P Z_f = U diag(μ) Uᵀ and
 w_i = (Uᵀ Z_fᵀ P y)_i / √μ_i, which are N(0, 1) where the family is not there,
@@ -10,6 +10,7 @@ Source: Crainiceanu and Ruppert, *Likelihood ratio tests in linear mixed models 
 component*, J. R. Stat. Soc. B 66 (2004) 165.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,11 +29,11 @@ RANK = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """Evidence for one family.
+    """Evidence for one family, or one effect.
 
     Attributes:
         ratio: T, twice the gain of the restricted log likelihood.
-        p_value: share of ratios at least as large where the family is not there.
+        p_value: share of ratios at least as large where the family is not there; 1 for rank 0.
         rank: number of its directions that the others do not span.
     """
 
@@ -42,18 +43,27 @@ class Evidence:
 
 
 def evidence(
-    problem: MixedProblem, family: int, rng: np.random.Generator, start: Floats | None = None
+    problem: MixedProblem,
+    families: int | Sequence[int],
+    rng: np.random.Generator,
+    start: Floats | None = None,
 ) -> Evidence:
-    """Return the evidence for a family.
+    """Return the evidence for a family, or for several of one effect.
+
+    Several are tested by one multiple of their ordinary standard deviations, the priors' means.
 
     Args:
-        problem: with the family.
-        family: its number.
+        problem: with the families.
+        families: their numbers.
         rng: draws the ratios.
         start: (F + N,) log s and η of the whole problem; without it the priors' means.
     """
-    without, own = problem.without(family), problem.columns_of(family)
-    begun = None if start is None else np.delete(start, family)
+    numbers = [families] if isinstance(families, int) else list(families)
+    without = problem.without(numbers)
+    ordinary = np.exp([f.prior.mean for f in problem.families.random])
+    mine = np.isin(problem.family, numbers)
+    own = problem.x[:, problem.flat :][:, mine] * ordinary[problem.family[mine]]
+    begun = None if start is None else np.delete(start, numbers)
     inner, score = estimate_variances(without, begun).equations.score(own)
     mu, u = np.linalg.eigh((inner + inner.T) / 2)
     seen = mu > RANK * max(float(np.sum(own**2)), 1e-300)

@@ -90,20 +90,16 @@ class MixedProblem:
             start = stop
         return theta
 
-    def without(self, family: int) -> "MixedProblem":
-        """Return the problem without the columns of a family."""
-        random = tuple(f for k, f in enumerate(self.families.random) if k != family)
-        kept = self.family != family
+    def without(self, numbers: Sequence[int]) -> "MixedProblem":
+        """Return the problem without the columns of some families."""
+        random = tuple(f for k, f in enumerate(self.families.random) if k not in numbers)
+        kept = ~np.isin(self.family, numbers)
         x = np.hstack([self.x[:, : self.flat], self.x[:, self.flat :][:, kept]])
-        number = self.family[kept]
+        place = np.cumsum(~np.isin(np.arange(len(self.families.random)), numbers)) - 1
         return MixedProblem(
             self.y, x, self.frames, Families(self.families.frames, random),
-            number - (number > family), self.noise, self.shape,
+            place[self.family[kept]], self.noise, self.shape,
         )  # fmt: skip
-
-    def columns_of(self, family: int) -> Floats:
-        """(R, q) columns of a family."""
-        return self.x[:, self.flat :][:, self.family == family]
 
 
 def mixed_problem(

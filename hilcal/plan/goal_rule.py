@@ -142,7 +142,7 @@ class GoalRule:
             std = {name: s for name, s in std.items() if not held[name]}
             position = self._position(found) if self._work_q else None
             status = self.goal.met(std, value, position, self._predicted)
-            return replace(status, model=found.model.names, fitted=found.mode), found
+            return replace(status, model=found.model.named, fitted=found.mode), found
         except (HilcalError, np.linalg.LinAlgError):
             return None
 

@@ -149,7 +149,7 @@ def _revision(c: Chapter, e: FullPrediction, axes: Floats, measured: Floats) -> 
     return StoryRevision(
         revision=c.number,
         change=change(c.added, c.removed, c.fit.readings.arm_scatter is not None),
-        model=c.fit.model.names,
+        model=c.fit.model.named,
         verdict=UNDIAGNOSED if d is None else d.verdict,
         message="run hilcal diagnose for a verdict" if d is None else message(d),
         residual=residual,

@@ -16,7 +16,7 @@ from hilcal.report.verdict_words import message
 def to_json(d: Diagnosis) -> dict[str, object]:
     """Return the keys of the contract, and all else that a diagnosis holds."""
     return {
-        "model": list(d.fit.model.names),
+        "model": list(d.fit.model.named),
         "verdict": d.verdict,
         "message": message(d),
         "reason": d.reason,
@@ -45,6 +45,9 @@ def to_json(d: Diagnosis) -> dict[str, object]:
             "share": d.insufficiency.share,
             "variance_factor": d.insufficiency.variance_factor,
         },
+        "background": [
+            {"effect": b.effect, "p_value": b.p_value, "rms_m": b.rms_m} for b in d.background
+        ],
         "pose_alone": None if d.pose_alone is None else asdict(d.pose_alone),
         "rejected": list(d.history.rejected),
         "alternatives": [

@@ -10,6 +10,7 @@ from rich.text import Text
 from hilcal.diagnose.effect_ranking import FALSE_ALARM, LEAST_SHARE
 from hilcal.diagnose.misfit_breakdown import Group, MisfitShare
 from hilcal.effects.protocol import Effect
+from hilcal.identify.background import background_of
 from hilcal.identify.before import error_before
 from hilcal.identify.fit import Fit
 from hilcal.identify.fit_document import notes
@@ -61,7 +62,7 @@ def kind(fit: Fit) -> str:
 
 def fit_report(fit: Fit) -> Iterator[RenderableType]:
     """Yield all that people want to know of a fit."""
-    yield heading(f"Model: {model_name(fit.model.names)}")
+    yield heading(f"Model: {model_name(fit.model.named)}")
     yield f"Fitted to {kind(fit)}; scaling {fit.scaling}."
     yield f"{before_and_after(fit)}\n"
     yield from parameters(fit)
@@ -76,6 +77,8 @@ def parameters(fit: Fit) -> Iterator[RenderableType]:
     families, unseen = [], []
     seen = fit.uncertainty.identifiable
     for effect, s in zip(fit.model.effects, fit.model.slices(), strict=True):
+        if effect.name in fit.model.background:
+            continue
         index = np.arange(s.start, s.stop)
         if effect.groups() is not None or len(index) > ALL_ROWS:
             families.append(family(fit, effect, index))
@@ -174,6 +177,12 @@ def remarks(fit: Fit) -> Iterator[RenderableType]:
         f"Variance factor {fit.variance_factor:.3g} (95 % interval {low:.3g} to {high:.3g}): the "
         "squared error in units of the noise, 1 where model and noise are right."
     )
+    behind = background_of(fit)
+    if behind.effects:
+        yield (
+            f"Background: {len(behind.effects)} effects that are not named, together "
+            f"{numbers.length(behind.rms_m)} rms; all are predicted with."
+        )
     scatter = fit.readings.arm_scatter
     if scatter is not None:
         yield f"The covariance has the arm's scatter as estimated: {sigmas(scatter)}."

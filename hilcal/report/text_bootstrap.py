@@ -23,7 +23,7 @@ CROWDED = 0.5
 def bootstrap_report(found: Bootstrap) -> Iterator[RenderableType]:
     """Yield all that people want to know of a bootstrap."""
     fit = found.fit
-    yield heading(f"Model: {model_name(fit.model.names)}")
+    yield heading(f"Model: {model_name(fit.model.named)}")
     yield (
         f"Fitted to {kind(fit)}; {len(found.theta)} times to {found.poses} poses drawn from its "
         f"{found.poses}, with replacement.\n"

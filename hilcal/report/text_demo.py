@@ -23,7 +23,7 @@ how far it misses. While it is fitted to few poses, and lacks what is hidden, th
 
 def step_report(number: int, change: str, d: Diagnosis) -> Iterator[RenderableType]:
     """Yield what one revision shows: how far off, where, and which effect would explain it."""
-    name = change or text.model_name(d.fit.model.names)
+    name = change or text.model_name(d.fit.model.named)
     yield text.heading(f"Revision {number}: {name}")
     yield text.misses(d.fit)
     if d.verdict != "adequate":

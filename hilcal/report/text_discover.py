@@ -20,7 +20,7 @@ LEAST_BINS = 3
 
 def discovery_report(d: Discovery) -> Iterator[RenderableType]:
     """Yield what was found, or why nothing is proposed."""
-    yield text.heading(f"Laws for what {text.model_name(d.fit.model.names)} leaves unexplained")
+    yield text.heading(f"Laws for what {text.model_name(d.fit.model.named)} leaves unexplained")
     if not d.laws:
         yield numbers.sentence(silence(d))
         yield from text_unknown.curves(d.carried)
@@ -173,7 +173,7 @@ def laws_json(s: LawSearch) -> dict[str, object]:
 def to_json(d: Discovery) -> dict[str, object]:
     """Return the document of `discover`."""
     return {
-        "model": list(d.fit.model.names),
+        "model": list(d.fit.model.named),
         "reason": d.reason,
         "attainable_share": d.attainable,
         "searched_share": d.searched_share,

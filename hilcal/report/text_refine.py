@@ -68,7 +68,7 @@ def addition_lines(s: Suspect) -> Iterator[str]:
 
 def diagnosis_report(d: Diagnosis) -> Iterator[RenderableType]:
     """Yield the verdict, where the model fails and the suspects."""
-    yield text.heading(f"Model: {text.model_name(d.fit.model.names)}")
+    yield text.heading(f"Model: {text.model_name(d.fit.model.named)}")
     yield text.misses(d.fit)
     if d.verdict != "adequate" and not d.dependences:
         yield text.follows(d.misfit_breakdown)
@@ -133,7 +133,7 @@ def revisions_table(rows: Sequence[tuple[int, str, Fit, str]]) -> RenderableType
     for number, change, fit, verdict in rows:
         out.add_row(
             str(number),
-            change or text.model_name(fit.model.names),
+            change or text.model_name(fit.model.named),
             numbers.length(fit.error.rms_m),
             f"{fit.error.rms_sigma:.2f}",
             numbers.length(fit.holdout.rms_m),

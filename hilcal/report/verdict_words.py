@@ -1,5 +1,6 @@
 """A diagnosis in one sentence; the `message` of JSON documents and files."""
 
+from hilcal.diagnose.background_evidence import LIKELY
 from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.diagnose.effect_ranking import LEAST_SHARE, Suspect
 from hilcal.diagnose.noise import PureError
@@ -10,6 +11,9 @@ from hilcal.diagnose.stepwise_alternatives import Alternative
 from hilcal.identify.disagreement_words import disagreement_words
 from hilcal.report.numbers import p_equals, sizes
 from hilcal.report.scatter_words import correlated, left_to_the_arm, no_repeatability
+
+MOST_LIKELY = 4
+"""Effects of a background that the sentence names."""
 
 
 def message(d: Diagnosis) -> str:
@@ -31,6 +35,8 @@ def _verdict(d: Diagnosis) -> str:
         return _no_suspect(d)
     if d.reason == "misjudged_noise":
         return _misjudged(d)
+    if d.reason == "background":
+        return _background(d)
     if d.reason == "arm_scatter":
         return left_to_the_arm(d)
     if d.pose_alone is not None:
@@ -45,6 +51,19 @@ def _verdict(d: Diagnosis) -> str:
         return adequate
     doubts = "; ".join(_alternative(a) for a in d.alternatives if a.inseparable)
     return f"{adequate}; but {doubts}: measure what separates them"
+
+
+def _background(d: Diagnosis) -> str:
+    """Say which effects of the background are likely, and what to measure."""
+    of = d.background
+    likely = [b for b in of if b.p_value < LIKELY][:MOST_LIKELY]
+    names = ", ".join(f"{b.effect} ({p_equals(b.p_value)})" for b in likely)
+    told = f"likeliest: {names}" if likely else "none stands out"
+    return (
+        f"{len(of)} effects of the catalogue together predict what the named ones leave, and these "
+        f"readings prove none of them by itself; {told}: all are predicted with; more poses, "
+        "spread over all joints, tell which are there"
+    )
 
 
 def _missing(s: Suspect) -> str:

@@ -121,7 +121,7 @@ def model(view: View, d: Snapshot) -> None:
     """Draw the effects of the model, each with a button that takes it out."""
     called = "Baseline, not kept yet" if d.number is None else f"Revision {d.number}"
     with ui.row().classes("items-center").style("gap: 6px 10px"):
-        ui.label(f"{called}: {text.model_name(d.fit.model.names)}").classes("soft")
+        ui.label(f"{called}: {text.model_name(d.fit.model.named)}").classes("soft")
         for name in d.removable:
             button(view, f"Remove {name}", partial(view.remove, name), "outline dense")
 

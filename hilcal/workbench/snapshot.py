@@ -93,7 +93,7 @@ class Snapshot:
     def removable(self) -> tuple[str, ...]:
         """Effects of the shown model that may be taken out: all but frames that are unknown."""
         frames = self.fit.model.catalogue.unknown_frames(self.fit.model.cell)
-        return tuple(name for name in self.fit.model.names if name not in frames)
+        return tuple(name for name in self.fit.model.named if name not in frames)
 
 
 def row_of(record: RevisionRecord) -> RevisionRow:
