@@ -95,6 +95,7 @@ def refine(
     history: History = NOTHING,
     laws: LawSearch | None = None,
     seen: Callable[[Step], None] = lambda step: None,
+    background: bool = False,
 ) -> Refinement:
     """Fit, diagnose, add the first suspect, and repeat.
 
@@ -102,8 +103,8 @@ def refine(
     linearisation promised (see `diagnose.promise`). Where the readings do not separate
     the first suspect from others it is added all the same, since any of them lowers the error.
     When no suspect is left, every addition is reconsidered: a redundant one is removed, one that
-    others replace better is exchanged for them. Where more than noise is left then, all effects of
-    the catalogue are fitted together, see `Path.take_background`. Effects that were tried or taken
+    others replace better is exchanged for them. Where more than noise is left then, and `background`
+    asks for it, all effects of the catalogue are fitted together, see `Path.take_background`. Effects that were tried or taken
     out enter the history by which `verdict.judge` judges each step. Where the arm's scatter is what
     is left, the last step is a fit with it in the covariance, so that weights, uncertainties and
     p-values have it, too. A correlation of the noise along the order of the readings is in all fits
@@ -121,6 +122,7 @@ def refine(
             resemble what is missing are added, and where the misfit is taken for the arm's scatter;
             the law is then added and judged like any effect.
         seen: takes each step as soon as it is judged; of the last one the verdict can still change.
+        background: whether all effects may predict together.
 
     Raises:
         InputError: too many readings.
@@ -129,7 +131,7 @@ def refine(
     say(f"fitting {' + '.join(model.names) or 'the bare arm'}")
     readings = with_prior_scatter(model, readings.with_serial(None))
     first = with_serial_noise(fit(model, readings, mode))
-    found = refine_from(first, say, history, laws, seen)
+    found = refine_from(first, say, history, laws, seen, background)
     last = found.fit
     if last.model.names == first.model.names:
         return found
@@ -142,7 +144,7 @@ def refine(
         return found
     say("the noise is correlated along the order" if noise else "the noise is white after all")
     first = fit(model, first.readings.with_serial(noise), mode)
-    return refine_from(first, say, history, laws, seen)
+    return refine_from(first, say, history, laws, seen, background)
 
 
 def refine_from(
@@ -151,6 +153,7 @@ def refine_from(
     history: History = NOTHING,
     laws: LawSearch | None = None,
     seen: Callable[[Step], None] = lambda step: None,
+    background: bool = False,
 ) -> Refinement:
     """Refine a fit with its noise correlated as it is in its covariance; see `refine`."""
     with later() as ahead:
@@ -161,7 +164,8 @@ def refine_from(
         changed = True
         while changed:
             path.extend()
-            changed = path.reconsider() or path.take_background() or path.take_scatter()
+            changed = path.reconsider()
+            changed = changed or (background and path.take_background()) or path.take_scatter()
     return Refinement(tuple(path.steps))
 
 

@@ -207,6 +207,13 @@ def refine(
             "written beside the campaign: found.py.",
         ),
     ] = False,
+    background: Annotated[
+        bool,
+        typer.Option(
+            "--background",
+            help="Few poses: where named effects leave more than noise, predict with all effects.",
+        ),
+    ] = False,
     record: Record = None,
     view: View = False,
     effects_from: EffectsFrom = None,
@@ -256,7 +263,7 @@ def refine(
                     live.revised(chapter_of(number, step))
 
             with later() as ahead:
-                found = refine_model(model, fitted, mode, say, how, laws, seen)
+                found = refine_model(model, fitted, mode, say, how, laws, seen, background)
             if laws is not None:
                 laws.write(found.names)
             rows: list[Row] = []

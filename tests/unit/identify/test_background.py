@@ -35,7 +35,7 @@ def series(ipa_ur10: Path) -> Readings:
 def found(series: Readings) -> Refinement:
     cell = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
     some = series[:30]
-    return refine(baseline(cell, some, "absolute"), some, "absolute")
+    return refine(baseline(cell, some, "absolute"), some, "absolute", background=True)
 
 
 def error(fit: Fit, of: Readings) -> float:
