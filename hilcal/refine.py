@@ -103,12 +103,13 @@ def refine(
     linearisation promised (see `diagnose.promise`). Where the readings do not separate
     the first suspect from others it is added all the same, since any of them lowers the error.
     When no suspect is left, every addition is reconsidered: a redundant one is removed, one that
-    others replace better is exchanged for them. Where more than noise is left then, and `background`
-    asks for it, all effects of the catalogue are fitted together, see `Path.take_background`. Effects that were tried or taken
-    out enter the history by which `verdict.judge` judges each step. Where the arm's scatter is what
-    is left, the last step is a fit with it in the covariance, so that weights, uncertainties and
-    p-values have it, too. A correlation of the noise along the order of the readings is in all fits
-    (see `diagnose.serial_noise`): it would be taken for effects.
+    others replace better is exchanged for them. Where more than noise is left then, and
+    `background` asks for it, all effects of the catalogue are fitted together, see
+    `Path.take_background`. Effects that were tried or taken out enter the history by which
+    `verdict.judge` judges each step. Where the arm's scatter is what is left, the last step is a
+    fit with it in the covariance, so that weights, uncertainties and p-values have it, too. A
+    correlation of the noise along the order of the readings is in all fits (see
+    `diagnose.serial_noise`): it would be taken for effects.
 
     Args:
         model: the starting model. Its effects are not taken out, but for those of a carried prior
