@@ -101,6 +101,11 @@ def _settled(o: Campaign, d: Diagnosis) -> str:
             f"{head} the noise is misjudged, see hilcal diagnose {quoted(o.path)}; repeat "
             "some readings, or state the covariance anew"
         )
+    if d.reason == "background":
+        return (
+            f"{head} effects of the background are not told apart one by one; measure more poses, "
+            f"spread over all joints, with: hilcal plan CELL.toml --after {quoted(o.path)}"
+        )
     if d.verdict == "missing_effect":
         lead = d.suspects[0]
         if lead.coarse:
