@@ -262,6 +262,7 @@ def refine(
     readings: str | None = None,
     prior: Posterior | CarriedPrior | None = None,
     discover: str | Path | None = None,
+    background: bool = True,
 ) -> Refinement:
     """Fit, diagnose, add the leading suspect, and repeat until the model is adequate.
 
@@ -278,6 +279,8 @@ def refine(
         prior: as for `fit`.
         discover: a folder; a law is then searched where no effect explains the misfit, as by
             `hilcal refine --discover`, and the files of laws that stay are written there.
+        background: whether all effects of the catalogue predict together where the named ones
+            leave more than noise.
 
     Raises:
         InputError: another kind of readings, a prior that is not one of them, or no such folder.
@@ -286,11 +289,11 @@ def refine(
     if prior is not None:
         model = _with_prior(model, data, prior)
     if discover is None:
-        return refine_model(model, data, _mode(readings, data))
+        return refine_model(model, data, _mode(readings, data), background=background)
     if not Path(discover).is_dir():
         raise InputError(f"discover={str(discover)!r}: no such folder; valid: one for laws' files")
     laws = LawSearch(Path(discover))
-    found = refine_model(model, data, _mode(readings, data), laws=laws)
+    found = refine_model(model, data, _mode(readings, data), laws=laws, background=background)
     laws.write(found.names)
     return found
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from hilcal import limits
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode
-from hilcal.diagnose.background_evidence import background_helps, proved
+from hilcal.diagnose.background_evidence import TOGETHER, is_better, proved, together
 from hilcal.diagnose.diagnosis import Diagnosis, History, Verdict
 from hilcal.diagnose.effect_ranking import LEAST_SHARE
 from hilcal.diagnose.evidence import Evidence
@@ -18,7 +18,7 @@ from hilcal.diagnose.stepwise_alternatives import Alternative
 from hilcal.diagnose.verdict import NOTHING, judge, with_one_named
 from hilcal.discover.proposal import LawSearch
 from hilcal.identify.arm_scatter import with_arm_scatter, with_prior_scatter
-from hilcal.identify.background import with_background
+from hilcal.identify.background import allows_background, with_background
 from hilcal.identify.carried_evidence import carried_effects
 from hilcal.identify.fit import Fit, fit
 from hilcal.model import Model
@@ -95,7 +95,7 @@ def refine(
     history: History = NOTHING,
     laws: LawSearch | None = None,
     seen: Callable[[Step], None] = lambda step: None,
-    background: bool = False,
+    background: bool = True,
 ) -> Refinement:
     """Fit, diagnose, add the first suspect, and repeat.
 
@@ -154,7 +154,7 @@ def refine_from(
     history: History = NOTHING,
     laws: LawSearch | None = None,
     seen: Callable[[Step], None] = lambda step: None,
-    background: bool = False,
+    background: bool = True,
 ) -> Refinement:
     """Refine a fit with its noise correlated as it is in its covariance; see `refine`."""
     with later() as ahead:
@@ -313,9 +313,11 @@ class Path:
         if tried or not self._room or last.diagnosis.residual_is_noise:
             return False
         self._background_tried = True
+        if not allows_background(last.fit) or together(last.fit) > TOGETHER:
+            return False
         self._say("fitting all effects of the catalogue together")
         found = with_background(last.fit, self._given)
-        if found is None or not background_helps(last.fit, found):
+        if not is_better(last.fit, found):
             return False
         unknown = last.diagnosis.verdict == "unknown_effect"
         if unknown and not predicts_better(last.fit, found):

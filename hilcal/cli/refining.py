@@ -210,10 +210,11 @@ def refine(
     background: Annotated[
         bool,
         typer.Option(
-            "--background",
-            help="Few poses: where named effects leave more than noise, predict with all effects.",
+            "--background/--no-background",
+            help="Where named effects leave more than noise, also fit all others of the catalogue, "
+            "as a background that predicts.",
         ),
-    ] = False,
+    ] = True,
     record: Record = None,
     view: View = False,
     effects_from: EffectsFrom = None,

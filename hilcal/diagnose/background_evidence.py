@@ -14,7 +14,7 @@ from hilcal.diagnose.effect_ranking import Detection, LeftOut, Suspect
 from hilcal.diagnose.minimum_detectable_effect import Strength
 from hilcal.identify.fit import Fit
 from hilcal.identify.linearisation import HeldOut
-from hilcal.identify.mixed_fit import mixed_fit_at
+from hilcal.identify.mixed_fit import linearised_problem, mixed_fit_at, with_all_effects
 from hilcal.mixed.equations import Equations
 from hilcal.mixed.evidence import evidence
 from hilcal.regression.evidence import FamilyScore
@@ -27,7 +27,7 @@ WORTH = 0.05
 """Share by which the rms error on poses left out must fall for a background; a choice: it has
 hundreds of parameters, and those that name an effect alone are easier to understand."""
 TOGETHER = 0.001
-"""Chance of a background where the noise is misjudged and nothing else is there; a choice."""
+"""Chance of trying a background where nothing but misjudged noise is there; a choice."""
 LIKELY = 0.1
 """p-value below which an effect of the background is named as one that may be there; a choice."""
 SEED = 0
@@ -59,25 +59,41 @@ class BackgroundEffect:
     step: Floats
 
 
-def background_helps(before: Fit, after: Fit) -> bool:
+def together(of: Fit) -> float:
+    """p-value of all other effects of the catalogue together, beside a noise of any size.
+
+    They are tested at the fit of the named ones, by one multiple of their ordinary sizes.
+    """
+    named = of.model.names
+    kept = of.readings[~of.outlier].as_stated()
+    model = with_all_effects(of.model, kept.states)
+    known = {
+        (e.name, p.name): value
+        for e, mine in zip(of.model.effects, of.model.slices(), strict=True)
+        for p, value in zip(e.parameters, of.theta[mine], strict=True)
+    }
+    theta = np.array(
+        [known.get((e.name, p.name), 0.0) for e in model.effects for p in e.parameters]
+    )
+    problem = linearised_problem(model, kept, of.mode, theta)
+    families = problem.families.random
+    numbers = [k for k, f in enumerate(families) if f.effect not in named]
+    return evidence(problem, numbers, np.random.default_rng(SEED)).p_value
+
+
+def is_better(before: Fit, after: Fit) -> bool:
     """Whether a background belongs to the model.
 
-    The readings must prove effects together, beside a noise of any size, and the error on poses
-    left out must fall.
+    The error on poses left out must fall by `WORTH`, and all its effects be of plausible size
+    (`Effect.most`): effects that would have to be larger stand in for one that the catalogue lacks.
 
     Args:
         before: the fit of the named effects alone.
         after: the fit of all, each with its standard deviation.
     """
-    if after.holdout.rms_sigma > (1 - WORTH) * before.holdout.rms_sigma:
-        return False
-    kept = after.readings[~after.outlier].as_stated()
-    found = mixed_fit_at(after.model, kept, after.mode, after.theta)
-    role = {e.name: e.role for e in after.model.effects}
-    families = found.equations.problem.families.random
-    numbers = [k for k, f in enumerate(families) if role[f.effect] == "effect"]
-    rng = np.random.default_rng(SEED)
-    return evidence(found.equations.problem, numbers, rng, found.log_std).p_value < TOGETHER
+    random = (e for e in after.model.effects if e.name in after.model.random)
+    plausible = all(np.all(after.model.random[e.name] <= e.most() * e.magnitudes) for e in random)
+    return plausible and after.holdout.rms_sigma <= (1 - WORTH) * before.holdout.rms_sigma
 
 
 def background_evidence(fit: Fit) -> tuple[BackgroundEffect, ...]:

@@ -35,9 +35,9 @@ Noise that is correlated along the order of the readings is in the covariance of
 is judged (see `serial_noise`). Where it is not proved, since effects explain the readings as well,
 3 and 5c become `ambiguous`.
 
-Where the model has a background and its residual is noise, or the arm's scatter, effects of the
-catalogue are there that the readings do not prove one by one: 3 and 5c become `ambiguous`, and the
-suspects are those of the background.
+Where the model has a background and its residual is noise of any size, or the arm's scatter,
+effects of the catalogue are there that the readings do not prove one by one: 3, 5 and 6 become
+`ambiguous`, the suspects are those of the background, and the size of the noise is said.
 
 A fit whose covariance has the estimated scatter in it (`Readings.arm_scatter`) is judged by the
 same rules, but that it may be smaller than its noise: the scatter is never negative, so that an
@@ -67,6 +67,10 @@ IN_SAMPLE = ("pose", "direction")
 """First words of variables whose share is not of poses left out."""
 MOST_NAMED = 2
 """Variables that a sentence names."""
+BESIDE_A_BACKGROUND: tuple[Reason, ...] = (
+    "residual_is_noise", "inseparable_addition", "arm_scatter", "misjudged_noise",
+)  # fmt: skip
+"""Reasons that are not the whole truth where effects are proved together, not one by one."""
 SAME_IN_POSE = 0.5
 """Share of the misfit in common to all readings of a pose from which on it is not the scatter of
 single arrivals; a choice."""
@@ -205,7 +209,7 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
         serial = e.fit.readings.serial
         if reason in ("residual_is_noise", "arm_scatter") and serial and not serial.proved:
             reason = "serial_or_effect"
-        if reason in ("residual_is_noise", "inseparable_addition", "arm_scatter") and e.background:
+        if reason in BESIDE_A_BACKGROUND and e.background:
             reason, suspects = "background", (*as_suspects(e.background), *suspects)
     alone = None
     if reason in ("misjudged_noise", "no_suspect") and e.misfit and not _predicted(e, regression):

@@ -91,20 +91,25 @@ def _rms(moves: Floats) -> float:
     return float(np.sqrt(np.mean(np.sum(moves.sum(axis=2) ** 2, axis=1))))
 
 
-def with_background(of: Fit, named: Collection[str]) -> Fit | None:
-    """Fit all effects of the catalogue; None where there are too many readings.
+def allows_background(of: Fit) -> bool:
+    """Whether the readings are few enough for a background, and no other campaign is the prior.
+
+    A prior of another campaign says of its own effects how large they are.
+    """
+    return len(of.white) <= MOST_ROWS and of.model.prior is None
+
+
+def with_background(of: Fit, named: Collection[str]) -> Fit:
+    """Fit all effects of the catalogue.
 
     The noise is as the mixed model estimates it: the arm's scatter is in the covariance, and a
     factor of the instrument's makes the standard deviations of the effects smaller by as much,
     which is the same fit. Readings that were set aside as gross errors stay so.
 
     Args:
-        of: a fit; a prior of another campaign says of its own effects how large they are, so that
-            there is no background beside it.
+        of: a fit that allows it.
         named: effects that are not of the background.
     """
-    if len(of.white) > MOST_ROWS or of.model.prior is not None:
-        return None
     readings = of.readings.as_stated()
     found = mixed_fit(of.model, readings[~of.outlier], of.mode, np.random.default_rng(SEED))
     if not readings.scatter_stated:

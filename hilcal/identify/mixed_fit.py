@@ -55,6 +55,8 @@ class MixedFit:
         theta: (P,) parameters.
         variances: those of the families and of the noise, at the last linearisation.
         covariance: (K, K) of the errors of the coordinates.
+        log_std: (F + N,) of the families and of the noise: those of the estimate, or of the roots
+            of the mean variances where they were averaged over.
     """
 
     model: Model
@@ -63,6 +65,7 @@ class MixedFit:
     theta: Floats
     variances: Variances
     covariance: Floats
+    log_std: Floats
 
     @property
     def problem(self) -> MixedProblem:
@@ -71,12 +74,12 @@ class MixedFit:
 
     def std(self, name: str) -> float:
         """Return the estimated standard deviation of a family or of a component of the noise."""
-        return float(np.exp(self.variances.log_std[self.problem.names.index(name)]))
+        return float(np.exp(self.log_std[self.problem.names.index(name)]))
 
     def prior_std(self) -> Floats:
         """(P,) standard deviations of the parameters; infinite for frames."""
         out = np.full(self.model.size, np.inf)
-        for f, log_std in zip(self.problem.families.random, self.variances.log_std, strict=False):
+        for f, log_std in zip(self.problem.families.random, self.log_std, strict=False):
             out[f.parameters] = np.exp(log_std) * f.magnitude
         return out
 
@@ -152,10 +155,11 @@ def mixed_fit(model: Model, readings: Readings, mode: Mode, rng: np.random.Gener
             break
         white = now
     if len(problem.y) > FEW_ROWS:
-        return MixedFit(model, readings, w, theta, found, coordinates_covariance(found))
+        covariance = coordinates_covariance(found)
+        return MixedFit(model, readings, w, theta, found, covariance, found.log_std)
     mean = average(found, rng, WALK)
     theta = problem.parameters(mean.coordinates, model.size)
-    return MixedFit(model, readings, w, theta, found, mean.covariance)
+    return MixedFit(model, readings, w, theta, found, mean.covariance, mean.log_std)
 
 
 def mixed_fit_at(model: Model, readings: Readings, mode: Mode, theta: Floats) -> Variances:
@@ -167,8 +171,13 @@ def mixed_fit_at(model: Model, readings: Readings, mode: Mode, theta: Floats) ->
         mode: "deflection" or "absolute".
         theta: where the model is linearised.
     """
+    return estimate_variances(linearised_problem(model, readings, mode, theta))
+
+
+def linearised_problem(model: Model, readings: Readings, mode: Mode, theta: Floats) -> MixedProblem:
+    """Return the linear problem of a model at parameters theta (P,); arguments as above."""
     w = whitening(readings, mode, "gc")
-    return estimate_variances(_linearised(model, readings, w, theta)[0])
+    return _linearised(model, readings, w, theta)[0]
 
 
 def _linearised(

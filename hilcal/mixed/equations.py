@@ -27,6 +27,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.linalg.lapack import dpotri
 
 from hilcal.mixed.problem import MixedProblem
 from hilcal.types import Floats
@@ -75,20 +76,26 @@ class _ByRows:
         self.rows, self.flat, q, z = rows, flat, rows[:, :flat], rows[:, flat:]
         n = z @ z.T
         n[np.diag_indices_from(n)] += 1.0
-        factor = cho_factor(n, lower=True, overwrite_a=True)
-        inverse = cho_solve(factor, np.eye(len(rows)))
-        self.log_det = 2.0 * float(np.log(np.diagonal(factor[0])).sum())
-        self.b, self.frames = inverse @ q, np.zeros((flat, flat))
+        self._factor = cho_factor(n, lower=True, overwrite_a=True)
+        self.log_det = 2.0 * float(np.log(np.diagonal(self._factor[0])).sum())
+        self.b, self.frames = cho_solve(self._factor, q), np.zeros((flat, flat))
         if flat:
             inner = cho_factor(q.T @ self.b, lower=True)
             self.log_det += 2.0 * float(np.log(np.diagonal(inner[0])).sum())
             self.frames = cho_solve(inner, np.eye(flat))
-            inverse -= self.b @ self.frames @ self.b.T
-        self.p = inverse
+
+    @cached_property
+    def p(self) -> Floats:
+        """(R, R) P; a trial of a step does not need it."""
+        inverse, _ = dpotri(self._factor[0], lower=True)
+        inverse = np.tril(inverse) + np.tril(inverse, -1).T
+        inverse -= self.b @ self.frames @ self.b.T
+        return np.asarray(inverse)
 
     def project(self, v: Floats) -> Floats:
         """P v."""
-        return np.asarray(self.p @ v)
+        solved = cho_solve(self._factor, v)
+        return np.asarray(solved - self.b @ (self.frames @ (self.b.T @ v)))
 
     @cached_property
     def inverse(self) -> Floats:

@@ -62,8 +62,16 @@ def _background(d: Diagnosis) -> str:
     return (
         f"{len(of)} effects of the catalogue together predict what the named ones leave, and these "
         f"readings prove none of them by itself; {told}: all are predicted with; more poses, "
-        "spread over all joints, tell which are there"
+        f"spread over all joints, tell which are there{_noise_beside(d)}"
     )
+
+
+def _noise_beside(d: Diagnosis) -> str:
+    """Say how large the noise is that a background leaves, where it is not the stated one."""
+    if d.noise is None or not d.noise.misjudged:
+        return ""
+    times = d.fit.variance_factor**0.5
+    return f"; what they leave is {times:.1f} times the stated noise: repeat some readings"
 
 
 def _missing(s: Suspect) -> str:
