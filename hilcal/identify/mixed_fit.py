@@ -55,8 +55,6 @@ class MixedFit:
         theta: (P,) parameters.
         variances: those of the families and of the noise, at the last linearisation.
         covariance: (K, K) of the errors of the coordinates.
-        log_std: (F + N,) of the families and of the noise: those of the estimate, or of the roots
-            of the mean variances where they were averaged over.
     """
 
     model: Model
@@ -65,7 +63,6 @@ class MixedFit:
     theta: Floats
     variances: Variances
     covariance: Floats
-    log_std: Floats
 
     @property
     def problem(self) -> MixedProblem:
@@ -74,12 +71,12 @@ class MixedFit:
 
     def std(self, name: str) -> float:
         """Return the estimated standard deviation of a family or of a component of the noise."""
-        return float(np.exp(self.log_std[self.problem.names.index(name)]))
+        return float(np.exp(self.variances.log_std[self.problem.names.index(name)]))
 
     def prior_std(self) -> Floats:
         """(P,) standard deviations of the parameters; infinite for frames."""
         out = np.full(self.model.size, np.inf)
-        for f, log_std in zip(self.problem.families.random, self.log_std, strict=False):
+        for f, log_std in zip(self.problem.families.random, self.variances.log_std, strict=False):
             out[f.parameters] = np.exp(log_std) * f.magnitude
         return out
 
@@ -155,11 +152,10 @@ def mixed_fit(model: Model, readings: Readings, mode: Mode, rng: np.random.Gener
             break
         white = now
     if len(problem.y) > FEW_ROWS:
-        covariance = coordinates_covariance(found)
-        return MixedFit(model, readings, w, theta, found, covariance, found.log_std)
+        return MixedFit(model, readings, w, theta, found, coordinates_covariance(found))
     mean = average(found, rng, WALK)
     theta = problem.parameters(mean.coordinates, model.size)
-    return MixedFit(model, readings, w, theta, found, mean.covariance, mean.log_std)
+    return MixedFit(model, readings, w, theta, found, mean.covariance)
 
 
 def mixed_fit_at(model: Model, readings: Readings, mode: Mode, theta: Floats) -> Variances:

@@ -49,26 +49,19 @@ class Average:
         coordinates: (K,) mean.
         covariance: (K, K) of their errors: the mean covariance at given standard deviations, and
             the covariance of the coordinates between them.
-        log_std: (F + N,) logarithms of the roots of the mean variances. Predictions with them, as
-            if they were known, err by 2 % more than the mean of the coordinates, and have bands
-            about as wide as those of the covariance (nine campaigns of 30 poses of real arms).
     """
 
     coordinates: Floats
     covariance: Floats
-    log_std: Floats
 
 
 def average(found: Variances, rng: np.random.Generator, steps: int) -> Average:
     """Average the coordinates and the covariance of their errors over the posterior."""
     coordinates: list[Floats] = []
-    variance = np.zeros(len(found.log_std))
     covariance, count = np.zeros_like(found.equations.covariance), 0
     for k, e in enumerate(walk(found, rng, steps)):
         coordinates.append(e.coordinates)
-        variance += np.exp(2.0 * e.log_std)
         if k % THINNED == 0:
             covariance, count = covariance + e.covariance, count + 1
     between = np.cov(np.array(coordinates), rowvar=False, bias=True)
-    log_std = 0.5 * np.log(variance / len(coordinates))
-    return Average(np.mean(coordinates, axis=0), covariance / count + between, log_std)
+    return Average(np.mean(coordinates, axis=0), covariance / count + between)
