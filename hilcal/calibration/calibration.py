@@ -29,13 +29,14 @@ from hilcal.calibration.measured import Measured
 from hilcal.calibration.poses import ToolPoses
 from hilcal.calibration.scatter import Scatter, scatter_of
 from hilcal.calibration.sensed import SensorMount
-from hilcal.calibration.tool import Tool, in_chain, one_of_each, tool_of, tool_poses
+from hilcal.calibration.tool import Tool, in_chain, tool_of, tool_poses
 from hilcal.data.readings import States
 from hilcal.data.whitening import Mode
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError
 from hilcal.identify.fit import Fit
 from hilcal.identify.predictive import open_prior, position_factor, predictive
+from hilcal.identify.robot_frames import RobotFrames, one_of_each, robot_frames
 from hilcal.model import Model, Prediction
 from hilcal.robot import se3
 from hilcal.robot.chain import evaluate
@@ -259,12 +260,17 @@ class Calibration:
         return self.sensor.load_wrench(self.model.cell, at, every)
 
     def tool_pose(self, tool: Floats | None = None) -> Floats:
-        """(4, 4) T_flange_tool of the nominal arm: as given, or the tracked target."""
+        """(4, 4) T_flange_tool: as given, or the tracked target as stated, else as fitted."""
         return self._tool(tool).nominal
 
+    @cached_property
+    def frames(self) -> RobotFrames:
+        """Base and flange that everything is counted from."""
+        return robot_frames(self.model, self.theta)
+
     def base_in_tracker(self) -> Floats:
-        """(4, 4) T_sensor_base: as known, or where the nominal arm fits the readings best."""
-        return self.model.cell.registration
+        """(4, 4) T_sensor_base, see `identify.robot_frames`."""
+        return self.frames.base
 
     def _tool(self, pose: Floats | None) -> Tool:
         """Return the tool with a pose on the flange; raises as `predict` does."""

@@ -104,9 +104,10 @@ def ur_kinematics(
 def frames(calibration: Calibration, found: Corrected, beyond_flange: Floats | None) -> str:
     """Return the frames that a controller asks for, as JSON: x, y, z, rx, ry, rz in m and rad.
 
-    `tool_on_flange` and `base_in_tracker` are those of the corrected arm. A controller computes
-    with its own arm: its tool centre point and its base have the constant parts of the two ends
-    with them, which are under "controller", in m and, as PolyScope shows them, in mm.
+    `base_in_tracker` is the one base of all that is handed out, `base_is` how it is known.
+    `tool_on_flange` is that of the corrected arm. A controller computes with its own arm: its tool
+    centre point has the constant part of the last link with it, under "controller", in m and, as
+    PolyScope shows them, in mm.
 
     Args:
         calibration: the calibration.
@@ -117,19 +118,19 @@ def frames(calibration: Calibration, found: Corrected, beyond_flange: Floats | N
     tool, base = calibration.tool_pose(), calibration.base_in_tracker()
     nominal, arm = calibration.model.cell.arm, found.arm
     tcp = se3.inverse(nominal.links[-1]) @ arm.links[-1] @ tool
-    own_base = base @ arm.links[0] @ se3.inverse(nominal.links[0])
-    tracker = se3.inverse(own_base)
+    tracker = se3.inverse(base)
     document = {
         "arm": nominal.name,
         "tool_on_flange": se3.six(tool),
         "base_in_tracker": se3.six(base),
+        "base_is": calibration.frames.base_is,
         "in_transforms": list(found.within),
         "not_in_transforms": list(found.beyond),
         "controller": {
             "tcp_m_rad": se3.six(tcp),
             "tcp_mm_rad": _millimetres(tcp),
             "urscript": f"set_tcp(p[{', '.join(f'{v:.9f}' for v in se3.six(tcp))}])",
-            "base_in_tracker_m_rad": se3.six(own_base),
+            "base_in_tracker_m_rad": se3.six(base),
             "tracker_in_base_m_rad": se3.six(tracker),
             "tracker_in_base_mm_rad": _millimetres(tracker),
         },

@@ -1,13 +1,9 @@
 """Where the tool is by a model: the arm's own pose in base axes, without the instruments.
 
-    T_base_tool = exp(base) T_base_flange(q, w) T_flange_tool
+    T_base_tool = T_base_chain T_chain_flange(q, w) T_chainflange_flange T_flange_tool
 
-Base axes are those in which the nominal arm fits the readings best, where the registration was
-estimated: `Cell.registration`. A fit that knows the geometry, too, moves them along with the first
-link (both mean the same to every reading), so the frames that were fitted along (effects of the
-roles "registration" and "target") are part of the arm here: the one before the first joint, the
-other, the tracked target as fitted over the target as registered, behind the flange. What
-instruments do (fields "station" and "scale") is no motion of the tool.
+Base and flange are those that `identify.robot_frames` declares. What instruments do (fields
+"station" and "scale") is no motion of the tool.
 """
 
 from dataclasses import dataclass, replace
@@ -17,6 +13,7 @@ import numpy as np
 from hilcal.cell import Cell
 from hilcal.data.readings import States
 from hilcal.effects.protocol import FRAME_ROLES, Effect
+from hilcal.identify.robot_frames import one_of_each, robot_frames
 from hilcal.model import Model, Prediction
 from hilcal.robot import se3
 from hilcal.types import Floats, Ints
@@ -30,8 +27,9 @@ class Tool:
         model: whose target is the tool; without effects that place another target.
         theta: (P,) its parameters.
         kept: (P,) which of the parameters of the fitted model they are.
-        nominal: (4, 4) T_flange_tool of the nominal arm.
-        pose: (4, 4) the same of the fitted arm, with what the fit knows of it.
+        nominal: (4, 4) T_flange_tool.
+        pose: (4, 4) T_chainflange_tool, the same on the flange of the fitted chain.
+        registered: (4, 4) from the axes of the registration to those of the base.
         base: (4, 4) from the axes of the chain to those of the base, constant effects alone.
         frames: effects that say where the base is, with their parameters.
         moving: effects that move base or target and are no frames, with their parameters.
@@ -42,6 +40,7 @@ class Tool:
     kept: Ints
     nominal: Floats
     pose: Floats
+    registered: Floats
     base: Floats
     frames: tuple[tuple[Effect, slice], ...]
     moving: tuple[tuple[Effect, slice], ...]
@@ -56,39 +55,27 @@ def tool_of(model: Model, theta: Floats, pose: Floats | None) -> Tool:
         pose: (4, 4) T_flange_tool; the (first) tracked target where None.
     """
     every = np.arange(model.size)
-    base, behind = ends(model, theta)
+    at = robot_frames(model, theta)
     if pose is None:
-        nominal = model.cell.all_targets[0]
-        frames, moving = _base_frames(model), _moving(model, theta)
-        return Tool(model, theta, every, nominal, behind @ nominal, base, frames, moving)
-    named = [e for e in model.effects if e.role != "target"]
-    parts = [every[s] for e, s in zip(model.effects, model.slices(), strict=True) if e in named]
-    kept = np.concatenate([every[:0], *parts])
-    cell = replace(model.cell, targets=None, target_names=(), targets_known=())
-    cell = replace(cell, target=behind @ pose, target_known=True)
-    own = replace(model, cell=cell, effects=tuple(named))
-    frames, moving = _base_frames(own), _moving(own, theta[kept])
-    return Tool(own, theta[kept], kept, pose, behind @ pose, base, frames, moving)
-
-
-def ends(model: Model, theta: Floats) -> tuple[Floats, Floats]:
-    """Return what the fitted frames move: (4, 4) before the first joint, (4, 4) behind the flange.
-
-    Args:
-        model: the fitted model.
-        theta: (P,) its parameters.
-    """
-    situation = model.predict(_one(model.cell), theta).situation
-    base, target = np.zeros(6), model.cell.all_targets[0].copy()
-    for e, mine in zip(model.effects, model.slices(), strict=True):
-        d = e.deviation(theta[mine], situation)
-        if e.role == "registration" and d.base is not None:
-            base = base + d.base[0]
-        if e.role == "target" and d.target is not None:
-            target[:3, 3] += d.target[0, :3]
-            target[:3, :3] = se3.rotation(d.target[0, 3:]) @ target[:3, :3]
-    behind = target @ se3.inverse(model.cell.all_targets[0])
-    return se3.matrix(*se3.exp(base)), np.asarray(behind)
+        nominal, own, kept = at.declared[0], model, every
+    else:
+        nominal, named = pose, [e for e in model.effects if e.role != "target"]
+        parts = [every[s] for e, s in zip(model.effects, model.slices(), strict=True) if e in named]
+        kept = np.concatenate([every[:0], *parts])
+        cell = replace(model.cell, targets=None, target_names=(), targets_known=())
+        cell = replace(cell, target=at.flange @ pose, target_known=True)
+        own = replace(model, cell=cell, effects=tuple(named))
+    return Tool(
+        model=own,
+        theta=theta[kept],
+        kept=kept,
+        nominal=nominal,
+        pose=at.flange @ nominal,
+        registered=at.registered,
+        base=at.chain,
+        frames=_base_frames(own),
+        moving=_moving(own, theta[kept]),
+    )
 
 
 def tool_poses(tool: Tool, prediction: Prediction) -> tuple[Floats, Floats]:
@@ -106,6 +93,8 @@ def tool_poses(tool: Tool, prediction: Prediction) -> tuple[Floats, Floats]:
     moved += [e.deviation(tool.theta[mine], s) for e, mine in tool.frames]
     base = [d.base for d in moved if d.base is not None]
     r, p = se3.exp(sum(base[1:], base[0]))
+    turn = tool.registered[:3, :3]
+    r, p = se3.product(turn, r), tool.registered[:3, 3] + se3.apply(turn, p)
     return se3.product(r, rotation), p + se3.apply(r, position)
 
 
@@ -113,21 +102,6 @@ def in_chain(tool: Tool, rotation: Floats, position: Floats) -> tuple[Floats, Fl
     """Poses (N, 3, 3) and (N, 3) in the axes of the fitted chain, from those in base axes."""
     turn = tool.base[:3, :3].T
     return se3.product(turn, rotation), se3.apply(turn, position - tool.base[:3, 3])
-
-
-def one_of_each(cell: Cell) -> States:
-    """Return one state that has every column, for effects that are built without readings."""
-    n = cell.arm.n
-    one = np.zeros(1)
-    return States(
-        q=np.zeros((1, n)),
-        wrench=np.zeros((1, 6)),
-        time=one,
-        load_time=one,
-        air_temperature=one,
-        joint_temperature=np.zeros((1, n)),
-        approach=np.ones((1, n)),
-    )
 
 
 def _moving(model: Model, theta: Floats) -> tuple[tuple[Effect, slice], ...]:

@@ -27,6 +27,7 @@ from hilcal.identify import parameters_document
 from hilcal.identify.residual_table import residual_table
 from hilcal.report.numbers import length
 from hilcal.report.progress import Say, working
+from hilcal.report.text_registration import base_line
 from hilcal.whole_file import replace_file
 
 MANY = 10.0
@@ -278,8 +279,10 @@ def _write_geometry(found: Calibration, wanted: Geometry) -> Iterator[str]:
     if not wanted.paths:
         return
     arm = corrected(found)
-    nominal, beyond = found.model.cell.arm, None
+    cell, beyond = found.model.cell, None
+    nominal = cell.arm
     note = f"{nominal.name} as calibrated with hilcal, {found.source['campaign']}"
+    base = base_line(cell, found.frames)
     holds = ", ".join(arm.within) or "the nominal geometry"
     said: list[str] = []
     write: list[Callable[[], object]] = []
@@ -288,7 +291,7 @@ def _write_geometry(found: Calibration, wanted: Geometry) -> Iterator[str]:
         write.append(lambda: replace_file(path, text))
 
     if wanted.ur_kinematics is not None:
-        words = _ur_note(note, arm, wanted.ur_hash)
+        words = _ur_note(note, base, arm, wanted.ur_hash)
         text, beyond = handover.ur_kinematics(nominal, arm.arm, words, wanted.ur_hash)
         later(wanted.ur_kinematics, text)
         shift, tilt = np.linalg.norm(beyond[:3, 3]), np.linalg.norm(beyond[:3, :3] - np.eye(3))
@@ -298,7 +301,7 @@ def _write_geometry(found: Calibration, wanted: Geometry) -> Iterator[str]:
             f"({1e3 * float(tilt) / np.sqrt(2):.2g} mrad): tcp_for_ur_kinematics of --frames does"
         )
     if wanted.urdf is not None:
-        later(wanted.urdf, handover.urdf(arm.arm, note))
+        later(wanted.urdf, handover.urdf(arm.arm, f"{note}. {base}"))
         said.append(f"{wanted.urdf}: URDF, base_link to tool0, with {holds}")
     if wanted.dh is not None:
         rows = dh_table.dh_rows(arm.arm, "modified" if wanted.modified else "standard")
@@ -316,12 +319,13 @@ def _write_geometry(found: Calibration, wanted: Geometry) -> Iterator[str]:
     for each in write:
         each()
     yield from said
+    yield base
     if arm.beyond:
         yield f"Not in it, since not constant: {', '.join(arm.beyond)}; hilcal compensate has it"
 
 
-def _ur_note(note: str, arm: Corrected, digest: str | None) -> str:
-    lines = [f"{note}; for kinematics_params_file of ur_robot_driver."]
+def _ur_note(note: str, base: str, arm: Corrected, digest: str | None) -> str:
+    lines = [f"{note}; for kinematics_params_file of ur_robot_driver.", base]
     if arm.beyond:
         lines.append(f"Not in it, since not constant: {', '.join(arm.beyond)}.")
     if digest is None:

@@ -1,6 +1,7 @@
 """A fit: parameters, their uncertainties, residuals and errors."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -18,6 +19,7 @@ from hilcal.identify.gauss_newton import Solution, solve
 from hilcal.identify.holdout import leave_out
 from hilcal.identify.outliers import limit
 from hilcal.identify.residual import residual
+from hilcal.identify.robot_frames import RobotFrames, robot_frames
 from hilcal.identify.summary import summary
 from hilcal.identify.uncertainty import Uncertainty, uncertainty
 from hilcal.identify.variance_factor import WithVarianceFactor
@@ -159,9 +161,13 @@ class Fit(WithVarianceFactor):
             return self.raw
         if frame != "base":
             raise InputError(f"frame {frame!r} is unknown; valid: sensor, base")
-        axes = self.solution.prediction.observation.axes[self.whitening.reading]
         parts = self.raw.reshape(len(self.raw), -1, 3)
-        return np.asarray(np.einsum("dji,dkj->dki", axes, parts).reshape(self.raw.shape))
+        return np.asarray((parts @ self.frames.base[:3, :3]).reshape(self.raw.shape))
+
+    @cached_property
+    def frames(self) -> RobotFrames:
+        """Base and flange of the robot."""
+        return robot_frames(self.model, self.theta)
 
     def predict(self, states: States) -> Observation:
         """Predict what the sensor reads in N states.

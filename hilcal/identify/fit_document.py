@@ -9,7 +9,7 @@ from hilcal.identify.background import background_of
 from hilcal.identify.before import error_before
 from hilcal.identify.disagreement_words import disagreement_words
 from hilcal.identify.fit import Fit
-from hilcal.identify.frames_document import fit_to_json, frames_of_fit
+from hilcal.identify.frames_document import fit_to_json
 from hilcal.identify.full_prediction import full_prediction
 from hilcal.identify.gross_errors import gross_errors
 from hilcal.identify.weight import weight_note
@@ -52,7 +52,7 @@ def to_json(fit: Fit) -> dict[str, object]:
         "outliers": outliers(fit),
         "arm_scatter": None if scatter is None else scatter.to_json(),
         "serial_noise": None if serial is None else serial.to_json(),
-        "registration": frames_of_fit(fit)[0].tolist(),
+        "registration": fit.frames.base.tolist(),
         "frames": fit_to_json(fit),
         "notes": list(notes(fit)),
         **prior_to_json(fit),

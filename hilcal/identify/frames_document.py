@@ -4,32 +4,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hilcal.effects.target_offset import TargetOffset
 from hilcal.identify.fit import Fit
 from hilcal.identify.registration import Registration, Undetermined, register
 from hilcal.robot import se3
 from hilcal.types import Floats
 
 
-def frames_of_fit(fit: Fit) -> tuple[Floats, Floats]:
-    """T_sensor_base (4, 4) and T_flange_target (T, 4, 4) as fitted: start and effects."""
-    base, targets = fit.model.cell.registration, fit.model.cell.all_targets
-    for effect, rows in zip(fit.model.effects, fit.model.slices(), strict=True):
-        theta = fit.theta[rows]
-        if effect.role == "registration":
-            base = np.asarray(base @ se3.matrix(*se3.exp(theta)))
-        elif isinstance(effect, TargetOffset):
-            targets = effect.displaced(theta)
-            if effect.size == 6:
-                turns = se3.rotation(theta.reshape(-1, 6)[:, 3:])
-                targets[effect.moved, :3, :3] = turns @ targets[effect.moved, :3, :3]
-    return base, targets
-
-
 def fit_to_json(fit: Fit) -> dict[str, object]:
     """Frames as fitted; residual and undetermined directions of the nominal arm's registration."""
-    base, targets = frames_of_fit(fit)
-    return document(register(fit.model.cell, fit.readings), base, targets)
+    found = fit.frames
+    registered = document(register(fit.model.cell, fit.readings), found.base, found.targets)
+    return {**registered, "base_is": found.base_is}
 
 
 def document(

@@ -26,13 +26,12 @@ def residual_table(fit: Fit) -> dict[str, Column]:
     """
     r, (raw, w) = fit.readings, with_outliers(fit)
     left_out = all_left_out(fit)[0]
-    axes = fit.model.predict(r.states, fit.theta).observation.axes[w.reading]
     table = named(r)
     table["set_aside"] = fit.outlier.astype(int)
     table["sigma"] = _spread(np.sqrt(mahalanobis2(raw, w.covariance))[:, None], w.reading, r)[0]
     for what, values in (("residual", raw), ("left_out", left_out)):
         parts = values.reshape(len(values), -1, 3)
-        base = np.einsum("dji,dkj->dki", axes, parts).reshape(values.shape)
+        base = (parts @ fit.frames.base[:3, :3]).reshape(values.shape)
         for frame, of in (("", values), ("base_", base)):
             columns = _spread(of, w.reading, r)
             names = (f"{what}_{frame}{element}" for element in ELEMENTS[: values.shape[1]])

@@ -71,8 +71,8 @@ class Chapter:
 def build_story(chapters: Sequence[Chapter]) -> Story:
     """Build the story of successive revisions of one campaign, in base axes.
 
-    All readings are shown, also those that were set aside as gross errors. Sensor axes are
-    turned into base axes by the last revision's registration. An arrow starts where the rigid
+    All readings are shown, also those that were set aside as gross errors. The base is that of
+    the last revision. An arrow starts where the rigid
     nominal arm would hold the target.
 
     Raises:
@@ -89,10 +89,12 @@ def build_story(chapters: Sequence[Chapter]) -> Story:
                 f"revision {c.number} was fitted to other readings; nothing to compare"
             )
     readings, rows = last.readings, last.whitening.reading
-    axes = np.swapaxes(last.prediction.observation.axes[rows], 1, 2)
-    nominal = _nominal(chapters[-1].fit.model.cell, last)
+    frames = chapters[-1].fit.frames
+    axes = np.broadcast_to(frames.base[:3, :3].T, (len(rows), 3, 3))
+    nominal = _nominal(chapters[-1].fit.model.cell.with_targets(frames.declared), last)
     if mode == "absolute":
-        measured = last.prediction.observation.base_position + _turn(axes, last.raw[:, :3])
+        chain, predicted = frames.chain, last.prediction.observation.base_position
+        measured = chain[:3, 3] + predicted @ chain[:3, :3].T + _turn(axes, last.raw[:, :3])
     else:
         measured = _turn(axes, last.whitening.raw(readings.value[:, :3]))
     covariance = axes @ last.whitening.covariance[:, :3, :3] @ np.swapaxes(axes, 1, 2)

@@ -12,6 +12,8 @@ from hilcal.calibration.measured import Outside
 from hilcal.calibration.poses import BAND
 from hilcal.calibration.urscript import Waypoint
 from hilcal.report import numbers, text
+from hilcal.report.text_registration import base_line
+from hilcal.robot import se3
 from hilcal.types import Floats
 
 MOST = 12
@@ -75,6 +77,7 @@ def report(
         f"{numbers.length(float(later.max()))}; expected {numbers.length(_rms(c.after.std_m))} rms"
     )
     yield f"  the latter includes {', '.join(_parts(calibration))}"
+    yield f"  {base_line(calibration.model.cell, calibration.frames)}"
     out = text.table("point", "before", "after, 95 %", "largest correction")
     order = np.argsort(-now, kind="stable")[:MOST]
     for k in sorted(order):
@@ -160,6 +163,8 @@ def document(calibration: Calibration, names: Sequence[str], c: Compensation) ->
     return {
         "calibration": dict(calibration.source),
         "readings": calibration.mode,
+        "base_in_tracker": se3.six(calibration.base_in_tracker()),
+        "base_is": calibration.frames.base_is,
         "n_points": len(names),
         "error_before": _block(c.before.error_m),
         "error_after": {

@@ -6,9 +6,9 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.identify.fit import Fit
-from hilcal.identify.frames_document import frames_of_fit
 from hilcal.identify.other_arm import OtherArm
 from hilcal.identify.registration import Registration, Undetermined, register
+from hilcal.identify.robot_frames import RobotFrames
 from hilcal.report import numbers
 from hilcal.robot import se3
 from hilcal.types import Bools, Floats
@@ -38,23 +38,23 @@ def other_arm_line(found: OtherArm) -> str:
 
 
 def fitted_lines(fit: Fit) -> Iterator[str]:
-    """Yield where base and target are as fitted, where they were unknown."""
-    names = {e.role: e.name for e in fit.model.effects if e.role in ("registration", "target")}
-    if not names:
-        return
-    base, targets = frames_of_fit(fit)
-    parts = []
-    if "registration" in names:
-        parts.append(_base(base))
-    if "target" in names:
-        parts.append(_targets(fit.model.cell.with_targets(targets)))
-    those = " and ".join(names.values())
-    yield (
-        f"As fitted, {'; '.join(parts)}; {those} "
-        f"{'are' if len(names) > 1 else 'is'} what was added to the registration that the fit "
-        "started from."
-    )
-    yield from undetermined_lines(register(fit.model.cell, fit.readings))
+    """Yield where the robot's base is, and the targets that were unknown."""
+    roles = [e.role for e in fit.model.effects]
+    yield base_line(fit.model.cell, fit.frames)
+    if "target" in roles:
+        yield f"As fitted, {_targets(fit.model.cell.with_targets(fit.frames.targets))}."
+    if "target" in roles or "registration" in roles:
+        yield from undetermined_lines(register(fit.model.cell, fit.readings))
+
+
+def base_line(cell: Cell, found: RobotFrames) -> str:
+    """Return where the robot's base is, which poses, exports and errors are counted from."""
+    if not found.base_stated:
+        why = "the nominal arm on it has the axis of joint 1 where the readings have it"
+        return f"The robot's base: {_at(found.base)}; {why}."
+    if np.array_equal(found.base, np.eye(4)):
+        return "The robot's base: the axes that the positions are given in."
+    return f"The robot's base: {_at(found.base)}; as the cell states it."
 
 
 def undetermined_lines(found: Registration) -> Iterator[str]:
@@ -117,7 +117,11 @@ def _why(still: Bools) -> str:
 
 
 def _base(t: Floats) -> str:
-    return f"the base is at {_place(t)} in the tracker frame"
+    return f"the base is {_at(t)}"
+
+
+def _at(t: Floats) -> str:
+    return f"at {_place(t)} in the tracker frame"
 
 
 def _targets(cell: Cell) -> str:

@@ -1,6 +1,7 @@
 """`compensate` through the command line."""
 
 import csv
+import json
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,9 @@ from hilcal.calibration.urscript import waypoints
 from hilcal.config import load_config
 from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.covariance import COVERS, WHOLE
+from hilcal.data.readings import States
 from hilcal.robot.chain import evaluate
-from hilcal.robot.se3 import rotation
+from hilcal.robot.se3 import matrix, of_six, rotation, six
 from tests.support.cli_cases import CELL, ok, refused, rehearsal
 
 JOINTS = "q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg"
@@ -240,3 +242,37 @@ def test_a_load_as_the_force_sensor_reads_it_is_the_load(capsys, fitted, tmp_pat
     assert (tmp_path / "felt.csv").read_text() == (tmp_path / "named.csv").read_text()
     two = refused(capsys, 2, "compensate", fitted, points, "--load", "10kg")
     assert "the load is given twice" in two
+
+
+def test_every_command_counts_from_one_base_which_is_the_worlds(capsys, fitted, tmp_path) -> None:
+    """A pose in the base that is handed over, corrected, is where the simulated tracker has it."""
+    told = tmp_path / "frames.json"
+    exported = ok(capsys, "export", fitted, "--frames", told, "--urdf", tmp_path / "a.urdf").out
+    shown = next(line for line in exported.splitlines() if line.startswith("The robot's base: at"))
+    frames = json.loads(told.read_text())
+    base, tool = (of_six(frames[k]) for k in ("base_in_tracker", "tool_on_flange"))
+    assert frames["controller"]["base_in_tracker_m_rad"] == frames["base_in_tracker"]
+    world = rehearsal("nothing").world
+    np.testing.assert_allclose(base, world.registration, atol=5e-5)
+    with hc.Campaign.open(fitted, read_only=True) as run:
+        arm, q = run.cell.arm, np.unique(run.readings.states.q, axis=0)[:8]
+        load = run.calibration().loads["10kg"]
+    chain = evaluate(arm, q)
+    asked = matrix(chain.rotation[-1], chain.position[-1]) @ tool
+    rows = [[*np.degrees(a), *six(t)] for a, t in zip(q, asked, strict=True)]
+    points = tmp_path / "poses.csv"
+    lines = [f"{JOINTS},x_m,y_m,z_m,rx_rad,ry_rad,rz_rad"]
+    points.write_text("\n".join(lines + [",".join(f"{v:.12g}" for v in r) for r in rows]))
+    words = ok(capsys, "compensate", fitted, points, "--load", "10kg").out
+    assert " ".join(shown.split()) in " ".join(words.split())
+    found = ok(capsys, "compensate", fitted, points, "--load", "10kg", "--json").document
+    assert found["base_in_tracker"] == frames["base_in_tracker"]
+    assert found["base_is"] == frames["base_is"] == "mechanical"
+    corrected = np.array([p["q_corrected"] for p in found["points"]])
+    read = world.sight(States(corrected, np.tile(load, (len(q), 1)))).value(3)
+    off = np.linalg.norm((read - base[:3, 3]) @ base[:3, :3] - asked[:, :3, 3], axis=1)
+    assert np.all(off <= [p["band_m"] for p in found["points"]])
+    assert found["error_before"]["mean_m"] > 20 * off.mean()
+    report = tmp_path / "r.html"
+    ok(capsys, "report", fitted, "-o", report)
+    assert "the nominal arm on it has the axis of joint 1" in report.read_text()

@@ -15,7 +15,6 @@ from hilcal.errors import InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.fit_document import plain, to_json
-from hilcal.identify.frames_document import frames_of_fit
 from hilcal.refine import add
 from hilcal.report.diagnosis_document import to_json as diagnosis_json
 from hilcal.revisions import chain, restore, restore_model, to_record
@@ -104,7 +103,7 @@ def test_a_prior_that_no_fit_can_have_had_is_damage(wide: float) -> None:
 def test_the_registration_that_is_reported_is_the_true_one() -> None:
     r = rehearsal("nothing", poses=30)
     found = baseline_fit(r)
-    away = np.linalg.inv(r.world.registration) @ frames_of_fit(found)[0]
+    away = np.linalg.inv(r.world.registration) @ found.frames.base
     np.testing.assert_allclose(away, np.eye(4), atol=3e-5)
     assert not np.allclose(found.model.cell.registration, r.world.registration, atol=3e-5)
 

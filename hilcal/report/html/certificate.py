@@ -14,6 +14,7 @@ from hilcal.report.html.content import ReportContent
 from hilcal.report.html.first_screen import limit_words, mm
 from hilcal.report.html.parts import Items, Part, Section, Table, Words, from_terminal, table
 from hilcal.report.text_prior import prior_lines
+from hilcal.report.text_registration import base_line
 from hilcal.types import Floats
 
 
@@ -214,6 +215,7 @@ def _instruments(m: ReportContent) -> Iterator[Part]:
         ("", ""),
         (
             ("Robot", o.config.robot.model),
+            ("Base", base_line(m.fit.model.cell, m.fit.frames)),
             ("Operator", m.operator or "not stated"),
             ("Campaign", f"{m.name}, made {o.created[:19].replace('T', ' ')} UTC"),
             ("SHA-256 of the file", m.sha256),

@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from hilcal.calibration.corrected import corrected
 from hilcal.calibration.handover import UR_JOINTS, frames, ur_kinematics, urdf
-from hilcal.calibration.tool import ends
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.robot import se3
 from hilcal.robot.catalogue import load_arm, robot_names
@@ -41,7 +40,7 @@ def test_constant_effects_are_in_the_transforms_exactly(effect: str) -> None:
     for e, mine in zip(c.model.effects, c.model.slices(), strict=True):
         if e.name == effect:
             deviation = e.deviation(c.theta[mine], situation)
-    base, behind = ends(c.model, c.theta)
+    base, behind = c.frames.chain, c.frames.flange
     expected = base @ flanges(c.model.cell.arm, states.q, deviation) @ behind
     np.testing.assert_allclose(flanges(found.arm, states.q), expected, atol=1e-12)
     assert np.abs(expected - flanges(c.model.cell.arm, states.q)).max() > 1e-5
@@ -50,12 +49,10 @@ def test_constant_effects_are_in_the_transforms_exactly(effect: str) -> None:
 @pytest.mark.parametrize("effect", ["joint_tilt_compliance", "transmission_error"])
 def test_what_is_not_constant_is_named_and_left_out(effect: str) -> None:
     c = calibrated(effect)
-    found, (base, behind) = corrected(c), ends(c.model, c.theta)
+    found = corrected(c)
     assert effect in found.beyond
     assert found.within == ()
-    links = c.model.cell.arm.links.copy()
-    links[0], links[-1] = base @ links[0], links[-1] @ behind
-    np.testing.assert_array_equal(found.arm.links, links)
+    np.testing.assert_allclose(found.arm.links, c.model.cell.arm.links, atol=1e-12)
 
 
 def test_pinocchio_reads_the_same_kinematics_from_the_urdf(tmp_path: Path) -> None:
