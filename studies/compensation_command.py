@@ -185,7 +185,7 @@ def _left(name: str, which: str, c: Calibration, others: Readings, before: Float
     return Left(
         split=name,
         model=which,
-        scatter=c.scatter.known,
+        scatter=c.scatter.source == "estimated",
         poses=len(errors),
         before_m=float(before.mean()),
         mean_m=float(errors.mean()),

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilcal.calibration.calibration import Calibration
+from hilcal.calibration.scatter import ScatterSource
 from hilcal.calibration.tool import tool_of
 from hilcal.identify.fit import Fit
 from hilcal.robot.chain import evaluate
@@ -31,14 +32,14 @@ class Budget:
 
     Attributes:
         parameters: of the estimated parameters.
-        scatter: of the arm's own repeatability; zero where it is not known.
-        scatter_known: whether it was stated or estimated.
+        scatter: of the arm's own repeatability.
+        scatter_source: what that is from.
         misfit: of what the model misses beyond the noise.
     """
 
     parameters: Floats
     scatter: Floats
-    scatter_known: bool
+    scatter_source: ScatterSource
     misfit: Floats
 
     @property
@@ -72,6 +73,6 @@ def budget(fit: Fit) -> Budget:
     return Budget(
         parameters=np.sqrt(np.maximum(total - scatter - misfit, 0.0)),
         scatter=np.sqrt(scatter),
-        scatter_known=c.scatter.known,
+        scatter_source=c.scatter.source,
         misfit=np.sqrt(misfit),
     )

@@ -115,7 +115,7 @@ class Calibration:
             mode=found.mode,
             root=vectors * np.sqrt(kappa * np.maximum(values, 0.0)),
             misfit=p.excess.position / readings,
-            scatter=scatter_of(found.readings, model.cell),
+            scatter=scatter_of(found),
             measured=Measured.of(used.states, p, noise),
             loads={load.name: load.wrench(model.cell.gravity) for load in loads},
             source=dict(source or {}),

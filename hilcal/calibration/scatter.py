@@ -1,15 +1,41 @@
-"""The arm's scatter from one arrival to the next, as a covariance of the tool's position."""
+"""The arm's scatter from one arrival to the next, as a covariance of the tool's position.
+
+Every arm scatters. Where neither the fit has estimated it nor the cell states it, it is what
+repeated readings show: with S = Σ |e − ē|² over the positions' residuals e of k readings of one
+state, C their stated covariance and J the Jacobian of the target,
+
+    E S = N + σ² G,   N = Σ (1 − 1/k) tr C,   G = Σ (1 − 1/k) tr J Jᵀ,   u(S) = max(S, N) √(2/ν)
+
+is solved for σ², one for all joints; where S − N is below its standard uncertainty u, the arm may
+scatter as much as that. Where C has the arm's scatter already, all of S is taken for it. Without
+repeats it is what the arm's maker states.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.data.readings import Readings
+from hilcal.diagnose.arm_repeatability import RP_PER_RMS, stated_repeatability
+from hilcal.diagnose.noise import FEWEST
+from hilcal.diagnose.repeats import classes
+from hilcal.identify.fit import Fit
+from hilcal.identify.full_covariance import joint_factors
 from hilcal.robot.chain import Chain, drive_jacobian
 from hilcal.types import Floats
+
+ScatterSource = Literal["estimated", "stated", "repeats", "maker", "industry", "unknown"]
+"""What a scatter is from:
+
+- estimated: the fit, from its residuals;
+- stated: `[repeatability]` of the cell;
+- repeats: what repeated readings scatter by beyond the instrument's noise;
+- maker: the pose repeatability that the robot's file states;
+- industry: that of industrial arms, where the robot's file states none;
+- unknown: a calibration file of an older program, which took it for zero.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -19,12 +45,17 @@ class Scatter:
     Attributes:
         joint_std: (n,) of the drives, rad.
         std_m: of the position along each axis beside that, m.
-        known: whether it was stated or estimated; zeros mean nothing otherwise.
+        source: what they are from.
     """
 
     joint_std: Floats
     std_m: float
-    known: bool
+    source: ScatterSource
+
+    @property
+    def known(self) -> bool:
+        """Whether it is of this very arm."""
+        return self.source in ("estimated", "stated", "repeats")
 
     def covariance(self, cell: Cell, chain: Chain, position: Floats) -> Floats:
         """(N, 3, 3) covariance of points (N, 3) that the flange carries, base axes, m²."""
@@ -33,22 +64,58 @@ class Scatter:
 
     def to_json(self) -> dict[str, object]:
         """Return it as JSON, SI."""
-        return {"joint_std": self.joint_std.tolist(), "std_m": self.std_m, "known": self.known}
+        return {
+            "joint_std": self.joint_std.tolist(),
+            "std_m": self.std_m,
+            "known": self.known,
+            "source": self.source,
+        }
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> "Scatter":
-        """Return what `to_json` wrote."""
+        """Return what `to_json` wrote; older programs told whether it was known alone."""
         joint_std = np.array(content["joint_std"], dtype=float)
-        return cls(joint_std, float(content["std_m"]), bool(content["known"]))
+        source = content.get("source", "stated" if content["known"] else "unknown")
+        if source not in get_args(ScatterSource):
+            raise ValueError(f"a scatter from {source!r}")
+        return cls(joint_std, float(content["std_m"]), source)
 
 
-def scatter_of(readings: Readings, cell: Cell) -> Scatter:
-    """Return the scatter as it was estimated from readings, or as the cell states it."""
-    n, found = cell.arm.n, readings.arm_scatter
-    if found is None:
-        config = cell.config
-        stated = np.zeros(n) if config is None else config.repeatability.per_joint(n)
-        return Scatter(stated, 0.0, bool(stated.any()))
-    if found.kind == "isotropic":
-        return Scatter(np.zeros(n), found.std[0], known=True)
-    return Scatter(np.broadcast_to(np.array(found.std), (n,)).copy(), 0.0, known=True)
+def scatter_of(fit: Fit) -> Scatter:
+    """Return the arm's scatter by the best that is known of it; never zero."""
+    cell, n, found = fit.model.cell, fit.model.cell.arm.n, fit.readings.arm_scatter
+    if found is not None and found.kind == "isotropic":
+        return Scatter(np.zeros(n), found.std[0], "estimated")
+    if found is not None:
+        return Scatter(np.broadcast_to(np.array(found.std), (n,)).copy(), 0.0, "estimated")
+    stated = np.zeros(n) if cell.config is None else cell.config.repeatability.per_joint(n)
+    if stated.any():
+        return Scatter(stated, 0.0, "stated")
+    shown = _shown_by_repeats(fit)
+    if shown is not None:
+        return Scatter(np.full(n, shown), 0.0, "repeats")
+    std_m = stated_repeatability(cell.arm) / RP_PER_RMS / np.sqrt(3.0)
+    source: ScatterSource = "industry" if cell.arm.repeatability is None else "maker"
+    return Scatter(np.zeros(n), float(std_m), source)
+
+
+def _shown_by_repeats(fit: Fit) -> float | None:
+    """Standard deviation of each joint, rad; None where there are too few repeats."""
+    kept = fit.readings[~fit.outlier]
+    _, kind, count = np.unique(classes(kept), return_inverse=True, return_counts=True)
+    dof = 3 * (len(kept) - len(count))
+    if dof < FEWEST:
+        return None
+    off = kept.value[:, :3] - fit.solution.prediction.observation.position
+    mean = np.zeros((len(count), 3))
+    np.add.at(mean, kind, off)
+    away = off - (mean / count[:, None])[kind]
+    share = (1.0 - 1.0 / count)[kind]
+    moved = joint_factors(fit.model.cell, kept, np.ones(fit.model.cell.arm.n))[:, :3]
+    scatter = float(np.sum(away**2))
+    stated = kept.covariance[:, :3, :3] if not kept.scatter_stated else np.zeros((len(kept), 3, 3))
+    noise = float(share @ np.trace(stated, axis1=1, axis2=2))
+    gain = float(share @ np.sum(moved**2, axis=(1, 2)))
+    unsure = max(scatter, noise) * np.sqrt(2.0 / dof)
+    std = np.sqrt(max(scatter - noise, min(scatter, unsure)) / gain)
+    return float(std) if std > 0.0 else None

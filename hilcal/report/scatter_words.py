@@ -1,8 +1,14 @@
 """The arm's own scatter, and noise that is correlated along the order, in words."""
 
+from hilcal.calibration.scatter import ScatterSource
 from hilcal.data.arm_scatter import ArmScatter
 from hilcal.data.serial_noise import SerialNoise
-from hilcal.diagnose.arm_repeatability import RP_PER_RMS, instrument_instead, separated
+from hilcal.diagnose.arm_repeatability import (
+    INDUSTRIAL,
+    RP_PER_RMS,
+    instrument_instead,
+    separated,
+)
 from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.report import numbers
 from hilcal.robot.arm import Arm
@@ -88,6 +94,21 @@ def _maker(s: ArmScatter, arm: Arm) -> str:
     if arm.repeatability is None:
         return f"{own}; arms of industry have 0.02 to 0.1 mm)"
     return f"{own}; the maker states {numbers.digits(1e3 * arm.repeatability, 2)} mm)"
+
+
+def repeatability_source(source: ScatterSource, arm: Arm) -> str:
+    """Say what an arm's repeatability is from, as an uncertainty budget does."""
+    if source == "estimated":
+        return "type A: estimated with the model"
+    if source == "stated":
+        return "type B: as [repeatability] states it"
+    if source == "repeats":
+        return "type A: scatter of the repeated readings"
+    if source == "maker" and arm.repeatability is not None:
+        return f"type B: the maker states RP {numbers.length(arm.repeatability)} (ISO 9283)"
+    if source == "industry":
+        return f"type B: not known; RP of arms of industry is up to {numbers.length(INDUSTRIAL)}"
+    return "not known"
 
 
 def _scatter(d: Diagnosis) -> ArmScatter:

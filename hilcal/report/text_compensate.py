@@ -12,6 +12,7 @@ from hilcal.calibration.measured import Outside
 from hilcal.calibration.poses import BAND
 from hilcal.calibration.urscript import Waypoint
 from hilcal.report import numbers, text
+from hilcal.report.scatter_words import repeatability_source
 from hilcal.report.text_registration import base_line
 from hilcal.robot import se3
 from hilcal.types import Floats
@@ -105,11 +106,10 @@ def _parts(calibration: Calibration) -> list[str]:
     if calibration.misfit > 0:
         left = numbers.length(float(np.sqrt(3 * calibration.misfit)))
         parts.append(f"what the model leaves ({left} rms)")
-    scatter = calibration.scatter
-    parts.append(
-        "the arm's repeatability" if scatter.known else "no repeatability, which is not known"
-    )
-    return parts
+    source, arm = calibration.scatter.source, calibration.model.cell.arm
+    if source == "unknown":
+        return [*parts, "no repeatability, which is not known"]
+    return [*parts, f"the arm's repeatability ({repeatability_source(source, arm)})"]
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hilcal.config import Repeatability
 from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.covariance import COVERS, INSTRUMENT
+from hilcal.identify.full_covariance import joint_factors
 from hilcal.robot.catalogue import configs_dir
 from studies.change import measured
 from tests.support.campaigns import campaign as simulated
@@ -79,3 +82,23 @@ def test_what_cannot_be_is_refused_in_one_line(
 ) -> None:
     monkeypatch.chdir(campaign.parent)
     assert says in refused(capsys, 2, "report", "run.hilcal", *arguments)
+
+
+def test_the_certificate_never_takes_the_arm_to_come_back_exactly(
+    tmp_path: Path, capsys: Capsys
+) -> None:
+    """Unloaded readings are repeated, deflections are not; the cell states no repeatability."""
+    site = simulated(poses=8, cycles=3)
+    r, true = site.readings, replace(site.cell, registration=site.world.registration)
+    f = joint_factors(true, r, site.world.joint_std)
+    r = replace(r, covariance=r.covariance - f @ np.swapaxes(f, 1, 2))
+    run, base = tmp_path / "run.hilcal", str(configs_dir() / "cells")
+    config = configuration().model_copy(update={"repeatability": Repeatability()})
+    with CampaignFile.create(run, config.to_json(), base, "t", more={COVERS: INSTRUMENT}) as file:
+        file.append_readings(r[(r.cycle == 0) | (r.load == r.load_names.index("none"))])
+    ok(capsys, "report", run)
+    text = run.with_suffix(".html").read_text(encoding="utf-8")
+    assert "taken as zero" not in text
+    assert "type A: scatter of the repeated readings" in text
+    assert "No reading was repeated" not in text
+    assert "16 of 56 readings repeat an earlier one, too few to judge the noise" in text

@@ -13,8 +13,10 @@ from hilcal.report.covariance_words import covariance_words
 from hilcal.report.html.content import ReportContent
 from hilcal.report.html.first_screen import limit_words, mm
 from hilcal.report.html.parts import Items, Part, Section, Table, Words, from_terminal, table
+from hilcal.report.scatter_words import repeatability_source
 from hilcal.report.text_prior import prior_lines
 from hilcal.report.text_registration import base_line
+from hilcal.robot.arm import Arm
 from hilcal.types import Floats
 
 
@@ -132,7 +134,7 @@ def _uncertainty(fit: Fit) -> Iterator[Part]:
         ("contribution", "evaluated by", "rms", "share of u²"),
         (
             (name, how, mm(_rms(part)), numbers.percent(float(np.mean(part**2) / np.mean(u**2))))
-            for name, how, part in _contributions(b)
+            for name, how, part in _contributions(b, fit.model.cell.arm)
         ),
     )
     yield Words(
@@ -145,10 +147,9 @@ def _uncertainty(fit: Fit) -> Iterator[Part]:
     )
 
 
-def _contributions(b: Budget) -> Iterator[tuple[str, str, Floats]]:
+def _contributions(b: Budget, arm: Arm) -> Iterator[tuple[str, str, Floats]]:
     yield "estimated parameters", "type A: covariance of the fit", b.parameters
-    how = "type B: as stated, or estimated" if b.scatter_known else "not known, taken as zero"
-    yield "repeatability of the arm", how, b.scatter
+    yield "repeatability of the arm", repeatability_source(b.scatter_source, arm), b.scatter
     yield "what the model misses", "type A: residuals beyond the noise", b.misfit
     yield "combined", "", b.combined
 

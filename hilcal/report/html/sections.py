@@ -2,9 +2,13 @@
 
 from collections.abc import Iterator, Sequence
 
+import numpy as np
+
 from hilcal.data.command_line import COMMAND
 from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.diagnose.effect_ranking import Suspect
+from hilcal.diagnose.repeats import classes
+from hilcal.identify.fit import Fit
 from hilcal.identify.full_prediction import full_prediction
 from hilcal.report import numbers, text
 from hilcal.report.build_story import curve, regressor
@@ -223,7 +227,7 @@ def _noise(m: ReportContent) -> Section:
     if d is not None:
         e = d.pure_error
         if e is None:
-            parts.append(Words("No reading was repeated: the noise is judged by the model alone."))
+            parts.append(Words(_too_few_repeats(m.fit)))
         else:
             low, high = e.interval
             parts.append(
@@ -234,6 +238,19 @@ def _noise(m: ReportContent) -> Section:
                 )
             )
     return Section("noise", "Noise check", tuple(parts))
+
+
+def _too_few_repeats(fit: Fit) -> str:
+    """Say that repeats do not judge the noise of what was fitted."""
+    kept = fit.readings[~fit.outlier]
+    again = len(kept) - len(np.unique(classes(kept)))
+    if not again:
+        return "No reading was repeated: the noise is judged by the model alone."
+    what = "deflection" if fit.mode == "deflection" else "reading"
+    return (
+        f"{again} of {len(kept)} readings repeat an earlier one, too few to judge the noise of a "
+        f"{what} by them: the model alone does."
+    )
 
 
 def _scalings(m: ReportContent) -> Section | None:

@@ -291,7 +291,7 @@ def test_the_scatter_of_the_joints_is_that_of_drawn_ones() -> None:
     std = np.array([1.0, 2.0, 0.5, 3.0, 1.0, 2.0]) * 1e-4
     chain = evaluate(c.model.cell.arm, q)
     offset = np.array([0.1, 0.0, 0.2])
-    stated = Scatter(std, 0.0, known=True).covariance(c.model.cell, chain, chain.point(offset))[0]
+    stated = Scatter(std, 0.0, "stated").covariance(c.model.cell, chain, chain.point(offset))[0]
     rng = np.random.default_rng(0)
     many = evaluate(c.model.cell.arm, q + std * rng.standard_normal((20000, 6))).point(offset)
     np.testing.assert_allclose(np.cov(many.T), stated, atol=0.05 * np.trace(stated))
@@ -317,7 +317,7 @@ def test_coupled_joints_are_compensated_by_the_controllers_values() -> None:
         mode="absolute",
         root=np.zeros((12, 1)),
         misfit=0.0,
-        scatter=Scatter(np.zeros(6), 0.0, known=False),
+        scatter=Scatter(np.zeros(6), 0.0, "unknown"),
         measured=Measured((), 1.0),
         loads={},
         source={},

@@ -145,7 +145,7 @@ def random_calibration(names: tuple[str, ...], seed: int) -> Calibration:
         mode="absolute",
         root=1e-2 * np.diag(scale),
         misfit=1e-12,
-        scatter=Scatter(np.full(6, 1e-5), 0.0, known=True),
+        scatter=Scatter(np.full(6, 1e-5), 0.0, "stated"),
         measured=Measured((), 1.0),
         loads={"5kg": np.array([0.0, 0.0, -49.0, 0.0, 0.0, 0.0])},
         source={"campaign": "made"},

@@ -1,0 +1,83 @@
+"""The arm's scatter is never taken for zero: repeats show it, else the maker states it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hilcal.calibration.budget import budget
+from hilcal.calibration.calibration import Calibration
+from hilcal.config import Repeatability
+from hilcal.data.readings import Readings
+from hilcal.data.whitening import Mode
+from hilcal.diagnose.arm_repeatability import RP_PER_RMS
+from hilcal.identify.baseline import baseline
+from hilcal.identify.fit import Fit, fit
+from hilcal.identify.full_covariance import joint_factors
+from tests.support.campaigns import Campaign, campaign
+
+TRUE = 1e-5
+"""rad; what the simulated arm scatters by."""
+
+
+def instrument(c: Campaign) -> Readings:
+    """Readings with the covariance of the instrument alone."""
+    true = replace(c.cell, registration=c.world.registration)
+    f = joint_factors(true, c.readings, np.full(6, TRUE))
+    alone = c.readings.covariance - f @ np.swapaxes(f, 1, 2)
+    return replace(c.readings, covariance=alone, scatter_stated=False)
+
+
+def fitted(c: Campaign, mode: Mode, readings: Readings, rp: float | None = 5e-5) -> Fit:
+    """Fit a cell that says nothing of its repeatability."""
+    config = c.cell.configured().model_copy(update={"repeatability": Repeatability()})
+    cell = replace(c.cell, config=config, arm=replace(c.cell.arm, repeatability=rp))
+    return fit(baseline(cell, readings, mode), readings, mode)
+
+
+def once(readings: Readings) -> Readings:
+    """The first reading of each state."""
+    _, first = np.unique(np.stack([readings.pose, readings.load]), axis=1, return_index=True)
+    return readings[np.sort(first)]
+
+
+@pytest.mark.parametrize("mode", ["absolute", "deflection"])
+def test_repeats_show_the_scatter(mode: Mode) -> None:
+    c = campaign(poses=16, cycles=3)
+    found = Calibration.of(fitted(c, mode, instrument(c)))
+    assert found.scatter.source == "repeats"
+    np.testing.assert_allclose(found.scatter.joint_std, TRUE, rtol=0.25)
+
+
+@pytest.mark.parametrize("mode", ["absolute", "deflection"])
+@pytest.mark.parametrize(("rp", "source"), [(5e-5, "maker"), (None, "industry")])
+def test_without_repeats_it_is_the_makers(mode: Mode, rp: float | None, source: str) -> None:
+    c = campaign(poses=16)
+    found = fitted(c, mode, once(instrument(c)), rp)
+    b = budget(found)
+    assert b.scatter_source == source
+    np.testing.assert_allclose(b.scatter, (rp or 1e-4) / RP_PER_RMS)
+    assert np.all(b.expanded >= 2 * b.scatter)
+
+
+def test_identical_rows_are_no_repeats() -> None:
+    """Rows that were copied say that the arm does not scatter at all."""
+    c = campaign(poses=16)
+    one = once(instrument(c))
+    twice = Readings.joined([one, one])
+    assert Calibration.of(fitted(c, "absolute", twice)).scatter.source == "maker"
+
+
+def test_repeats_below_the_noise_say_how_much_it_can_be() -> None:
+    c = campaign(poses=16, cycles=3)
+    own = instrument(c)
+    noisy = replace(own, covariance=100.0 * own.covariance)
+    scatter = Calibration.of(fitted(c, "absolute", noisy)).scatter
+    assert scatter.source == "repeats"
+    assert TRUE < scatter.joint_std[0] < 10 * TRUE
+
+
+def test_what_the_fit_or_the_cell_states_goes_first() -> None:
+    c = campaign(poses=16, cycles=3)
+    found: Fit = fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute")
+    assert Calibration.of(found).scatter.source == "stated"
