@@ -37,10 +37,11 @@ from hilcal.errors import InputError
 from hilcal.identify.fit import Fit
 from hilcal.identify.predictive import open_prior, position_factor, predictive
 from hilcal.identify.robot_frames import RobotFrames, one_of_each, robot_frames
+from hilcal.identify.whole_turns import whole_turns
 from hilcal.model import Model, Prediction
 from hilcal.robot import se3
 from hilcal.robot.chain import evaluate
-from hilcal.types import Floats, Ints
+from hilcal.types import Bools, Floats, Ints
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,6 +269,11 @@ class Calibration:
         """Base and flange that everything is counted from."""
         return robot_frames(self.model, self.theta)
 
+    @cached_property
+    def turns(self) -> Bools:
+        """(n,) joints whose angles mean the same whole turns on, see `identify.whole_turns`."""
+        return whole_turns(self.model, self.theta)
+
     def base_in_tracker(self) -> Floats:
         """(4, 4) T_sensor_base, see `identify.robot_frames`."""
         return self.frames.base
@@ -341,7 +347,7 @@ class Calibration:
             scatter = self.scatter.covariance(of.model.cell, chain, at)
             covariance = turn @ (known + scatter) @ turn.T + self.misfit * np.eye(3)
             known = np.sqrt(np.trace(known, axis1=1, axis2=2))
-        outside = tuple(self.measured.outside(states, known))
+        outside = tuple(self.measured.outside(states, known, self.turns))
         return ToolPoses(position, rotation, nominal[1], nominal[0], covariance, outside)
 
     @cached_property

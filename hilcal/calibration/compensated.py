@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hilcal.calibration.compensation import Inverse, singular
+from hilcal.calibration.measured import Outside
 from hilcal.calibration.poses import ToolPoses
 from hilcal.calibration.tool import Tool
 from hilcal.data.readings import States
@@ -75,6 +76,15 @@ class Compensation:
         """(N,) whether the pose is singular."""
         arm = self._tool.model.cell.arm
         return singular(arm, evaluate(arm, self.q), self.after.position)
+
+    @property
+    def turned_on(self) -> tuple[Outside, ...]:
+        """Joint angles that are inside of what was measured by whole turns alone."""
+        counted = self._calibration.measured.turned_on(replace(self._states, q=self.q))
+        left = {o.of.variable: o.points for o in self.after.outside}
+        nowhere = np.zeros(len(self.q), dtype=np.bool_)
+        found = [replace(o, points=o.points & ~left.get(o.of.variable, nowhere)) for o in counted]
+        return tuple(o for o in found if o.points.any())
 
     @property
     def usable(self) -> Bools:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from hilcal.data.ranges import Range, ranges_of, variables
+from hilcal.data.ranges import Range, ranges_of, turning_variables, variables
 from hilcal.data.readings import States
 from hilcal.identify.extrapolation import FAR
 from hilcal.identify.predictive import Predictive
@@ -54,16 +54,17 @@ class Measured:
         spread = noise * p.leverage / (1 - p.leverage)
         return cls(ranges_of(states), float(np.sqrt(FAR * np.quantile(spread, 0.99))))
 
-    def outside(self, states: States, std_m: Floats | None) -> list[Outside]:
+    def outside(self, states: States, std_m: Floats | None, turns: Bools) -> list[Outside]:
         """Return what points leave, by variable.
 
         Args:
             states: N points.
             std_m: (N,) standard deviation of the predictions; None where it is not known.
+            turns: (n,) joints that are the same whole turns on.
         """
-        known = {r.variable: r for r in self.ranges}
+        known, turning = {r.variable: r for r in self.ranges}, turning_variables(turns)
         found = [
-            Outside(known[name], known[name].beyond(values), values)
+            Outside(known[name], known[name].beyond(values, turning=name in turning), values)
             for name, _, values in variables(states)
             if name in known
         ]
@@ -71,6 +72,11 @@ class Measured:
             limit = Range("standard deviation of the position", "m", 0.0, self.most_std_m)
             found.append(Outside(limit, std_m > self.most_std_m, std_m))
         return [o for o in found if o.points.any()]
+
+    def turned_on(self, states: States) -> list[Outside]:
+        """Return what points leave in joint angles that are counted without whole turns."""
+        none = np.zeros(states.q.shape[1], dtype=np.bool_)
+        return [o for o in self.outside(states, None, none) if o.of.unit == "rad"]
 
     def to_json(self) -> dict[str, object]:
         """Return it as JSON, SI."""

@@ -11,6 +11,7 @@ from hilcal.types import Bools, Floats
 MARGIN = 0.02
 """Share of the fitted range by which a reading is beyond it; a choice: of two random halves, few
 readings are."""
+FULL_TURN = 2.0 * np.pi
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,16 +23,38 @@ class Range:
     low: float
     high: float
 
-    def beyond(self, values: Floats) -> Bools:
-        """Which values are outside, by more than `MARGIN` of the range."""
+    def over(self, values: Floats, *, turning: bool = False) -> Floats:
+        """Return by how much values are outside; zero or less inside.
+
+        Args:
+            values: (N,) SI.
+            turning: angles that mean the same whole turns on.
+        """
+        if not turning:
+            return np.asarray(np.maximum(values - self.high, self.low - values))
+        above = np.mod(values - self.low, FULL_TURN)
+        return np.asarray(np.minimum(above - (self.high - self.low), FULL_TURN - above))
+
+    def beyond(self, values: Floats, *, turning: bool = False) -> Bools:
+        """Which values are outside, by more than `MARGIN` of the range; arguments as of `over`."""
         allowed = MARGIN * (self.high - self.low) + 1e-9 * max(abs(self.low), abs(self.high), 1.0)
-        return np.asarray(np.maximum(values - self.high, self.low - values) > allowed)
+        return np.asarray(self.over(values, turning=turning) > allowed)
+
+
+def angle_name(joint: int) -> str:
+    """Return the variable of a joint's angle; joints count from 0."""
+    return f"joint {joint + 1} angle"
+
+
+def turning_variables(turns: Bools) -> frozenset[str]:
+    """Return the variables that mean the same whole turns on, of joints (n,) that do."""
+    return frozenset(angle_name(j) for j in np.flatnonzero(turns).tolist())
 
 
 def variables(s: States) -> Iterator[tuple[str, str, Floats]]:
     """Yield name, unit, and the values (N,) of what a prediction may extrapolate in."""
     for j in range(s.q.shape[1]):
-        yield f"joint {j + 1} angle", "rad", s.q[:, j]
+        yield angle_name(j), "rad", s.q[:, j]
     for name, unit, part in (("force", "N", slice(0, 3)), ("moment", "N·m", slice(3, 6))):
         yield name, unit, np.linalg.norm(s.wrench[:, part], axis=1)
     if s.air_temperature is not None:

@@ -2,7 +2,8 @@
 
 A model may be wrong wherever nothing was measured, however well it predicts poses left out among
 those that were. A variable is left where a reading is beyond the fitted ones' smallest or largest
-value by more than `MARGIN` of their range. Joint angles inside of their ranges can be far from all
+value by more than `MARGIN` of their range; an angle is where it is whole turns on, too, unless the
+model tells them apart (`whole_turns`). Joint angles inside of their ranges can be far from all
 fitted ones as well; then the leverage of a reading is large: the variance of its prediction over
 that of the noise, (J C Jᵀ) V⁻¹ σ⁻² with the largest eigenvalue, compared with h/(1 − h) of the
 fitted measurements, each predicted without itself.
@@ -12,12 +13,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.data.ranges import MARGIN, variables
+from hilcal.data.ranges import ranges_of, turning_variables, variables
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Whitening, inverse_root
 from hilcal.identify.errors import ErrorBlock
 from hilcal.identify.predictive import Predictive
 from hilcal.identify.validation import Validation
+from hilcal.identify.whole_turns import whole_turns
 from hilcal.types import Bools, Floats
 
 FAR = 2.0
@@ -83,18 +85,16 @@ def extrapolation(p: Predictive, fitted: Readings, found: Validation) -> Extrapo
     leverage = np.linalg.eigvalsh(root @ spread @ np.swapaxes(root, 1, 2))[:, -1]
     outside = np.zeros(len(w.reading), dtype=np.bool_)
     beyond_any = []
-    known = {name: values for name, _, values in variables(fitted.states)}
-    for name, unit, after in variables(other.states):
-        before = known.get(name)
-        if before is None:
+    known = {r.variable: r for r in ranges_of(fitted.states)}
+    turning = turning_variables(whole_turns(p.model, p.theta))
+    for name, unit, values in variables(other.states):
+        if name not in known:
             continue
-        low, high = float(before.min()), float(before.max())
-        beyond = np.maximum(after - high, low - after)[w.reading]
-        far = beyond > MARGIN * (high - low) + 1e-9 * max(abs(low), abs(high), 1.0)
+        r, after, turns = known[name], values[w.reading], name in turning
+        far = r.beyond(after, turning=turns)
         if far.any():
-            beyond_any.append(
-                Beyond(name, unit, low, high, int(far.sum()), float(beyond[far].max()))
-            )
+            most = float(r.over(after[far], turning=turns).max())
+            beyond_any.append(Beyond(name, unit, r.low, r.high, int(far.sum()), most))
         outside |= far
     limit = FAR * float(np.quantile(p.leverage / (1 - p.leverage), 0.99))
     far = leverage > max(limit, 1e-12)

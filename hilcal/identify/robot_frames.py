@@ -156,7 +156,7 @@ def _constant(model: Model, theta: Floats) -> tuple[Floats, tuple[str, ...], tup
     arm = model.cell.arm
     dq, twist = np.zeros(arm.n), np.zeros((arm.n + 1, 6))
     within, beyond = [], []
-    situation = model.predict(_random_states(model.cell), 0 * theta).situation
+    situation = model.predict(random_states(model.cell), 0 * theta).situation
     for e, mine in zip(model.effects, model.slices(), strict=True):
         if e.role in FRAME_ROLES:
             continue
@@ -180,7 +180,7 @@ def _same(values: Floats | None) -> bool:
     return values is None or bool(np.abs(values - values[:1]).max() <= SAME)
 
 
-def _random_states(cell: Cell) -> States:
+def random_states(cell: Cell) -> States:
     """Return random states under random loads, with every column."""
     n, rng = cell.arm.n, np.random.default_rng(20250308)
     return States(

@@ -276,3 +276,27 @@ def test_every_command_counts_from_one_base_which_is_the_worlds(capsys, fitted, 
     report = tmp_path / "r.html"
     ok(capsys, "report", fitted, "-o", report)
     assert "the nominal arm on it has the axis of joint 1" in report.read_text()
+
+
+def test_a_joint_whole_turns_from_what_was_measured_is_inside(capsys, fitted, tmp_path) -> None:
+    """184.8 degrees are -175.2: the arm is there as measured, and stays on the turn it is given."""
+    with hc.Campaign.open(fitted, read_only=True) as run:
+        q = np.unique(run.readings.states.q, axis=0)
+    low, high = q[:, 5].min(), q[:, 5].max()
+    k = next(k for k in np.argsort(q[:, 5]) if q[k, 5] + 2 * np.pi > high + 0.1)
+    rows = np.stack([q[k], q[k] + 2 * np.pi * np.eye(6)[5], q[k]])
+    rows[2, 5] = high + 0.5 * (low + 2 * np.pi - high)  # where no turn has it
+    assert rows[1, 5] < 2 * np.pi
+    points = tmp_path / "points.csv"
+    lines = [",".join(f"{v:.9f}" for v in np.degrees(row)) for row in rows]
+    points.write_text("\n".join([JOINTS, *lines[:2]]))
+    found = ok(capsys, "compensate", fitted, points, "--load", "10kg", "--json").document
+    here, there = (np.array(p["q_corrected"]) for p in found["points"])
+    np.testing.assert_allclose(there - here, [0, 0, 0, 0, 0, 2 * np.pi], atol=1e-6)
+    assert [p["inside"] for p in found["points"]] == [True, True]
+    shown = ok(capsys, "compensate", fitted, points, "--load", "10kg").out
+    words = "joint 6 angle: in 1 of 2 points whole turns from what was measured"
+    assert words in " ".join(shown.split())
+    points.write_text("\n".join([JOINTS, *lines]))
+    said = refused(capsys, 4, "compensate", fitted, points, "--load", "10kg")
+    assert "1 of 3 points are refused: 3: joint 6 angle" in said
