@@ -94,8 +94,8 @@ def report(
     yield out
     for o in c.turned_on:
         yield (
-            f"{o.of.variable}: in {int(o.points.sum())} of {len(names)} points whole turns from what "
-            f"was measured, {_degrees(o.of.low)} to {_degrees(o.of.high)}. The model is the same "
+            f"{o.of.variable}: in {int(o.points.sum())} of {len(names)} points whole turns from "
+            f"what was measured, {_degrees(o.of.low)} to {_degrees(o.of.high)}. The model is the same "
             "there; what cables do is not in it."
         )
     if len(names) > MOST:
