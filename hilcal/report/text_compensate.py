@@ -95,8 +95,8 @@ def report(
     for o in c.turned_on:
         yield (
             f"{o.of.variable}: in {int(o.points.sum())} of {len(names)} points whole turns from "
-            f"what was measured, {_degrees(o.of.low)} to {_degrees(o.of.high)}. The model is the same "
-            "there; what cables do is not in it."
+            f"what was measured, {_degrees(o.of.low)} to {_degrees(o.of.high)}. The model is the "
+            "same there; what cables do is not in it."
         )
     if len(names) > MOST:
         yield f"The {MOST} of {len(names)} points with the largest error before are listed."
