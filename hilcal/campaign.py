@@ -201,10 +201,40 @@ class Campaign:
         try:
             return restore(record, self.cell, self.readings, self.catalogue, self.data_hash)
         except InputError as error:
-            if record.number != self.file.accepted():
-                raise
-            on = f"it is the accepted one: hilcal accept {quoted(self.path)} N accepts another"
-            raise InputError(f"{error}; {on}") from None
+            raise InputError(f"{error}{self._until_used(record.number)}") from None
+
+    def require_gc(self, number: int | None, scaling: str, what: str) -> None:
+        """Refuse a fit whose residual is not whitened.
+
+        Args:
+            number: of its revision; None for a baseline that is not kept.
+            scaling: of the fit.
+            what: is to be done with it.
+
+        Raises:
+            InputError: another scaling than gc; says how to get one.
+        """
+        if scaling != "gc":
+            raise InputError(
+                f"revision {number} has scaling {scaling}; {what} needs gc: run hilcal identify "
+                f"again{self._until_used(number)}"
+            )
+
+    def _until_used(self, number: int | None) -> str:
+        """Return what a new fit lacks until commands use it in the place of a revision.
+
+        Args:
+            number: of the revision that will not do.
+
+        Returns:
+            Words to go after "run hilcal identify again"; nothing where the latest one is used.
+        """
+        if number is None or number != self.file.accepted():
+            return ""
+        return (
+            f"; revision {number} is accepted: release it, and the latest one is used: "
+            f"hilcal accept {quoted(self.path)} --release"
+        )
 
     def fitted_readings(self, record: RevisionRecord) -> Readings:
         """Return the readings that a revision was fitted to; later ones come after them."""

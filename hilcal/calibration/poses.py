@@ -75,7 +75,12 @@ class ToolPoses:
 
 
 def band(covariance: Floats) -> Floats:
-    """(N,) radius that `BAND` of normal vectors with covariance (N, 3, 3) stay within."""
-    first = np.maximum(np.trace(covariance, axis1=1, axis2=2), 1e-300)
-    second = np.maximum(np.einsum("nij,nji->n", covariance, covariance), 1e-300 * first)
-    return np.asarray(np.sqrt(second / first * chi2.ppf(BAND, first**2 / second)))
+    """(N,) radius that `BAND` of normal vectors with covariance (N, 3, 3) stay within.
+
+    By the χ² with the same mean and variance (Satterthwaite); 0 where the covariance is.
+    """
+    size = np.trace(covariance, axis1=1, axis2=2)
+    shape = covariance / np.where(size > 0, size, 1.0)[:, None, None]
+    second = np.einsum("nij,nji->n", shape, shape)
+    second = np.where(size > 0, second, 1.0)
+    return np.asarray(np.sqrt(size * second * chi2.ppf(BAND, 1.0 / second)))

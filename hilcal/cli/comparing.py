@@ -71,11 +71,7 @@ def _one(t: Terminal, run: Path, revision: int | None, catalogue: Catalogue) -> 
     """Show where the model fails on its own readings."""
     with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
         number, found = fit_of(t, o, say, revision)
-        if found.scaling != "gc":
-            raise InputError(
-                f"revision {number} has scaling {found.scaling}; comparing needs gc: run hilcal "
-                "identify again"
-            )
+        o.require_gc(number, found.scaling, "comparing")
         say("looking where it fails")
         places = misfit_breakdown(linearise(found))
         finish(found, say)

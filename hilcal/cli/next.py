@@ -116,11 +116,7 @@ def _without_suspects(
         CannotAnswerError: nothing is in doubt; says what else to do.
     """
     number, newest = fit_of(t, o, say, revision)
-    if newest.scaling != "gc":
-        raise InputError(
-            f"revision {number} has scaling {newest.scaling}; next needs gc: run hilcal identify "
-            "again"
-        )
+    o.require_gc(number, newest.scaling, "next")
     if prior is not None:
         say("fitting with the prior")
         newest = fitted_with(prior, o, newest)

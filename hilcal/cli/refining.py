@@ -82,6 +82,7 @@ def diagnose(
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
         number, found = fit_of(t, o, say, revision)
+        o.require_gc(number, found.scaling, "diagnosing")
         say("diagnosing" if number is None else f"diagnosing revision {number}")
         d = judge(found, o.history(number), say)
         finish(found, say)

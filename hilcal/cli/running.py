@@ -100,6 +100,11 @@ def run(
     config, numbers = read_cell(cell)
     goal = None if until is None else GoalRule(until, numbers, config, catalogue)
     base_dir = cell.absolute().parent
+    if rehearse:
+        from drivers.simulated.rehearsal import NOTHING, as_told
+
+        # Refuses what cannot be hidden before anything is planned.
+        as_told(config, config.simulation.hide or NOTHING, catalogue)
     with ExitStack() as stack:
         if resume:
             if append:
@@ -124,7 +129,6 @@ def run(
             with working(t.progress) as say:
                 say("starting the simulated devices")
                 from drivers.simulated.on_the_wire import case_of_plan, simulated_cell
-                from drivers.simulated.rehearsal import NOTHING
 
                 choice = config.simulation.hide or NOTHING
                 secret = case_of_plan(config, made, choice, config.simulation.seed, catalogue)

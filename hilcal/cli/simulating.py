@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from drivers.simulated.on_the_wire import case_of_plan, simulated_cell
-from drivers.simulated.rehearsal import NOTHING
+from drivers.simulated.rehearsal import NOTHING, as_told
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.ending import told_to_end
 from hilcal.cli.plan_output import POSES
@@ -68,6 +68,8 @@ def simulate(
         simulation = config.simulation.model_copy(update={"clock": clock})
         config = config.model_copy(update={"simulation": simulation})
     base_dir = cell.absolute().parent
+    choice = hide or config.simulation.hide or NOTHING
+    as_told(config, choice, catalogue)  # refuses what cannot be hidden before anything is planned
     with working(t.progress) as say:
         if plan is None:
             say("planning a campaign, to know how strong an effect has to be")
@@ -75,7 +77,6 @@ def simulate(
         else:
             made = load_plan(plan)
         say("preparing the simulated cell")
-        choice = hide or config.simulation.hide or NOTHING
         secret = case_of_plan(config, made, choice, number, catalogue)
     with told_to_end(signal.SIGTERM, signal.SIGINT, signal.SIGHUP) as wait, ExitStack() as stack:
         with working(t.progress) as say:

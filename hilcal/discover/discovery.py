@@ -47,7 +47,8 @@ Reason = Literal["law", "adequate", "catalogue", "no_law", "unpredictable"]
 - law: at least one is proposed;
 - adequate: the stated noise explains the residual;
 - catalogue: effects of the catalogue explain it as well;
-- no_law: something predicts it, but no law of this complexity does;
+- no_law: something predicts it, but no law of this complexity does, or none that the exact model
+  can be fitted with;
 - unpredictable: nothing recorded predicts it.
 """
 LEAST_SHARE = 0.1
@@ -76,6 +77,8 @@ class Discovery:
         source: of the first law's effect, as a Python file.
         curves: the first law over what it depends on, with the readings.
         carried: where no law is found, recorded variables that the misfit depends on.
+        refused: laws that predict the misfit and are not proposed, and why: their exact refits
+            failed.
     """
 
     fit: Fit
@@ -89,6 +92,7 @@ class Discovery:
     source: str = ""
     curves: tuple[Curve, ...] = ()
     carried: tuple[Dependence, ...] = ()
+    refused: tuple[tuple[str, str], ...] = ()
 
 
 def discover(
@@ -184,12 +188,14 @@ def _laws(
     rank = fit.whitening.rank
     misfit = max(float(before.sum()) - rank, 3.0 * np.sqrt(2.0 * rank))
     made: list[tuple[Law, Fit, Floats, str]] = []
+    refused: list[tuple[str, str]] = []
     for s in selections:
         form = refine(found, form_of(found, s.terms))
         say(f"refitting with {form.text()}")
         try:
-            after, coefficients, _ = exact(found, form, name)
-        except HilcalError:
+            after, form, coefficients, _ = exact(found, form, name)
+        except HilcalError as error:
+            refused.append((form.text(), str(error)))
             continue
         left = left_out_by_pose(after)
         share = float(np.clip((before.sum() - left.sum()) / misfit, -1.0, 1.0))
@@ -201,7 +207,8 @@ def _laws(
         source = source_of_form(form, name, coefficients, evidence, f"{name}.py")
         made.append((law, after, left, source))
     if not made:
-        return _silent(fit, found, say, folds.share)
+        silent = _silent(fit, found, say, folds.share)
+        return replace(silent, reason="no_law", refused=tuple(refused))
     best = min(range(len(made)), key=lambda k: float(made[k][2].sum()))
     kept = [k for k in range(len(made)) if _as_good(made[k][2], made[best][2])]
     say("asking what is predictable at all")
@@ -221,6 +228,7 @@ def _laws(
         made[kept[0]][1],
         made[kept[0]][3],
         curves(made[kept[0]][1], laws[0].form),
+        refused=tuple(refused),
     )
 
 

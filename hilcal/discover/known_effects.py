@@ -108,7 +108,7 @@ def _exact_law(fit: Fit, problem: Problem, law: Selection) -> float:
     screen = problem.screen
     form = refine(screen, form_of(screen, law.terms))
     try:
-        after, _, _ = exact(screen, form, "law")
+        after, form, *_ = exact(screen, form, "law")
     except HilcalError:
         return law.total
     left = left_by(screen, form, fit.solution.prediction.situation)

@@ -1,6 +1,6 @@
 """A law in readable form: where it acts, its formula, its parameters, what speaks for it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -143,6 +143,13 @@ def with_factors(form: Form, factors: dict[tuple[int, int], Factor]) -> Form:
     for k, p in enumerate(form.parts):
         own = tuple(factors.get((k, i), f) for i, f in enumerate(p.amplitude.factors))
         parts.append(replace(p, amplitude=Amplitude(own)))
+    return Form(tuple(parts))
+
+
+def with_coefficients(form: Form, kept: Sequence[int]) -> Form:
+    """Return a law with some of its coefficients, in their order; the others are zero."""
+    at = {old: new for new, old in enumerate(kept)}
+    parts = (replace(p, coefficient=at[p.coefficient]) for p in form.parts if p.coefficient in at)
     return Form(tuple(parts))
 
 

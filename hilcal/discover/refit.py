@@ -11,10 +11,11 @@ from dataclasses import replace
 import numpy as np
 
 from hilcal.discover.free_numbers import free_numbers, with_values
-from hilcal.discover.law import LETTERS, Coefficient, Form, ordinary
+from hilcal.discover.law import LETTERS, Coefficient, Form, ordinary, with_coefficients
 from hilcal.discover.screen import Screen
 from hilcal.discover.write_effect import effect_class, source_of_form
-from hilcal.effects.protocol import Situation
+from hilcal.effects.check import check_effect
+from hilcal.effects.protocol import Effect, Situation
 from hilcal.errors import CannotAnswerError
 from hilcal.identify.fit import Fit, fit
 from hilcal.types import Floats
@@ -89,31 +90,42 @@ def at_linearisation(screen: Screen, form: Form) -> tuple[Coefficient, ...]:
     )
 
 
-def exact(screen: Screen, form: Form, name: str) -> tuple[Fit, tuple[Coefficient, ...], str]:
-    """Refit the model with the law as an effect.
+def exact(
+    screen: Screen, form: Form, name: str
+) -> tuple[Fit, Form, tuple[Coefficient, ...], type[Effect]]:
+    """Refit the model with the law as an effect that keeps to the protocol.
+
+    A coefficient that the model absorbs is dropped, as the zero of a compliance that grows with
+    time, a τ (t − t0), beside a compliance of the model: it is no part of what is found.
 
     Returns:
-        The fit, the coefficients, and the source of the effect.
+        The fit, the law as it was fitted, its coefficients, and the effect.
 
     Raises:
-        CannotAnswerError: the model finds no equilibrium with the law.
+        CannotAnswerError: the readings do not determine the law, or the model finds no equilibrium
+            with it.
+        InputError: the effect does not keep to the protocol.
     """
     before = screen.linear.fit
     s = before.solution.prediction.situation
-    letters = LETTERS[: form.count]
-    source = source_of_form(form, name, at_linearisation(screen, form))
-    kind = effect_class(source, name)
-    effect = kind(before.model.cell, s.states)
-    model = replace(before.model, effects=(*before.model.effects, effect))
-    start = np.concatenate([before.theta, np.zeros(form.count)])
-    after = fit(model, before.readings, before.mode, before.scaling, start)
-    rows = model.slices()[-1]
-    std = after.uncertainty.std[rows]
-    values = after.theta[rows]
+    while True:
+        letters = LETTERS[: form.count]
+        kind = effect_class(source_of_form(form, name, at_linearisation(screen, form)), name)
+        check_effect(kind, before.model.cell)
+        effect = kind(before.model.cell, s.states)
+        model = replace(before.model, effects=(*before.model.effects, effect))
+        start = np.concatenate([before.theta, np.zeros(form.count)])
+        after = fit(model, before.readings, before.mode, before.scaling, start)
+        rows = model.slices()[-1]
+        values, std = after.theta[rows], after.uncertainty.std[rows]
+        determined = np.isfinite(std)
+        if determined.all():
+            break
+        if not determined.any():
+            raise CannotAnswerError("the readings do not determine it beside the model")
+        form = with_coefficients(form, np.flatnonzero(determined).tolist())
     found = tuple(
         Coefficient(letter, float(values[k]), float(std[k]), form.unit(k))
         for k, letter in enumerate(letters)
     )
-    if not all(np.isfinite(c.std) for c in found):
-        raise CannotAnswerError("the readings do not determine the law")
-    return after, found, source
+    return after, form, found, kind

@@ -44,8 +44,9 @@ NEEDS = (
 )
 """Columns of `States` that readings may lack."""
 AGREES = 1e-3
-"""Share of the largest value by which a derivative may differ from the difference quotient. A
-guess, far above 1e-5, by which the built-in effects differ at most (`backlash`)."""
+"""Share of the largest value by which a derivative may be outside of the difference quotients of
+both sides, between which it lies, at a bend as well: max(τ, 0) has its own at τ = 0. A guess, far
+above rounding."""
 ROUNDING = 1e-9
 """Share of the largest value that rounding may change; a guess, far above 1e-16."""
 STEP = 1e-4
@@ -264,12 +265,12 @@ def _elastic(effect: Effect, theta: Floats, s: Situation) -> None:
     step = STEP * rng.normal(size=s.wrench.shape) * [60, 60, 60, 20, 20, 20]
     up, down = (replace(s, wrench=w) for w in (s.wrench + step, s.wrench - step))
     response = effect.response(theta, s, step[:, None])
-    for key, quotient in _quotients(effect, theta, up, down).items():
-        still = effect.elastic or not np.any(quotient)
+    for key, quotients in _quotients(effect, theta, up, s, down).items():
+        still = effect.elastic or not any(map(np.any, quotients))
         _need(still, "columns follow the wrenches; set elastic = True and give response")
         given = getattr(response, key, None)
         found = np.zeros(1) if given is None else given[:, 0]
-        _agree("response", f"of columns by the wrenches: {key}", found, quotient)
+        _agree("response", f"of columns by the wrenches: {key}", found, *quotients)
 
 
 def _local(effect: Effect, theta: Floats, s: Situation) -> None:
@@ -298,21 +299,21 @@ def _compliance(effect: Effect, theta: Floats, s: Situation) -> None:
     step = STEP * s.compliance * np.random.default_rng(4).normal(size=len(s.compliance))
     up, down = (replace(s, compliance=c) for c in (s.compliance + step, s.compliance - step))
     found = total(effect.compliance_columns(theta, s), step, s)
-    for key, quotient in _quotients(effect, theta, up, down).items():
+    for key, quotients in _quotients(effect, theta, up, s, down).items():
         what = f"of columns by the compliance: {key}"
-        _agree("compliance_columns", what, _field(found, key), quotient)
+        _agree("compliance_columns", what, _field(found, key), *quotients)
 
 
 def _load(effect: Effect, theta: Floats, s: Situation, scale: Floats) -> None:
     """Compare `wrench_columns` with how the effect changes the load."""
     step = STEP * scale * np.random.default_rng(3).normal(size=len(scale))
-    up, down = (_transmitted(effect, t, s) for t in (theta + step, theta - step))
+    up, at, down = (_transmitted(effect, t, s) for t in (theta + step, theta, theta - step))
     found = effect.wrench_columns(theta, s)
     given = np.zeros(1) if found is None else np.einsum("npki,p->nki", found, step)
-    _agree("wrench_columns", "of the wrenches by the parameters: it", given, (up - down) / 2)
+    _agree("wrench_columns", "of the wrenches by the parameters: it", given, up - at, at - down)
     if (by_load := effect.load_columns(theta, s)) is not None and found is not None:
         by_slots = load_wrench_change(s.chain, s.load, by_load)
-        _agree("load_columns", "of the load's wrench by the parameters: it", by_slots, found)
+        _agree("load_columns", "of the load's wrench by the parameters: it", by_slots, found, found)
 
 
 def _transmitted(effect: Effect, theta: Floats, s: Situation) -> Floats:
@@ -338,10 +339,14 @@ def _needs(kind: type[Effect], cell: Cell, states: States) -> None:
             raise InputError(f'uses {column}; name it: needs = ("{column}",)') from None
 
 
-def _quotients(effect: Effect, theta: Floats, up: Situation, down: Situation) -> dict[str, Floats]:
-    """Half the difference of two deviations, by field."""
-    a, b = effect.deviation(theta, up), effect.deviation(theta, down)
-    return {key: (_field(a, key) - _field(b, key)) / 2 for key in _FIELDS}
+def _quotients(
+    effect: Effect, theta: Floats, up: Situation, at: Situation, down: Situation
+) -> dict[str, tuple[Floats, Floats]]:
+    """Differences of the deviation to both sides of a situation, by field."""
+    a, b, c = (effect.deviation(theta, s) for s in (up, at, down))
+    return {
+        key: (_field(a, key) - _field(b, key), _field(b, key) - _field(c, key)) for key in _FIELDS
+    }
 
 
 def _field(deviation: Deviation, key: str) -> Floats:
@@ -349,9 +354,10 @@ def _field(deviation: Deviation, key: str) -> Floats:
     return np.zeros(1) if found is None else found
 
 
-def _agree(method: str, of_what: str, found: Floats, expected: Floats) -> None:
-    """Compare a derivative with the difference quotient."""
-    size = float(max(np.abs(found).max(), np.abs(expected).max()))
-    off = float(np.abs(found - expected).max()) / size if size > 0 else 0.0
+def _agree(method: str, of_what: str, found: Floats, above: Floats, below: Floats) -> None:
+    """Compare a derivative with the difference quotients of both sides."""
+    outside = found - np.clip(found, np.minimum(above, below), np.maximum(above, below))
+    size = float(max(np.abs(x).max() for x in (found, above, below)))
+    off = float(np.abs(outside).max()) / size if size > 0 else 0.0
     wrong = f"{method} is not the derivative {of_what} is off by {100 * off:.1f} %"
     _need(off <= AGREES, f"{wrong} of its largest value")

@@ -49,6 +49,12 @@ def silence(d: Discovery) -> str:
             f"no law: {tried}, and none explains the misfit better than effects of the catalogue "
             f"do ({numbers.names(d.catalogue)}); hilcal refine adds them"
         )
+    if d.refused:
+        law, why = d.refused[0]
+        return (
+            f"no law is proposed: {tried}; {law} predicts {numbers.percent(d.searched_share)} of "
+            f"the misfit on poses left out, but the exact model cannot be fitted with it ({why})"
+        )
     if d.reason == "no_law":
         return (
             f"no law: {numbers.percent(d.attainable)} of the misfit is predictable on poses left "
@@ -183,6 +189,7 @@ def to_json(d: Discovery) -> dict[str, object]:
             {"variable": c.variable, "share": c.share, "moves": c.moves} for c in d.carried
         ],
         "laws": [law_json(law) for law in d.laws],
+        "refused": [{"formula": formula, "why": why} for formula, why in d.refused],
         "curves": [curve_json(c) for c in d.curves],
     }
 

@@ -7,7 +7,6 @@ from typing import Any
 from hilcal.campaign import Campaign
 from hilcal.data.revision import RevisionRecord, change
 from hilcal.diagnose.diagnosis import Diagnosis
-from hilcal.errors import InputError
 from hilcal.identify.fit import Fit
 from hilcal.report.build_story import Chapter
 from hilcal.report.story import Story, StoryRevision
@@ -118,7 +117,4 @@ def require_judged(o: Campaign, chapter: Chapter) -> None:
         InputError: it was fitted without the full covariance.
     """
     if chapter.diagnosis is None:
-        raise InputError(
-            f"{o.path}: revision {chapter.number} has scaling {chapter.fit.scaling}; judging it "
-            "needs gc: run hilcal identify again"
-        )
+        o.require_gc(chapter.number, chapter.fit.scaling, "judging")

@@ -307,3 +307,23 @@ def test_a_ur_arm_without_ur_rtde(
     monkeypatch.setattr("drivers.ur.NO_WHEEL", no_wheel)
     line = refused(capsys, 2, "check", cell)
     assert line == f"error: arm: driver ur needs ur-rtde, which {said}".format(sys.version_info[1])
+
+
+@pytest.mark.parametrize("command", ["simulate", "run"])
+def test_what_cannot_be_hidden_is_refused_before_anything_is_planned(
+    command: str, tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def planned(*_: object) -> None:
+        raise AssertionError("it plans first")
+
+    for module in ("simulating", "running"):
+        name = "make_plan" if module == "simulating" else "_own_plan"
+        monkeypatch.setattr(f"hilcal.cli.{module}.{name}", planned)
+    path, words = tmp_path / "CELL.toml", CELL.read_text(encoding="utf-8")
+    path.write_text(words.replace("[simulation]", '[simulation]\nhide = "foo"'), encoding="utf-8")
+    more = ("--rehearse",) if command == "run" else ()
+    line = refused(capsys, 2, command, path, "-o", tmp_path / "out", *more)
+    assert "hide 'foo'; valid: " in line
+    if command == "simulate":
+        option = refused(capsys, 2, command, CELL, "-o", tmp_path / "out", "--hide", "foo")
+        assert option == line

@@ -4,6 +4,7 @@ import hashlib
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,7 @@ from tests.support.cli_cases import run as command
 from tests.support.paths import ROOT
 
 Capsys = pytest.CaptureFixture[str]
+Made = Callable[[Path, Capsys], str]
 BASE = ["base_frame", "joint_compliance"]
 
 
@@ -237,20 +239,52 @@ def test_exploring_does_not_change_what_others_use_once_a_revision_is_accepted(
     assert ok(capsys, "compare", run, "--json").document["revision"] == 6
 
 
-def test_an_accepted_revision_that_has_become_too_old_says_how_to_go_on(
-    run: Path, capsys: Capsys
-) -> None:
+def outdated(run: Path, capsys: Capsys) -> str:
+    """The accepted revision has fewer readings than the campaign, as after run --append."""
     ok(capsys, "accept", run, "2")
     with Campaign.open(run) as o:
         o.file.append_readings(o.file.readings()[:5])
-    result = command(capsys, "compare", run)
-    assert result.code == 2
-    said = result.err.splitlines()[-1]
-    assert "revision 2 was fitted before readings were appended" in said
-    assert said.endswith(f"hilcal accept {run} N accepts another")
-    ok(capsys, "identify", run)
+    return "revision 2 was fitted before readings were appended"
+
+
+def of_another_scaling(run: Path, capsys: Capsys) -> str:
+    """The accepted revision cannot be judged."""
+    ok(capsys, "identify", run, "--scaling", "none")
     ok(capsys, "accept", run)
-    assert ok(capsys, "compare", run, "--json").document["revision"] == 4
+    return "revision 4 has scaling none"
+
+
+def take(said: str, run: Path, capsys: Capsys) -> None:
+    """Do what a message says, in its order: each command in it, as it stands."""
+    commands = re.findall(r"hilcal (identify|accept)((?: --?\w+| \S+/\S+)*)", said)
+    assert commands, said
+    for name, rest in commands:
+        ok(capsys, name, *(rest.split() or [run]))
+
+
+@pytest.mark.parametrize("made", [outdated, of_another_scaling])
+@pytest.mark.parametrize(
+    "asked", [("compare",), ("diagnose",), ("next", "-o", "{out}/p.json")], ids=lambda x: x[0]
+)
+def test_what_is_said_of_an_accepted_revision_that_will_not_do_leads_on(
+    run: Path, tmp_path: Path, capsys: Capsys, made: Made, asked: tuple[str, ...]
+) -> None:
+    words = made(run, capsys)
+    name, *rest = (part.format(out=tmp_path) for part in asked)
+    result = command(capsys, name, run, *rest)
+    said = result.err.splitlines()[-1]
+    assert result.code == 2
+    assert words in said
+    assert said.endswith(f"hilcal accept {run} --release")
+    take(said, run, capsys)
+    if name == "next":
+        rest += ["--suspects", "creep,hysteresis", "--poses", "2", "--quick"]
+    result = ok(capsys, name, run, *rest, "--json")
+    assert "accepted" not in result.err
+    with Campaign.open(run) as o:
+        assert o.in_use() == o.latest()
+        assert o.fit().scaling == "gc"
+        assert len(o.fit().readings) == len(o.readings)
 
 
 def test_what_cannot_be_accepted_is_refused(run: Path, fresh: bytes, capsys: Capsys) -> None:

@@ -277,6 +277,15 @@ def test_wrong_input_is_refused_in_words() -> None:
             call()
 
 
+@pytest.mark.parametrize("size", [0.0, 1e-320, 1e-200, 1e-12])
+def test_the_band_of_what_hardly_scatters_is_a_number(size: float) -> None:
+    """Nothing left beside a scatter that is not known: a band of 0, not one that is no number."""
+    c = np.diag([1.0, 2.0, 3.0])
+    (found,) = band(size * c[None])
+    assert found == pytest.approx(np.sqrt(size) * band(c[None])[0], rel=1e-2)
+    assert band(np.stack([size * c, c]))[1] == band(c[None])[0]
+
+
 def test_the_band_holds_its_share() -> None:
     rng = np.random.default_rng(1)
     for scale in ([1.0, 1.0, 1.0], [1.0, 0.1, 0.01], [1.0, 1.0, 0.1]):

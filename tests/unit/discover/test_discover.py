@@ -33,7 +33,7 @@ from hilcal.discover.write_effect import effect_class, source_of_form
 from hilcal.effects.catalogue import installed
 from hilcal.effects.check import check_effect
 from hilcal.effects.example import example_cell, example_situation, example_states
-from hilcal.errors import InputError
+from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.baseline import baseline
 from hilcal.identify.effect_columns import effect_columns
 from hilcal.identify.fit import Fit, fit
@@ -298,7 +298,7 @@ def test_a_wave_of_high_order_is_drawn_over_one_period() -> None:
     v = next(v for v in variables(f.solution.prediction.situation) if v.symbol == "q_2")
     wave = Amplitude((Factor(v, shapes.FINE_COS, (40.0,)),))
     form = Form((Part(screened().sites[1], wave, 0),))
-    after, _, _ = exact(screened(), form, "waves")
+    after, *_ = exact(screened(), form, "waves")
     (c,) = curves(after, form)
     assert np.abs(c.x).max() <= np.pi / 40
     assert c.quantity == "q_2 within a period of 2π/40"
@@ -386,3 +386,40 @@ def test_every_coefficient_has_a_unit() -> None:
         assert form.unit(0).startswith("rad")
         assert form.text().startswith("dq_1 = a")
         assert form.latex()
+
+
+def with_zero(symbol: str, *more: Part) -> Form:
+    """A law a·cos(q_4)·τ_3, and b times a quantity at the same site."""
+    s = screened().linear.fit.solution.prediction.situation
+    known = {v.symbol: v for v in variables(s)}
+    wave, torque = Factor(known["q_4"], shapes.COS, (1.0,)), Factor(known["τ_3"], shapes.LINEAR)
+    other = Factor(known[symbol], shapes.LINEAR)
+    place = next(x for x in screened().sites if x.field == "dq" and x.element == 2)
+    both = Part(place, Amplitude((other,)), 0), Part(place, Amplitude((wave, torque)), 1)
+    return Form((*both, *more))
+
+
+def test_a_number_that_the_model_absorbs_is_dropped() -> None:
+    """The zero of a compliance that is no constant: the model has one already."""
+    form = with_zero("τ_3")
+    assert form.text() == "dq_3 = a·τ_3 + b·cos(q_4)·τ_3"
+    after, kept, values, kind = exact(screened(), form, "kept")
+    assert kept.text() == "dq_3 = a·cos(q_4)·τ_3"
+    assert [c.name for c in values] == ["a"]
+    assert abs(values[0].value) > 10 * values[0].std
+    assert after.variance_factor == pytest.approx(found().laws[0].left, rel=1e-3)
+    check_effect(kind)
+
+
+def test_a_law_whose_refit_fails_is_named_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object) -> None:
+        raise CannotAnswerError("it finds no equilibrium")
+
+    monkeypatch.setattr(sys.modules[discover.__module__], "exact", fails)
+    d = discover(campaign(LAW), name="bent")
+    assert d.reason == "no_law"
+    said = silence(d)
+    assert "dq_3 = a·cos(q_4)·τ_3 predicts" in said
+    assert "it finds no equilibrium" in said
+    assert "no law of this size" not in said
+    assert to_json(d)["refused"]

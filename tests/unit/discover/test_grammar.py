@@ -47,6 +47,29 @@ def test_every_function_is_an_effect_with_its_derivative() -> None:
         check_effect(effect_class(source_of_form(form, "tried"), "tried"))
 
 
+@pytest.mark.parametrize("joint", [1, 3])
+@pytest.mark.parametrize(
+    ("shape", "numbers"),
+    [
+        (shapes.PLUS, ()),
+        (shapes.MINUS, ()),
+        (shapes.ABOVE, (0.0,)),
+        (shapes.ABOVE_POWER, (0.0, 1.5)),
+        (shapes.BELOW_POWER, (0.0, 1.2)),
+        (shapes.SATURATION, (0.05,)),
+    ],
+)
+def test_a_one_sided_law_is_an_effect_also_where_nothing_hangs(
+    shape: shapes.Shape, numbers: tuple[float, ...], joint: int
+) -> None:
+    """Joint 1 of an unloaded arm has no torque: the states are at the bend itself."""
+    cell = example_cell()
+    s = example_situation(cell, example_states(cell))
+    (torque,) = (v for v in variables(s) if v.symbol == f"τ_{joint}")
+    form = Form((Part(sites(6)[joint - 1], Amplitude((Factor(torque, shape, numbers),)), 0),))
+    check_effect(effect_class(source_of_form(form, "tried"), "tried"))
+
+
 def test_fine_waves_are_tried_up_to_the_number_of_poses_and_in_no_product(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -7,6 +7,7 @@ import pytest
 
 import hilcal as hc
 from hilcal.calibration.improvement import Improvement
+from hilcal.config.cell import Repeatability
 from hilcal.config.write import to_toml
 from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.plan import REFERENCE
@@ -17,7 +18,7 @@ from hilcal.data.same_readings import already
 from hilcal.errors import InputError
 from hilcal.identify.carried import carried_prior
 from hilcal.library import load_posterior
-from hilcal.procedure.state import FROZEN
+from hilcal.procedure.state import DECIDED, FROZEN
 from tests.support.paths import ROOT
 from tests.support.procedure_cases import Drawn, KilledError, again, drawn, small
 from tests.unit.test_docs import blocks
@@ -151,6 +152,17 @@ def test_a_goal_below_the_repeatability_is_not_measured_for(tmp_path) -> None:
     assert kinds == ALL[:4]
     assert found.reason == "floor"
     assert found.error.floor_m > 5e-6
+
+
+def test_a_calibration_without_a_stated_repeatability_goes_to_its_end(tmp_path) -> None:
+    """Its readings show no scatter beyond the instrument's, and the model leaves nothing."""
+    config = small(1).model_copy(update={"repeatability": Repeatability()})
+    d = drawn(tmp_path / "run.hilcal", config=config, poses=4, validation=4, goal_m=1e-4)
+    assert isinstance(d.to_the_end(), Improvement)
+    with CampaignFile.open(d.procedure.run) as campaign:
+        found = ProcedureLog(campaign).last(DECIDED)
+    assert (found["reason"], found["floor_m"]) == ("goal_met", 0.0)
+    assert 0 < found["predicted_m"] < 1e-4
 
 
 def test_a_goal_within_reach_is_measured_for(tmp_path) -> None:

@@ -1,0 +1,48 @@
+"""`calibrate --rehearse` of random cells: whatever a cell states or leaves out, it has an end."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tomli_w
+
+from tests.support.campaign_cases import STARVED, TRIES
+from tests.support.cli_cases import Outcome, run
+from tests.support.random_cells import random_cell, random_options
+
+ENDS = (0, 4, 5)
+"""Done; the data cannot answer; a limit is not kept."""
+SMALL = ("--poses", "4", "--validation", "3", "--rehearse", "--yes", "--json")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2))
+def test_a_random_cell_is_calibrated_to_an_end(
+    seed: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rng = np.random.default_rng([seed, 32])
+    cell = tmp_path / "CELL.toml"
+    cell.write_text(tomli_w.dumps(random_cell(rng)), encoding="utf-8")
+    options = (*random_options(rng), *SMALL)
+    found = rehearsed(capsys, cell, *options)
+    assert found.code in ENDS, found.err
+    document = json.loads(found.out)
+    assert ("error" in document) == bool(found.code)
+    if found.code != 4:
+        assert document["improvement"]
+        again = run(capsys, "calibrate", cell, "-o", cell.with_name("run.hilcal"), "--resume",
+                    *options)  # fmt: skip
+        assert again.code == found.code
+        assert json.loads(again.out)["improvement"] == document["improvement"]
+
+
+def rehearsed(capsys: pytest.CaptureFixture[str], cell: Path, *options: str) -> Outcome:
+    """Rehearse; where this computer was too busy for the devices, go on as an operator does."""
+    path = cell.with_name("run.hilcal")
+    for _ in range(TRIES):
+        resume = ("--resume",) if path.exists() else ()
+        found = run(capsys, "calibrate", cell, "-o", path, *resume, *options)
+        if found.code != 3 or not STARVED.search(found.err):
+            break
+    return found

@@ -1,0 +1,65 @@
+"""Random cells, every optional section absent or present, as a lab's first CELL.toml may be."""
+
+from typing import Any
+
+import numpy as np
+
+LOADS: tuple[dict[str, Any], ...] = (
+    {"name": "5kg", "mass_kg": 5.0},
+    {"name": "3 kg", "mass_kg": 3.0},
+    {"name": "pull x", "force_N": [80.0, 0.0, 0.0], "moment_Nm": [0.0, 6.0, 6.0]},
+    {"name": "pull y", "force_N": [0.0, 60.0, 0.0]},
+)
+HIDDEN = ("nothing", "joint_stiffening", "base_compliance", "transmission_error")
+LENGTHS = ("1 um", "30 um", "0.1 mm", "1 mm", "1 m")
+
+
+def random_cell(rng: np.random.Generator) -> dict[str, Any]:
+    """Return the sections of a cell as TOML has them; plans of it take a second."""
+
+    def some(p: float = 0.5) -> bool:
+        return bool(rng.random() < p)
+
+    def one_of(values: tuple[Any, ...]) -> Any:
+        return values[int(rng.integers(len(values)))]
+
+    out: dict[str, Any] = {"robot": {"model": one_of(("ur10e", "ur10e", "ur5e"))}}
+    if some(0.8):
+        tool = {
+            "target_m": [0.06, 0.02, 0.12],
+            "load_point_m": [0.1, 0.0, 0.15],
+            "mass_kg": 0.8,
+            "com_m": [0.01, 0.0, 0.06],
+        }
+        out["tool"] = {key: value for key, value in tool.items() if some(0.7)}
+    if some():
+        noise = 10.0 ** rng.uniform(-6, -3.7)
+        out["tracker"] = {"range_std_m": noise, "transverse_std_m": one_of((1.0, 1.5)) * noise}
+    if some():
+        out["repeatability"] = {"joint_std_rad": one_of((0.0, 1e-6, 1e-5, [1e-5] * 6))}
+    loads = [load for load in LOADS if some(0.4)]
+    if loads:
+        out["loads"] = loads
+        if some():
+            out["force_sensor"] = {"driver": "ft300", "port": "simulated"}
+    if some():
+        out["limits"] = {"workspace_min_m": [-1.6, -1.6, 0.05]}
+        if some():
+            out["limits"]["accuracy_m"] = one_of((1e-5, 1e-3))
+    out["planning"] = {"candidates": 60, "against": []}
+    if not loads or some(0.3):
+        out["planning"] |= {"readings": "absolute", "model": ["base_frame"]}
+    out["simulation"] = {"clock": 20.0, "seed": int(rng.integers(1000))}
+    if some():
+        hidden = HIDDEN if loads else (HIDDEN[0], HIDDEN[-1])
+        out["simulation"]["hide"] = one_of(hidden)
+    return out
+
+
+def random_options(rng: np.random.Generator) -> list[str]:
+    """Return options of `calibrate`: a goal, a limit, or none."""
+    out: list[str] = []
+    for option in ("--goal", "--limit"):
+        if rng.random() < 0.7:
+            out += [option, LENGTHS[int(rng.integers(len(LENGTHS)))]]
+    return out
