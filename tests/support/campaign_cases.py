@@ -194,7 +194,11 @@ def right(site: Site, path: Path) -> None:
     known = with_joint_scatter(_registered(site), readings, scatter)
     white = np.linalg.solve(np.linalg.cholesky(known.covariance), off[:, :, None])
     # a wrong pose, load or a broken frame is off by hundreds
-    assert np.abs(white).max() < 7.0
+    worst = int(np.abs(white).max(axis=(1, 2)).argmax())
+    assert np.abs(white).max() < 7.0, (
+        f"reading {worst + 1} of {len(white)} is off by {np.abs(white[worst]).max():.1f} σ, "
+        f"{off[worst].tolist()} m"
+    )
 
 
 def _registered(site: Site) -> Cell:

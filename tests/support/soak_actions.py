@@ -77,6 +77,7 @@ class Soak:
     _path: Path | None = None
     _calibration: Calibration | None = None
     _number: int = 0
+    _met: str = ""
 
     # --- cells ---
 
@@ -128,6 +129,7 @@ class Soak:
     def do(self, way: Callable[[], str]) -> None:
         """Do it; a failed check is kept, and the next thing is done on another cell."""
         self.counts[way.__name__] += 1
+        self._met = ""
         try:
             way()
         except Exception as error:
@@ -141,7 +143,8 @@ class Soak:
             if STARVED.search(words):
                 self.starved += 1
             else:
-                self.findings.append(f"{way.__name__}: {at.name}:{at.lineno}: {words[:600]}")
+                where = f"{way.__name__} {self._met}: {at.name}:{at.lineno}"
+                self.findings.append(f"{where}: {words[:600]}")
             self.close()
 
     def one_fault(self) -> str:
@@ -375,6 +378,7 @@ class Soak:
         undo: bool = True,
     ) -> str:
         since = self.site.now()
+        self._met = ", ".join(fault.name for fault in faults)
         try:
             for k, fault in enumerate(faults):
                 if k:
