@@ -186,7 +186,8 @@ def test_the_steps_of_a_refinement_carry_what_it_tried(monkeypatch: pytest.Monke
     refinement = sys.modules["hilcal.refine"]  # hilcal.refine is a function of the library
     judged = refinement.predicts_better
     monkeypatch.setattr(refinement, "predicts_better", predicts_better)
-    r = refine(baseline(c.cell, c.readings, "deflection"), c.readings, "deflection")
+    start = baseline(c.cell, c.readings, "deflection")
+    r = refine(start, c.readings, "deflection", background=False)
     assert len(r.rejected) == 1
     assert r.diagnosis is r.steps[-1].diagnosis
     for before, after in zip(r.steps, r.steps[1:], strict=False):
