@@ -14,6 +14,7 @@ import traceback
 from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from types import FrameType
 from typing import Any
@@ -97,7 +98,9 @@ class Processes:
         self._end(list(self._all))
 
     def _begin(self) -> None:
-        # Ctrl-C is for this process: a worker is born with it blocked.
+        # Ctrl-C is for this process: a worker is born with it blocked. Python 3.11 unblocks it
+        # where the first worker starts the tracker of resources, so that is started before.
+        resource_tracker.ensure_running()
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             worker = _Worker(self._scratch)

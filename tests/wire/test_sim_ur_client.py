@@ -32,6 +32,21 @@ def test_watchdog_stops_the_arm_when_the_client_is_killed(sim):
         assert not state["script_running"]
 
 
+def test_the_watchdog_waits_for_a_client_that_had_no_turn(sim):
+    with client(sim.host, "control") as run:
+        goal = under_way(run, sim, watchdog=10.0)
+        time.sleep(0.3)
+        assert sim.admin()["qd"][0] == 0.0  # nothing moves meanwhile
+        assert sim.admin()["script_running"]
+        run("control", "kickWatchdog")
+        while sim.admin()["moving"]:
+            run("control", "kickWatchdog")
+            time.sleep(0.01)
+        np.testing.assert_allclose(sim.admin()["q"], goal, atol=1e-12)
+        time.sleep(0.8)  # no machine is so busy
+        assert not sim.admin()["script_running"]
+
+
 def test_without_watchdog_the_arm_goes_on(sim):
     with client(sim.host, "control") as run:
         goal = under_way(run, sim)

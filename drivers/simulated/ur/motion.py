@@ -91,6 +91,7 @@ class Trajectory:
         self._now = now
         self._segment: LinearMotion | None = None
         self._time = 0.0  # along the segment
+        self._stands: float | None = None  # since when it stands within the segment, at rate 0
         self._stopping = False
         self._next: tuple[Floats, float, float] | None = None
         self._told: tuple[Floats, float, float] | None = None
@@ -143,7 +144,7 @@ class Trajectory:
         speed *= self.rate
         if speed <= 1e-9:
             self.q = self._segment.origin + self._segment.direction * way
-            self._end(now)
+            self._end(now if self._stands is None else self._stands)
             return
         if not self._stopping:
             rest = max(self._segment.length - way, 1e-9)
@@ -161,6 +162,10 @@ class Trajectory:
             rate = 1.0 if self._stopping else self.rate
             step = (now - self._now) * rate
             left = self._segment.duration - self._time
+            if rate > 0.0:
+                self._stands = None
+            elif self._stands is None:
+                self._stands = self._now
             if step < left:
                 self._time += step
                 way, speed = self._segment.at(self._time)
@@ -174,7 +179,7 @@ class Trajectory:
 
     def _begin(self, goal: Floats, speed: float, acceleration: float) -> None:
         self._segment = line(self.q, goal, speed, acceleration)
-        self._time, self._stopping = 0.0, False
+        self._time, self._stopping, self._stands = 0.0, False, None
         self._told = goal, speed, acceleration
         if self._segment is not None:
             moved = np.abs(goal - self.q) > _NOTHING

@@ -61,6 +61,10 @@ class RtdeLinks:
         """Return when the next package is due, real time in s; infinite where none is."""
         return min((link.due for link in self.links if link.started), default=float("inf"))
 
+    def hears(self, register: int) -> bool:
+        """Return whether a client that writes an integer register has an open link."""
+        return not self.faults.rtde_mute and f"{_INT}{register}" in self.owners
+
     def send(self, now: float) -> None:
         """Send what is due."""
         ready = [link for link in self.links if link.started and link.due <= now]

@@ -73,7 +73,8 @@ class ControlScript:
         if found is None:
             raise ValueError("not a control script")
         self._arm = arm
-        self._base = int(found.group(1))
+        self.register = int(found.group(1))
+        """The integer register of commands."""
         self._path = tuple(_moves(text))
         self._executing = False
         self._work: Iterator[None] | None = None
@@ -85,12 +86,12 @@ class ControlScript:
         self._progress(None)
 
     @property
-    def late(self) -> bool:
-        """Whether the watchdog has to bark: no package with the command register came."""
+    def late(self) -> float:
+        """How long the package with the command register is late by the watchdog, s; 0 is not."""
         if not self.watchdog:
-            return False
-        silence = time.monotonic_ns() - self._arm.registers.written_ns[self._base]
-        return silence * self.watchdog > 1e9
+            return 0.0
+        silence = (time.monotonic_ns() - self._arm.registers.written_ns[self.register]) * 1e-9
+        return max(0.0, silence - 1.0 / self.watchdog)
 
     def poll(self) -> bool:
         """Do what there is to do; return whether the program goes on.
@@ -107,7 +108,7 @@ class ControlScript:
                 return True
             self._work = None
             self._signal(_DONE)
-        number = self._arm.registers.in_int[self._base]
+        number = self._arm.registers.in_int[self.register]
         if number == 0:
             self._executing = False
             self._signal(_READY)
@@ -174,10 +175,10 @@ class ControlScript:
                 self._answer(pose(flange @ transform(self._doubles(6, 6))))
             case ScriptCommand.IS_STEADY:
                 steady = not motion.moving and now - motion.rest_time > _STEADY
-                arm.registers.out_int[self._base + 1] = int(steady)
+                arm.registers.out_int[self.register + 1] = int(steady)
             case ScriptCommand.JOINTS_SAFE:
                 safe = np.all(np.abs(self._doubles(0, 6)) <= _JOINT_LIMIT)
-                arm.registers.out_int[self._base + 1] = int(safe)
+                arm.registers.out_int[self.register + 1] = int(safe)
             case ScriptCommand.WATCHDOG:
                 self.watchdog = float(self._doubles(0, 1)[0])
                 arm.note(f"watchdog {self.watchdog:g} Hz")
@@ -207,19 +208,21 @@ class ControlScript:
         word = self._async_count << 16 | self._async_number << 24
         if value is not None:
             word |= 1 << 15 | value
-        self._arm.registers.out_int[self._base + 2] = word
+        self._arm.registers.out_int[self.register + 2] = word
 
     def _signal(self, value: int) -> None:
-        self._arm.registers.out_int[self._base] = value
+        self._arm.registers.out_int[self.register] = value
 
     def _answer(self, values: Floats) -> None:
-        self._arm.registers.out_double[self._base : self._base + len(values)] = values.tolist()
+        self._arm.registers.out_double[self.register : self.register + len(values)] = (
+            values.tolist()
+        )
 
     def _int(self, k: int) -> int:
-        return self._arm.registers.in_int[self._base + k]
+        return self._arm.registers.in_int[self.register + k]
 
     def _doubles(self, k: int, count: int) -> Floats:
-        start = self._base + k
+        start = self.register + k
         return np.array(self._arm.registers.in_double[start : start + count])
 
 

@@ -57,6 +57,7 @@ class Server:
         self.controller = Controller(state, board)
         sensors = Sensors(state, board, rng)
         self.rtde = RtdeLinks(state, sensors, self.faults, self.controller.step)
+        self.controller.hears = self.rtde.hears
         model = state.kinematics.arm.name
         self.dashboard = Dashboard(self.controller, self.faults, model)
         self._host = host

@@ -43,7 +43,7 @@ class WaypointProgram:
     """A program of moves, while it plays."""
 
     watchdog = 0.0
-    late = False
+    late = 0.0
 
     def __init__(self, text: str, arm: ArmState) -> None:
         """Read the program.

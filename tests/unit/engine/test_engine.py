@@ -129,7 +129,8 @@ def test_a_signal_leaves_no_process_and_no_folder(kind: signal.Signals, tmp_path
     workers = psutil.Process(process.pid).children(recursive=True)
     assert len(workers) >= 2
     assert list(tmp_path.glob("hilcal-workers-*"))
-    if kind is signal.SIGINT:  # as a terminal sends it: to all of them
+    if kind is signal.SIGINT:  # as a terminal sends it: to all of them, and only one heeds it
+        assert all(deaf(worker.pid, kind) for worker in workers)
         os.killpg(process.pid, kind)
     else:  # as a service manager does
         process.send_signal(kind)
@@ -145,6 +146,13 @@ def test_a_signal_leaves_no_process_and_no_folder(kind: signal.Signals, tmp_path
     else:
         assert process.returncode == 128 + kind
         assert "Traceback" not in told
+
+
+def deaf(pid: int, number: signal.Signals) -> bool:
+    """Whether a process blocks or ignores a signal; proc(5), SigBlk and SigIgn."""
+    lines = Path(f"/proc/{pid}/status").read_text(encoding="ascii").splitlines()
+    masks = [int(line.split()[1], 16) for line in lines if line.startswith(("SigBlk", "SigIgn"))]
+    return any(mask & 1 << (number - 1) for mask in masks)
 
 
 @pytest.mark.slow
