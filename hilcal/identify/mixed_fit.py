@@ -18,7 +18,7 @@ from hilcal.identify.residual import residual
 from hilcal.mixed.families import LogStdPrior, families_of
 from hilcal.mixed.posterior import average
 from hilcal.mixed.prediction import coordinates_covariance
-from hilcal.mixed.problem import MixedProblem, Noise, mixed_problem
+from hilcal.mixed.problem import MixedProblem, Noise, independent_rows, mixed_problem
 from hilcal.mixed.variances import Variances, estimate_variances
 from hilcal.model import Model
 from hilcal.types import Floats
@@ -35,6 +35,8 @@ SCATTER_RAD = 3e-5
 """Ordinary scatter of a joint, rad: 30 µm at 1 m, as makers state it; η of it is about zero."""
 INSTRUMENT, SCATTER = "instrument", "arm's scatter"
 """Names of the components of the noise."""
+UNSEEN = -0.5
+"""`independent_rows` gives a row that is not seen the variance -1."""
 NOISE_SPREAD = 1.5
 """Of the log of the noise: a factor of 4.5 either way; a choice."""
 FEW_ROWS = 300
@@ -183,29 +185,36 @@ def _linearised(
     prediction = model.predict(readings.states, theta)
     now = w.whiten(residual(readings, prediction, w)).reshape(-1)
     jacobian = w.whiten_readings(model.jacobian(prediction, theta, w.m))
-    shape = [(len(b.loaded), b.factor.shape[-1]) for b in w.buckets]
-    noise = _noise(model, readings, w)
-    y = now + jacobian @ theta
-    return mixed_problem(y, jacobian, families_of(model), noise, shape), now
+    rows, noise = _noise(model, readings, w, np.column_stack([now + jacobian @ theta, jacobian]))
+    return mixed_problem(rows[:, 0], rows[:, 1:], families_of(model), noise), now
 
 
-def _noise(model: Model, readings: Readings, w: Whitening) -> list[Noise]:
-    """Components: the instrument's, and the arm's scatter where the readings do not state it."""
-    seen = tuple(
-        np.any(b.factor != 0, axis=2)[:, :, None] * np.eye(b.factor.shape[-1]) for b in w.buckets
-    )
-    whole = all(bool(s.any(axis=2).all()) for s in seen)
-    instrument = Noise(INSTRUMENT, None if whole else seen, LogStdPrior(0.0, NOISE_SPREAD))
+def _noise(
+    model: Model, readings: Readings, w: Whitening, rows: Floats
+) -> tuple[Floats, list[Noise]]:
+    """Whitened rows (R, ...), turned so that all noise is diagonal, and its components.
+
+    They are the instrument's, and the arm's scatter where the readings do not state it.
+    """
+    prior = LogStdPrior(0.0, NOISE_SPREAD)
+    seen = [np.any(b.factor != 0, axis=2) for b in w.buckets]
     if readings.scatter_stated:
-        return [instrument]
+        whole = np.concatenate([s.reshape(-1) for s in seen]).astype(np.float64)
+        return rows, [Noise(INSTRUMENT, whole, prior)]
     f = _scatter_factors(model, readings)
     common = None if readings.states.target is None else f
     of = replace(readings, covariance=f @ np.swapaxes(f, 1, 2), common=common, serial=None)
-    blocks = tuple(
-        b.factor @ c @ np.swapaxes(b.factor, 1, 2)
-        for b, c in zip(w.buckets, covariance_blocks(of, w), strict=True)
-    )
-    return [instrument, Noise(SCATTER, blocks, LogStdPrior(0.0, NOISE_SPREAD))]
+    turned, instrument, scatter, start = np.empty_like(rows), [], [], 0
+    for b, c, s in zip(w.buckets, covariance_blocks(of, w), seen, strict=True):
+        u, variance = independent_rows(b.factor @ c @ np.swapaxes(b.factor, 1, 2), s)
+        stop = start + s.size
+        block = rows[start:stop].reshape(*s.shape, -1)
+        turned[start:stop] = (np.swapaxes(u, 1, 2) @ block).reshape(s.size, -1)
+        instrument.append((variance > UNSEEN).reshape(-1).astype(np.float64))
+        scatter.append(np.maximum(variance, 0.0).reshape(-1))
+        start = stop
+    components = ((INSTRUMENT, instrument), (SCATTER, scatter))
+    return turned, [Noise(name, np.concatenate(v), prior) for name, v in components]
 
 
 def _scatter_factors(model: Model, readings: Readings) -> Floats:

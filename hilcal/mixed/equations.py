@@ -1,7 +1,7 @@
 """Henderson's mixed-model equations at given variances, and the restricted likelihood's slopes.
 
-With S the standard deviations s_f of the random columns (1 for the frames), L Lᵀ = R the noise,
-and rows T = L⁻¹ X S, t = L⁻¹ y,
+With S the standard deviations s_f of the random columns (1 for the frames), R = Σ_k exp(2 η_k) R_k
+the noise, diagonal, and rows T = R^−½ X S, t = R^−½ y,
 
     C = Tᵀ T + E,    E = 1 for random columns, 0 for the frames
     C c = Tᵀ t,      coordinates S c
@@ -11,7 +11,7 @@ and rows T = L⁻¹ X S, t = L⁻¹ y,
 and, γ_f = Σ_i T_iᵀ P T_i over its columns the parameters that family f spends,
 
     ∂ℓ/∂log s_f = c_fᵀ c_f − γ_f
-    ∂ℓ/∂η_k     = eᵀ W_k e − tr(P W_k),    W_k = L⁻¹ R_k L⁻ᵀ, R_k times its variance
+    ∂ℓ/∂η_k     = eᵀ W_k e − tr(P W_k),    W_k = exp(2 η_k) R_k R⁻¹
     AI_ij       = ½ v_iᵀ P v_j,    v_f = 2 T_f c_f,    v_k = 2 W_k e
 
 P is formed by rows where they are fewer than the columns, P = N⁻¹ − B (Qᵀ N⁻¹ Q)⁻¹ Bᵀ with
@@ -63,10 +63,10 @@ class _ByColumns:
     def _lifted(self) -> Floats:
         return np.asarray(solve_triangular(self.factor[0], self.rows.T, lower=True)).T
 
-    def blocks(self, rows: slice, shape: tuple[int, int]) -> Floats:
-        """(G, S, S) blocks of P on the diagonal."""
-        t = self._lifted[rows].reshape(*shape, -1)
-        return np.asarray(np.eye(shape[1]) - t @ np.swapaxes(t, 1, 2))
+    @cached_property
+    def diagonal(self) -> Floats:
+        """(R,) diagonal of P."""
+        return 1.0 - np.asarray(np.sum(self._lifted**2, axis=1))
 
 
 class _ByRows:
@@ -113,11 +113,10 @@ class _ByRows:
         """(K,) T_iᵀ P T_i."""
         return np.asarray(np.einsum("ri,ri->i", self.rows, self.p @ self.rows))
 
-    def blocks(self, rows: slice, shape: tuple[int, int]) -> Floats:
-        """(G, S, S) blocks of P on the diagonal."""
-        g, s = shape
-        own = self.p[rows, rows].reshape(g, s, g, s)
-        return np.ascontiguousarray(np.moveaxis(np.diagonal(own, axis1=0, axis2=2), -1, 0))
+    @property
+    def diagonal(self) -> Floats:
+        """(R,) diagonal of P."""
+        return np.asarray(np.diagonal(self.p))
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +128,7 @@ class Equations:
         log_std: (F + N,) log s of the families, η of the noise.
         rows: (R, K) T.
         target: (R,) t.
-        roots: (G, S, S) L of each run of rows.
+        noise_std: (R,) R^½.
         projection: P.
     """
 
@@ -137,17 +136,13 @@ class Equations:
     log_std: Floats
     rows: Floats
     target: Floats
-    roots: tuple[Floats, ...]
+    noise_std: Floats
     projection: _ByColumns | _ByRows
 
     @property
     def _count(self) -> int:
         """Number of families."""
         return len(self.problem.families.random)
-
-    @property
-    def _instrument_alone(self) -> bool:
-        return len(self.problem.noise) == 1 and self.problem.noise[0].blocks is None
 
     @cached_property
     def scale(self) -> Floats:
@@ -171,9 +166,8 @@ class Equations:
     @cached_property
     def log_likelihood(self) -> float:
         """ℓ, the restricted log likelihood, without its constant."""
-        det_r = sum(np.log(np.diagonal(r, axis1=1, axis2=2)).sum() for r in self.roots)
         square = float(self.target @ self.residual)
-        return -float(det_r) - 0.5 * (self.projection.log_det + square)
+        return -float(np.log(self.noise_std).sum()) - 0.5 * (self.projection.log_det + square)
 
     @cached_property
     def spent(self) -> Floats:
@@ -187,34 +181,16 @@ class Equations:
         """(F + N,) ∂ℓ by log s and η."""
         p = self.problem
         square = np.bincount(p.family, self.c[p.flat :] ** 2, minlength=self._count)
-        return np.concatenate([square - self.spent, self._noise_slope()])
-
-    def _noise_slope(self) -> Floats:
-        if self._instrument_alone:  # W = 1, tr P = R − k − Σ γ
-            count = len(self.target) - self.problem.flat - self.spent.sum()
-            return np.array([float(self.residual @ self.residual) - count])
-        out = np.zeros(len(self.problem.noise))
-        for rows, shape, white in self._white_noise:
-            left, e = self.projection.blocks(rows, shape), self.residual[rows].reshape(shape)
-            for k, w in enumerate(white):
-                out[k] += np.einsum("gi,gij,gj->", e, w, e) - np.einsum("gij,gji->", left, w)
-        return out
+        noise = (self.residual**2 - self.projection.diagonal) @ self._white_noise
+        return np.concatenate([square - self.spent, noise])
 
     @cached_property
-    def _white_noise(self) -> list[tuple[slice, tuple[int, int], list[Floats]]]:
-        """Rows, shape (G, S) and W_k (G, S, S), by runs."""
-        out, start = [], 0
-        for run, (shape, root) in enumerate(zip(self.problem.shape, self.roots, strict=True)):
-            stop = start + shape[0] * shape[1]
-            white = []
-            for n, eta in zip(self.problem.noise, self.log_std[self._count :], strict=True):
-                inner = np.eye(shape[1]) if n.blocks is None else n.blocks[run]
-                half = np.linalg.solve(root, np.broadcast_to(inner, root.shape))
-                w = np.linalg.solve(root, np.swapaxes(half, 1, 2))
-                white.append(np.exp(2 * eta) * w)
-            out.append((slice(start, stop), shape, white))
-            start = stop
-        return out
+    def _white_noise(self) -> Floats:
+        """(R, N) diagonals of W_k."""
+        p = self.problem
+        eta = self.log_std[self._count :]
+        parts = np.stack([n.variance for n in p.noise], axis=1) * np.exp(2 * eta)
+        return np.asarray(parts / self.noise_std[:, None] ** 2)
 
     @cached_property
     def working(self) -> Floats:
@@ -224,13 +200,7 @@ class Equations:
         for f in range(first):
             own = np.flatnonzero(p.family == f) + p.flat
             out[:, f] = 2.0 * (self.rows[:, own] @ self.c[own])
-        if self._instrument_alone:
-            out[:, first] = 2.0 * self.residual
-            return out
-        for rows, shape, white in self._white_noise:
-            e = self.residual[rows].reshape(*shape, 1)
-            for k, w in enumerate(white):
-                out[rows, first + k] = 2.0 * (w @ e).reshape(-1)
+        out[:, first:] = 2.0 * self._white_noise * self.residual[:, None]
         return out
 
     @cached_property
@@ -259,7 +229,7 @@ class Equations:
 
     def score(self, columns: Floats) -> tuple[Floats, Floats]:
         """Return Zᵀ P Z (q, q) and Zᵀ P y (q,) of columns Z (R, q) that are not in the problem."""
-        white = whitened_rows(columns, self.problem.shape, self.roots)
+        white = columns / self.noise_std[:, None]
         return np.asarray(white.T @ self.projection.project(white)), white.T @ self.residual
 
 
@@ -270,37 +240,10 @@ def equations(problem: MixedProblem, log_std: Floats) -> Equations:
         numpy.linalg.LinAlgError: standard deviations so different that a matrix has no factor.
     """
     eta = log_std[len(problem.families.random) :]
-    if len(problem.noise) == 1 and problem.noise[0].blocks is None:
-        root = float(np.exp(eta[0]))
-        roots = tuple(np.broadcast_to(np.eye(s) * root, (g, s, s)) for g, s in problem.shape)
-        rows, target = problem.x / root, problem.y / root
-    else:
-        roots = tuple(_noise_roots(problem, eta, run) for run in range(len(problem.shape)))
-        rows = whitened_rows(problem.x, problem.shape, roots)
-        target = whitened_rows(problem.y, problem.shape, roots)
+    variance = sum(np.exp(2 * e) * n.variance for n, e in zip(problem.noise, eta, strict=True))
+    # A row without noise is one that carries no information.
+    noise_std = np.sqrt(np.where(variance == 0.0, 1.0, variance))
+    rows, target = problem.x / noise_std[:, None], problem.y / noise_std
     rows[:, problem.flat :] *= np.exp(log_std)[problem.family]
     form = _ByRows if rows.shape[0] < rows.shape[1] else _ByColumns
-    return Equations(problem, log_std, rows, target, roots, form(rows, problem.flat))
-
-
-def _noise_roots(problem: MixedProblem, eta: Floats, run: int) -> Floats:
-    groups, size = problem.shape[run]
-    total = np.zeros((groups, size, size))
-    for n, e in zip(problem.noise, eta, strict=True):
-        total += np.exp(2 * e) * (np.eye(size) if n.blocks is None else n.blocks[run])
-    each = np.arange(size)  # a row without noise is one that carries no information
-    total[:, each, each] += total[:, each, each] == 0.0
-    return np.asarray(np.linalg.cholesky(total))
-
-
-def whitened_rows(
-    x: Floats, shape: tuple[tuple[int, int], ...], roots: tuple[Floats, ...]
-) -> Floats:
-    """L⁻¹ X (R, ...) by runs of blocks."""
-    out, start = np.empty_like(x), 0
-    for (groups, size), root in zip(shape, roots, strict=True):
-        stop = start + groups * size
-        block = x[start:stop].reshape(groups, size, -1)
-        out[start:stop] = np.linalg.solve(root, block).reshape(x[start:stop].shape)
-        start = stop
-    return out
+    return Equations(problem, log_std, rows, target, noise_std, form(rows, problem.flat))

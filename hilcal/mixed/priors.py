@@ -9,9 +9,11 @@ what others explain; independent priors of the same spread predicted 4 % worse w
 real UR10 and of a real UR5. Components of the noise have their own spread alone.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from hilcal.mixed.problem import MixedProblem
+from hilcal.mixed.families import Family, LogStdPrior
 from hilcal.types import Floats
 
 ARM = 1.5
@@ -21,12 +23,18 @@ EFFECT = 1.0
 """Of an effect beside its arm: a factor of 2.7; a choice."""
 
 
-def log_std_prior(problem: MixedProblem) -> tuple[Floats, Floats]:
-    """Mean (F + N,) and precision (F + N, F + N) of log s and η."""
-    mean = np.array([p.mean for p in problem.priors])
-    covariance = np.diag([p.spread**2 for p in problem.priors])
-    effect = np.array([f.effect for f in problem.families.random])
-    unknown = np.array([not f.known for f in problem.families.random], dtype=float)
+def log_std_prior(
+    priors: Sequence[LogStdPrior], families: Sequence[Family]
+) -> tuple[Floats, Floats]:
+    """Mean (F + N,) and precision (F + N, F + N) of log s and η.
+
+    Args:
+        priors: of each of them by itself.
+        families: the first F of them.
+    """
+    covariance = np.diag([p.spread**2 for p in priors])
+    effect = np.array([f.effect for f in families])
+    unknown = np.array([not f.known for f in families], dtype=float)
     shared = (ARM**2 + EFFECT**2 * (effect[:, None] == effect)) * np.outer(unknown, unknown)
     covariance[: len(effect), : len(effect)] += shared
-    return mean, np.linalg.inv(covariance)
+    return np.array([p.mean for p in priors]), np.linalg.inv(covariance)

@@ -2,18 +2,21 @@
 
     y = A b + Σ_f Z_f u_f + e,    e ~ N(0, Σ_k exp(2 η_k) R_k)
 
-The rows are whitened by the stated covariance, so that R_0 = 1 is the instrument; the other R_k,
-as the arm's scatter, are block diagonal. Columns are kept in ordinary magnitudes, X = [Q | Z D^½]
-with Q an orthonormal basis of the frames' columns.
+All R_k are diagonal. Rows whitened by the stated covariance have R_0 = 1, the instrument; where R_1
+is block diagonal, as the arm's scatter, its eigenvectors turn the rows so that both are diagonal
+(`independent_rows`). Columns are kept in ordinary magnitudes, X = [Q | Z D^½] with Q an orthonormal
+basis of the frames' columns.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from hilcal.mixed.families import Families, LogStdPrior
-from hilcal.types import Floats, Ints
+from hilcal.mixed.priors import log_std_prior
+from hilcal.types import Bools, Floats, Ints
 
 FRAMES_TOLERANCE = 1e-9
 """Share of the largest singular value of the frames' columns, scaled to unit length, below which a
@@ -26,16 +29,16 @@ class Noise:
 
     Attributes:
         name: of it.
-        blocks: one array (G, S, S) for each run of rows, G blocks of S rows; None for the identity.
+        variance: (R,) diagonal of R_k.
         prior: what is known of η.
     """
 
     name: str
-    blocks: tuple[Floats, ...] | None
+    variance: Floats
     prior: LogStdPrior
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class MixedProblem:
     """Rows, columns and noise at a linearisation.
 
@@ -46,7 +49,6 @@ class MixedProblem:
         families: of the other columns.
         family: (K − k,) family of each of them.
         noise: components, that of the instrument first.
-        shape: blocks of the rows, runs of (G, S).
     """
 
     y: Floats
@@ -55,7 +57,6 @@ class MixedProblem:
     families: Families
     family: Ints
     noise: tuple[Noise, ...]
-    shape: tuple[tuple[int, int], ...]
 
     @property
     def flat(self) -> int:
@@ -66,6 +67,11 @@ class MixedProblem:
     def priors(self) -> tuple[LogStdPrior, ...]:
         """What is known of each log s and η, families first."""
         return (*(f.prior for f in self.families.random), *(n.prior for n in self.noise))
+
+    @cached_property
+    def log_std_prior(self) -> tuple[Floats, Floats]:
+        """Mean (F + N,) and precision (F + N, F + N) of log s and η."""
+        return log_std_prior(self.priors, self.families.random)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -98,7 +104,7 @@ class MixedProblem:
         place = np.cumsum(~np.isin(np.arange(len(self.families.random)), numbers)) - 1
         return MixedProblem(
             self.y, x, self.frames, Families(self.families.frames, random),
-            place[self.family[kept]], self.noise, self.shape,
+            place[self.family[kept]], self.noise,
         )  # fmt: skip
 
 
@@ -107,7 +113,6 @@ def mixed_problem(
     jacobian: Floats,
     families: Families,
     noise: Sequence[Noise],
-    shape: Sequence[tuple[int, int]] | None = None,
 ) -> MixedProblem:
     """Build the problem from whitened rows.
 
@@ -116,17 +121,27 @@ def mixed_problem(
         jacobian: (R, P) whitened derivative by all parameters of the model.
         families: of the model.
         noise: components, that of the instrument first.
-        shape: blocks of the rows; one for each row unless given.
     """
     frames = _frame_basis(jacobian[:, families.frames])
     random = families.random
     counts = [len(f.parameters) for f in random]
     problem = MixedProblem(
         y, jacobian, frames, families, np.repeat(np.arange(len(random)), counts), tuple(noise),
-        tuple(shape) if shape is not None else ((len(y), 1),),
     )  # fmt: skip
     x = problem.coordinates(jacobian)
-    return MixedProblem(y, x, frames, families, problem.family, problem.noise, problem.shape)
+    return MixedProblem(y, x, frames, families, problem.family, problem.noise)
+
+
+def independent_rows(covariance: Floats, seen: Bools) -> tuple[Floats, Floats]:
+    """Return U (G, S, S) and the variances (G, S) of rows Uᵀ y with some covariance (G, S, S).
+
+    Rows that are not seen (G, S), of covariance zero, stay apart from those that are.
+    """
+    each = np.arange(seen.shape[1])
+    marked = covariance.copy()
+    marked[:, each, each] -= ~seen
+    variance, u = np.linalg.eigh(marked)
+    return np.asarray(u), np.asarray(variance)
 
 
 def _frame_basis(a: Floats) -> Floats:

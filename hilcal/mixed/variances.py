@@ -13,7 +13,6 @@ import numpy as np
 
 from hilcal.errors import CannotAnswerError
 from hilcal.mixed.equations import Equations, equations
-from hilcal.mixed.priors import log_std_prior
 from hilcal.mixed.problem import MixedProblem
 from hilcal.types import Floats
 
@@ -58,7 +57,7 @@ def estimate_variances(problem: MixedProblem, start: Floats | None = None) -> Va
     Raises:
         CannotAnswerError: the likelihood cannot be computed at the start.
     """
-    mean, precision = log_std_prior(problem)
+    mean, precision = problem.log_std_prior
     try:
         here = equations(problem, mean if start is None else start)
         best = log_posterior(here)
@@ -92,6 +91,6 @@ def estimate_variances(problem: MixedProblem, start: Floats | None = None) -> Va
 
 def log_posterior(e: Equations) -> float:
     """ℓ and the prior's, without constants."""
-    mean, precision = log_std_prior(e.problem)
+    mean, precision = e.problem.log_std_prior
     off = e.log_std - mean
     return e.log_likelihood - 0.5 * float(off @ precision @ off)

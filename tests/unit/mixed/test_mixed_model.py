@@ -9,7 +9,7 @@ from hilcal.mixed.evidence import evidence
 from hilcal.mixed.families import Families, Family, LogStdPrior
 from hilcal.mixed.posterior import average, walk
 from hilcal.mixed.prediction import predict
-from hilcal.mixed.problem import MixedProblem, Noise, mixed_problem
+from hilcal.mixed.problem import MixedProblem, Noise, independent_rows, mixed_problem
 from hilcal.mixed.variances import estimate_variances, log_posterior
 from hilcal.types import Floats
 
@@ -28,25 +28,24 @@ def problem(
     jacobian = rng.standard_normal((rows, 12 + over))
     jacobian[:, 3] = jacobian[:, 0] + jacobian[:, 1]
     families = Families(np.arange(4), (family("a", 4, 3), family("b", 7, 5 + over)))
-    noise = [Noise("instrument", None, LogStdPrior(0.0, 1.5))]
+    noise = [instrument(rows)]
     if scatter:
-        half = rng.standard_normal((groups, 3, 2))
-        noise.append(Noise("scatter", (half @ np.swapaxes(half, 1, 2),), LogStdPrior(0.0, 1.5)))
+        variance = rng.standard_normal(rows).clip(0.0) ** 2
+        noise.append(Noise("scatter", variance, LogStdPrior(0.0, 1.5)))
     y = rng.standard_normal(rows) * 2 + jacobian @ rng.standard_normal(12 + over)
-    return mixed_problem(y, jacobian, families, noise, [(groups, 3)])
+    return mixed_problem(y, jacobian, families, noise)
+
+
+def instrument(rows: int, spread: float = 1.5) -> Noise:
+    return Noise("instrument", np.ones(rows), LogStdPrior(0.0, spread))
 
 
 def dense(p: MixedProblem, x: Floats) -> tuple[float, Floats, Floats, Floats]:
     """ℓ from V = Σ s² Z D Zᵀ + R itself, BLUP coordinates, P, and their errors' covariance."""
     q, z = p.x[:, : p.flat], p.x[:, p.flat :]
     scale = np.exp(x)[p.family]
-    r = np.zeros((len(p.y), len(p.y)))
-    for n, eta in zip(p.noise, x[len(p.families.random) :], strict=True):
-        groups, size = p.shape[0]
-        blocks = np.tile(np.eye(size), (groups, 1, 1)) if n.blocks is None else n.blocks[0]
-        for g in range(groups):
-            own = slice(g * size, (g + 1) * size)
-            r[own, own] += np.exp(2 * eta) * blocks[g]
+    etas = x[len(p.families.random) :]
+    r = sum(np.exp(2 * eta) * np.diag(n.variance) for n, eta in zip(p.noise, etas, strict=True))
     v = r + (z * scale**2) @ z.T
     vi = np.linalg.inv(v)
     inner = q.T @ vi @ q
@@ -137,8 +136,7 @@ def drawn(
     true = rows @ u
     measured, fresh = rows[:-40], rows[-40:, None]
     y = true[:-40] + noise * rng.standard_normal(len(measured))
-    instrument = Noise("instrument", None, LogStdPrior(0.0, 1.5))
-    made = mixed_problem(y, measured, families, [instrument], [(groups, 3)])
+    made = mixed_problem(y, measured, families, [instrument(len(y))])
     return made, fresh, true[-40:, None]
 
 
@@ -180,7 +178,7 @@ def test_a_family_that_others_span_has_no_evidence_of_its_own() -> None:
     p = problem(rng, scatter=False)
     jacobian = np.hstack([p.x, p.x[:, :2]])
     families = Families(np.arange(2), (family("a", 2, 9), family("same as frames", 11, 2)))
-    again = mixed_problem(p.y, jacobian, families, p.noise, p.shape)
+    again = mixed_problem(p.y, jacobian, families, p.noise)
     assert evidence(again, 1, rng) == evidence(again, 1, rng)
     assert (evidence(again, 1, rng).ratio, evidence(again, 1, rng).rank) == (0.0, 0)
 
@@ -204,7 +202,7 @@ def test_coordinates_are_averaged_over_the_posterior() -> None:
         rng.standard_normal(9),
         jacobian,
         families,
-        [Noise("instrument", None, LogStdPrior(0.0, 1.0))],
+        [instrument(9, 1.0)],
     )
     grid = np.linspace(-5.0, 5.0, 41)
     all_of_them = [equations(p, np.array([s, eta])) for s in grid for eta in grid]
@@ -229,3 +227,20 @@ def test_standard_deviations_are_drawn_from_their_posterior() -> None:
     std = np.sqrt(np.diag(found.covariance))
     assert np.all(np.abs(off) < 0.5 * std)
     np.testing.assert_allclose(np.std(walked, axis=0), std, rtol=0.35)
+
+
+def test_rows_are_turned_so_that_blocks_of_noise_are_diagonal() -> None:
+    rng = np.random.default_rng(11)
+    half = rng.standard_normal((4, 5, 2))  # of a rank below that of the rows
+    half[1, 3:] = half[2, :1] = 0.0
+    seen = np.ones((4, 5), dtype=np.bool_)
+    seen[1, 3:] = seen[2, :1] = False
+    covariance = half @ np.swapaxes(half, 1, 2)
+    u, variance = independent_rows(covariance, seen)
+    turned = np.swapaxes(u, 1, 2) @ covariance @ u
+    expected = np.einsum("gs,st->gst", np.where(variance < -0.5, 0.0, variance), np.eye(5))
+    np.testing.assert_allclose(turned, expected, atol=1e-12)
+    for g in range(4):  # a row that is not seen is none of a sum of others
+        apart = np.abs(u[g][:, variance[g] < -0.5])
+        np.testing.assert_allclose(np.sort(apart.max(axis=0, initial=0.0)), 1.0)
+        assert apart[seen[g]].max(initial=0.0) < 1e-12
