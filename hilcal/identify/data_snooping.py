@@ -46,6 +46,8 @@ ROUGH_M = 1e-3
 choice: more than any arm leaves beside its geometry."""
 ROUNDS = 20
 """Most rounds in which readings join and leave; a choice."""
+WHITENED = 4096
+"""Readings that are whitened at a time."""
 EXACT = 1e-6
 """Share of a group's mean covariance that each of its readings has at least; a choice: an unloaded
 reading that is stated to be exact is so all the same."""
@@ -242,12 +244,16 @@ class _Linearised:
         """Return the linear model with smooth nuisance columns of some variance above the noise."""
         of, readings = self.of, self.of.readings
         rank = readings.m * int(np.count_nonzero(self.linear.tested))
-        raw = smooth_nuisance_columns(of.model, self.prediction, readings, rank)
-        columns = self.linear.root @ raw
-        length = np.sqrt(np.mean(columns**2, axis=(0, 1)))
+        columns = smooth_nuisance_columns(of.model, self.prediction, readings, rank)
+        for k in range(0, len(columns), WHITENED):  # in place: they are the largest array of a fit
+            rows = slice(k, k + WHITENED)
+            columns[rows] = self.linear.root[rows] @ columns[rows]
+        count = max(columns.shape[0] * columns.shape[1], 1)
+        length = np.sqrt(np.einsum("nip,nip->p", columns, columns) / count)
         kept = length > 1e-9 * length.max(initial=0.0)
         size = np.sqrt(max(misfit - 1.0, 0.0) / max(int(np.count_nonzero(kept)), 1))
-        return self.linear.with_columns(columns[:, :, kept] * (size / length[kept]))
+        columns *= np.where(kept, size / np.where(kept, length, 1.0), 0.0)
+        return self.linear.with_columns(columns if kept.all() else columns[:, :, kept])
 
 
 def _linearised(of: Snooping, y: Floats) -> _Linearised:

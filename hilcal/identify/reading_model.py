@@ -20,6 +20,8 @@ from hilcal.types import Bools, Floats, Ints
 SINGULAR = 1e-9
 """Ridge, as a share of a column's square in all readings: few readings determine few columns, and
 some columns none; a choice between rounding and what readings tell."""
+AT_A_TIME = 4096
+"""Readings whose covariance is formed at a time."""
 LEVERAGE = 1e-6
 """Share of a reading's information that the others must leave for a test; a choice."""
 
@@ -115,7 +117,10 @@ class ReadingModel:
         and r_kᵀ (I + H_k)⁻ r_k of another one; χ²_m of a good reading, whatever its leverage.
         """
         _, covariance, r, b = self._fitted(used)
-        spread = (b @ covariance) @ b.swapaxes(1, 2)
+        spread = np.empty((len(b), self.m, self.m))
+        for k in range(0, len(b), AT_A_TIME):
+            some = b[k : k + AT_A_TIME]
+            spread[k : k + AT_A_TIME] = (some @ covariance) @ some.swapaxes(1, 2)
         if len(self.members):
             own = self.group >= 0
             root, offset = self.root[own], self._offset_covariance(used)[self.group[own]]
@@ -154,7 +159,8 @@ class ReadingModel:
         if len(self.members):
             both = self._both - self._offsets(used)
             r, b = both[:, :, -1], both[:, :, :-1]
-        rows = b[used].reshape(self.m * np.count_nonzero(used), b.shape[2])
+        some = b if used.all() else b[used]
+        rows = some.reshape(self.m * len(some), b.shape[2])
         h = rows.T @ rows
         h[np.diag_indices_from(h)] += self.precision + self._guard
         covariance = np.asarray(np.linalg.inv(h), dtype=float)
