@@ -12,7 +12,7 @@ import numpy as np
 
 from hilcal.diagnose.effect_ranking import Detection, LeftOut, Suspect
 from hilcal.diagnose.minimum_detectable_effect import Strength
-from hilcal.identify.fit import Fit
+from hilcal.identify.fit import Fit, all_left_out
 from hilcal.identify.linearisation import HeldOut
 from hilcal.identify.mixed_fit import linearised_problem, mixed_fit_at, with_all_effects
 from hilcal.mixed.equations import Equations
@@ -26,8 +26,9 @@ choice: that something is there has been shown by poses left out."""
 WORTH = 0.05
 """Share by which the rms error on poses left out must fall for a background; a choice: it has
 hundreds of parameters, and those that name an effect alone are easier to understand."""
-TOGETHER = 0.001
-"""Chance of trying a background where nothing but misjudged noise is there; a choice."""
+TOGETHER = 0.05
+"""Chance of trying a background where nothing but noise of another size, or the arm's scatter, is
+there; a choice: the error on poses left out has to fall, too."""
 LIKELY = 0.1
 """p-value below which an effect of the background is named as one that may be there; a choice."""
 SEED = 0
@@ -84,16 +85,22 @@ def together(of: Fit) -> float:
 def is_better(before: Fit, after: Fit) -> bool:
     """Whether a background belongs to the model.
 
-    The error on poses left out must fall by `WORTH`, and all its effects be of plausible size
-    (`Effect.most`): effects that would have to be larger stand in for one that the catalogue lacks.
+    The error on poses left out must fall by `WORTH`, both weighted by the noise of the latter, and
+    all effects that were not named before be of plausible size (`Effect.most`): those that would
+    have to be larger stand in for one that the catalogue lacks.
 
     Args:
         before: the fit of the named effects alone.
         after: the fit of all, each with its standard deviation.
     """
-    random = (e for e in after.model.effects if e.name in after.model.random)
-    plausible = all(np.all(after.model.random[e.name] <= e.most() * e.magnitudes) for e in random)
-    return plausible and after.holdout.rms_sigma <= (1 - WORTH) * before.holdout.rms_sigma
+    random, known = after.model.random, before.model.named
+    new = (e for e in after.model.effects if e.name in random and e.name not in known)
+    plausible = all(np.all(random[e.name] <= e.most() * e.magnitudes) for e in new)
+    if not plausible:
+        return False
+    raw, w = all_left_out(after)
+    one, other = (float(np.sum(w.whiten(r) ** 2)) for r in (all_left_out(before)[0], raw))
+    return other <= (1 - WORTH) ** 2 * one
 
 
 def background_evidence(fit: Fit) -> tuple[BackgroundEffect, ...]:
