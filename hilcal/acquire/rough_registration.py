@@ -9,6 +9,8 @@ from hilcal.robot.chain import drive_jacobian
 from hilcal.types import Bools, Floats
 
 ENOUGH = 4
+WITNESSES = 2
+"""Readings that agree, from which on another one is judged by its distances from them."""
 SPREAD_M = 0.05
 """Second extent of a cloud of positions that fixes a rotation, m."""
 PLAUSIBLE_M = 0.1
@@ -78,16 +80,20 @@ class RoughRegistration:
         stuck = self._stuck(self._positions(q)[target], position, target)
         if stuck is not None:
             return stuck
-        places = self.expected(q)
-        if places is None or not self._cell.known_targets[target]:
+        if not self._cell.known_targets[target]:
             return None
-        off = float(np.linalg.norm(position - places[target]))
+        places = self.expected(q)
+        if places is None:
+            off = self._apart(self._positions(q)[target], position)
+        else:
+            off = float(np.linalg.norm(position - places[target]))
         if off <= PLAUSIBLE_M:
             return None
+        least = " or more" if places is None else ""
         return (
-            f"tracker: it sees its target {off:.3g} m from where the arm holds it; does it follow "
-            "another reflector, or has it been moved? Have it see the target; where it has been "
-            "moved, go on in a new campaign"
+            f"tracker: it sees its target {off:.3g} m{least} from where the arm holds it; does it "
+            "follow another reflector, or has it been moved? Have it see the target; where it has "
+            "been moved, go on in a new campaign"
         )
 
     def _stuck(self, held: Floats, position: Floats, target: int) -> str | None:
@@ -110,6 +116,18 @@ class RoughRegistration:
             f"{1e3 * moved:.3g} mm: it repeats an old reading, or follows a reflector that is not "
             "on the arm. Have it see the target"
         )
+
+    def _apart(self, held: Floats, position: Floats) -> float:
+        """By how much a distance from the readings that agree is not that of the arm, m.
+
+        Zero where fewer than two agree: it is not known then which reading is of the target.
+        """
+        agree = self._agreeing()
+        if agree.sum() < WITNESSES:
+            return 0.0
+        seen = np.linalg.norm(np.array(self._seen)[agree] - position, axis=1)
+        moved = np.linalg.norm(np.array(self._held)[agree] - held, axis=1)
+        return float(np.abs(seen - moved).max())
 
     def _agreeing(self) -> Bools:
         """Return which readings (K,) are of the target: the most that agree with one of them.

@@ -206,13 +206,15 @@ class Session:
         self._watched(self._tare)
 
     def _check_tracker(self, seen: list[tuple[Floats, Floats]]) -> None:
-        """Refuse a tracker whose target did not move with the arm."""
+        """Refuse a tracker whose target did not move with the arm; readings are held to these."""
         registration = RoughRegistration(self._cell)
         for q, position in seen:
             wrong = registration.implausible(q, position)
             if wrong is not None:
                 raise DeviceError(wrong)
             registration.add(q, position)
+        for q, position in seen:
+            self._state.registration.add(q, position)
 
     def _move(self, stop: Stop) -> None:
         if not self._mover.is_at(stop.q):

@@ -1,15 +1,20 @@
 """A campaign under a fault at any call of any device: each reading exactly once, arm stopped."""
 
 from collections import Counter
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
+from hilcal.acquire.rough_registration import RoughRegistration
 from hilcal.acquire.run import HOW_ON, run
+from hilcal.cell import Cell
 from hilcal.config import Limits
 from hilcal.data.plan import Plan
 from hilcal.errors import DeviceError, InputError
+from hilcal.robot import chain as chains
+from hilcal.robot.catalogue import configs_dir
 from tests.support.fake_bench import Bench, plan_of
 from tests.support.fake_world import Killed
 
@@ -202,3 +207,26 @@ def test_nothing_is_stopped_before_the_arm_is_ours() -> None:
         measure(b, small_plan())
     assert "arm.take_control" not in b.world.calls
     assert "arm.stop" not in b.world.calls
+
+
+def test_another_reflector_is_noticed_before_the_registration_is_known() -> None:
+    """By distances from two readings that agree; one alone may be the one that is wrong."""
+    cell = Cell.load(configs_dir() / "cells" / "demo_ur10e.toml")
+    cell = replace(cell, registration_known=False, target_known=True)
+    rng = np.random.default_rng(0)
+    noticed = 0
+    for _ in range(40):
+        known = RoughRegistration(cell)
+        joints = np.array([0.0, -1.2, 1.4, -1.7, -1.5, 0.0]) + rng.uniform(-0.5, 0.5, (3, 6))
+        chain = chains.evaluate(cell.arm, joints)
+        places = chain.point(cell.target[:3, 3]) @ cell.registration[:3, :3].T
+        known.add(joints[0], places[0])
+        stray = places[1] + 0.3 * rng.standard_normal(3)
+        assert known.implausible(joints[1], stray) is None  # a run must not end by that
+        known.add(joints[1], places[1])
+        assert known.implausible(joints[2], places[2]) is None
+        stray = places[2] + 0.3 * rng.standard_normal(3)
+        told = known.implausible(joints[2], stray)
+        noticed += told is not None
+        assert told is None or "does it follow another reflector" in told
+    assert noticed > 25
