@@ -57,7 +57,7 @@ def import_readings(
     notes = tuple(note + where * (note == FROM_TRACKER) for note in result.notes)
     stated = FROM_TRACKER not in result.notes
     covers = WHOLE if stated and config.repeatability.in_tables else result.covers
-    return ImportResult(result.readings, notes, covers)
+    return ImportResult(result.readings, notes, covers, stated or tracker.states_noise)
 
 
 def _mapping(form: str | Path) -> Mapping | None:

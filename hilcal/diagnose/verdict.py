@@ -173,14 +173,16 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
             reason = "inseparable_suspects" if rivals else "one_suspect"
         follows = _carrying(regression)
     else:
-        regression = e.regression if e.misfit else ResidualRegression(0.0, ())
+        # A noise that was estimated with something missing is too large to show it.
+        hidden = not e.fit.readings.noise_stated and e.regression.sure
+        regression = e.regression if e.misfit or hidden else ResidualRegression(0.0, ())
         significant = _significant(e.misfit_breakdown)
         follows = _carrying(regression) or tuple(v.variable for v in significant)
         sizes = [
             *(v.share for v in significant),
             *(s.holdout_share for s in suspects if s.explains),
         ]
-        predicted = max([regression.share, *sizes]) if e.misfit else 0.0
+        predicted = max([regression.share, *sizes]) if e.misfit or hidden else 0.0
         # What an implausible size would explain is no noise either.
         patterns = [
             s.holdout_share
@@ -197,7 +199,9 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
         if found is not None and (by_arm or noise.misjudged):
             by = follows[:MOST_NAMED]
             scatter = replace(found, predicted_share=predicted, predicted_by=by)
-        if by_arm:
+        if hidden and predicted > PREDICTABLE:
+            reason = "no_suspect"
+        elif by_arm:
             reason = "arm_scatter"
         elif noise.misjudged and not (in_fit and noise.reason == "too_large"):
             reason = "misjudged_noise"

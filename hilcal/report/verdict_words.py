@@ -217,7 +217,8 @@ def _misjudged(d: Diagnosis) -> str:
 
 
 def _spread(d: Diagnosis) -> str:
-    return f"{d.fit.variance_factor**0.5:.2g} times the stated noise"
+    noise = "stated" if d.fit.readings.noise_stated else "estimated"
+    return f"{d.fit.variance_factor**0.5:.2g} times the {noise} noise"
 
 
 def _repeats_scatter_less(noise: NoiseVerdict | None, repeats: PureError | None) -> str:
