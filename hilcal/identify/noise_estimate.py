@@ -23,6 +23,7 @@ from hilcal.config import CellConfig
 from hilcal.data.covariance import INSTRUMENT, WHOLE
 from hilcal.data.imported import ImportResult
 from hilcal.data.readings import Readings
+from hilcal.data.table import FROM_TRACKER
 from hilcal.data.whitening import usual_mode
 from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.errors import HilcalError
@@ -130,7 +131,9 @@ def with_estimated_noise(
     if not together:
         factors.pop(SCATTER, None)
     whole = _with(readings, station, model, factors)
-    return replace(found, readings=whole, covers=WHOLE if together else INSTRUMENT), estimate
+    covers = WHOLE if together else INSTRUMENT
+    notes = tuple(n for n in found.notes if not n.startswith(FROM_TRACKER))
+    return replace(found, readings=whole, covers=covers, notes=notes), estimate
 
 
 def _some(readings: Readings) -> Readings:
