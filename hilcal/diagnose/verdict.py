@@ -118,10 +118,33 @@ def with_one_named(
 
 def judge(e: Evidence, history: History) -> Diagnosis:
     """Combine the evidence of a fit with what is known of the way to its model."""
+    if e.wrong_figures:
+        return _misdescribed(e, history)
     found = _with_arrivals(e, history)
     if e.fit.disagreement is not None and not any(s.passes for s in found.suspects):
         return replace(found, reason="readings_disagree")
     return found
+
+
+def _misdescribed(e: Evidence, history: History) -> Diagnosis:
+    """Judge a fit that a figure of the cell explains: no effect is looked for before that."""
+    return Diagnosis(
+        fit=e.fit,
+        history=history,
+        reason="wrong_figure",
+        suspects=(),
+        misfit_breakdown=e.misfit_breakdown,
+        predictable_share=0.0,
+        dependences=(),
+        follows=(),
+        pure_error=e.pure_error,
+        noise=None,
+        redundant=(),
+        separability=(),
+        insufficiency=None,
+        alternatives=(),
+        wrong_figures=e.wrong_figures,
+    )
 
 
 def _with_arrivals(e: Evidence, history: History) -> Diagnosis:
