@@ -2,6 +2,8 @@
 
 The rules, in this order:
 
+0. A figure of the cell that was entered otherwise explains the misfit (see `wrong_figures`):
+   `misdescribed`; nothing else is looked for.
 1. A suspect passes all tests (see `effect_ranking.Suspect.passes`), and all effects of the
    catalogue together leave more than noise (see `catalogue_sufficiency`): `unknown_effect`.
 2. A suspect passes, and the readings separate it from every other: `missing_effect`; else
@@ -26,6 +28,10 @@ The rules, in this order:
       and the verdict stays.
 6. Otherwise the stated noise is too small, or too large: `noise_misjudged` (see `noise_verdict`).
    This holds where the arm's repeatability is stated, too: the noise is then complete, and wrong.
+
+A noise that was estimated from the readings (`Readings.noise_stated`) is too large where something
+is missing that the catalogue does not have, so that χ² does not show it: 4 holds as well where laws
+surely predict the residual on poses left out.
 
 Of several targets that are read in one arrival, where the arm's scatter is not stated and χ² is too
 large, the rules hold for the fit with the estimated scatter in its covariance (see

@@ -192,8 +192,8 @@ def _first(of: Fit, figure: _Figure) -> tuple[Floats, float]:
     prediction = of.model.predict(of.readings.states, of.theta)
     whole = replace(of, outlier=np.zeros_like(of.outlier), raw=raw, whitening=w)
     x, r = figure.columns(whole, prediction)[:, 0], w.whiten(raw).reshape(-1)
-    step = float(x @ r) / max(float(x @ x), 1e-300)
-    return np.array([step]), step * float(x @ r) / max(float(r @ r), 1e-300)
+    size = float(x @ r) / max(float(x @ x), 1e-300)
+    return np.array([size]), size * float(x @ r) / max(float(r @ r), 1e-300)
 
 
 def _step(of: Fit, figure: _Figure) -> tuple[Floats, float]:

@@ -170,7 +170,10 @@ def _factors(
         for f, s in zip(found.equations.problem.families.random, scale, strict=False):
             random[f.parameters] = s * f.magnitude
         of = replace(whole, random=_by_effect(whole, random))
-        now = ~fit(of, _with(readings, station, model, factors), mode, start=theta).outlier
+        noisy = _with(readings, station, model, factors)
+        if joint_std.any():
+            noisy = with_joint_scatter(model.cell, noisy, joint_std)
+        now = ~fit(of, noisy, mode, start=theta).outlier
         if np.array_equal(now, used):
             break
         used = now

@@ -80,7 +80,7 @@ def test_a_tool_elsewhere_than_stated_is_named() -> None:
     ],
 )
 def test_effects_are_no_wrong_figures(effect: str, mode: Mode) -> None:
-    """Of 63 campaigns with 19 effects of 3 and 6 σ, none was one, on the way to the model either."""
+    """Of 63 campaigns with 19 effects of 3 and 6 σ, none was one, nor on the way to the model."""
     c = campaign(effect, mode, 1, poses=16)
     d = judged(c.cell, c.readings, mode)
     assert d.suspects[0].effect == effect, message(d)
