@@ -155,16 +155,17 @@ def _factors(
     used = ~fit(model, readings, mode).outlier
     for _ in range(ROUNDS):
         kept = readings[used]
-        parts = [*_instrument(kept, station)]
+        instrument = [*_instrument(kept, station)]
         if joint_std.any():
             known = with_joint_scatter(model.cell, kept, joint_std)
             more = known.covariance - kept.covariance
-            parts.append(Part(STATED, more, LogStdPrior(0.0, KNOWN), known.common))
+            arm = Part(STATED, more, LogStdPrior(0.0, KNOWN), known.common)
         else:
-            parts.append(scatter_part(model, kept))
-        found, theta = variances_with_noise(whole, kept, mode, parts)
-        std = np.exp(found.log_std[-len(parts) :])
-        factors = {p.name: float(s) for p, s in zip(parts, std, strict=True)}
+            arm = scatter_part(model, kept)
+        found, theta = variances_with_noise(whole, kept, mode, instrument, arm)
+        std = np.exp(found.log_std[-len(instrument) - 1 :])
+        names = (*(p.name for p in instrument), arm.name)
+        factors = dict(zip(names, std.tolist(), strict=True))
         scale = np.exp(found.log_std)
         random = np.full(whole.size, np.inf)
         for f, s in zip(found.equations.problem.families.random, scale, strict=False):
