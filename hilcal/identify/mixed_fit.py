@@ -192,7 +192,7 @@ def linearised_problem(model: Model, readings: Readings, mode: Mode, theta: Floa
 def variances_with_noise(
     model: Model, readings: Readings, mode: Mode, instrument: Sequence[Part], arm: Part
 ) -> tuple[Variances, Floats]:
-    """Estimate the variances of effects, of parts of the instrument's noise and of the arm's scatter.
+    """Estimate the variances of effects, of parts of the instrument's noise and of the arm's.
 
     Args:
         model: with all effects that take part.
