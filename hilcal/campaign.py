@@ -30,6 +30,7 @@ from hilcal.identify.full_covariance import (
     campaign_readings,
     covariance_parts,
 )
+from hilcal.identify.noise_estimate import NOISE, NoiseEstimate
 from hilcal.identify.posterior import Posterior, Source
 from hilcal.identify.predictive import Predictive
 from hilcal.model import Model
@@ -95,6 +96,7 @@ class Campaign:
             check_robot(file.path, file.config_json, file.about(ROBOT_FILE))
             cell = cell_from_config(config, None, file.about(ROBOT_FILE))
             readings = campaign_readings(file, cell, config)
+            readings = replace(readings, noise_stated=file.about(NOISE) is None)
         except BaseException:
             file.close()
             raise
@@ -109,6 +111,11 @@ class Campaign:
     def covariance_parts(self) -> CovarianceParts:
         """What the covariance of its readings consists of."""
         return covariance_parts(self.file.about(COVERS), self.config)
+
+    @property
+    def noise(self) -> NoiseEstimate | None:
+        """The noise as it was estimated at import; None where the table or the cell states it."""
+        return NoiseEstimate.from_json(self.file.about(NOISE))
 
     @property
     def covers(self) -> str:

@@ -29,6 +29,7 @@ from hilcal.identify.arm_scatter import with_prior_scatter
 from hilcal.identify.carried import CarriedPrior, carried_prior, check_prior
 from hilcal.identify.fit import Fit
 from hilcal.identify.full_covariance import full_readings
+from hilcal.identify.noise_estimate import with_estimated_noise
 from hilcal.identify.posterior import Posterior
 from hilcal.model import Model
 from hilcal.plan.checked_plan import CheckedPlan, checked
@@ -53,7 +54,8 @@ def read_table(path: str | Path, cell: Cell, mapping: str | Path | None = None) 
     Args:
         path: the table; without a mapping the exchange table, docs/reference/exchange-table.md.
         cell: the cell that it was measured in; its tracker gives the covariances where the table
-            has none, and its [repeatability] is added where the table's do not include it.
+            has none, the readings themselves where it states no noise, and its [repeatability] is
+            added where the table's do not include it.
         mapping: what `hilcal import --format` takes: the path of a mapping file
             (docs/how-to/import-a-table.md), or the name of a format.
 
@@ -61,8 +63,10 @@ def read_table(path: str | Path, cell: Cell, mapping: str | Path | None = None) 
         InputError: anything that cannot be right, with row and column.
     """
     form, config = "table" if mapping is None else mapping, cell.configured()
-    found = import_readings(Path(path), form, config, cell.arm)
-    return full_readings(found.readings, found.covers, cell, config)
+    imported = import_readings(Path(path), form, config, cell.arm)
+    found, noise = with_estimated_noise(imported, cell, config)
+    readings = full_readings(found.readings, found.covers, cell, config)
+    return replace(readings, noise_stated=noise is None)
 
 
 def fit_stream(

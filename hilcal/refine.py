@@ -278,6 +278,8 @@ class Path:
     def reconsider(self) -> bool:
         """Judge every addition anew; returns whether one was removed or exchanged."""
         last = self.steps[-1]
+        if last.diagnosis.wrong_figures:
+            return False
         if last.fit.model.background:  # what is named does not depend on what was added before
             return False
         added = [n for n in last.fit.model.named if n not in self._given]
@@ -310,7 +312,8 @@ class Path:
         """
         last = self.steps[-1]
         tried = self._background_tried or bool(last.fit.model.background)
-        if tried or not self._room or last.diagnosis.residual_is_noise:
+        d = last.diagnosis
+        if tried or not self._room or d.residual_is_noise or d.wrong_figures:
             return False
         self._background_tried = True
         if not allows_background(last.fit) or together(last.fit) > TOGETHER:

@@ -14,6 +14,7 @@ from hilcal.data.repair import repair as repaired
 from hilcal.data.revision import RevisionRecord
 from hilcal.errors import InputError
 from hilcal.identify.full_covariance import covariance_parts
+from hilcal.identify.noise_estimate import NOISE, NoiseEstimate
 from hilcal.names import quoted
 from hilcal.report import text
 from hilcal.report.covariance_words import covariance_words
@@ -26,7 +27,8 @@ def info(run: Run, as_json: Json = False) -> None:
     with CampaignFile.open(run, read_only=True) as file:
         found = overview(file)
         parts = covariance_parts(file.about(COVERS), found.config)
-    t.show(info_report(found, run.name, covariance_words(parts)))
+        noise = NoiseEstimate.from_json(file.about(NOISE))
+    t.show(info_report(found, run.name, covariance_words(parts, noise)))
     t.document(to_json(found, str(run), parts))
 
 

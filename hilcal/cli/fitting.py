@@ -129,7 +129,7 @@ def identify(
             number = o.store(kept, None, None)
     t.show(text.fit_report(kept))
     t.show(prior_lines(kept))
-    t.show(numbers.sentence(covariance_words(o.covariance_parts)))
+    t.show(numbers.sentence(covariance_words(o.covariance_parts, o.noise)))
     t.show(options_line(kept))
     other = other_arm_of(o.cell, o.readings)
     if other is not None:

@@ -45,6 +45,7 @@ from hilcal.refine import Step as RefinementStep
 from hilcal.refine import refine as refine_model
 from hilcal.report import numbers, text, text_refine
 from hilcal.report.build_story import Chapter
+from hilcal.report.covariance_words import covariance_words
 from hilcal.report.diagnosis_document import suspect_json, to_json
 from hilcal.report.progress import working
 from hilcal.report.text_discover import laws_json, refined_laws
@@ -280,6 +281,8 @@ def refine(
         t.show(text_refine.revisions_table([r.shown for r in rows]))
         t.show(text_refine.key())
         t.show(options_line(rows[-1].fit))
+        if o.noise is not None:
+            t.show(numbers.sentence(covariance_words(o.covariance_parts, o.noise)))
         t.show(text_refine.verdict_line(found.diagnosis))
         t.show([*fitted_lines(found.fit)])
         t.show(prior_lines(found.fit))

@@ -1,5 +1,6 @@
 """`import`: tables in."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,6 +20,7 @@ from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify import description_words, frames_document
 from hilcal.identify.full_covariance import covariance_parts
 from hilcal.identify.gate import examine
+from hilcal.identify.noise_estimate import NOISE, with_estimated_noise
 from hilcal.identify.other_arm import other_arm
 from hilcal.identify.registration import Registration, register
 from hilcal.report import text
@@ -77,8 +79,11 @@ def import_(
     with working(t.progress) as say:
         say(f"reading {table}")
         found = import_readings(table, kind, settings, cell.arm, second)
+        if not found.noise_stated:
+            say("estimating the noise, which nothing states")
+        found, noise = with_estimated_noise(found, cell, settings)
         readings, parts = found.readings, covariance_parts(found.covers, settings)
-        notes = (*found.notes, covariance_words(parts), *cell.arm.notes)
+        notes = (*found.notes, covariance_words(parts, noise), *cell.arm.notes)
         say(f"writing {output}")
         source = f"{table.name} ({Path(kind).name})"
         CampaignFile.create(
@@ -87,7 +92,7 @@ def import_(
             str(base_dir),
             source,
             overwrite=force,
-            more={COVERS: found.covers},
+            more={COVERS: found.covers, **({} if noise is None else {NOISE: noise.to_json()})},
             readings=readings,
         ).close()
     loads = [readings.load_names[k] for k in np.unique(readings.load)]
@@ -124,6 +129,7 @@ def import_(
             "loads": loads,
             "targets": targets,
             "covariance": parts,
+            "noise": None if noise is None else asdict(noise),
             "notes": list(notes),
             "description": None
             if wrong is None

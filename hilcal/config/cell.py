@@ -214,6 +214,11 @@ class Tracker(Section):
         8.7e-5, description=_std("of a target's orientation in rad, more than 0, e.g. 8.7e-5")
     )
 
+    @property
+    def states_noise(self) -> bool:
+        """Whether any figure of the noise is stated, and not a default."""
+        return any("_std_" in key for key in self.model_fields_set)
+
     @model_validator(mode="after")
     def _registration(self) -> "Tracker":
         given = [k for k in ("base_xyz_m", "base_rotvec_rad") if getattr(self, k) is not None]

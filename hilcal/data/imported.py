@@ -14,8 +14,11 @@ class ImportResult:
         readings: the readings that can be used.
         notes: one sentence per decision; left out rows are named as a spreadsheet counts them.
         covers: what the covariances cover, see `data.covariance`.
+        noise_stated: whether the table or [tracker] states the noise; where False, the covariances
+            are those of the instrument that [tracker] has by default.
     """
 
     readings: Readings
     notes: tuple[str, ...]
     covers: str = INSTRUMENT
+    noise_stated: bool = True

@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import numpy as np
+
 from hilcal import limits
 from hilcal.config import CellConfig
 from hilcal.data.covariance import WHOLE, tracker_noise
@@ -9,10 +11,13 @@ from hilcal.data.imported import ImportResult
 from hilcal.data.ipa_ur10 import read_ipa_ur10
 from hilcal.data.mapped import import_mapped
 from hilcal.data.mapping import Mapping, find_mapping, mapping_names
+from hilcal.data.readings import Readings
+from hilcal.data.stated_noise import rounding_variance
 from hilcal.data.table import FROM_TRACKER, import_table
 from hilcal.errors import InputError
 from hilcal.robot.arm import Arm
 from hilcal.toml import suggest
+from hilcal.types import Bools
 
 FORMATS = ("table", "ipa-ur10")
 """Formats that are read without a mapping."""
@@ -57,7 +62,10 @@ def import_readings(
     notes = tuple(note + where * (note == FROM_TRACKER) for note in result.notes)
     stated = FROM_TRACKER not in result.notes
     covers = WHOLE if stated and config.repeatability.in_tables else result.covers
-    return ImportResult(result.readings, notes, covers)
+    copied = _copies(result.readings)
+    notes += _told(result.readings, copied)
+    kept = result.readings[~copied]
+    return ImportResult(kept, notes, covers, stated or tracker.states_noise)
 
 
 def _mapping(form: str | Path) -> Mapping | None:
@@ -70,3 +78,40 @@ def _mapping(form: str | Path) -> Mapping | None:
             f"or the path of a mapping file (.toml)"
         )
     return find_mapping(form)
+
+
+def _copies(readings: Readings) -> Bools:
+    """(N,) rows that repeat an earlier one to the last digit: copies, not readings made again.
+
+    A measurement that is repeated scatters. Where positions are rounded to more than their noise,
+    or are those of another cycle, equal ones may be readings, and stay; so do rows whose pose has
+    others that are none.
+    """
+    s, value = readings.states, readings.value
+    rounding = np.sqrt(12.0 * rounding_variance(value[:, :3], 1.0))
+    noise = np.sqrt(np.median(readings.covariance[:, range(3), range(3)], axis=0))
+    none = np.zeros(len(readings), dtype=bool)
+    if s.time is None and np.any(rounding > noise):
+        return none
+    given = [s.time, s.load_time, s.air_temperature]
+    columns = [s.q, s.wrench, value, *(x[:, None] for x in given if x is not None)]
+    names = np.stack([readings.load, readings.cycle, readings.target], axis=1)
+    keys = np.concatenate([*columns, names], axis=1)
+    _, first, of = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    copied = first[of.reshape(-1)] != np.arange(len(readings))
+    same = readings.pose == readings.pose[first[of.reshape(-1)]]
+    whole = ~np.isin(readings.pose, readings.pose[~copied])
+    return np.asarray(copied & (same | whole))
+
+
+def _told(readings: Readings, copied: Bools) -> tuple[str, ...]:
+    """Say how many rows are copies, and name the first."""
+    if not copied.any():
+        return ()
+    k = int(np.argmax(copied))
+    name = f"{readings.pose_names[readings.pose[k]]}/{readings.load_names[readings.load[k]]}"
+    return (
+        f"{int(copied.sum())} of {len(copied)} rows are copies of others to the last digit (the "
+        f"first is of {name}): each is counted once, since a reading that is made again scatters; "
+        "take them out of the table",
+    )

@@ -75,6 +75,8 @@ class Readings:
             is part of `covariance`. None where no such error is known.
         scatter_stated: whether the arm's own scatter is in the covariances, as far as it is known;
             where False, `hilcal.diagnose` may find what is left to be that scatter.
+        noise_stated: whether somebody states the noise; where False, it was estimated from these
+            readings, so that χ² says nothing of what is missing.
         stated: (N, m, m) the covariance without a scatter that was estimated; None where
             `covariance` has none.
         arm_scatter: the estimate that `covariance` includes beside `stated`.
@@ -94,6 +96,7 @@ class Readings:
     target_names: tuple[str, ...] = ()
     common: Floats | None = None
     scatter_stated: bool = True
+    noise_stated: bool = True
     stated: Floats | None = None
     arm_scatter: ArmScatter | None = None
     serial: SerialNoise | None = None

@@ -18,9 +18,17 @@ from hilcal.diagnose.pose_alone import PoseAlone
 from hilcal.diagnose.residual_regression import Dependence
 from hilcal.diagnose.separability import Separability
 from hilcal.diagnose.stepwise_alternatives import Alternative
+from hilcal.diagnose.wrong_figures import WrongFigure
 from hilcal.identify.fit import Fit
 
-Verdict = Literal["adequate", "missing_effect", "ambiguous", "unknown_effect", "noise_misjudged"]
+Verdict = Literal[
+    "adequate",
+    "missing_effect",
+    "ambiguous",
+    "unknown_effect",
+    "noise_misjudged",
+    "misdescribed",
+]
 Reason = Literal[
     "residual_is_noise",
     "one_suspect",
@@ -34,6 +42,7 @@ Reason = Literal[
     "readings_disagree",
     "serial_or_effect",
     "background",
+    "wrong_figure",
 ]
 VERDICTS: dict[Reason, Verdict] = {
     "residual_is_noise": "adequate",
@@ -48,6 +57,7 @@ VERDICTS: dict[Reason, Verdict] = {
     "readings_disagree": "unknown_effect",
     "serial_or_effect": "ambiguous",
     "background": "ambiguous",
+    "wrong_figure": "misdescribed",
 }
 """The verdict that each reason leads to."""
 
@@ -98,6 +108,8 @@ class Diagnosis:
         pose_alone: the misfit where it is the same under every load of a pose, nothing predicts it
             on poses left out, and more poses would tell what it is.
         background: the effects of the model's background, those with the smallest p-values first.
+        wrong_figures: figures of the cell that seem to be entered wrongly: any one of them explains
+            the misfit. No effect is a suspect then.
     """
 
     fit: Fit
@@ -117,6 +129,7 @@ class Diagnosis:
     scatter: ArmScatter | None = None
     pose_alone: PoseAlone | None = None
     background: tuple[BackgroundEffect, ...] = ()
+    wrong_figures: tuple[WrongFigure, ...] = ()
 
     @property
     def verdict(self) -> Verdict:

@@ -23,6 +23,7 @@ from hilcal.diagnose.pose_alone import PoseAlone, pose_alone
 from hilcal.diagnose.residual_regression import Regressions, ResidualRegression
 from hilcal.diagnose.stepwise import add
 from hilcal.diagnose.stepwise_alternatives import Alternative, StepwiseAlternatives
+from hilcal.diagnose.wrong_figures import WrongFigure, wrong_figures
 from hilcal.effects.protocol import Effect
 from hilcal.errors import InputError
 from hilcal.identify.arm_scatter import estimate_arm_scatter, with_arm_scatter
@@ -99,6 +100,13 @@ class Evidence:
         return rank_suspects(
             self.linearisation, self.effects, refit=self._refit, likely=self._lead_likely
         )
+
+    @once
+    def wrong_figures(self) -> tuple[WrongFigure, ...]:
+        """Figures of the cell that seem to be entered wrongly."""
+        if self.misfit or self.fit.outlier.any() or not self.fit.readings.noise_stated:
+            return wrong_figures(self.fit, self.suspects)
+        return ()
 
     @once
     def background(self) -> tuple[BackgroundEffect, ...]:

@@ -32,8 +32,9 @@ from hilcal.diagnose.recorded import (
 from hilcal.diagnose.tree_share import tree_share
 from hilcal.identify.fit import Fit
 from hilcal.identify.folds import random_folds
-from hilcal.identify.linearisation import Linearisation
+from hilcal.identify.linearisation import Linearisation, by_pose
 from hilcal.regression.block_selection import BlockSelection, block_evidence
+from hilcal.regression.paired_test import improves
 from hilcal.regression.schur import positive_solve
 from hilcal.threads import in_threads
 from hilcal.types import Bools, Floats, Ints
@@ -46,6 +47,9 @@ LEAST_EVIDENCE = 8.0
 """Gain in log evidence that a law needs, for the many that are tried; a guess."""
 STRENGTHS = np.logspace(-2, 3, 21)
 """Prior standard deviations that are tried: fewer than for effects, since laws are many."""
+SURE = 3.0
+"""Standard errors from pose to pose by which what laws predict must be certain; a choice: laws are
+sought in every campaign, and one in a thousand is then found by chance."""
 LITTLE = 0.1
 """Share that smooth laws predict below which trees are fitted as well; a guess."""
 AT_ONCE = 16
@@ -97,10 +101,13 @@ class ResidualRegression:
     Attributes:
         share: of the misfit, within [0, 1].
         dependences: variables that carry it, largest share first.
+        sure: whether smooth laws predict by more than the error scatters from pose to pose,
+            however large the noise is.
     """
 
     share: float
     dependences: tuple[Dependence, ...]
+    sure: bool = False
 
 
 class Regressions:
@@ -210,7 +217,7 @@ def smooth_laws(p: Linearisation) -> ResidualRegression:
     selection = BlockSelection(p.rows[some], ridge, laws.at(some), white[some], of_row[some])
     refits = _Refits(p, laws, of_row)
     rng = np.random.default_rng(20250302)
-    without = with_ = 0.0
+    before, left_out = np.zeros(len(white)), np.zeros(len(white))
     lost: dict[str, float] = {}
 
     def left(f: int) -> tuple[list[int], Floats, Floats, list[Floats]]:
@@ -224,8 +231,7 @@ def smooth_laws(p: Linearisation) -> ResidualRegression:
         base = white[mine] - p.rows[mine] @ step
         curves = list(zip(chosen, coefficients, strict=True))
         after = base - sum((laws.chosen(k)[mine] @ c for k, c in curves), 0.0)
-        without += float(bare @ bare)
-        with_ += float(after @ after)
+        before[mine], left_out[mine] = bare, after
         names = [laws.variables[laws.variable[k]].names for k in chosen]
         for name in dict.fromkeys(n for of_law in names for n in of_law):
             for _ in range(SHUFFLES):
@@ -239,9 +245,11 @@ def smooth_laws(p: Linearisation) -> ResidualRegression:
                 more = float(other @ other) - float(after @ after)
                 lost[name] = lost.get(name, 0.0) + more / SHUFFLES
     rank = w.rank
+    without, with_ = float(before @ before), float(left_out @ left_out)
     misfit = max(without - rank, 3 * np.sqrt(2 * rank))
     share = float(np.clip((without - with_) / misfit, 0.0, 1.0))
-    return ResidualRegression(share, _dependences(p, laws, lost, share))
+    sure = improves(by_pose(p.fit, before), by_pose(p.fit, left_out), SURE)
+    return ResidualRegression(share, _dependences(p, laws, lost, share), sure)
 
 
 def _thinned(count: int, m: int) -> Bools:

@@ -2,6 +2,8 @@
 
 The rules, in this order:
 
+0. A figure of the cell that was entered otherwise explains the misfit (see `wrong_figures`):
+   `misdescribed`; nothing else is looked for.
 1. A suspect passes all tests (see `effect_ranking.Suspect.passes`), and all effects of the
    catalogue together leave more than noise (see `catalogue_sufficiency`): `unknown_effect`.
 2. A suspect passes, and the readings separate it from every other: `missing_effect`; else
@@ -26,6 +28,10 @@ The rules, in this order:
       and the verdict stays.
 6. Otherwise the stated noise is too small, or too large: `noise_misjudged` (see `noise_verdict`).
    This holds where the arm's repeatability is stated, too: the noise is then complete, and wrong.
+
+A noise that was estimated from the readings (`Readings.noise_stated`) is too large where something
+is missing that the catalogue does not have, so that χ² does not show it: 4 holds as well where laws
+surely predict the residual on poses left out.
 
 Of several targets that are read in one arrival, where the arm's scatter is not stated and χ² is too
 large, the rules hold for the fit with the estimated scatter in its covariance (see
@@ -118,10 +124,33 @@ def with_one_named(
 
 def judge(e: Evidence, history: History) -> Diagnosis:
     """Combine the evidence of a fit with what is known of the way to its model."""
+    if e.wrong_figures:
+        return _misdescribed(e, history)
     found = _with_arrivals(e, history)
     if e.fit.disagreement is not None and not any(s.passes for s in found.suspects):
         return replace(found, reason="readings_disagree")
     return found
+
+
+def _misdescribed(e: Evidence, history: History) -> Diagnosis:
+    """Judge a fit that a figure of the cell explains: no effect is looked for before that."""
+    return Diagnosis(
+        fit=e.fit,
+        history=history,
+        reason="wrong_figure",
+        suspects=(),
+        misfit_breakdown=e.misfit_breakdown,
+        predictable_share=0.0,
+        dependences=(),
+        follows=(),
+        pure_error=e.pure_error,
+        noise=None,
+        redundant=(),
+        separability=(),
+        insufficiency=None,
+        alternatives=(),
+        wrong_figures=e.wrong_figures,
+    )
 
 
 def _with_arrivals(e: Evidence, history: History) -> Diagnosis:
@@ -173,14 +202,16 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
             reason = "inseparable_suspects" if rivals else "one_suspect"
         follows = _carrying(regression)
     else:
-        regression = e.regression if e.misfit else ResidualRegression(0.0, ())
+        # A noise that was estimated with something missing is too large to show it.
+        hidden = not e.fit.readings.noise_stated and e.regression.sure
+        regression = e.regression if e.misfit or hidden else ResidualRegression(0.0, ())
         significant = _significant(e.misfit_breakdown)
         follows = _carrying(regression) or tuple(v.variable for v in significant)
         sizes = [
             *(v.share for v in significant),
             *(s.holdout_share for s in suspects if s.explains),
         ]
-        predicted = max([regression.share, *sizes]) if e.misfit else 0.0
+        predicted = max([regression.share, *sizes]) if e.misfit or hidden else 0.0
         # What an implausible size would explain is no noise either.
         patterns = [
             s.holdout_share
@@ -197,7 +228,9 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
         if found is not None and (by_arm or noise.misjudged):
             by = follows[:MOST_NAMED]
             scatter = replace(found, predicted_share=predicted, predicted_by=by)
-        if by_arm:
+        if hidden and predicted > PREDICTABLE:
+            reason = "no_suspect"
+        elif by_arm:
             reason = "arm_scatter"
         elif noise.misjudged and not (in_fit and noise.reason == "too_large"):
             reason = "misjudged_noise"

@@ -5,6 +5,7 @@ A `Change` maps arm and readings to what they are under it; changes are applied 
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Literal
 
 import numpy as np
@@ -13,7 +14,7 @@ from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm, robot_names
 from hilcal.robot.conventions import may_follow, with_conventions
-from hilcal.types import Floats
+from hilcal.types import Bools, Floats
 
 Kind = Literal[
     "joint",
@@ -31,7 +32,11 @@ Kind = Literal[
     "arm",
     "base_unknown",
     "target_unknown",
+    "shift",
+    "columns",
 ]
+SHIFTS = (1, -1, 2, -2)
+"""Rows by which joints and positions are tried against each other."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,6 +50,7 @@ class Described:
         turn: (N, 3) rotation vectors of the attitudes, rad, or None.
         base_unknown: whether the base is estimated.
         target_unknown: whether the targets are.
+        shift: by how many rows the joint values come after the positions that they belong to.
     """
 
     arm: Arm
@@ -53,6 +59,13 @@ class Described:
     turn: Floats | None
     base_unknown: bool
     target_unknown: bool
+    shift: int = 0
+
+    @property
+    def paired(self) -> Bools:
+        """(N,) rows that have joint values and a position under the shift."""
+        k = np.arange(len(self.q)) + self.shift
+        return (k >= 0) & (k < len(self.q))
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +80,8 @@ class Change:
         follows: number of the joint that it follows, from 1; with `factor`.
         factor: of the coupling.
         arm: another arm of the catalogue.
+        shift: by how many rows the joint values come after their positions.
+        order: column, from 1, that holds the values of each joint.
     """
 
     kind: Kind
@@ -76,6 +91,8 @@ class Change:
     follows: int = 0
     factor: float = 0.0
     arm: str = ""
+    shift: int = 0
+    order: tuple[int, ...] = ()
 
     @property
     def is_zero(self) -> bool:
@@ -106,6 +123,10 @@ class Change:
             )
         if self.kind in ("millimetres", "metres"):
             return replace(d, value=d.value * (1e-3 if self.kind == "millimetres" else 1e3))
+        if self.kind == "shift":
+            return replace(d, q=np.roll(d.q, -self.shift, axis=0), shift=d.shift + self.shift)
+        if self.kind == "columns":
+            return replace(d, q=d.q[:, np.array(self.order) - 1])
         if self.kind == "base_unknown":
             return replace(d, base_unknown=True)
         if self.kind == "target_unknown":
@@ -158,6 +179,20 @@ def changes(d: Described) -> Iterator[Change]:
     for name in robot_names():
         if name != d.arm.name and load_arm(name).n == n:
             yield Change("arm", arm=name)
+    yield from (Change("shift", shift=k) for k in SHIFTS)
+    yield from (Change("columns", order=order) for order in column_orders(n))
+
+
+def column_orders(n: int) -> Iterator[tuple[int, ...]]:
+    """Yield orders of the joints' columns other than their own: two exchanged, or all in a turn."""
+    own = list(range(1, n + 1))
+    orders = []
+    for i, j in combinations(range(n), 2):
+        order = own.copy()
+        order[i], order[j] = order[j], order[i]
+        orders.append(tuple(order))
+    orders += [(*own[k:], *own[:k]) for k in range(1, n)]
+    yield from dict.fromkeys((*orders, tuple(own[::-1])))
 
 
 def pairs(n: int) -> Iterator[tuple[Change, ...]]:

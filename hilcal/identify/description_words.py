@@ -18,8 +18,8 @@ SIGN, OFFSET, COUPLING = Conventions.model_fields
 MOST_NAMED = 8
 """Rows, or explanations, that are named; a choice."""
 TRIED = (
-    "signs, zeros and couplings of the joints, units, mirrored axes, inverse poses, other arms, "
-    "alone and in combination"
+    "signs, zeros, couplings and columns of the joints, units, shifted rows, mirrored axes, "
+    "inverse poses, other arms, alone and in combination"
 )
 
 
@@ -70,6 +70,16 @@ def _said(c: Change) -> str:
     if c.kind == "coupling":
         way = "with" if c.factor > 0 else "against"
         return f"joint {c.joint} turns {way} joint {c.follows} (a coupling of {c.factor:+g})"
+    if c.kind == "shift":
+        rows = "row" if abs(c.shift) == 1 else "rows"
+        way = "before" if c.shift > 0 else "after"
+        return f"each position stands {abs(c.shift)} {rows} {way} the joint values it belongs to"
+    if c.kind == "columns":
+        moved = [(j, k) for j, k in enumerate(c.order, 1) if j != k]
+        if len(moved) == 2:
+            return f"the columns of joints {moved[0][0]} and {moved[1][0]} are exchanged"
+        told = ", ".join(f"joint {j}'s values are in the column of joint {k}" for j, k in moved)
+        return f"the columns of the joints are in another order: {told}"
     if c.kind == "arm":
         return f"the arm is another one, {c.arm}"
     return {

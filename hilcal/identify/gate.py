@@ -12,7 +12,7 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.data.readings import Readings
-from hilcal.identify.description import Change, Described, changes, pairs
+from hilcal.identify.description import Change, Described, Kind, changes, pairs
 from hilcal.identify.registration import Registration, angles
 from hilcal.identify.registration_starts import closed_forms, rotated
 from hilcal.identify.rigid_frames import (
@@ -54,6 +54,8 @@ ALIKE = 2.0
 """Changes that leave less than so many times the least misfit do equally well; a choice."""
 WRONG_ROWS = 0.2
 """Largest share of rows that may be wrong by themselves; a choice."""
+FIRST: tuple[Kind, ...] = ("shift", "columns")
+"""Changes that others are combined with where they help by themselves, for speed."""
 OFF_DEG = 0.2
 """Zero of a single joint, degrees, from which on it is worth a word; a choice."""
 
@@ -121,6 +123,9 @@ def examine(registered: Registration, readings: Readings) -> Finding | None:
     if far.any():
         others = _size(registered.off[~far])
         search = _Search(cell, readings, max(3.0 * noise, others))
+        shifted = search.shifted()
+        if shifted:
+            return Finding(rms, gate, shifted, np.zeros_like(far), (), search.tried)
         swapped = search.swapped(search.robust(()), np.flatnonzero(far))
         return Finding(rms if swapped else others, gate, (), far, swapped, 1)
     if rms <= min(LOOK * gate, max(GATE_EXTENT * extent, 5.0 * noise)):
@@ -129,6 +134,8 @@ def examine(registered: Registration, readings: Readings) -> Finding | None:
     search = _Search(cell, readings, max(3.0 * noise, min(0.25 * gate, close)))
     whole = search.robust(())
     bad = whole.far
+    if bad.any() and (shifted := search.shifted()):
+        return Finding(rms, gate, shifted, np.zeros_like(bad), (), search.tried)
     if bad.any() and bad.mean() <= WRONG_ROWS and whole.rms <= search.enough:
         return Finding(rms, gate, (), bad, search.swapped(whole, np.flatnonzero(bad)), 1)
     found = search.explain(gate, DEPTH if rms > gate else 1)
@@ -193,7 +200,8 @@ class _Search:
         beam: list[tuple[Change, ...]] = [()]
         tried: dict[tuple[Change, ...], float] = {}
         for depth in range(most):
-            ways = [(*begun, c) for begun in beam for c in singles if not _excluded(c, begun)]
+            others = [c for c in singles if depth == 0 or c.kind not in FIRST]
+            ways = [(*begun, c) for begun in beam for c in others if not _excluded(c, begun)]
             if depth == 1:
                 ways += pairs(self._cell.arm.n)
             rough = {w: self.score(w, True) for w in {tuple(sorted(w, key=_order)) for w in ways}}
@@ -208,6 +216,16 @@ class _Search:
             beam = sorted(now, key=lambda w: (now[w], _cost(w)))[: BEAM[min(depth, 1)]]
         way = min(tried, key=lambda w: tried[w])
         good = tried[way] <= min(gate, base / FACTOR)
+        return (Explanation(way, tried[way]),) if good else ()
+
+    def shifted(self) -> tuple[Explanation, ...]:
+        """Return the shift of rows that explains the readings, where one does.
+
+        Where a pose has many readings, only its last one is wrong, and looks like a gross error.
+        """
+        tried = {(c,): self.score((c,)) for c in changes(self._whole) if c.kind == "shift"}
+        way = min(tried, key=lambda w: tried[w])
+        good = tried[way] <= min(self.enough, self.score(()) / FACTOR)
         return (Explanation(way, tried[way]),) if good else ()
 
     def _enough(
@@ -311,9 +329,8 @@ class _Search:
 
     def _problem(self, way: tuple[Change, ...], rows: Ints) -> tuple[Seen, Frames, Free]:
         """Flange poses and readings of some rows under some changes."""
-        d = self._whole
-        for change in way:
-            d = change.applied(d)
+        d = self._described(way)
+        rows = rows[d.paired[rows]]
         chain = chains.evaluate(d.arm, d.q[rows])
         m = 3 if d.turn is None else 6
         root = np.diag(np.repeat([1.0, LEVER], 3)[:m])
@@ -334,6 +351,12 @@ class _Search:
         given = Frames(base, np.where(own, cell.all_targets, np.eye(4)))
         return seen, given, Free.of(d.base_unknown, ~known, axes)
 
+    def _described(self, way: tuple[Change, ...]) -> Described:
+        d = self._whole
+        for change in way:
+            d = change.applied(d)
+        return d
+
     def robust(self, way: tuple[Change, ...]) -> _Robust:
         """Registration by most of the rows: reweighted until the others do not matter."""
         seen, given, free = self._problem(way, np.arange(len(self._readings)))
@@ -349,7 +372,9 @@ class _Search:
         scale = max(float(np.median(distance)), self.enough / 10)
         far = distance > 8.0 * scale
         near = distance[~far]
-        return _Robust(float(np.sqrt(np.mean(near**2))), far, seen, at)
+        everywhere = np.zeros(len(self._readings), dtype=bool)
+        everywhere[self._described(way).paired] = far
+        return _Robust(float(np.sqrt(np.mean(near**2))), everywhere, seen, at)
 
     def within(self, gate: float, whole: _Robust) -> bool:
         """Whether most rows fit to within the gate, so that the others are to blame."""

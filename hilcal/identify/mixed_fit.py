@@ -5,6 +5,7 @@ variance of its own (see `hilcal.mixed`). The rows are linearised at the joint o
 parameters that the mixed model predicts, again until they stay.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -37,6 +38,8 @@ INSTRUMENT, SCATTER = "instrument", "arm's scatter"
 """Names of the components of the noise."""
 UNSEEN = -0.5
 """`independent_rows` gives a row that is not seen the variance -1."""
+LITTLE = 1e-3
+"""Share by which the arm's scatter turns rows that the instrument's parts leave alike."""
 NOISE_SPREAD = 1.5
 """Of the log of the noise: a factor of 4.5 either way; a choice."""
 FEW_ROWS = 300
@@ -44,6 +47,23 @@ FEW_ROWS = 300
 of the walk costs the cube of the rows. A choice."""
 WALK = 600
 """Steps of the walk; a choice: twice as many change errors by less than 1 %."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """A part of the noise of N readings.
+
+    Attributes:
+        name: of it.
+        covariance: (N, m, m) of a part of ordinary size.
+        prior: of the log of the standard deviation, in that size.
+        common: (N, m, n) F of what readings of one arrival have in common; see `Readings.common`.
+    """
+
+    name: str
+    covariance: Floats
+    prior: LogStdPrior
+    common: Floats | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,14 +127,14 @@ class MixedFit:
         return np.asarray(total)
 
 
-def with_all_effects(model: Model, states: States) -> Model:
+def with_all_effects(model: Model, states: States, harmonics: int = HARMONICS) -> Model:
     """Return a model with every effect of its catalogue that the states allow.
 
-    Waves that few poses cannot resolve are there all the same; `HARMONICS` of them are kept.
+    Waves that few poses cannot resolve are there all the same; `harmonics` of them are kept.
     """
     finer = tuple(
-        e.with_options(states, harmonics=HARMONICS)
-        if "harmonics" in e.options and len(getattr(e, "harmonics", ())) < HARMONICS
+        e.with_options(states, harmonics=harmonics)
+        if "harmonics" in e.options and len(getattr(e, "harmonics", ())) < harmonics
         else e
         for e in model.effects
     )
@@ -122,7 +142,7 @@ def with_all_effects(model: Model, states: States) -> Model:
     for kind in model.catalogue.effects:
         if kind.name in model.names or kind.role in FRAME_ROLES or not kind.computable(states):
             continue
-        fine = {"harmonics": HARMONICS} if "harmonics" in kind.option_help else {}
+        fine = {"harmonics": harmonics} if "harmonics" in kind.option_help else {}
         model = model + EffectSpec(kind.name, fine)
     return model
 
@@ -142,17 +162,8 @@ def mixed_fit(model: Model, readings: Readings, mode: Mode, rng: np.random.Gener
     """
     model = with_all_effects(model, readings.states)
     w = whitening(readings, mode, "gc")
-    theta, white = np.zeros(model.size), np.full(w.m * len(w), np.inf)
-    start: Floats | None = None
-    rounds = 0
-    while True:
-        problem, now = _linearised(model, readings, w, theta)
-        found = estimate_variances(problem, start)
-        theta = problem.parameters(found.equations.coordinates, model.size)
-        rounds, start = rounds + 1, found.log_std
-        if rounds == ROUNDS or np.sqrt(np.mean((now - white) ** 2)) < CONVERGED:
-            break
-        white = now
+    found, theta = _iterated(model, readings, w)
+    problem = found.equations.problem
     if len(problem.y) > FEW_ROWS:
         return MixedFit(model, readings, w, theta, found, coordinates_covariance(found))
     mean = average(found, rng, WALK)
@@ -178,14 +189,57 @@ def linearised_problem(model: Model, readings: Readings, mode: Mode, theta: Floa
     return _linearised(model, readings, w, theta)[0]
 
 
+def variances_with_noise(
+    model: Model, readings: Readings, mode: Mode, instrument: Sequence[Part], arm: Part
+) -> tuple[Variances, Floats]:
+    """Estimate the variances of effects, of parts of the instrument's noise and of the arm's.
+
+    Args:
+        model: with all effects that take part.
+        readings: without gross errors, with the covariance of the instrument.
+        mode: "deflection" or "absolute".
+        instrument: parts that add up to that covariance.
+        arm: its scatter.
+
+    Returns:
+        The variances, the components of the noise last, and the parameters (P,) predicted.
+    """
+    return _iterated(model, readings, whitening(readings, mode, "gc"), (*instrument, arm))
+
+
+def _iterated(
+    model: Model, readings: Readings, w: Whitening, parts: Sequence[Part] = ()
+) -> tuple[Variances, Floats]:
+    """Estimate the variances, linearised at the parameters (P,) that they predict; and those."""
+    theta, white = np.zeros(model.size), np.full(w.m * len(w), np.inf)
+    start: Floats | None = None
+    rounds = 0
+    while True:
+        problem, now = _linearised(model, readings, w, theta, parts)
+        found = estimate_variances(problem, start)
+        theta = problem.parameters(found.equations.coordinates, model.size)
+        rounds, start = rounds + 1, found.log_std
+        if rounds == ROUNDS or np.sqrt(np.mean((now - white) ** 2)) < CONVERGED:
+            return found, theta
+        white = now
+
+
 def _linearised(
-    model: Model, readings: Readings, w: Whitening, theta: Floats
+    model: Model,
+    readings: Readings,
+    w: Whitening,
+    theta: Floats,
+    parts: Sequence[Part] = (),
 ) -> tuple[MixedProblem, Floats]:
     """Return the linear problem at theta (P,), and the whitened residual (R,) there."""
     prediction = model.predict(readings.states, theta)
     now = w.whiten(residual(readings, prediction, w)).reshape(-1)
     jacobian = w.whiten_readings(model.jacobian(prediction, theta, w.m))
-    rows, noise = _noise(model, readings, w, np.column_stack([now + jacobian @ theta, jacobian]))
+    rows = np.column_stack([now + jacobian @ theta, jacobian])
+    if parts:
+        rows, noise = _noise_of(parts, readings, w, rows)
+    else:
+        rows, noise = _noise(model, readings, w, rows)
     return mixed_problem(rows[:, 0], rows[:, 1:], families_of(model), noise), now
 
 
@@ -215,6 +269,47 @@ def _noise(
         start = stop
     components = ((INSTRUMENT, instrument), (SCATTER, scatter))
     return turned, [Noise(name, np.concatenate(v), prior) for name, v in components]
+
+
+def _noise_of(
+    parts: Sequence[Part], readings: Readings, w: Whitening, rows: Floats
+) -> tuple[Floats, list[Noise]]:
+    """Whitened rows (R, ...), turned so that the parts of the noise are diagonal, and these.
+
+    The instrument's parts add up to what the rows are whitened by, so that they share their
+    eigenvectors; of the arm's, the last one, what is correlated between two of these parts is left
+    out.
+    """
+    blocks = [
+        covariance_blocks(
+            replace(readings, covariance=p.covariance, common=p.common, serial=None), w
+        )
+        for p in parts
+    ]
+    turned, start = np.empty_like(rows), 0
+    variances: list[list[Floats]] = [[] for _ in parts]
+    for k, b in enumerate(w.buckets):
+        *instrument, arm = (b.factor @ of[k] @ np.swapaxes(b.factor, 1, 2) for of in blocks)
+        size = max(float(np.abs(arm).max(initial=0.0)), 1e-300)
+        apart = sum((j * x for j, x in enumerate(instrument, 1)), LITTLE * arm / size)
+        u = np.linalg.eigh(apart)[1]
+        stop = start + u.shape[0] * u.shape[1]
+        block = rows[start:stop].reshape(*u.shape[:2], -1)
+        turned[start:stop] = (np.swapaxes(u, 1, 2) @ block).reshape(stop - start, -1)
+        for of_part, x in zip(variances, (*instrument, arm), strict=True):
+            of_part.append(np.einsum("gij,gik,gkj->gj", u, x, u).reshape(-1))
+        start = stop
+    return turned, [
+        Noise(p.name, np.maximum(np.concatenate(v), 0.0), p.prior)
+        for p, v in zip(parts, variances, strict=True)
+    ]
+
+
+def scatter_part(model: Model, readings: Readings) -> Part:
+    """Return the arm's scatter, of `SCATTER_RAD` in each joint, as a part of the noise."""
+    f = _scatter_factors(model, readings)
+    common = None if readings.states.target is None else f
+    return Part(SCATTER, f @ np.swapaxes(f, 1, 2), LogStdPrior(0.0, NOISE_SPREAD), common)
 
 
 def _scatter_factors(model: Model, readings: Readings) -> Floats:

@@ -1,6 +1,8 @@
 """What the covariance of a reading consists of, in words."""
 
 from hilcal.identify.full_covariance import CovarianceParts
+from hilcal.identify.noise_estimate import NoiseEstimate
+from hilcal.report import numbers
 
 WORDS: dict[CovarianceParts, str] = {
     "instrument": (
@@ -20,6 +22,25 @@ WORDS: dict[CovarianceParts, str] = {
 }
 
 
-def covariance_words(parts: CovarianceParts) -> str:
-    """Return a sentence without its full stop."""
+def covariance_words(parts: CovarianceParts, noise: NoiseEstimate | None = None) -> str:
+    """Return a sentence without its full stop.
+
+    Args:
+        parts: what the covariance consists of.
+        noise: the estimate of the noise, where nothing states it.
+    """
+    if noise is not None:
+        return _estimated(noise)
     return f"each covariance is that of {WORDS[parts]}"
+
+
+def _estimated(n: NoiseEstimate) -> str:
+    turn = "" if n.orientation_rad is None else f", orientations {1e6 * n.orientation_rad:.2g} µrad"
+    arm = ""
+    if n.joint_std_rad is not None:
+        arm = f"; each joint scatters by {1e6 * n.joint_std_rad:.2g} µrad from arrival to arrival"
+    return (
+        f"neither the table nor [tracker] states the noise; it was estimated from the readings, "
+        f"together with all effects: {numbers.length(n.along_m)} along the beam, "
+        f"{numbers.length(n.across_m)} across it at {n.distance_m:.2g} m{turn}{arm}"
+    )

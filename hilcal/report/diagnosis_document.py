@@ -48,6 +48,7 @@ def to_json(d: Diagnosis) -> dict[str, object]:
         "background": [
             {"effect": b.effect, "p_value": b.p_value, "rms_m": b.rms_m} for b in d.background
         ],
+        "wrong_figures": [asdict(f) for f in d.wrong_figures],
         "pose_alone": None if d.pose_alone is None else asdict(d.pose_alone),
         "rejected": list(d.history.rejected),
         "alternatives": [

@@ -21,6 +21,7 @@ VERDICTS: Mapping[str, str] = {
     "ambiguous": "ambiguous: these readings do not separate the suspects",
     "unknown_effect": "unknown effect: an effect is missing that the catalogue does not hold",
     "noise_misjudged": "the noise is not what was stated",
+    "misdescribed": "a figure was entered wrongly",
 }
 SUSPECTS = 6
 

@@ -8,8 +8,9 @@ from hilcal.diagnose.noise_verdict import NoiseVerdict
 from hilcal.diagnose.pose_alone import PoseAlone
 from hilcal.diagnose.separability import Separability
 from hilcal.diagnose.stepwise_alternatives import Alternative
+from hilcal.diagnose.wrong_figures import WrongFigure
 from hilcal.identify.disagreement_words import disagreement_words
-from hilcal.report.numbers import p_equals, sizes
+from hilcal.report.numbers import length, p_equals, sizes
 from hilcal.report.scatter_words import correlated, left_to_the_arm, no_repeatability
 
 MOST_LIKELY = 4
@@ -23,6 +24,8 @@ def message(d: Diagnosis) -> str:
 
 
 def _verdict(d: Diagnosis) -> str:
+    if d.wrong_figures:
+        return _wrong(d.wrong_figures)
     if d.reason == "one_suspect":
         return _missing(d.suspects[0])
     if d.reason == "inseparable_suspects":
@@ -51,6 +54,34 @@ def _verdict(d: Diagnosis) -> str:
         return adequate
     doubts = "; ".join(_alternative(a) for a in d.alternatives if a.inseparable)
     return f"{adequate}; but {doubts}: measure what separates them"
+
+
+def _wrong(found: tuple[WrongFigure, ...]) -> str:
+    """Say which figure is to be checked first; any one of several explains the misfit."""
+    told = "; or, as well: ".join(_figure(f) for f in found)
+    return f"{told}. Until that is settled no effect is looked for"
+
+
+def _figure(f: WrongFigure) -> str:
+    change = f"({length(f.rms_m)} → {length(f.rms_with_m)} rms with it)"
+    if f.kind == "tool_com":
+        there, here = (", ".join(f"{1e3 * x:.0f}" for x in at) for at in (f.found, f.stated))
+        return (
+            f"the tool's centre of mass seems to be at ({there}) mm, not ({here}) mm {change}: "
+            "measure it, correct [tool] com_m, and import or measure again"
+        )
+    found, stated = (f"{x[0]:.3g} {f.unit}" for x in (f.found, f.stated))
+    if f.kind == "tool_mass":
+        return (
+            f"the tool seems to weigh {found}, not {stated} {change}: weigh it, correct [tool] "
+            "mass_kg, and import or measure again"
+        )
+    does, check = ("weigh", "weigh it") if f.unit == "kg" else ("pull with", "measure its force")
+    return (
+        f"load '{f.load}' seems to {does} {found}, not {stated} {change}: {check}, correct it "
+        "where it was entered ([[loads]] of CELL.toml, or the table's wrench), and import or "
+        "measure again"
+    )
 
 
 def _background(d: Diagnosis) -> str:
@@ -217,7 +248,8 @@ def _misjudged(d: Diagnosis) -> str:
 
 
 def _spread(d: Diagnosis) -> str:
-    return f"{d.fit.variance_factor**0.5:.2g} times the stated noise"
+    noise = "stated" if d.fit.readings.noise_stated else "estimated"
+    return f"{d.fit.variance_factor**0.5:.2g} times the {noise} noise"
 
 
 def _repeats_scatter_less(noise: NoiseVerdict | None, repeats: PureError | None) -> str:

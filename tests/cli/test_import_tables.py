@@ -197,6 +197,18 @@ def test_a_good_table(tmp_path: Path, capsys: Capsys) -> None:
     np.testing.assert_allclose(x.covariance[0], (2e-5) ** 2 * np.eye(3), rtol=1e-9, atol=1e-18)
 
 
+def test_copied_rows_are_said_and_counted_once(tmp_path: Path, capsys: Capsys) -> None:
+    """A block that was pasted twice, once under other names; a reading made again scatters."""
+    _, *rows = GOOD.splitlines()
+    pasted = [*rows[:3], *(row.replace("P", "Q", 1) for row in rows[4:6])]
+    again = rows[7].split(";")
+    again[HEADER.index("X")] = f"{float(again[HEADER.index('X')]) + 0.01:.6f}"
+    d = imported(capsys, tmp_path, "\n".join([GOOD.strip(), *pasted, ";".join(again)]) + "\n")
+    assert d["n_readings"] == 13
+    said = " ".join(d["notes"])
+    assert "5 of 18 rows are copies of others to the last digit (the first is of P0/5kg)" in said
+
+
 def test_the_same_table_with_all_that_is_in_the_wild(tmp_path: Path, capsys: Capsys) -> None:
     imported(capsys, tmp_path, GOOD)
     plain = values(tmp_path)

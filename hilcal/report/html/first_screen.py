@@ -78,6 +78,8 @@ def headline_of(d: Diagnosis | None) -> tuple[str, str]:
         if d.reason == "inseparable_addition":
             return "The model is good, but another one would be as good", "doubt"
         return "The model is incomplete, and these readings cannot tell what is missing", "doubt"
+    if d.verdict == "misdescribed":
+        return "A figure of the cell seems to be wrong: correct it first", "bad"
     if d.verdict == "unknown_effect":
         return "The model is incomplete: no known effect explains what is left", "bad"
     return "The stated noise is wrong: the model cannot be judged by it", "doubt"
@@ -118,6 +120,8 @@ def missing(d: Diagnosis | None) -> str:
         return "Not judged; hilcal identify --scaling gc, then hilcal diagnose, say it."
     if d.verdict == "adequate":
         return "Nothing that these readings could show."
+    if d.wrong_figures:
+        return numbers.sentence(message(d))
     if d.reason == "inseparable_addition":
         return _as_good(d)
     if d.reason == "no_suspect":

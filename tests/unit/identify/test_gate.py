@@ -79,6 +79,37 @@ def test_millimetres_and_swapped_rows_are_named():
     assert "rows are swapped (p5/none with p20/none)" in words(finding, cell, crossed)
 
 
+@pytest.mark.parametrize("shift", [1, -2])
+def test_positions_of_other_rows_are_named(shift):
+    """Also where three of four readings of a pose are the same, and look right."""
+    good = readings_of(None, 3)
+    off = replace(good, value=np.roll(good.value, shift, axis=0))
+    finding, cell = found_in(off)
+    way = "after" if shift > 0 else "before"
+    rows = "1 row" if shift == 1 else "2 rows"
+    said = words(finding, cell, off)
+    assert finding.refused
+    assert f"each position stands {rows} {way} the joint values it belongs to" in said
+    assert said.endswith("correct it in the table")
+    four = good[np.repeat(np.arange(40), 8)]
+    off = replace(four, value=np.roll(four.value, 1, axis=0))
+    finding, cell = found_in(off)
+    assert "each position stands 1 row after" in words(finding, cell, off)
+
+
+def test_exchanged_columns_of_joints_are_named():
+    good = readings_of(None, 3)
+    for order, said in (
+        ([0, 4, 2, 3, 1, 5], "the columns of joints 2 and 5 are exchanged"),
+        ([0, 1, 2, 3, 5, 4], "the columns of joints 5 and 6 are exchanged"),
+        ([1, 2, 3, 4, 5, 0], "joint 1's values are in the column of joint 6"),
+    ):
+        off = replace(good, states=replace(good.states, q=good.states.q[:, order]))
+        finding, cell = found_in(off)
+        assert finding.refused
+        assert said in words(finding, cell, off)
+
+
 def test_a_gauge_is_not_proposed():
     """The zero of joint 1 goes into the base, that of the last joint into the target."""
     for joint in (1, 6):

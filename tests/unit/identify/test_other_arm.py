@@ -1,5 +1,7 @@
 """Readings of another arm of the catalogue are noticed; ordinary errors are not taken for one."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from hilcal.data.readings import Readings, States
 from hilcal.identify.other_arm import BEYOND_NOISE, other_arm, other_arm_of
 from hilcal.identify.registration import register
 from hilcal.robot.catalogue import load_arm, robot_names
+from hilcal.types import Floats
 
 TARGET = np.array([0.03, -0.02, 0.1])
 NOISE = 3e-5
@@ -23,8 +26,14 @@ def rotation(rng, angle=None):
     return np.eye(3) + np.sin(a) * k + (1 - np.cos(a)) * k @ k
 
 
-def measured(name: str, seed: int, off: float, poses: int = 30) -> Readings:
-    """Positions of an arm each of whose links is off by `off` mm and mrad, by matrix products."""
+def measured(
+    name: str, seed: int, off: float, poses: int = 30, noise: float = NOISE,
+    errs: Callable[[Floats], Floats] = np.zeros_like,
+) -> Readings:  # fmt: skip
+    """Positions of an arm each of whose links is off by `off` mm and mrad, by matrix products.
+
+    Its joints err by `errs` (poses, n) of their angles.
+    """
     rng, arm = np.random.default_rng(seed), load_arm(name)
     q = rng.uniform(-2.5, 2.5, (poses, arm.n))
     links = arm.links.copy()
@@ -33,16 +42,16 @@ def measured(name: str, seed: int, off: float, poses: int = 30) -> Readings:
         link[:3, 3] += 1e-3 * off * rng.standard_normal(3)
     base, shift = rotation(rng), 2 * rng.standard_normal(3)
     x = []
-    for row in q:
+    for row in q + errs(q):
         place = links[0]
         for angle, link in zip(row, links[1:], strict=True):
             c, s = np.cos(angle), np.sin(angle)
             turn = np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
             place = place @ turn @ link
         x.append(base @ (place[:3, :3] @ TARGET + place[:3, 3]) + shift)
-    value = np.array(x) + NOISE * rng.standard_normal((poses, 3))
+    value = np.array(x) + noise * rng.standard_normal((poses, 3))
     k = np.arange(poses)
-    cov = np.tile(NOISE**2 * np.eye(3), (poses, 1, 1))
+    cov = np.tile(noise**2 * np.eye(3), (poses, 1, 1))
     states = States(q=q, wrench=np.zeros((poses, 6)))
     return Readings(states, k, 0 * k, 0 * k, value, cov, ("none",), tuple(map(str, k)))
 
