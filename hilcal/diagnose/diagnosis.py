@@ -21,14 +21,7 @@ from hilcal.diagnose.stepwise_alternatives import Alternative
 from hilcal.diagnose.wrong_figures import WrongFigure
 from hilcal.identify.fit import Fit
 
-Verdict = Literal[
-    "adequate",
-    "missing_effect",
-    "ambiguous",
-    "unknown_effect",
-    "noise_misjudged",
-    "misdescribed",
-]
+Verdict = Literal["adequate", "missing_effect", "ambiguous", "unknown_effect", "noise_misjudged"]
 Reason = Literal[
     "residual_is_noise",
     "one_suspect",
@@ -57,7 +50,7 @@ VERDICTS: dict[Reason, Verdict] = {
     "readings_disagree": "unknown_effect",
     "serial_or_effect": "ambiguous",
     "background": "ambiguous",
-    "wrong_figure": "misdescribed",
+    "wrong_figure": "ambiguous",
 }
 """The verdict that each reason leads to."""
 

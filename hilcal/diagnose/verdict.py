@@ -3,7 +3,7 @@
 The rules, in this order:
 
 0. A figure of the cell that was entered otherwise explains the misfit (see `wrong_figures`):
-   `misdescribed`; nothing else is looked for.
+   `ambiguous`, by that figure or an effect like it; nothing else is looked for before it is settled.
 1. A suspect passes all tests (see `effect_ranking.Suspect.passes`), and all effects of the
    catalogue together leave more than noise (see `catalogue_sufficiency`): `unknown_effect`.
 2. A suspect passes, and the readings separate it from every other: `missing_effect`; else
@@ -125,14 +125,14 @@ def with_one_named(
 def judge(e: Evidence, history: History) -> Diagnosis:
     """Combine the evidence of a fit with what is known of the way to its model."""
     if e.wrong_figures:
-        return _misdescribed(e, history)
+        return _wrong_figure(e, history)
     found = _with_arrivals(e, history)
     if e.fit.disagreement is not None and not any(s.passes for s in found.suspects):
         return replace(found, reason="readings_disagree")
     return found
 
 
-def _misdescribed(e: Evidence, history: History) -> Diagnosis:
+def _wrong_figure(e: Evidence, history: History) -> Diagnosis:
     """Judge a fit that a figure of the cell explains: no effect is looked for before that."""
     return Diagnosis(
         fit=e.fit,

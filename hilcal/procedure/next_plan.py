@@ -96,7 +96,7 @@ def _settled(o: Campaign, d: Diagnosis) -> str:
             f"{head} the model is adequate; to sharpen it, plan on with: hilcal plan CELL.toml "
             f"--after {quoted(o.path)}, or separate named effects with --suspects A,B"
         )
-    if d.verdict == "misdescribed":
+    if d.wrong_figures:
         return (
             f"{head} a figure of the cell seems to be wrong, see hilcal diagnose {quoted(o.path)}"
         )

@@ -122,10 +122,9 @@ def decision_report(d: "Decision", goal_m: float | None, clock: float = 1.0) -> 
         "readings of this kind will not name it. The validation says how much it matters.",
         "noise_misjudged": "The stated noise is wrong; more readings will not mend that. The "
         "validation says how far the arm is off.",
-        "misdescribed": "A figure of the cell seems to be wrong: correct it before anything more "
-        "is measured.",
         "missing_effect": "An effect is missing that does not lower the error on poses left out.",
-        "ambiguous": "Several effects explain the misfit alike: any of them corrects it.",
+        "ambiguous": "Several effects explain the misfit alike, or a figure that was entered "
+        "wrongly does: the diagnosis names them.",
     }
     yield f"{reasons[d.reason]}\n"
 

@@ -21,8 +21,8 @@ VERDICTS: Mapping[str, str] = {
     "ambiguous": "ambiguous: these readings do not separate the suspects",
     "unknown_effect": "unknown effect: an effect is missing that the catalogue does not hold",
     "noise_misjudged": "the noise is not what was stated",
-    "misdescribed": "a figure was entered wrongly",
 }
+WRONG_FIGURE = "ambiguous: a figure of the cell may have been entered wrongly"
 SUSPECTS = 6
 
 
@@ -30,7 +30,8 @@ def verdict_line(d: Diagnosis) -> Text:
     """Return the verdict with its message; names of the catalogue keep their spelling."""
     style = "bold green" if d.verdict == "adequate" else "bold yellow"
     words = numbers.sentence(message(d), d.fit.model.catalogue.names)
-    return Text.assemble("Verdict: ", (VERDICTS[d.verdict], style), f".\n{words}")
+    verdict = WRONG_FIGURE if d.wrong_figures else VERDICTS[d.verdict]
+    return Text.assemble("Verdict: ", (verdict, style), f".\n{words}")
 
 
 def suspects_table(d: Diagnosis, most: int = SUSPECTS) -> RenderableType:

@@ -17,9 +17,7 @@ from tests.support.cli_cases import CELL, ok, refused, rehearsal, run, table
 
 Capsys = pytest.CaptureFixture[str]
 ERROR = {"rms_m", "mean_m", "max_m", "rms_sigma"}
-VERDICTS = {
-    "adequate", "missing_effect", "ambiguous", "unknown_effect", "noise_misjudged", "misdescribed",
-}  # fmt: skip
+VERDICTS = {"adequate", "missing_effect", "ambiguous", "unknown_effect", "noise_misjudged"}
 
 
 @pytest.fixture(scope="module")

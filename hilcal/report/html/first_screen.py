@@ -74,12 +74,12 @@ def headline_of(d: Diagnosis | None) -> tuple[str, str]:
         return "The model is good: what is left is noise", "good"
     if d.verdict == "missing_effect":
         return f"The model is incomplete: {lead} is missing", "bad"
+    if d.wrong_figures:
+        return "A figure of the cell seems to be wrong: correct it first", "bad"
     if d.verdict == "ambiguous":
         if d.reason == "inseparable_addition":
             return "The model is good, but another one would be as good", "doubt"
         return "The model is incomplete, and these readings cannot tell what is missing", "doubt"
-    if d.verdict == "misdescribed":
-        return "A figure of the cell seems to be wrong: correct it first", "bad"
     if d.verdict == "unknown_effect":
         return "The model is incomplete: no known effect explains what is left", "bad"
     return "The stated noise is wrong: the model cannot be judged by it", "doubt"

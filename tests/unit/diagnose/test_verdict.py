@@ -89,5 +89,4 @@ def test_every_reason_has_a_verdict():
         "ambiguous",
         "unknown_effect",
         "noise_misjudged",
-        "misdescribed",
     }

@@ -41,7 +41,7 @@ def test_a_load_at_twice_its_weight_is_named(
     """Also where all its readings were taken for gross errors, and beside a hidden effect."""
     c = campaign(hidden, mode, 1, poses=20)
     d = judged(c.cell, doubled(c.readings, load), mode)
-    assert d.verdict == "misdescribed", message(d)
+    assert d.reason == "wrong_figure", message(d)
     (figure,) = d.wrong_figures
     assert figure.stated == pytest.approx((2 * true,))
     assert figure.found == pytest.approx((true,), rel=0.15)
@@ -54,7 +54,7 @@ def test_a_tool_at_twice_its_mass_is_named_and_refine_adds_nothing() -> None:
     cell = replace(c.cell, tool_mass=2 * c.cell.tool_mass)
     found = refine(baseline(cell, c.readings, "absolute"), c.readings, "absolute")
     (step,) = found.steps
-    assert found.verdict == "misdescribed"
+    assert found.verdict == "ambiguous"
     assert message(step.diagnosis).startswith("the tool seems to weigh 0.8")
     assert "correct [tool] mass_kg" in message(step.diagnosis)
     (figure,) = to_json(step.diagnosis)["wrong_figures"]
