@@ -153,7 +153,7 @@ def baseline(
     Args:
         cell: the cell.
         data: what is to be fitted.
-        readings: "deflection" or "absolute"; what the data allow where None.
+        readings: "deflection" or "absolute"; as the cell plans and the data allow where None.
         catalogue: the effects that a model can have; the installed ones where None.
         prior: what another campaign taught of this arm, from `load_posterior`; its effects are in
             the model, and fits start from what it knows. `carried_prior` says more of the two.
@@ -163,7 +163,7 @@ def baseline(
         CannotAnswerError: the readings do not determine an unknown frame.
     """
     known = _carried(prior, catalogue)
-    return starting_models.baseline(cell, data, _mode(readings, data), catalogue, known)
+    return starting_models.baseline(cell, data, _mode(readings, data, cell), catalogue, known)
 
 
 def _with_prior(model: Model, data: Readings, prior: Posterior | CarriedPrior) -> Model:
@@ -202,7 +202,7 @@ def fit(
     Args:
         model: robot and effects.
         data: what was measured.
-        readings: "deflection" or "absolute"; what the data allow where None.
+        readings: "deflection" or "absolute"; as the cell plans and the data allow where None.
         scaling: "none", "gu" or "gc" (whitened by the full covariance).
         prior: what another campaign taught of this arm, for those effects that the model has in
             common with it (`baseline` adds the others); or (P,) standard deviations of zero-mean
@@ -222,7 +222,7 @@ def fit(
     data = with_prior_scatter(model, data)
     for known in SCALINGS:
         if scaling == known:
-            found = fits.fit(model, data, _mode(readings, data), known, prior=std)
+            found = fits.fit(model, data, _mode(readings, data, model.cell), known, prior=std)
             return with_serial_noise(found, std)
     raise InputError(f"scaling {scaling!r} is unknown; valid: {', '.join(SCALINGS)}")
 
@@ -275,7 +275,7 @@ def refine(
     Args:
         model: the model to start from.
         data: what was measured.
-        readings: "deflection" or "absolute"; what the data allow where None.
+        readings: "deflection" or "absolute"; as the cell plans and the data allow where None.
         prior: as for `fit`.
         discover: a folder; a law is then searched where no effect explains the misfit, as by
             `hilcal refine --discover`, and the files of laws that stay are written there.
@@ -288,12 +288,13 @@ def refine(
     """
     if prior is not None:
         model = _with_prior(model, data, prior)
+    mode = _mode(readings, data, model.cell)
     if discover is None:
-        return refine_model(model, data, _mode(readings, data), background=background)
+        return refine_model(model, data, mode, background=background)
     if not Path(discover).is_dir():
         raise InputError(f"discover={str(discover)!r}: no such folder; valid: one for laws' files")
     laws = LawSearch(Path(discover))
-    found = refine_model(model, data, _mode(readings, data), laws=laws, background=background)
+    found = refine_model(model, data, mode, laws=laws, background=background)
     laws.write(found.names)
     return found
 
@@ -355,10 +356,11 @@ def view(run: Campaign, port: int = 9877) -> Iterator[str]:
         yield served.url
 
 
-def _mode(asked: str | None, data: Readings) -> Mode:
-    """Check the kind of readings; what the data allow where none is asked for."""
+def _mode(asked: str | None, data: Readings, cell: Cell) -> Mode:
+    """Check the kind of readings; as the cell plans and the data allow where none is asked for."""
     if asked is None:
-        return usual_mode(data)
+        config = cell.config
+        return usual_mode(data) if config is None else usual_mode(data, config.planning.readings)
     for known in MODES:
         if asked == known:
             return known

@@ -251,11 +251,10 @@ def _procedure(
         check_effects(cell, config, catalogue)
         if resume:
             told.t.notice(f"{output} is not there yet: the calibration begins")
-        kind: Mode = config.planning.readings if config.loads else "absolute"
-        _refuse_goal(kind, asked, path)
+        _refuse_goal(config.fitted, asked, path)
         seed = config.simulation.seed
         usual = Settings(POSES, VALIDATION, parse_duration(LONGEST, "--max-time"), seed=seed)
-        settings = replace(usual, readings=kind, hide=hide, **asked)
+        settings = replace(usual, readings=config.fitted, hide=hide, **asked)
         p = Procedure(output, cell, config, base_dir, catalogue, settings)
         p.check_files()
         return p

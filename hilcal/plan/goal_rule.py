@@ -79,11 +79,10 @@ class GoalRule:
         self._work_q: tuple[tuple[float, ...], ...] = ()
         self._predicted = ""
         if self.goal.of_position:
-            mode = config.planning.readings if config.loads else "absolute"
-            shown = "position" if mode == "absolute" else "deflection"
+            shown = "position" if config.fitted == "absolute" else "deflection"
             if self.goal.what != shown:
                 raise InputError(
-                    f'goal "{text}": [planning] readings = "{mode}", which show the {shown}; '
+                    f'goal "{text}": [planning] readings = "{config.fitted}", which show the {shown}; '
                     f"valid: {shown}"
                 )
             planning = config.planning

@@ -78,7 +78,7 @@ def nothing_missing(d: Diagnosis) -> str:
     if d.fit.mode == "deflection":
         return (
             f"no effect that deflections show is missing; {UNCALIBRATED}: what is the same under "
-            "every load cancels in them, and --readings absolute shows it"
+            "every load cancels in them, and hilcal refine --readings absolute shows it"
         )
     if hidden := few(d.not_shown, MOST_HIDDEN):
         return f"no effect that these readings could show is missing (they cannot show {hidden})"

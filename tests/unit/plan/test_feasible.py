@@ -215,7 +215,12 @@ NOTHING = {
     ),
     "walled in": (
         {"obstacles": [{"name": "block", "center_m": [0, 0, 1], "size_m": [4, 4, 4]}]},
-        r"0 are clear of obstacles \(\[\[obstacles\]\]",
+        r"0 are clear of obstacles \(.+ and block touch in \d+ % of the others; look at \[\[obst",
+    ),
+    "a target inside of the arm": (
+        {"tool": {"target_m": [0.0, 0.0, -0.12]}},
+        r"0 do not touch themselves \(.*tool at the target.* touch in \d+ % of the others; look at "
+        r"\[tool\] target_m",
     ),
     "no regular pose": ({"planning": {"singularity": 0.9}}, r"0 are not singular \(\[planning\] "),
     "weak": ({"limits": {"torque_share": 0.001}}, r"0 keep the joint torques \(\[limits\] torque_"),
