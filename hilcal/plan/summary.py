@@ -259,7 +259,7 @@ def remarks(planned: Planned) -> tuple[str, ...]:
         for name, gain in planned.loads.left_out
     )
     without = tuple(u.remark for u in planned.undetermined)
-    notes = (*without, *planned.drawn.remarks, *planned.problem.notes, *omitted)
+    notes = (*without, *omitted, *planned.drawn.remarks, *planned.problem.notes)
     return tuple(dict.fromkeys(notes))
 
 
