@@ -315,7 +315,7 @@ def plan(
 
     Args:
         cell: the cell with its limits, loads and `[planning]`, from `Cell.load`.
-        poses: as many readings as so many poses take, unloaded and under each load.
+        poses: how many, each read unloaded and under every load that it bears.
         criterion: "D", "A", "E", "K", "I" or "separate"; that of `[planning]` where None.
         given: a fit of what has been measured already.
         seed: of the random candidates.
@@ -329,7 +329,7 @@ def plan(
     config, rng = cell.configured(), np.random.default_rng(seed)
     if given is not None and prior is not None:
         raise InputError("a plan after a fit has the prior of that fit; leave out one of both")
-    request = Request(poses, criterion=criterion)
+    request = Request(poses, whole=True, criterion=criterion)
     planned = make(cell, config, request, rng, given, prior=_carried(prior, None))
     file = replace(planned.ordered.plan, about=about(planned))
     return checked(cell, config, file, summarise(planned, config, rng, compare=False))

@@ -336,9 +336,7 @@ def init(
     tracker_port: Annotated[str | None, typer.Option(help="Its serial port.")] = None,
     tracker_accuracy: Annotated[
         str | None,
-        typer.Option(
-            metavar="LENGTH", help='Standard deviation of a point, e.g. "8 um + 3 um/m".'
-        ),
+        typer.Option(metavar="LENGTH", help='Standard deviation of a point, e.g. "8 um + 3 um/m".'),
     ] = None,
     force_sensor: Annotated[str | None, typer.Option(help="The force sensor's driver.")] = None,
     force_port: Annotated[str | None, typer.Option(help="Its serial port.")] = None,

@@ -41,7 +41,12 @@ def plan(
     output: Output,
     poses: Poses = POSES,
     readings: Annotated[
-        int | None, typer.Option("--readings", help="Or so many readings, repeats not counted.")
+        int | None,
+        typer.Option(
+            "--readings",
+            help="Or so many readings, repeats not counted, at as many poses and under those loads "
+            "that tell most.",
+        ),
     ] = None,
     criterion: Annotated[
         str | None,
@@ -80,7 +85,7 @@ def plan(
     carried = PriorOptions(prior, prior_of, drift).load(catalogue)
     config, numbers = read_cell(cell)
     unloaded: Literal["around", "first"] = "first" if unloaded_first else "around"
-    wanted = Request(poses, readings, _criterion(criterion), unloaded=unloaded)
+    wanted = Request(poses, True, readings, _criterion(criterion), unloaded=unloaded)
     with working(t.progress) as say:
         known = None if after is None else _known(t, after, revision, catalogue, say)
         rng = generator(seed)

@@ -151,9 +151,7 @@ def _touching(space: Space, reason: str, lost: dict[str, Floats]) -> str:
     if reason not in _OF_PAIRS or reason not in lost:
         return ""
     met = Counter(
-        found.of
-        for q in lost[reason]
-        for found in space.findings(q[None], UNLOADED, (reason,))
+        found.of for q in lost[reason] for found in space.findings(q[None], UNLOADED, (reason,))
     )
     if not met:
         return ""

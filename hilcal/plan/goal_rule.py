@@ -82,8 +82,8 @@ class GoalRule:
             shown = "position" if config.fitted == "absolute" else "deflection"
             if self.goal.what != shown:
                 raise InputError(
-                    f'goal "{text}": [planning] readings = "{config.fitted}", which show the {shown}; '
-                    f"valid: {shown}"
+                    f'goal "{text}": [planning] readings = "{config.fitted}", which show the '
+                    f"{shown}; valid: {shown}"
                 )
             planning = config.planning
             if not planning.work_q_rad and planning.work_min_m is None:

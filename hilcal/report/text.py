@@ -110,7 +110,7 @@ def parameters(fit: Fit, most: int = ALL_ROWS) -> Iterator[RenderableType]:
     rest = len(frames) + len(rows) - most
     if frames or rows:
         out = table("parameter", "value", "±", "unit", "meaning", left=(0, 3, 4))
-        for row in ([*frames, *rows] if rest <= 0 else [*rows, *frames][:most]):
+        for row in [*frames, *rows] if rest <= 0 else [*rows, *frames][:most]:
             out.add_row(*row)
         yield out
         more = f"{rest} more parameters: --details. " if rest > 0 else ""

@@ -221,9 +221,8 @@ def _limit_words(found: Improvement, limit_m: float) -> str:
     largest = numbers.length(found.everything.after.max_m)
     of = " for deflections" if found.mode == "deflection" else ""
     if not over:
-        return (
-            f"PASSED{of}: no error at the corrected targets is over {size}, the largest is {largest}."
-        )
+        words = f"no error at the corrected targets is over {size}, the largest is {largest}."
+        return f"PASSED{of}: {words}"
     return (
         f"FAILED{of}: {over} of {found.everything.count} errors at the corrected targets are over "
         f"{size}; the largest is {largest}."

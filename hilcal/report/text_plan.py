@@ -63,8 +63,9 @@ def plan_screen(s: PlanSummary) -> Iterator[RenderableType]:
     if out.row_count:
         yield out
         yield ""
-    if s.curve:
-        yield enough(s.curve)
+    if more := [c for c in s.curve if c.poses > s.poses]:
+        told = [f"{c.poses} poses ± {numbers.length(c.position_std_m)}" for c in more[::2]]
+        yield f"More would give, predicted for the {s.quantity}: {', '.join(told)}."
     if seen := detectable(s):
         (first, least), (last, most) = seen[0], seen[-1]
         yield f"Outside of the model: {first} is seen from {least}, ..., {last} from {most}."
@@ -162,7 +163,7 @@ def cost_rows(s: PlanSummary) -> Iterator[tuple[str, str]]:
 
 def _asked(s: PlanSummary) -> str:
     """Say why there are other poses than were asked for; nothing where there are as many."""
-    if s.asked_poses is None or s.asked_poses == s.poses:
+    if s.asked_poses in (None, s.poses):
         return ""
     return f": as many readings as {s.asked_poses} poses take, which determine more at {s.poses}"
 

@@ -67,9 +67,7 @@ def test_check_reads_the_file_and_asks_for_what_was_left_open(
     assert "[robot] driver is missing" in refused(capsys, 2, "check", path)
 
 
-def test_what_is_fitted_is_stated_and_absolute_unless_asked(
-    tmp_path: Path, capsys: Capsys
-) -> None:
+def test_what_is_fitted_is_stated_and_absolute_unless_asked(tmp_path: Path, capsys: Capsys) -> None:
     path = tmp_path / "CELL.toml"
     loaded = ("--robot", "ur10e", "--load", "5 kg")
     for options, readings, geometry in (
