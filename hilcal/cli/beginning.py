@@ -250,8 +250,8 @@ def items() -> tuple[Item, ...]:
         ),
         Item(
             "--tracker-accuracy",
-            "How accurate is the tracker? Standard deviation of a point, half of its maximum permissible "
-            "error, e.g. 8 um + 3 um/m",
+            "How accurate is the tracker? Standard deviation of a point, half of its maximum "
+            "permissible error, e.g. 8 um + 3 um/m",
             Draft.accuracy,
             without="as a Leica AT500",
         ),

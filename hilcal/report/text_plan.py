@@ -63,8 +63,8 @@ def plan_screen(s: PlanSummary) -> Iterator[RenderableType]:
     if out.row_count:
         yield out
         yield ""
-    if more := [c for c in s.curve if c.poses > s.poses]:
-        told = [f"{c.poses} poses ± {numbers.length(c.position_std_m)}" for c in more[::2]]
+    if larger := [c for c in s.curve if c.poses > s.poses]:
+        told = [f"{c.poses} poses ± {numbers.length(c.position_std_m)}" for c in larger[::2]]
         yield f"More would give, predicted for the {s.quantity}: {', '.join(told)}."
     if seen := detectable(s):
         (first, least), (last, most) = seen[0], seen[-1]
