@@ -115,7 +115,8 @@ def choose_poses(
 ) -> Design:
     """Return the exact design of so many poses, each read once under all that it bears.
 
-    Its bound is that of as many readings at any number of poses, under any loads.
+    Where the cell leaves fewer poses, some are read again. The design's bound is that of as many
+    readings at any number of poses, under any loads.
 
     Args:
         asked: the question, of all units.
@@ -136,11 +137,6 @@ def choose_poses(
             mine.clear()
         mine.append(k)
     members = list(of.values())
-    if poses > len(members):
-        raise CannotAnswerError(
-            f"{poses} poses are asked for, and the cell leaves {len(members)}; ask for fewer, or "
-            "widen [limits]"
-        )
     height = max(map(len, members)) * free.units.rows.shape[1]
     rows = np.zeros((len(members), height, free.units.rows.shape[2]))
     for out, mine in zip(rows, members, strict=True):
@@ -149,7 +145,7 @@ def choose_poses(
     units = CandidateSet(rows, np.ones(len(members)))
     found = best(
         units, asked.criterion, float(poses), asked.prior, rng,
-        most=1, names=asked.names, effort=effort,
+        most=-(-poses // max(len(members), 1)), names=asked.names, effort=effort,
     )  # fmt: skip
     counts = np.zeros(len(index), dtype=np.int64)
     for mine, count in zip(members, found.counts.tolist(), strict=True):

@@ -123,6 +123,7 @@ class PlanSummary:
         remarks: assumptions and omissions, one sentence each.
         asked_poses: poses that were asked for: as many readings as these take under every load;
             None where readings were.
+        whole: whether each pose is read under all that it bears, see `planner.Request`.
     """
 
     poses: int
@@ -142,6 +143,7 @@ class PlanSummary:
     shortest: Confounding | None = None
     remarks: tuple[str, ...] = ()
     asked_poses: int | None = None
+    whole: bool = False
 
     @property
     def quantity(self) -> str:
@@ -224,6 +226,7 @@ def summarise(
         shortest=planned.ordered.confounding_shortest,
         remarks=remarks(planned),
         asked_poses=planned.asked_poses,
+        whole=planned.whole,
     )
 
 

@@ -165,6 +165,8 @@ def _asked(s: PlanSummary) -> str:
     """Say why there are other poses than were asked for; nothing where there are as many."""
     if s.asked_poses in (None, s.poses):
         return ""
+    if s.whole:
+        return f": the cell leaves no more of {s.asked_poses}, so that some are read again"
     return f": as many readings as {s.asked_poses} poses take, which determine more at {s.poses}"
 
 
