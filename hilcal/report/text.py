@@ -76,9 +76,10 @@ def fit_report(fit: Fit, details: bool = True) -> Iterator[RenderableType]:
 def _short(fit: Fit) -> Iterator[str]:
     """Yield the remarks of the first screen."""
     yield _variance_factor(fit)
-    count, gross = len(fit.uncertainty.null), len(gross_errors(fit))
-    if count:
-        yield f"{count} direction{'s' * (count > 1)} cannot be seen in these readings."
+    null, gross = [str(d) for d in fit.uncertainty.null], len(gross_errors(fit))
+    if null:
+        several = f"{len(null)} directions" if len(null) > 1 else "1 direction"
+        yield f"{several} cannot be seen in these readings: {numbers.few(null, 1)}."
     if gross:
         yield f"{gross} readings are set aside as gross errors; --details lists them."
     yield from list(fitted_lines(fit))[:1]
