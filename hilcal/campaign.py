@@ -183,9 +183,11 @@ class Campaign:
         self.file.accept(revision)
 
     def mode(self) -> Mode:
-        """Kind of readings: that of the revision in use, else what the readings allow."""
+        """Kind of readings: that of the revision in use, else as planned and the readings allow."""
         record = self.in_use()
-        return usual_mode(self.readings) if record is None else mode_of(record)
+        if record is not None:
+            return mode_of(record)
+        return usual_mode(self.readings, self.config.planning.readings)
 
     def fit(self, revision: int | None = None) -> Fit:
         """Return a stored fit, found again from its stored parameters.

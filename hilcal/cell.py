@@ -136,6 +136,8 @@ def cell_from_config(
         arm = as_counted(arm, robot)
     except InputError as error:
         raise InputError(f"[robot] {error}") from None
+    if robot.repeatability_m is not None:
+        arm = replace(arm, repeatability=robot.repeatability_m)
     config.repeatability.per_joint(arm.n)
     described = tool.targets or (tool,)
     poses = np.stack([_pose(t.target_m, t.target_rotvec_rad) for t in described])

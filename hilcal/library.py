@@ -157,7 +157,7 @@ def baseline(
     Args:
         cell: the cell.
         data: what is to be fitted.
-        readings: "deflection" or "absolute"; what the data allow where None.
+        readings: "deflection" or "absolute"; as the cell plans and the data allow where None.
         catalogue: the effects that a model can have; the installed ones where None.
         prior: what another campaign taught of this arm, from `load_posterior`; its effects are in
             the model, and fits start from what it knows. `carried_prior` says more of the two.
@@ -167,7 +167,7 @@ def baseline(
         CannotAnswerError: the readings do not determine an unknown frame.
     """
     known = _carried(prior, catalogue)
-    return starting_models.baseline(cell, data, _mode(readings, data), catalogue, known)
+    return starting_models.baseline(cell, data, _mode(readings, data, cell), catalogue, known)
 
 
 def _with_prior(model: Model, data: Readings, prior: Posterior | CarriedPrior) -> Model:
@@ -206,7 +206,7 @@ def fit(
     Args:
         model: robot and effects.
         data: what was measured.
-        readings: "deflection" or "absolute"; what the data allow where None.
+        readings: "deflection" or "absolute"; as the cell plans and the data allow where None.
         scaling: "none", "gu" or "gc" (whitened by the full covariance).
         prior: what another campaign taught of this arm, for those effects that the model has in
             common with it (`baseline` adds the others); or (P,) standard deviations of zero-mean
@@ -226,7 +226,7 @@ def fit(
     data = with_prior_scatter(model, data)
     for known in SCALINGS:
         if scaling == known:
-            found = fits.fit(model, data, _mode(readings, data), known, prior=std)
+            found = fits.fit(model, data, _mode(readings, data, model.cell), known, prior=std)
             return with_serial_noise(found, std)
     raise InputError(f"scaling {scaling!r} is unknown; valid: {', '.join(SCALINGS)}")
 
@@ -279,7 +279,7 @@ def refine(
     Args:
         model: the model to start from.
         data: what was measured.
-        readings: "deflection" or "absolute"; what the data allow where None.
+        readings: "deflection" or "absolute"; as the cell plans and the data allow where None.
         prior: as for `fit`.
         discover: a folder; a law is then searched where no effect explains the misfit, as by
             `hilcal refine --discover`, and the files of laws that stay are written there.
@@ -292,12 +292,13 @@ def refine(
     """
     if prior is not None:
         model = _with_prior(model, data, prior)
+    mode = _mode(readings, data, model.cell)
     if discover is None:
-        return refine_model(model, data, _mode(readings, data), background=background)
+        return refine_model(model, data, mode, background=background)
     if not Path(discover).is_dir():
         raise InputError(f"discover={str(discover)!r}: no such folder; valid: one for laws' files")
     laws = LawSearch(Path(discover))
-    found = refine_model(model, data, _mode(readings, data), laws=laws, background=background)
+    found = refine_model(model, data, mode, laws=laws, background=background)
     laws.write(found.names)
     return found
 
@@ -318,7 +319,7 @@ def plan(
 
     Args:
         cell: the cell with its limits, loads and `[planning]`, from `Cell.load`.
-        poses: as many readings as so many poses take, unloaded and under each load.
+        poses: how many, each read unloaded and under every load that it bears.
         criterion: "D", "A", "E", "K", "I" or "separate"; that of `[planning]` where None.
         given: a fit of what has been measured already.
         seed: of the random candidates.
@@ -332,7 +333,7 @@ def plan(
     config, rng = cell.configured(), np.random.default_rng(seed)
     if given is not None and prior is not None:
         raise InputError("a plan after a fit has the prior of that fit; leave out one of both")
-    request = Request(poses, criterion=criterion)
+    request = Request(poses, whole=True, criterion=criterion)
     planned = make(cell, config, request, rng, given, prior=_carried(prior, None))
     file = replace(planned.ordered.plan, about=about(planned))
     return checked(cell, config, file, summarise(planned, config, rng, compare=False))
@@ -359,10 +360,11 @@ def view(run: Campaign, port: int = 9877) -> Iterator[str]:
         yield served.url
 
 
-def _mode(asked: str | None, data: Readings) -> Mode:
-    """Check the kind of readings; what the data allow where none is asked for."""
+def _mode(asked: str | None, data: Readings, cell: Cell) -> Mode:
+    """Check the kind of readings; as the cell plans and the data allow where none is asked for."""
     if asked is None:
-        return usual_mode(data)
+        config = cell.config
+        return usual_mode(data) if config is None else usual_mode(data, config.planning.readings)
     for known in MODES:
         if asked == known:
             return known

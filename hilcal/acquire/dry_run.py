@@ -62,7 +62,7 @@ def dry_run(cell: Cell, config: CellConfig, plan: Plan) -> DryRun:
     changes = sum(stop.change_to is not None for stop in stops)
     return DryRun(
         tuple(dict.fromkeys(problems)),
-        (*_remarks(plan), *_unseen(limits), *limits.remarks),
+        (*_remarks(plan, config.fitted), *_unseen(limits), *limits.remarks),
         _duration(config, stops, changes, len(plan.steps)),
         len(moves),
         changes,
@@ -132,12 +132,12 @@ def _unseen(limits: Feasibility) -> tuple[str, ...]:
     return (UNKNOWN,) if asked and limits.sight is None else ()
 
 
-def _remarks(plan: Plan) -> tuple[str, ...]:
+def _remarks(plan: Plan, mode: str) -> tuple[str, ...]:
     out = []
     tests = "purpose" in plan.about  # of a model: what it is compared with may be in another file
     unloaded = {(s.pose, s.cycle) for s in plan.steps if s.load == UNLOADED}
     lacking = [s for s in plan.steps if (s.pose, s.cycle) not in unloaded]
-    if lacking and not tests:
+    if lacking and not tests and mode == "deflection":
         first = Step(lacking[0].pose, UNLOADED, lacking[0].cycle)
         out.append(
             f"{len(lacking)} loaded readings have no unloaded one of the same pose and cycle, "

@@ -478,7 +478,7 @@ class _Touch:
             else:
                 text = f"they are {gap:.3g} m apart, {self.margin:g} m are kept"
             text += f" ({self.guessed})" if self.guessed else ""
-            yield Finding(kind, f"{a} {b}", UNLOADED, f"{a} and {b} collide: {text}")
+            yield Finding(kind, f"{a} and {b}", UNLOADED, f"{a} and {b} collide: {text}")
 
     def _of(self, rows: Ints) -> Segment | None:
         x = self.segment

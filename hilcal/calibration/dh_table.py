@@ -148,23 +148,13 @@ def to_toml(rows: DhRows, arm: Arm, title: str) -> str:
 
     Args:
         rows: of the arm.
-        arm: gives masses, limits and payload.
+        arm: gives masses, limits and payload; what its description lacks is left out.
         title: of the arm.
-
-    Raises:
-        InputError: the arm's description has no payload, or no torque of a joint, as a URDF.
     """
-    missing = [name for name, t in zip(arm.joint_names, arm.torque_max, strict=True) if t == np.inf]
-    if missing or not np.isfinite(arm.payload):
-        what = f"no torque of {', '.join(missing)}" if missing else "no payload"
-        raise InputError(
-            f"{arm.name}: its description has {what}, which a robot file needs; valid: the rows "
-            "alone, --dh F.csv, or --urdf F.urdf"
-        )
     com = _centres(rows, arm)
     content: dict[str, object] = {
         "title": escaped(title),
-        "payload_kg": float(arm.payload),
+        **({"payload_kg": float(arm.payload)} if np.isfinite(arm.payload) else {}),
         "source": escaped(f"{arm.source}; corrected by calibration"),
         "convention": rows.convention,
         "base_m_rad": se3.six(rows.base),
@@ -183,9 +173,9 @@ def to_toml(rows: DhRows, arm: Arm, title: str) -> str:
             "com_m": com[k].tolist(),
             "q_min_deg": float(np.degrees(arm.q_min[k])),
             "q_max_deg": float(np.degrees(arm.q_max[k])),
-            "torque_max_Nm": float(arm.torque_max[k]),
+            **({"torque_max_Nm": torque} if np.isfinite(torque) else {}),
         }
-        for k in range(arm.n)
+        for k, torque in enumerate(arm.torque_max.tolist())
     ]
     law = {
         "standard": "B * product of Rz(q + offset) Tz(d) Tx(a) Rx(alpha) * E",

@@ -17,14 +17,15 @@ from hilcal.cell import cell_from_config
 from hilcal.cli.asking import agreed, somebody_there
 from hilcal.cli.terminal import Json, Terminal, terminal
 from hilcal.config import CellConfig
-from hilcal.config.planning import WITHOUT_LOADS
+from hilcal.config.planning import GEOMETRY
 from hilcal.config.template import cell_text
+from hilcal.data.quantities import LENGTHS
 from hilcal.effects.catalogue import installed
 from hilcal.errors import InputError, StoppedError
 from hilcal.names import quoted
 from hilcal.plan.nominal_model import check_effects
 from hilcal.report import text
-from hilcal.robot.catalogue import load_arm, robot_names
+from hilcal.robot.catalogue import OTHER_ARMS, load_arm, robot_names
 from hilcal.toml import check_section
 from hilcal.whole_file import replace_file
 
@@ -32,7 +33,15 @@ SIMULATED = "simulated"
 """Port of a force sensor that exists in the rehearsal only."""
 CLOCK = 20.0
 """How much faster than real time a rehearsal goes, as in the demo's cell."""
-_LOAD = re.compile(r"(?:(?P<name>[^=]+)=)?(?P<values>[^=]+?)\s*(?P<unit>kg|N)\s*")
+UNITS: dict[str, dict[str, float]] = {
+    "m": {**LENGTHS, "cm": 1e-2},
+    "m/m": {"m/m": 1.0, "mm/m": 1e-3, "um/m": 1e-6, "µm/m": 1e-6, "μm/m": 1e-6},
+    "kg": {"kg": 1.0, "g": 1e-3},
+    "N": {"N": 1.0, "kN": 1e3},
+}
+"""Units that a quantity may be given in; it is in the first of them, SI, where none is given."""
+_QUANTITY = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\W\d]+(?:/m)?)?")
+_LOAD = re.compile(r"(?:(?P<name>[^=]+)=)?(?P<values>[^=]*?\d[^=]*?(?P<unit>kg|g|N|kN))\s*")
 LOADS = 'e.g. "5 kg", or a pull in base axes: "pull x = 80, 0, 0 N"'
 
 
@@ -64,7 +73,7 @@ class Draft:
         if match is None:
             raise InputError(f"{words!r} is no load; valid: {LOADS}")
         one: dict[str, object] = {"name": (match["name"] or words.replace(" ", "")).strip()}
-        if match["unit"] == "kg":
+        if match["unit"] in UNITS["kg"]:
             one["mass_kg"] = number(match["values"], "kg")
         else:
             one["force_N"] = vector(match["values"], "N")
@@ -92,6 +101,20 @@ class Draft:
         driver(devices.TRACKERS, words, "[tracker] driver")
         self.set("tracker", driver=words)
 
+    def accuracy(self, words: str) -> None:
+        """Set the standard deviation of a point that the tracker measures."""
+        fixed, _, growing = words.partition("+")
+        std = number(fixed, "m")
+        per_m = number(growing, "m/m") if growing else 0.0
+        keys = ("range_std", "transverse_std")
+        self.set("tracker", **{f"{k}_m": std for k in keys}, **{f"{k}_per_m": per_m for k in keys})
+
+    def readings(self, words: str) -> None:
+        """Set what will be fitted."""
+        if words == "deflection" and not self.data.get("loads"):
+            raise InputError('"deflection" needs a load; valid without one: absolute')
+        self.set("planning", readings=words)
+
     def force_sensor(self, words: str) -> None:
         """Set the force sensor's driver."""
         driver(devices.FORCE_SENSORS, words, "[force_sensor] driver")
@@ -106,27 +129,49 @@ class Draft:
 
 
 def number(words: str, unit: str) -> float:
-    """Read a number.
+    """Read a number, in `unit` or in the one that is behind it.
 
     Raises:
         InputError: it is none.
     """
-    try:
-        return float(words)
-    except ValueError:
-        raise InputError(f"{words.strip()!r} is no number; valid: one in {unit}") from None
+    found = _quantities(words, unit)
+    if len(found) != 1:
+        raise InputError(f"{words.strip()!r} is no number; valid: one in {unit}")
+    return found[0]
 
 
 def vector(words: str, unit: str) -> list[float]:
-    """Read three numbers.
+    """Read three numbers, in `unit`, or each or all with the one behind it or them.
 
     Raises:
         InputError: they are not three.
     """
-    parts = words.replace(",", " ").replace("[", " ").replace("]", " ").split()
-    if len(parts) != 3:
-        raise InputError(f"{words.strip()!r} are {len(parts)} numbers; valid: three in {unit}")
-    return [number(part, unit) for part in parts]
+    found = _quantities(words, unit)
+    if len(found) != 3:
+        many = f"{len(found)} number{'s' * (len(found) != 1)}"
+        raise InputError(f"{words.strip()!r} is {many}; valid: three in {unit}")
+    return found
+
+
+def _quantities(words: str, unit: str) -> list[float]:
+    """Read numbers with their units; empty where anything else is among them.
+
+    Raises:
+        InputError: an unknown unit, or a unit behind some of the numbers only.
+    """
+    known, found = UNITS[unit], _QUANTITY.findall(words)
+    if _QUANTITY.sub("", words).strip("[](),; \t").replace(",", "").replace(";", "").strip():
+        return []
+    given = [u for _, u in found if u]
+    for u in given:
+        if u not in known:
+            raise InputError(f"{words.strip()!r} has the unit {u}; valid: {', '.join(known)}")
+    if len(given) == 1 and found[-1][1]:
+        given *= len(found)
+    if given and len(given) != len(found):
+        raise InputError(f"{words.strip()!r} has units behind some numbers only; valid: all or one")
+    factors = [known[u] for u in given] or [1.0] * len(found)
+    return [round(float(x) * f, 12) for (x, _), f in zip(found, factors, strict=True)]
 
 
 def drivers(group: str) -> list[str]:
@@ -180,10 +225,16 @@ def items() -> tuple[Item, ...]:
     return (
         Item(
             "--robot",
-            f"Which arm? One of {', '.join(robot_names())}, or the path of a .urdf file",
+            f"Which arm? One of {', '.join(robot_names())}, or {OTHER_ARMS}",
             Draft.robot,
         ),
         Item("--host", "Address of its controller", Draft.host, without="not connected yet"),
+        Item(
+            "--repeatability",
+            "What pose repeatability does its maker state (ISO 9283)? E.g. 0.05 mm",
+            _set("robot", "repeatability_m", lambda words: number(words, "m")),
+            without="that of the arm's file, if any",
+        ),
         Item(
             "--tracker",
             f"Which tracker? {' or '.join(trackers)}",
@@ -196,6 +247,13 @@ def items() -> tuple[Item, ...]:
             _set("tracker", "port", str),
             needs="tracker",
             without="not connected yet",
+        ),
+        Item(
+            "--tracker-accuracy",
+            "How accurate is the tracker? Standard deviation of a point, half of its maximum "
+            "permissible error, e.g. 8 um + 3 um/m",
+            Draft.accuracy,
+            without="as a Leica AT500",
         ),
         Item(
             "--force-sensor",
@@ -243,6 +301,13 @@ def items() -> tuple[Item, ...]:
             without="no more",
         ),
         Item(
+            "--readings",
+            "What is to be calibrated? absolute: where the tool is, geometry and loads; "
+            "deflection: what loads do, and no geometry",
+            Draft.readings,
+            without="absolute",
+        ),
+        Item(
             "--floor",
             "What height must arm and load stay above? In m, base axes",
             Draft.floor,
@@ -263,8 +328,16 @@ def init(
     ),
     robot: Annotated[str | None, typer.Option(help="The arm, e.g. ur10e, or a .urdf.")] = None,
     host: Annotated[str | None, typer.Option(help="Address of its controller.")] = None,
+    repeatability: Annotated[
+        str | None,
+        typer.Option(metavar="LENGTH", help='As the maker states it (ISO 9283), e.g. "0.05 mm".'),
+    ] = None,
     tracker: Annotated[str | None, typer.Option(help="The tracker's driver.")] = None,
     tracker_port: Annotated[str | None, typer.Option(help="Its serial port.")] = None,
+    tracker_accuracy: Annotated[
+        str | None,
+        typer.Option(metavar="LENGTH", help='Standard deviation of a point, e.g. "8 um + 3 um/m".'),
+    ] = None,
     force_sensor: Annotated[str | None, typer.Option(help="The force sensor's driver.")] = None,
     force_port: Annotated[str | None, typer.Option(help="Its serial port.")] = None,
     target: Annotated[
@@ -279,6 +352,10 @@ def init(
     ] = None,
     load: Annotated[
         list[str] | None, typer.Option(metavar="LOAD", help=f"A load, {LOADS}; repeatable.")
+    ] = None,
+    readings: Annotated[
+        str | None,
+        typer.Option(metavar="KIND", help="absolute (unless given) or deflection: what is fitted."),
     ] = None,
     floor: Annotated[
         str | None, typer.Option(metavar="Z", help="Height that the arm stays above, m.")
@@ -313,7 +390,7 @@ def init(
         elif item.option == "--robot":
             raise InputError(
                 f"--robot is missing, and nobody can be asked; valid: {', '.join(robot_names())}, "
-                "or the path of a .urdf file"
+                f"or {OTHER_ARMS}"
             )
     _complete(draft)
     written = cell_text(draft.data, f"The cell of a {draft.data['robot']['model']}")
@@ -330,8 +407,9 @@ def init(
 
 _OPTIONS = frozenset(
     {
-        *("robot", "host", "tracker", "tracker_port", "force_sensor", "force_port", "target"),
-        *("load_point", "tool_mass", "tool_com", "load", "floor", "tracker_place"),
+        *("robot", "host", "repeatability", "tracker", "tracker_port", "tracker_accuracy"),
+        *("force_sensor", "force_port", "target", "load_point", "tool_mass", "tool_com", "load"),
+        *("readings", "floor", "tracker_place"),
     }
 )
 
@@ -386,8 +464,9 @@ def _shortly(error: InputError) -> str:
 
 def _complete(draft: Draft) -> None:
     """Add what a plan and a rehearsal need, and check the whole."""
-    if not draft.data.get("loads"):
-        draft.set("planning", readings="absolute", model=list(WITHOUT_LOADS))
+    if draft.data.setdefault("planning", {}).setdefault("readings", "absolute") == "absolute":
+        loaded = () if not draft.data.get("loads") else ("joint_compliance",)
+        draft.set("planning", model=[*GEOMETRY, *loaded])
     draft.set("simulation", clock=CLOCK)
     config = check_section(draft.data, CellConfig, "the cell")
     check_effects(cell_from_config(config, draft.base_dir), config, installed())

@@ -70,8 +70,9 @@ def calibrate(
         typer.Option(
             "--goal",
             metavar="LENGTH",
-            help='The error that is wanted, e.g. "0.1 mm": it is measured on until 95 % of points '
-            "are predicted to be within it after compensation, as far as that can be had.",
+            help='The error of the position that is wanted, e.g. "0.1 mm"; of absolute readings: '
+            "it is measured on until 95 % of points are predicted to be within it after "
+            "compensation, as far as that can be had.",
         ),
     ] = None,
     limit: Annotated[
@@ -250,10 +251,10 @@ def _procedure(
         check_effects(cell, config, catalogue)
         if resume:
             told.t.notice(f"{output} is not there yet: the calibration begins")
-        kind: Mode = config.planning.readings if config.loads else "absolute"
+        _refuse_goal(config.fitted, asked, path)
         seed = config.simulation.seed
         usual = Settings(POSES, VALIDATION, parse_duration(LONGEST, "--max-time"), seed=seed)
-        settings = replace(usual, readings=kind, hide=hide, **asked)
+        settings = replace(usual, readings=config.fitted, hide=hide, **asked)
         p = Procedure(output, cell, config, base_dir, catalogue, settings)
         p.check_files()
         return p
@@ -266,11 +267,25 @@ def _procedure(
             f"{output}: a calibration is there already, {text_calibrate.standing(p.next())}; go on "
             f"with: {told.on}"
         )
+    _refuse_goal(p.settings.readings, asked, path)
     p = replace(p, settings=replace(p.settings, **asked))
     with CampaignFile.open(output) as campaign:
         p.resume(campaign)
     told.t.notice(f"{output}: a calibration, {text_calibrate.standing(p.next())}")
     return p
+
+
+def _refuse_goal(kind: Mode, asked: dict[str, Any], cell: Path) -> None:
+    """Refuse a goal that the readings do not show.
+
+    Raises:
+        InputError: a goal, and deflections are fitted.
+    """
+    if kind == "deflection" and "goal_m" in asked:
+        raise InputError(
+            "--goal is an error of the position, which deflections do not show: a calibration with "
+            f'[planning] readings = "absolute" in {cell} reaches it; or leave out --goal'
+        )
 
 
 def _document(p: Procedure) -> dict[str, object]:

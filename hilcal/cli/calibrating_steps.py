@@ -128,8 +128,9 @@ class Operator:
             _say_refined(t, self._p, found)
         elif kind == "decide":
             decided: Decision = found
-            goal = self._p.settings.goal_m
-            t.show(text_calibrate.decision_report(decided, goal, self._clock))
+            of = self._p.settings
+            report = text_calibrate.decision_report(decided, of.goal_m, of.readings, self._clock)
+            t.show(report)
         elif kind == "validate":
             t.show(text_calibrate.validation_lines(found))
 

@@ -19,7 +19,7 @@ from hilcal.cli.files import (
 )
 from hilcal.cli.prior import Drift, Prior, PriorOf, PriorOptions
 from hilcal.cli.streaming import identify_stream
-from hilcal.cli.terminal import Json, Run, terminal
+from hilcal.cli.terminal import Details, Json, Run, terminal
 from hilcal.data.purpose import purpose_of, refuse_fitting, release
 from hilcal.data.tabular import is_parquet
 from hilcal.data.whitening import Scaling
@@ -81,6 +81,7 @@ def identify(
     ] = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
+    details: Details = False,
     as_json: Json = False,
 ) -> None:
     """Fit a model to the readings, and keep it as a revision.
@@ -127,9 +128,10 @@ def identify(
                 finish(fits[s], say)
             kept = fits[wanted[-1]]
             number = o.store(kept, None, None)
-    t.show(text.fit_report(kept))
+    t.show(text.fit_report(kept, details))
     t.show(prior_lines(kept))
-    t.show(numbers.sentence(covariance_words(o.covariance_parts, o.noise)))
+    if details or o.noise:
+        t.show(numbers.sentence(covariance_words(o.covariance_parts, o.noise)))
     t.show(options_line(kept))
     other = other_arm_of(o.cell, o.readings)
     if other is not None:

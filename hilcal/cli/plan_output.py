@@ -25,8 +25,7 @@ Poses = Annotated[
     int,
     typer.Option(
         "--poses",
-        help="As many readings as so many poses take under every load; "
-        "the plan may spread them over more or fewer poses.",
+        help="So many poses, each read unloaded and under every load that it bears.",
     ),
 ]
 Seed = Annotated[int, typer.Option("--seed", help="Of the random candidates.")]

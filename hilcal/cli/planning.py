@@ -14,7 +14,7 @@ from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import check_record, fit_of
 from hilcal.cli.plan_output import POSES, Csv, Output, Poses, Quick, Seed, generator, write
 from hilcal.cli.prior import Drift, Prior, PriorOf, PriorOptions
-from hilcal.cli.terminal import Json, Record, Revision, Terminal, terminal
+from hilcal.cli.terminal import Details, Json, Record, Revision, Terminal, terminal
 from hilcal.config import CellConfig, load_config
 from hilcal.data.plan import Plan, load_plan
 from hilcal.effects.catalogue import Catalogue
@@ -28,7 +28,7 @@ from hilcal.plan.planner import Planned, Request, make
 from hilcal.plan.summary import about, remarks, summarise
 from hilcal.report import text_run
 from hilcal.report.progress import Say, working
-from hilcal.report.text_plan import plan_report
+from hilcal.report.text_plan import plan_report, plan_screen
 
 CellFile = Annotated[Path, typer.Argument(metavar="CELL.toml", help="The cell.")]
 PlanFile = Annotated[
@@ -41,7 +41,12 @@ def plan(
     output: Output,
     poses: Poses = POSES,
     readings: Annotated[
-        int | None, typer.Option("--readings", help="Or so many readings, repeats not counted.")
+        int | None,
+        typer.Option(
+            "--readings",
+            help="Or so many readings, repeats not counted, at as many poses and under those loads "
+            "that tell most.",
+        ),
     ] = None,
     criterion: Annotated[
         str | None,
@@ -66,6 +71,7 @@ def plan(
     quick: Quick = False,
     csv: Csv = None,
     record: Record = None,
+    details: Details = False,
     effects_from: EffectsFrom = None,
     as_json: Json = False,
 ) -> None:
@@ -79,7 +85,7 @@ def plan(
     carried = PriorOptions(prior, prior_of, drift).load(catalogue)
     config, numbers = read_cell(cell)
     unloaded: Literal["around", "first"] = "first" if unloaded_first else "around"
-    wanted = Request(poses, readings, _criterion(criterion), unloaded=unloaded)
+    wanted = Request(poses, True, readings, _criterion(criterion), unloaded=unloaded)
     with working(t.progress) as say:
         known = None if after is None else _known(t, after, revision, catalogue, say)
         rng = generator(seed)
@@ -89,7 +95,7 @@ def plan(
         say("checking every motion in a dry run")
         made = checked(numbers, config, plan_, summary)
     write(t, numbers, config, made, output, csv, record)
-    t.show(plan_report(made.summary))
+    t.show(plan_report(made.summary) if details else plan_screen(made.summary))
     t.show(f"The plan is in {output}: a file that you may edit. Every limit was checked.")
     t.document({**made.to_dict(), "plan": str(output)})
 

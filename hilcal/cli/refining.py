@@ -23,7 +23,7 @@ from hilcal.cli.files import (
 )
 from hilcal.cli.fitting import Readings, options_json, options_line
 from hilcal.cli.prior import Drift, Prior, PriorOf, PriorOptions
-from hilcal.cli.terminal import Json, Record, Revision, Run, terminal
+from hilcal.cli.terminal import Details, Json, Record, Revision, Run, terminal
 from hilcal.cli.viewing import View, followed
 from hilcal.data.purpose import refuse_fitting
 from hilcal.data.revision import change
@@ -219,6 +219,7 @@ def refine(
     ] = True,
     record: Record = None,
     view: View = False,
+    details: Details = False,
     effects_from: EffectsFrom = None,
     as_json: Json = False,
 ) -> None:
@@ -284,7 +285,7 @@ def refine(
         if o.noise is not None:
             t.show(numbers.sentence(covariance_words(o.covariance_parts, o.noise)))
         t.show(text_refine.verdict_line(found.diagnosis))
-        t.show([*fitted_lines(found.fit)])
+        t.show([*fitted_lines(found.fit)][: None if details else 1])
         t.show(prior_lines(found.fit))
         other = other_arm_of(o.cell, o.readings) if latest is None else None
         if other is not None:
@@ -302,7 +303,7 @@ def refine(
         last = found.diagnosis
         if last.verdict != "adequate" and not last.dependences:
             t.show(text.follows(last.misfit_breakdown))
-        t.show([*curves(last.dependences)])
+        t.show([*curves(last.dependences, len(last.dependences) if details else 1)])
         steps = zip(rows, found.steps, strict=True)
         chapters = [chapter_of(r.number, s) for r, s in steps]
         if live is not None:  # its verdict may have changed when others were tried

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from drivers.simulated.on_the_wire import case_of_plan, simulated_cell
-from drivers.simulated.rehearsal import NOTHING, as_told
+from drivers.simulated.rehearsal import NOTHING, RANDOM, as_told
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.ending import told_to_end
 from hilcal.cli.plan_output import POSES
@@ -78,6 +78,12 @@ def simulate(
             made = load_plan(plan)
         say("preparing the simulated cell")
         secret = case_of_plan(config, made, choice, number, catalogue)
+    if secret.hidden != NOTHING and (config.fitted, secret.mode) == ("deflection", "absolute"):
+        what = f"{choice} hides what they may not show" if choice == RANDOM else f"{choice} cancels"
+        t.notice(
+            f"warning: deflections are planned and fitted, and {what} in them; set readings = "
+            f'"absolute" in [planning] of {cell} for a campaign that shows it'
+        )
     with told_to_end(signal.SIGTERM, signal.SIGINT, signal.SIGHUP) as wait, ExitStack() as stack:
         with working(t.progress) as say:
             say("starting the devices")

@@ -27,6 +27,7 @@ Revision = Annotated[
         "--revision", metavar="N", help="This revision, not the accepted or the latest one."
     ),
 ]
+Details = Annotated[bool, typer.Option("--details", help="Print everything, not one screen of it.")]
 Record = Annotated[
     Path | None, typer.Option("--record", metavar="F.rrd", help="Write a recording for rerun.")
 ]

@@ -44,12 +44,19 @@ class Robot(Conventions):
 
     model: str = Field(
         min_length=1,
-        description='a catalogue name, e.g. "ur10e", or the path of a .urdf file',
+        description='a catalogue name, e.g. "ur10e", or the path of a .urdf file or of a .toml '
+        "file with DH rows",
         examples=["ur10e"],
     )
     gravity_m_s2: Vector3 = Field(
         (0.0, 0.0, -STANDARD_GRAVITY_M_S2),
         description="gravity in base axes: three finite numbers in m/s², e.g. [0.0, 0.0, -9.80665]",
+    )
+    repeatability_m: Positive | None = Field(
+        None,
+        description="the pose repeatability of ISO 9283 that the maker states, in m, more than 0; "
+        "that of the arm's file if absent",
+        examples=[5e-5],
     )
     driver: str | None = Field(
         None, min_length=1, description='the name of an arm\'s driver, e.g. "ur"', examples=["ur"]
@@ -352,6 +359,11 @@ class CellConfig(Section):
                     "place already; leave tracker_m out"
                 )
         return self
+
+    @property
+    def fitted(self) -> Literal["deflection", "absolute"]:
+        """What will be fitted: `[planning] readings`; without loads, absolute readings."""
+        return self.planning.readings if self.loads else "absolute"
 
     def to_json(self) -> str:
         """Return the configuration as JSON, defaults included; `from_json` reads it back."""

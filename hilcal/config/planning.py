@@ -12,8 +12,8 @@ _Name = Annotated[str, Field(min_length=1)]
 _Joints = Annotated[tuple[Number, ...], Field(min_length=1)]
 _BOX = ("center_m", "size_m")
 _CYLINDER = ("bottom_m", "radius_m", "height_m")
-WITHOUT_LOADS = ("encoder_offset",)
-"""What a first plan is for in a cell that has no loads."""
+GEOMETRY = ("encoder_offset",)
+"""What a first plan of absolute readings is for, beside what loads do."""
 
 
 class Planning(Section):

@@ -8,9 +8,12 @@ from hilcal.config.reference import Key, Table, inline, table, tables
 from hilcal.names import escaped
 
 SHOWN: dict[str, tuple[str, ...]] = {
-    "robot": ("model", "driver", "host"),
+    "robot": ("model", "repeatability_m", "driver", "host"),
     "tool": ("target_m", "load_point_m", "mass_kg", "com_m"),
-    "tracker": ("driver", "port", "frame", "range_std_m", "transverse_std_m"),
+    "tracker": (
+        *("driver", "port", "frame", "range_std_m", "range_std_per_m"),
+        *("transverse_std_m", "transverse_std_per_m"),
+    ),
     "force_sensor": ("driver", "port", "origin_m"),
     "repeatability": ("joint_std_rad",),
     "loads": ("name", "mass_kg", "force_N", "moment_Nm"),

@@ -378,8 +378,13 @@ def covariance_blocks(readings: Readings, w: Whitening) -> list[Floats]:
     return [_group_covariance(readings, b.loaded, b.reference, b.weights) for b in w.buckets]
 
 
-def usual_mode(readings: Readings) -> Mode:
-    """Deflections where every loaded reading has an unloaded one in its pose and cycle."""
-    if readings.unloaded.all():
+def usual_mode(readings: Readings, planned: Mode = "deflection") -> Mode:
+    """Deflections where every loaded reading has an unloaded one in its pose and cycle.
+
+    Args:
+        readings: the readings.
+        planned: `[planning] readings` of the cell; where it is "absolute", so is what is fitted.
+    """
+    if planned == "absolute" or readings.unloaded.all():
         return "absolute"
     return "deflection" if has_unloaded(readings).all() else "absolute"

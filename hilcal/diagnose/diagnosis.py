@@ -135,6 +135,16 @@ class Diagnosis:
         return tuple(s.effect for s in self.suspects if s.passes)
 
     @property
+    def not_shown(self) -> tuple[str, ...]:
+        """Names of the effects that these readings would reveal at no plausible size.
+
+        Of deflections these are errors that are the same under every load, as those of geometry.
+        """
+        predicted = {b.effect for b in self.background}
+        rest = (s for s in self.suspects if not s.passes and s.effect not in predicted)
+        return tuple(s.effect for s in rest if not s.shown)
+
+    @property
     def tested(self) -> int:
         """Number of effects that were tested; the level of the test is shared by them."""
         return sum(s.score.rank > 0 for s in self.suspects)

@@ -104,6 +104,7 @@ class Suspect:
             was not looked at, since the suspect fails other tests.
         refuted: whether the error on poses left out does not fall by it after all: beside geometry,
             where no load was hung (see `gravity`), or as a refit has shown.
+        most: largest plausible strength, in ordinary magnitudes; see `plausible_size`.
         same_as: other suspects that these readings do not separate from it.
         coarse: name of the effect of the model that it is finer than; empty for one that the model
             does not have.
@@ -118,6 +119,7 @@ class Suspect:
     needs: tuple[tuple[str, float, float], ...] = ()
     kept: float = 1.0
     refuted: bool = False
+    most: float = np.inf
     same_as: tuple[str, ...] = ()
     coarse: str = ""
 
@@ -135,6 +137,11 @@ class Suspect:
     def least(self) -> Strength:
         """The smallest strength of it that these readings would reveal."""
         return self.detection.least
+
+    @property
+    def shown(self) -> bool:
+        """Whether these readings would reveal it at a plausible size."""
+        return self.least.visible and self.least.ordinary <= self.most
 
     @property
     def passes(self) -> bool:
@@ -349,6 +356,7 @@ def _suspect(p: Linearisation, scored: _Scored, level: float, count: int) -> Sus
         explains=False,
         needs=_implausible(p, scored),
         detection=Detection(least),
+        most=largest,
     )
 
 

@@ -82,10 +82,8 @@ def _least(tests: "SuspectTests", full: EffectColumns, start: Strength) -> Stren
                 (unit, t * float(np.sqrt(np.mean(full.scale[_of_unit(full, unit)] ** 2))))
                 for unit, _ in start.parameters
             )
-            return Strength(float(displacement), own)
-    return replace(
-        start, displacement_m=np.inf, parameters=tuple((u, np.inf) for u, _ in start.parameters)
-    )
+            return Strength(float(displacement), own, t)
+    return Strength(np.inf, tuple((u, np.inf) for u, _ in start.parameters))
 
 
 def _of_unit(of: EffectColumns, unit: str) -> list[int]:

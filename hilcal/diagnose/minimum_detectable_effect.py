@@ -28,12 +28,14 @@ class Strength:
         displacement_m: rms displacement of the target (of the deflection), m; infinite where
             these readings cannot show the effect.
         parameters: the same in the effect's own units: (unit, rms of its parameters), SI.
+        ordinary: the same in the effect's ordinary magnitudes.
         finest_m: displacement from which the effect would have been revealed were it finer than the
             poses resolve (see `Effect.fine`), infinite where never; None where no such limit is.
     """
 
     displacement_m: float
     parameters: tuple[tuple[str, float], ...]
+    ordinary: float = np.inf
     finest_m: float | None = None
 
     @property
@@ -86,4 +88,4 @@ def least_strength(
         (unit, typical * float(np.sqrt(np.mean(scale[names == unit] ** 2))))
         for unit in dict.fromkeys(units)
     )
-    return Strength(float(np.median(moved)), own)
+    return Strength(float(np.median(moved)), own, typical)

@@ -3,7 +3,7 @@
 The rules, in this order:
 
 0. A figure of the cell that was entered otherwise explains the misfit (see `wrong_figures`):
-   `ambiguous`, by that figure or an effect like it; nothing else is looked for before it is settled.
+   `ambiguous`, until that is settled; nothing else is looked for.
 1. A suspect passes all tests (see `effect_ranking.Suspect.passes`), and all effects of the
    catalogue together leave more than noise (see `catalogue_sufficiency`): `unknown_effect`.
 2. A suspect passes, and the readings separate it from every other: `missing_effect`; else

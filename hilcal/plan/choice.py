@@ -105,6 +105,59 @@ def choose(
     )
 
 
+def choose_poses(
+    asked: Objective,
+    problem: Problem,
+    usable: Bools,
+    poses: int,
+    rng: np.random.Generator,
+    effort: int = EFFORT,
+) -> Design:
+    """Return the exact design of so many poses, each read once under all that it bears.
+
+    Where the cell leaves fewer poses, some are read again. The design's bound is that of as many
+    readings at any number of poses, under any loads.
+
+    Args:
+        asked: the question, of all units.
+        problem: the design problem.
+        usable: (K,) which units there are to choose from.
+        poses: how many.
+        rng: generator.
+        effort: of the search.
+    """
+    free, index = only(asked, usable), np.flatnonzero(usable)
+    of: dict[int, list[int]] = {}
+    for k, unit in enumerate(index):  # a deflection's unit with all loads holds the others
+        pose, loads = problem.what[unit]
+        mine = of.setdefault(pose, [])
+        if problem.mode == "deflection" and mine:
+            if len(loads) <= len(problem.what[index[mine[0]]][1]):
+                continue
+            mine.clear()
+        mine.append(k)
+    members = list(of.values())
+    height = max(map(len, members)) * free.units.rows.shape[1]
+    rows = np.zeros((len(members), height, free.units.rows.shape[2]))
+    for out, mine in zip(rows, members, strict=True):
+        stacked = free.units.rows[mine].reshape(-1, rows.shape[2])
+        out[: len(stacked)] = stacked
+    units = CandidateSet(rows, np.ones(len(members)))
+    found = best(
+        units, asked.criterion, float(poses), asked.prior, rng,
+        most=-(-poses // max(len(members), 1)), names=asked.names, effort=effort,
+    )  # fmt: skip
+    counts = np.zeros(len(index), dtype=np.int64)
+    for mine, count in zip(members, found.counts.tolist(), strict=True):
+        counts[mine] = count
+    cost = float(counts @ free.units.cost)
+    relaxed = relax(
+        free.units, asked.criterion, cost, asked.prior, names=asked.names, tolerance=LOOSE
+    )
+    bound = max(relaxed.bound, found.value)
+    return replace(found, counts=counts, bound=bound, cost=cost, relaxed=relaxed)
+
+
 def promising(asked: Objective, budget: float) -> Ints:
     """Return the units that a plan is likely to be made of: those of the best prices."""
     found = relax(
@@ -123,11 +176,13 @@ class Loads:
         names: those that are kept.
         budget: readings for them within the time.
         left_out: those that are not, with the gain of leaving each out as a share of φ.
+        spared: those that are kept, since all are asked for, with the same gain.
     """
 
     names: tuple[str, ...]
     budget: float
     left_out: tuple[tuple[str, float], ...]
+    spared: tuple[tuple[str, float], ...] = ()
 
 
 def worthwhile(

@@ -1,5 +1,6 @@
 """Candidate poses: drawn evenly over the joint space, those that the cell allows."""
 
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +26,8 @@ _FUNNEL = (  # cheap ones and those that leave little first
     "sight",
     "hanging",
 )
+_OF_PAIRS = ("self-collision", "obstacle")
+_LOOK = 64  # states of which is told what touches
 _OF_LOADS = ("payload", "torque", "force sensor", "hanging", "sight")
 
 
@@ -80,21 +83,21 @@ def draw(
 
     sequence = qmc.Sobol(len(low), scramble=False)
     shift = rng.random(len(low))
-    left = dict.fromkeys(_FUNNEL, 0)
+    left, lost = dict.fromkeys(_FUNNEL, 0), dict[str, Floats]()
     found = [np.empty((0, len(low)))]
     drawn = have = 0
     most = max(_MOST[0], _MOST[1] * count) if most is None else most
     if also is not None:
-        found.append(_kept(space, also, left))
+        found.append(_kept(space, also, left, lost))
         drawn, have = len(also), len(found[-1])
     while have < count and drawn < (most if have else _VAIN):
         u = (sequence.random(_CHUNK) + shift) % 1.0
         q = space.cell.arm.complete(low + u * (high - low))
-        found.append(_kept(space, q, left))
+        found.append(_kept(space, q, left, lost))
         drawn += _CHUNK
         have += len(found[-1])
     if have < least:
-        raise CannotAnswerError(_too_few(drawn, left, least))
+        raise CannotAnswerError(_too_few(space, drawn, left, lost, least))
     q = np.vstack(found)[:count]
     allowed = np.ones((len(q), len(space.loads)), dtype=np.bool_)
     remarks = [*space.remarks]
@@ -109,16 +112,24 @@ def draw(
     return Drawn(q, space.loads, allowed, drawn, left, tuple(remarks))
 
 
-def _kept(space: Space, q: Floats, left: dict[str, int]) -> Floats:
-    """Those of the states that are allowed unloaded; counts what each reason leaves."""
+def _kept(space: Space, q: Floats, left: dict[str, int], lost: dict[str, Floats]) -> Floats:
+    """Those of the states that are allowed unloaded.
+
+    Counts what each reason leaves, and keeps the last states that each has taken.
+    """
     for reason in _FUNNEL:
         if len(q):
-            q = q[space.keeps(reason, q, UNLOADED)]
+            keeps = space.keeps(reason, q, UNLOADED)
+            if not keeps.all():
+                lost[reason] = q[~keeps][:_LOOK]
+            q = q[keeps]
         left[reason] += len(q)
     return q
 
 
-def _too_few(drawn: int, left: dict[str, int], least: int) -> str:
+def _too_few(
+    space: Space, drawn: int, left: dict[str, int], lost: dict[str, Floats], least: int
+) -> str:
     """What leaves too few: the first reason that leaves none, else the one that takes most."""
     counts = list(left.values())
     names = list(left)
@@ -131,7 +142,21 @@ def _too_few(drawn: int, left: dict[str, int], least: int) -> str:
         if n < b
     ]
     head = "no pose" if counts[-1] == 0 else f"only {counts[-1]:,} poses, {least:,} are needed"
-    return f"{head}: of {drawn:,} drawn states {', '.join(told)} ({REASONS[names[worst]][1]})"
+    why = _touching(space, names[worst], lost) or REASONS[names[worst]][1]
+    return f"{head}: of {drawn:,} drawn states {', '.join(told)} ({why})"
+
+
+def _touching(space: Space, reason: str, lost: dict[str, Floats]) -> str:
+    """Name the bodies that touch in most of the states that were lost, and what to look at."""
+    if reason not in _OF_PAIRS or reason not in lost:
+        return ""
+    met = Counter(
+        found.of for q in lost[reason] for found in space.findings(q[None], UNLOADED, (reason,))
+    )
+    if not met:
+        return ""
+    (pair, count), look = met.most_common(1)[0], REASONS[reason][1]
+    return f"{pair} touch in {100 * count // len(lost[reason])} % of the others; look at {look}"
 
 
 def _unusable(space: Space, q: Floats, load: str) -> str:

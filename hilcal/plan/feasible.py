@@ -19,7 +19,10 @@ PLANNED = Margins(joint=1e-6, inside=0.02, clear=0.02, itself=0.01, bear=0.98)
 REASONS = {
     "joint limits": ("keep the joint limits", "[limits] joint_margin_rad"),
     "workspace": ("keep workspace and floor", "[limits] workspace_min_m, workspace_max_m"),
-    "self-collision": ("do not touch themselves", "the arm's shape, [tool]"),
+    "self-collision": (
+        "do not touch themselves",
+        "[tool] target_m, load_point_m in flange axes, [robot] model",
+    ),
     "obstacle": ("are clear of obstacles", "[[obstacles]]"),
     "singularity": ("are not singular", "[planning] singularity"),
     "torque": ("keep the joint torques", "[limits] torque_share"),

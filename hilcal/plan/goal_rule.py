@@ -79,10 +79,11 @@ class GoalRule:
         self._work_q: tuple[tuple[float, ...], ...] = ()
         self._predicted = ""
         if self.goal.of_position:
-            if self.goal.what == "deflection" and config.planning.readings != "deflection":
+            shown = "position" if config.fitted == "absolute" else "deflection"
+            if self.goal.what != shown:
                 raise InputError(
-                    f'goal "{text}": [planning] readings = "{config.planning.readings}", which '
-                    "predicts positions; valid: position"
+                    f'goal "{text}": [planning] readings = "{config.fitted}", which show the '
+                    f"{shown}; valid: {shown}"
                 )
             planning = config.planning
             if not planning.work_q_rad and planning.work_min_m is None:

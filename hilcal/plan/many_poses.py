@@ -53,7 +53,9 @@ def measure_poses(
     count = max(SPARE * poses, LEAST)
     planning = config.planning.model_copy(update={"readings": fit.mode, "candidates": count})
     config = config.model_copy(update={"loads": [], "planning": planning})
-    made = make(cell, config, Request(poses, poses, CRITERION, effort=0), rng, fit, say)
+    made = make(
+        cell, config, Request(poses, readings=poses, criterion=CRITERION, effort=0), rng, fit, say
+    )
     say("spreading the poses")
     of, space = made.problem, Space(cell, config)
     home = made.ordered.plan.q[0] if reference is None else reference

@@ -21,6 +21,7 @@ from hilcal.plan.choice import (
     Objective,
     canonical,
     choose,
+    choose_poses,
     only,
     promising,
     within,
@@ -58,6 +59,9 @@ class Request:
 
     Attributes:
         poses: as many readings as so many poses take unloaded and under each load.
+        whole: just so many poses, each read once unloaded and under every load that it bears;
+            else these readings are spread over as many poses, and under those loads, as determine
+            most.
         readings: or this many readings, those at the reference and repeats not counted.
         criterion: of `[planning]` where None.
         effort: of the search for whole numbers.
@@ -65,6 +69,7 @@ class Request:
     """
 
     poses: int = 20
+    whole: bool = False
     readings: int | None = None
     criterion: str | None = None
     effort: int = EFFORT
@@ -89,6 +94,7 @@ class Planned:
         predicted: standard uncertainties that a fit to the readings will have.
         undetermined: parameters of the model that no reading of the cell determines.
         asked_poses: poses that the budget was asked for by; None where readings were.
+        whole: whether each pose is read once under all that it bears, see `Request`.
     """
 
     ordered: Ordered
@@ -104,6 +110,7 @@ class Planned:
     predicted: Predicted
     undetermined: tuple[Undetermined, ...]
     asked_poses: int | None
+    whole: bool = False
 
     @property
     def counts(self) -> Floats:
@@ -161,13 +168,19 @@ def make(
     # so many readings and no more: then there is nothing to be had for a load's time
     change = 0.0 if request.readings is not None else seconds.change_s / seconds.reading_s
     loads = worthwhile(asked, of, budget, change, rng)
+    if whole := request.whole and request.readings is None:
+        kept = (*loads.names, *(name for name, _ in loads.left_out))
+        loads = Loads(kept, budget, (), loads.left_out)
     usable = within(of, loads.names)
     say(f"choosing poses by criterion {criterion}")
     pose_of = np.array([pose for pose, _ in of.what])
     first = np.flatnonzero(usable)[promising(only(asked, usable), loads.budget)]
     usable &= ~np.isin(pose_of, _unreachable(space, of, home, first))
     for _ in range(ROUNDS):
-        design = choose(only(asked, usable), loads.budget, rng, request.effort)
+        if whole:
+            design = choose_poses(asked, of, usable, request.poses, rng, request.effort)
+        else:
+            design = choose(only(asked, usable), loads.budget, rng, request.effort)
         units = np.flatnonzero(usable)[np.flatnonzero(design.counts)]
         lost = _unreachable(space, of, home, units)
         if not len(lost):
@@ -191,7 +204,7 @@ def make(
     knows = predicted(of, counts.astype(float), work=work)
     return Planned(
         ordered, design, loads, of, asked, usable, work, drawn, loads.budget, criterion, knows,
-        undetermined, None if request.readings is not None else request.poses,
+        undetermined, None if request.readings is not None else request.poses, whole,
     )  # fmt: skip
 
 

@@ -13,7 +13,7 @@ from hilcal.data.plan import REFERENCE
 from hilcal.effects.protocol import FRAME_ROLES, Role
 from hilcal.errors import CannotAnswerError
 from hilcal.plan.approximate_design import relax
-from hilcal.plan.choice import choose, only, unknown
+from hilcal.plan.choice import choose, choose_poses, only, unknown
 from hilcal.plan.compound_criteria import compound_objective
 from hilcal.plan.confounding import Confounding
 from hilcal.plan.detectable import DetectableEffect, detectable_effects
@@ -28,6 +28,8 @@ COMPARED = ("D", "A", "E", "K", "I")
 """Criteria of the comparison: all but T-optimality, which needs suspects."""
 SHARES = (0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
 """Budgets of the sample-size curve by the plan's own. A choice."""
+WORTH = 0.9
+"""Efficiency of a plan below which it is said what another one would give; a choice."""
 LOOSE = 3e-3
 """Relative gap of the continuous optima of the curve. A choice: below what a plot resolves."""
 _LEFT_OUT = {
@@ -121,6 +123,7 @@ class PlanSummary:
         remarks: assumptions and omissions, one sentence each.
         asked_poses: poses that were asked for: as many readings as these take under every load;
             None where readings were.
+        whole: whether each pose is read under all that it bears, see `planner.Request`.
     """
 
     poses: int
@@ -140,6 +143,7 @@ class PlanSummary:
     shortest: Confounding | None = None
     remarks: tuple[str, ...] = ()
     asked_poses: int | None = None
+    whole: bool = False
 
     @property
     def quantity(self) -> str:
@@ -222,6 +226,7 @@ def summarise(
         shortest=planned.ordered.confounding_shortest,
         remarks=remarks(planned),
         asked_poses=planned.asked_poses,
+        whole=planned.whole,
     )
 
 
@@ -258,8 +263,19 @@ def remarks(planned: Planned) -> tuple[str, ...]:
         "the same time"
         for name, gain in planned.loads.left_out
     )
+    omitted += tuple(
+        f'load "{name}" costs more than it tells: without it the same time would make the plan '
+        f"{100 * gain:.0f} % more efficient"
+        for name, gain in planned.loads.spared
+    )
+    if planned.whole and planned.design.efficiency < WORTH:
+        readings = int(planned.design.cost)
+        omitted += (
+            f"as many readings, spread over as many poses and loads as tell most (--readings "
+            f"{readings}), are up to {100 / planned.design.efficiency - 100:.0f} % more efficient",
+        )
     without = tuple(u.remark for u in planned.undetermined)
-    notes = (*without, *planned.drawn.remarks, *planned.problem.notes, *omitted)
+    notes = (*without, *omitted, *planned.drawn.remarks, *planned.problem.notes)
     return tuple(dict.fromkeys(notes))
 
 
@@ -293,8 +309,11 @@ def _criteria(planned: Planned, rng: np.random.Generator) -> Iterator[CriterionR
             yield _result(planned, name, planned.counts, planned.design.efficiency)
             continue
         try:
-            whole = compound_objective(of, name, planned.work, planned.budget, rng)
-            design = choose(only(whole, planned.usable), planned.budget, rng, 1)
+            asked = compound_objective(of, name, planned.work, planned.budget, rng)
+            if planned.whole and planned.asked_poses is not None:
+                design = choose_poses(asked, of, planned.usable, planned.asked_poses, rng, 1)
+            else:
+                design = choose(only(asked, planned.usable), planned.budget, rng, 1)
         except CannotAnswerError:
             continue
         counts = np.zeros(len(of.units))
@@ -343,7 +362,7 @@ def _curve(planned: Planned) -> Iterator[CurvePoint]:
     """Yield the sample-size curve, of continuous optima."""
     of = planned.problem
     asked, usable = only(planned.asked, planned.usable), np.flatnonzero(planned.usable)
-    own = float(planned.counts.sum())
+    own = len({of.what[k][0] for k in np.flatnonzero(planned.counts)})
     last, before = None, 0
     for share in SHARES:
         budget, poses = share * planned.budget, max(1, round(share * own))

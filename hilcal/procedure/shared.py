@@ -79,7 +79,7 @@ class Shared:
 
     def _mode(self, readings: Readings) -> Mode:
         """Return the kind of readings that is fitted; deflections where the readings allow."""
-        return "absolute" if self.settings.readings == "absolute" else usual_mode(readings)
+        return usual_mode(readings, self.settings.readings)
 
     def _record(self, o: Campaign) -> RevisionRecord:
         """Return the revision that the last refinement ended with.

@@ -1,6 +1,7 @@
 """From fits and diagnoses to the `Story` that the viewer draws."""
 
 import itertools
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -266,10 +267,12 @@ def _unit_of(d: Dependence) -> tuple[str, float]:
 
 def _limits(d: Diagnosis) -> tuple[StoryLimit, ...]:
     """What could have been seen of the effects that were not found, the best visible first."""
-    rest = [s for s in d.suspects if not s.passes]
+    rest = [
+        (s.least.displacement_m if s.shown else math.inf, s) for s in d.suspects if not s.passes
+    ]
     return tuple(
-        StoryLimit(s.effect, s.least.displacement_m, own_units(s.least) if s.least.visible else "")
-        for s in sorted(rest, key=lambda s: s.least.displacement_m)
+        StoryLimit(s.effect, least, own_units(s.least) if s.shown else "")
+        for least, s in sorted(rest, key=lambda of: of[0])
     )
 
 

@@ -28,6 +28,7 @@ def to_json(d: Diagnosis) -> dict[str, object]:
             for v in d.misfit_breakdown
         ],
         "suspects": [suspect_json(s) for s in d.suspects],
+        "not_shown": list(d.not_shown),
         "tests": {
             "count": d.tested,
             "level": FALSE_ALARM,
@@ -77,6 +78,7 @@ def suspect_json(s: Suspect) -> dict[str, object]:
         "significant": s.passes,
         "same_as": list(s.same_as),
         "least": least(s.least),
+        "shown": s.shown,
         "plausible": s.plausible,
         "needs": [{"unit": unit, "rms": rms, "plausible_rms": most} for unit, rms, most in s.needs],
         "kept_share": s.kept,

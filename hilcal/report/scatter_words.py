@@ -14,8 +14,8 @@ from hilcal.report import numbers
 from hilcal.robot.arm import Arm
 
 
-def left_to_the_arm(d: Diagnosis) -> str:
-    """Say that what is left is the arm's repeatability."""
+def left_to_the_arm(d: Diagnosis, nothing_missing: str) -> str:
+    """Say that what is left is the arm's repeatability, and that no effect is missing."""
     s = _scatter(d)
     doubt = ""
     if not separated(s):
@@ -30,8 +30,8 @@ def left_to_the_arm(d: Diagnosis) -> str:
         predicted = f"; {_predicted(s)}"
     return (
         f"What is left, {numbers.length(s.size_m)} rms, {alone}is of the size of the arm's "
-        f"repeatability: {sigmas(s)}{_maker(s, d.fit.model.cell.arm)}{predicted}; no effect of the "
-        f"catalogue is missing{doubt}{_too_large(d)}"
+        f"repeatability: {sigmas(s)}{_maker(s, d.fit.model.cell.arm)}{predicted}; "
+        f"{nothing_missing}{doubt}{_too_large(d)}"
     )
 
 

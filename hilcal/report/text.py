@@ -9,7 +9,7 @@ from rich.text import Text
 
 from hilcal.diagnose.effect_ranking import FALSE_ALARM, LEAST_SHARE
 from hilcal.diagnose.misfit_breakdown import Group, MisfitShare
-from hilcal.effects.protocol import Effect
+from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.identify.background import background_of
 from hilcal.identify.before import error_before
 from hilcal.identify.fit import Fit
@@ -23,6 +23,8 @@ from hilcal.report.word_table import WordTable
 from hilcal.types import Ints
 
 ALL_ROWS = 60
+SCREEN = 8
+"""Parameters on the first screen."""
 STRONGEST = 5
 DIRECTIONS = 8
 GROSS = 8
@@ -60,20 +62,38 @@ def kind(fit: Fit) -> str:
     return f"{len(fit.raw)} deflections (loaded minus unloaded) of {len(fit.readings)} readings"
 
 
-def fit_report(fit: Fit) -> Iterator[RenderableType]:
-    """Yield all that people want to know of a fit."""
+def fit_report(fit: Fit, details: bool = True) -> Iterator[RenderableType]:
+    """Yield all that people want to know of a fit, or one screen of it."""
     yield heading(f"Model: {model_name(fit.model.named)}")
     yield f"Fitted to {kind(fit)}; scaling {fit.scaling}."
     yield f"{before_and_after(fit)}\n"
-    yield from parameters(fit)
+    yield from parameters(fit, ALL_ROWS if details else SCREEN)
     yield errors(fit)
     yield ""
-    yield from remarks(fit)
+    yield from remarks(fit) if details else _short(fit)
 
 
-def parameters(fit: Fit) -> Iterator[RenderableType]:
-    """Yield a table of parameters, and a summary of each large family."""
-    rows = table("parameter", "value", "±", "unit", "meaning", left=(0, 3, 4))
+def _short(fit: Fit) -> Iterator[str]:
+    """Yield the remarks of the first screen."""
+    yield _variance_factor(fit)
+    null, gross = [str(d) for d in fit.uncertainty.null], len(gross_errors(fit))
+    if null:
+        several = f"{len(null)} directions" if len(null) > 1 else "1 direction"
+        yield f"{several} cannot be seen in these readings: {numbers.few(null, 1)}."
+    if gross:
+        yield f"{gross} readings are set aside as gross errors; --details lists them."
+    yield from list(fitted_lines(fit))[:1]
+
+
+def parameters(fit: Fit, most: int = ALL_ROWS) -> Iterator[RenderableType]:
+    """Yield a table of parameters, and a summary of each large family.
+
+    Args:
+        fit: the fit.
+        most: rows of the table; where there are more, those of frames come last.
+    """
+    rows: list[tuple[str, ...]] = []
+    frames: list[tuple[str, ...]] = []
     families, unseen = [], []
     seen = fit.uncertainty.identifiable
     for effect, s in zip(fit.model.effects, fit.model.slices(), strict=True):
@@ -83,13 +103,19 @@ def parameters(fit: Fit) -> Iterator[RenderableType]:
         if effect.groups() is not None or len(index) > ALL_ROWS:
             families.append(family(fit, effect, index))
         else:
-            _parameter_rows(rows, fit, effect, index)
+            of = frames if effect.role in FRAME_ROLES else rows
+            of += _parameter_rows(fit, effect, index)
             left = [p.name for k, p in zip(index, effect.parameters, strict=True) if not seen[k]]
             if left:
                 unseen.append(f"{effect.name} {_which(left, len(index))}")
-    if rows.row_count:
-        yield rows
-        yield Text("±: standard uncertainty.\n", style="dim")
+    rest = len(frames) + len(rows) - most
+    if frames or rows:
+        out = table("parameter", "value", "±", "unit", "meaning", left=(0, 3, 4))
+        for row in [*frames, *rows] if rest <= 0 else [*rows, *frames][:most]:
+            out.add_row(*row)
+        yield out
+        more = f"{rest} more parameters: --details. " if rest > 0 else ""
+        yield Text(f"{more}±: standard uncertainty.\n", style="dim")
     yield from families
     if unseen:
         yield f"Not determined by these readings: {'; '.join(unseen)}.\n"
@@ -101,7 +127,7 @@ def _which(names: Sequence[str], count: int) -> str:
     return " ".join(names) if len(names) <= 6 else f"({len(names)} of {count})"
 
 
-def _parameter_rows(rows: WordTable, fit: Fit, effect: Effect, index: Ints) -> None:
+def _parameter_rows(fit: Fit, effect: Effect, index: Ints) -> Iterator[tuple[str, ...]]:
     seen = fit.uncertainty.identifiable
     for k, p in zip(index, effect.parameters, strict=True):
         alike = [
@@ -113,7 +139,7 @@ def _parameter_rows(rows: WordTable, fit: Fit, effect: Effect, index: Ints) -> N
         value, std = numbers.with_std(
             factor * float(fit.theta[k]), factor * float(fit.uncertainty.std[k])
         )
-        rows.add_row(f"{effect.name}.{p.name}", value, std, unit, p.meaning)
+        yield f"{effect.name}.{p.name}", value, std, unit, p.meaning
 
 
 def family(fit: Fit, effect: Effect, index: Ints) -> RenderableType:
@@ -172,11 +198,7 @@ def before_and_after(fit: Fit) -> str:
 
 def remarks(fit: Fit) -> Iterator[RenderableType]:
     """Yield a sentence for each thing that the numbers alone do not say."""
-    low, high = fit.variance_factor_interval
-    yield (
-        f"Variance factor {fit.variance_factor:.3g} (95 % interval {low:.3g} to {high:.3g}): the "
-        "squared error in units of the noise, 1 where model and noise are right."
-    )
+    yield _variance_factor(fit)
     behind = background_of(fit)
     if behind.effects:
         yield (
@@ -206,6 +228,14 @@ def remarks(fit: Fit) -> Iterator[RenderableType]:
         yield from (f"  {g.pose}/{g.load}: {g.reason}" for g in gross[:GROSS])
         if len(gross) > GROSS:
             yield f"  ... and {len(gross) - GROSS} more; --json lists all"
+
+
+def _variance_factor(fit: Fit) -> str:
+    low, high = fit.variance_factor_interval
+    return (
+        f"Variance factor {fit.variance_factor:.3g} (95 % interval {low:.3g} to {high:.3g}): the "
+        "squared error in units of the noise, 1 where model and noise are right."
+    )
 
 
 def scaling_remark(fit: Fit) -> str:

@@ -9,9 +9,11 @@ from rich.text import Text
 from hilcal.calibration.improvement import Improved, Improvement
 from hilcal.calibration.poses import BAND
 from hilcal.data.plan import UNLOADED
+from hilcal.data.whitening import Mode
 from hilcal.identify.acceptance import Acceptance
 from hilcal.report import numbers, text
 from hilcal.report.text_run import spoken
+from hilcal.report.verdict_words import UNCALIBRATED
 
 if TYPE_CHECKING:
     from hilcal.procedure.decision import Decision
@@ -85,12 +87,15 @@ def standing(step: "Step") -> str:
     return f'its next step is "{where}"{left}'
 
 
-def decision_report(d: "Decision", goal_m: float | None, clock: float = 1.0) -> Iterator[str]:
+def decision_report(
+    d: "Decision", goal_m: float | None, mode: Mode, clock: float = 1.0
+) -> Iterator[str]:
     """Yield what was decided after a refinement, and why.
 
     Args:
         d: the decision.
         goal_m: the goal, m; None without one.
+        mode: what is fitted.
         clock: cell seconds per real second.
     """
     now = numbers.length(d.error.now_m)
@@ -103,10 +108,13 @@ def decision_report(d: "Decision", goal_m: float | None, clock: float = 1.0) -> 
         cost = f"{len(d.plan.steps)} further readings ({lasting(d.seconds, clock)})"
     names = numbers.names(d.suspects)
     power = "" if d.power is None else f"with a power of {d.power:.2f} at least"
+    of, rest = "", ""
+    if mode == "deflection":
+        of, rest = " for deflections", f" {numbers.sentence(UNCALIBRATED)}"
     reasons = {
-        "adequate": "The model is adequate; nothing more is measured to fit it.",
-        "goal_met": f"The model is adequate, and the goal of {goal} is met: nothing more is "
-        "measured to fit it.",
+        "adequate": f"The model is adequate{of}; nothing more is measured to fit it.{rest}",
+        "goal_met": f"The model is adequate, and the goal of {goal} is met{of}: nothing more is "
+        f"measured to fit it.{rest}",
         "doubt": f"{names} are in doubt: {cost} will separate them, {power}.",
         "goal": f"The goal is {goal}: {cost} are predicted to lower this to {then}.",
         "floor": f"The goal of {goal} is out of reach: the arm's repeatability and what the model "
@@ -150,7 +158,7 @@ def goal_words(mode: str) -> str:
     if mode == "deflection":
         return (
             "A point is where the unloaded arm was measured at the same nominal joint values: the "
-            "correction removes what the load does."
+            f"correction removes what the load does; {UNCALIBRATED}."
         )
     return (
         "A point is where the nominal arm has the tool, in the tracker's frame by the fitted "
@@ -212,12 +220,12 @@ def _rows(part: Improved) -> Iterator[tuple[str, ...]]:
 def _limit_words(found: Improvement, limit_m: float) -> str:
     over, size = found.over(limit_m), numbers.length(limit_m)
     largest = numbers.length(found.everything.after.max_m)
+    of = " for deflections" if found.mode == "deflection" else ""
     if not over:
-        return (
-            f"PASSED: no error at the corrected targets is over {size}, the largest is {largest}."
-        )
+        words = f"no error at the corrected targets is over {size}, the largest is {largest}."
+        return f"PASSED{of}: {words}"
     return (
-        f"FAILED: {over} of {found.everything.count} errors at the corrected targets are over "
+        f"FAILED{of}: {over} of {found.everything.count} errors at the corrected targets are over "
         f"{size}; the largest is {largest}."
     )
 

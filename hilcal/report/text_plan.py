@@ -23,6 +23,8 @@ CRITERIA = {
     "separate": "power to separate the leading suspects (T-optimality)",
 }
 BAR = 30
+SCREEN = 4
+"""Remarks on the first screen; the most important come first."""
 LIKE = 1.1
 """A number of poses is enough where the end of the curve is not better by more than this factor.
 A choice."""
@@ -50,6 +52,50 @@ def plan_facts(s: PlanSummary) -> Iterator[RenderableType]:
     for name, value in cost_rows(s):
         rows.add_row(name, Text(value, style="bold" if name == "efficiency" else ""))
     yield Padding(rows, (0, 0, 1, 0))
+
+
+def plan_screen(s: PlanSummary) -> Iterator[RenderableType]:
+    """Yield what a plan costs and reaches, on one screen; `plan_report` yields the rest as well."""
+    yield from plan_facts(s)
+    out = text.table("predicted for", "parameters", "±", "unit", "± in %, worst", left=(0, 3))
+    for row in effect_rows(s.parameters):
+        out.add_row(*row)
+    if out.row_count:
+        yield out
+        yield ""
+    if larger := [c for c in s.curve if c.poses > s.poses]:
+        told = [f"{c.poses} poses ± {numbers.length(c.position_std_m)}" for c in larger[::2]]
+        yield f"More would give, predicted for the {s.quantity}: {', '.join(told)}."
+    if seen := detectable(s):
+        (first, least), (last, most) = seen[0], seen[-1]
+        yield f"Outside of the model: {first} is seen from {least}, ..., {last} from {most}."
+    if words := undetectable(s):
+        yield words
+    yield from (f"note: {remark}" for remark in s.remarks[:SCREEN])
+    rest = len(s.remarks) - SCREEN
+    more = f"{rest} more notes, every parameter" if rest > 0 else "every parameter"
+    yield f"--details: {more}, criteria, numbers of poses, effects outside of the model."
+
+
+def effect_rows(parameters: Sequence[PredictedParameter]) -> Iterator[tuple[str, ...]]:
+    """Yield a row for the parameters of an effect that have one unit."""
+    groups: dict[tuple[str, str], list[PredictedParameter]] = {}
+    for p in parameters:
+        groups.setdefault((_effect(p.name), p.unit), []).append(p)
+    for (effect, si), all_of in groups.items():
+        known = [p for p in all_of if math.isfinite(p.std)]
+        count = str(len(all_of))
+        if len(known) < len(all_of):
+            count = f"{len(known)} of {len(all_of)}"
+        if not known:
+            yield effect, count, "not determined", "", ""
+            continue
+        stds = [p.std for p in known]
+        unit, factor = numbers.unit_for(si, stds)
+        least, most = (numbers.digits(factor * x, 2) for x in (min(stds), max(stds)))
+        shares = [p.std / abs(p.value) for p in known if p.value]
+        worst = f"{numbers.digits(100 * max(shares), 2)} %" if shares else ""
+        yield effect, count, least if least == most else f"{least} to {most}", unit, worst
 
 
 def plan_report(s: PlanSummary) -> Iterator[RenderableType]:
@@ -117,8 +163,10 @@ def cost_rows(s: PlanSummary) -> Iterator[tuple[str, str]]:
 
 def _asked(s: PlanSummary) -> str:
     """Say why there are other poses than were asked for; nothing where there are as many."""
-    if s.asked_poses is None or s.asked_poses == s.poses:
+    if s.asked_poses in (None, s.poses):
         return ""
+    if s.whole:
+        return f": the cell leaves no more of {s.asked_poses}, so that some are read again"
     return f": as many readings as {s.asked_poses} poses take, which determine more at {s.poses}"
 
 

@@ -1,6 +1,6 @@
 """Diagnoses and revisions in words and tables, for people."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 
 from rich.console import RenderableType
 from rich.text import Text
@@ -13,16 +13,8 @@ from hilcal.identify.full_prediction import full_prediction
 from hilcal.report import numbers, text
 from hilcal.report.text_seen import could_have_been_seen, doubtful, redundant_line
 from hilcal.report.text_unknown import curves, repeats
-from hilcal.report.verdict_words import implausible, message
+from hilcal.report.verdict_words import headline, implausible, message
 
-VERDICTS: Mapping[str, str] = {
-    "adequate": "adequate: the residual is noise",
-    "missing_effect": "an effect is missing",
-    "ambiguous": "ambiguous: these readings do not separate the suspects",
-    "unknown_effect": "unknown effect: an effect is missing that the catalogue does not hold",
-    "noise_misjudged": "the noise is not what was stated",
-}
-WRONG_FIGURE = "ambiguous: a figure of the cell may have been entered wrongly"
 SUSPECTS = 6
 
 
@@ -30,8 +22,7 @@ def verdict_line(d: Diagnosis) -> Text:
     """Return the verdict with its message; names of the catalogue keep their spelling."""
     style = "bold green" if d.verdict == "adequate" else "bold yellow"
     words = numbers.sentence(message(d), d.fit.model.catalogue.names)
-    verdict = WRONG_FIGURE if d.wrong_figures else VERDICTS[d.verdict]
-    return Text.assemble("Verdict: ", (verdict, style), f".\n{words}")
+    return Text.assemble("Verdict: ", (headline(d), style), f".\n{words}")
 
 
 def suspects_table(d: Diagnosis, most: int = SUSPECTS) -> RenderableType:

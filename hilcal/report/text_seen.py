@@ -15,8 +15,8 @@ from hilcal.report.verdict_words import broken, implausible
 def could_have_been_seen(d: Diagnosis) -> Iterator[RenderableType]:
     """Yield the table of effects that were not found, the best visible first."""
     rest = [s for s in d.suspects if not s.passes]
-    seen = sorted((s for s in rest if s.least.visible), key=lambda s: s.least.displacement_m)
-    hidden = [s.effect for s in rest if not s.least.visible]
+    seen = sorted((s for s in rest if s.shown), key=lambda s: s.least.displacement_m)
+    hidden = d.not_shown
     if seen:
         yield ""
         out = text.table("not found", "would be seen from", "its parameters, rms", left=(0, 2))
@@ -34,7 +34,7 @@ def could_have_been_seen(d: Diagnosis) -> Iterator[RenderableType]:
             when = f"from {much}" if np.isfinite(s.least.finest_m) else "at no size"
             yield f"A {s.effect} finer than these poses resolve would be seen {when}.\n"
     if hidden:
-        yield f"These readings cannot show {', '.join(hidden)}, however strong.\n"
+        yield f"At no plausible size would these readings show {numbers.names(hidden, 'or')}.\n"
 
 
 def own_units(least: Strength) -> str:

@@ -1,7 +1,9 @@
 """A diagnosis in one sentence; the `message` of JSON documents and files."""
 
+from collections.abc import Mapping
+
 from hilcal.diagnose.background_evidence import LIKELY
-from hilcal.diagnose.diagnosis import Diagnosis
+from hilcal.diagnose.diagnosis import Diagnosis, Verdict
 from hilcal.diagnose.effect_ranking import LEAST_SHARE, Suspect
 from hilcal.diagnose.noise import PureError
 from hilcal.diagnose.noise_verdict import NoiseVerdict
@@ -10,11 +12,31 @@ from hilcal.diagnose.separability import Separability
 from hilcal.diagnose.stepwise_alternatives import Alternative
 from hilcal.diagnose.wrong_figures import WrongFigure
 from hilcal.identify.disagreement_words import disagreement_words
-from hilcal.report.numbers import length, p_equals, sizes
+from hilcal.report.numbers import few, length, p_equals, sizes
 from hilcal.report.scatter_words import correlated, left_to_the_arm, no_repeatability
 
 MOST_LIKELY = 4
 """Effects of a background that the sentence names."""
+MOST_HIDDEN = 4
+"""Effects that the readings cannot show of which the sentence names so many."""
+HEADLINES: Mapping[Verdict, str] = {
+    "adequate": "adequate: the residual is noise",
+    "missing_effect": "an effect is missing",
+    "ambiguous": "ambiguous: these readings do not separate the suspects",
+    "unknown_effect": "unknown effect: an effect is missing that the catalogue does not hold",
+    "noise_misjudged": "the noise is not what was stated",
+}
+UNCALIBRATED = "geometry is not calibrated"
+"""What deflections leave: errors that are the same under every load cancel in them."""
+
+
+def headline(d: Diagnosis) -> str:
+    """Return the verdict in a few words."""
+    if d.verdict == "adequate" and d.fit.mode == "deflection":
+        return f"adequate for deflections; {UNCALIBRATED}"
+    if d.wrong_figures:
+        return "ambiguous: a figure of the cell may have been entered wrongly"
+    return HEADLINES[d.verdict]
 
 
 def message(d: Diagnosis) -> str:
@@ -41,15 +63,15 @@ def _verdict(d: Diagnosis) -> str:
     if d.reason == "background":
         return _background(d)
     if d.reason == "arm_scatter":
-        return left_to_the_arm(d)
+        return left_to_the_arm(d, nothing_missing(d))
     if d.pose_alone is not None:
         return _pose_alone(d, d.pose_alone)
     adequate = (
-        f"Residuals are what the noise explains: variance factor {d.fit.variance_factor:.2f}; no "
-        f"effect of the catalogue is missing{noise_place(d.pure_error)}"
+        f"Residuals are what the noise explains: variance factor {d.fit.variance_factor:.2f}; "
+        f"{nothing_missing(d)}{noise_place(d.pure_error)}"
     )
     if d.scatter is not None:
-        adequate = left_to_the_arm(d)
+        adequate = left_to_the_arm(d, nothing_missing(d))
     if d.reason in ("residual_is_noise", "serial_or_effect"):
         return adequate
     doubts = "; ".join(_alternative(a) for a in d.alternatives if a.inseparable)
@@ -82,6 +104,18 @@ def _figure(f: WrongFigure) -> str:
         "where it was entered ([[loads]] of CELL.toml, or the table's wrench), and import or "
         "measure again"
     )
+
+
+def nothing_missing(d: Diagnosis) -> str:
+    """Say that no effect is missing, of those that such readings show at a plausible size."""
+    if d.fit.mode == "deflection":
+        return (
+            f"no effect that deflections show is missing; {UNCALIBRATED}: what is the same under "
+            "every load cancels in them, and hilcal refine --readings absolute shows it"
+        )
+    if hidden := few(d.not_shown, MOST_HIDDEN):
+        return f"no effect that these readings could show is missing (they cannot show {hidden})"
+    return "no effect of the catalogue is missing"
 
 
 def _background(d: Diagnosis) -> str:

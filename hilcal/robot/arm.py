@@ -1,5 +1,6 @@
 """The arm: constant link transforms, joint axes along z, masses and limits."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,6 +8,35 @@ import numpy as np
 from hilcal import limits
 from hilcal.errors import InputError
 from hilcal.types import Bools, Floats
+
+NO_MASSES = (
+    "{} has no masses: the arm's own weight makes no torque in the model. Compliance is "
+    "right from deflections (loaded minus unloaded), and from absolute readings of poses under "
+    "several loads, where the weight is estimated; under one load it comes out too soft by "
+    "(weight + load)/load"
+)
+
+
+def missing(
+    file: str, weighed: bool, unlimited: Sequence[str], weak: Sequence[str]
+) -> tuple[str, ...]:
+    """Return what a description lacks, and what that means, a sentence each.
+
+    Args:
+        file: its name.
+        weighed: whether it has masses.
+        unlimited: joints without limits.
+        weak: joints without a torque or effort.
+    """
+    out = [] if weighed else [NO_MASSES.format(file)]
+    if unlimited:
+        out.append(f"no limits in {file} for {', '.join(unlimited)}: ±360° is assumed")
+    if weak:
+        out.append(
+            f"no torque limit in {file} for {', '.join(weak)}: plans have none there, and "
+            "what compliance counts as ordinary is taken from 150 N·m"
+        )
+    return tuple(out)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,6 +8,7 @@ from hilcal.robot.arm import Arm
 from hilcal.robot.dh import arm_from_dh
 from hilcal.toml import suggest
 
+OTHER_ARMS = "the path of a .urdf file, or of a .toml file with DH rows"
 _PACKAGE = Path(__file__).resolve().parents[1]
 
 
@@ -66,6 +67,6 @@ def load_arm(
     if model not in names:
         raise InputError(
             f'unknown robot "{model}"{suggest(model, names)}; '
-            f"valid: {', '.join(names)}, or the path of a .urdf file"
+            f"valid: {', '.join(names)}, or {OTHER_ARMS}"
         )
     return arm_from_dh(configs_dir() / "robots" / f"{model}.toml")

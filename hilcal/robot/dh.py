@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from hilcal.config.joints import Conventions
 from hilcal.errors import InputError
 from hilcal.robot import se3
-from hilcal.robot.arm import Arm
+from hilcal.robot.arm import Arm, missing
 from hilcal.robot.conventions import as_counted
 from hilcal.toml import NonNegative, Number, Positive, Section, Vector3, load_section
 from hilcal.types import Floats
@@ -30,33 +30,43 @@ class JointRow(Section):
     d_m: Number = Field(description=_LENGTH)
     alpha_deg: Number = Field(description=_ANGLE)
     offset_deg: Number = Field(0.0, description=_ANGLE)
-    mass_kg: NonNegative = Field(description="a mass in kg, 0 or more")
-    com_m: Vector3 = Field(description="three finite numbers in m, in DH frame i (after row i)")
-    q_min_deg: Number = Field(description=_ANGLE)
-    q_max_deg: Number = Field(description=_ANGLE)
-    torque_max_Nm: Positive = Field(description="a torque in N·m, more than 0")
+    mass_kg: NonNegative = Field(0.0, description="a mass in kg, 0 or more")
+    com_m: Vector3 = Field(
+        (0.0, 0.0, 0.0), description="three finite numbers in m, in DH frame i (after row i)"
+    )
+    q_min_deg: Number | None = Field(None, description=_ANGLE)
+    q_max_deg: Number | None = Field(None, description=_ANGLE)
+    torque_max_Nm: Positive | None = Field(None, description="a torque in N·m, more than 0")
 
     @model_validator(mode="after")
     def _range(self) -> "JointRow":
-        if self.q_min_deg >= self.q_max_deg:
-            raise ValueError(
-                f"q_min_deg = {self.q_min_deg} must be less than q_max_deg = {self.q_max_deg}"
-            )
+        low, high = self.q_min_deg, self.q_max_deg
+        if (low is None) != (high is None):
+            raise ValueError("q_min_deg and q_max_deg: give both or neither")
+        if low is not None and high is not None and low >= high:
+            raise ValueError(f"q_min_deg = {low} must be less than q_max_deg = {high}")
         return self
+
+    @property
+    def range_deg(self) -> tuple[float, float]:
+        """Lowest and highest joint value; a whole turn to either side where none is given."""
+        if self.q_min_deg is None or self.q_max_deg is None:
+            return -360.0, 360.0
+        return self.q_min_deg, self.q_max_deg
 
 
 class DhTable(Conventions):
     """A file of `configs/robots`."""
 
-    title: str = Field(min_length=1, description="the arm's full name")
-    payload_kg: Positive = Field(description="the rated payload in kg, more than 0")
+    title: str | None = Field(None, min_length=1, description="the arm's full name")
+    payload_kg: Positive | None = Field(None, description="the rated payload in kg, more than 0")
     weight_kg: Positive | None = Field(
         None, description="the weight of the whole arm in kg (not used in predictions)"
     )
     repeatability_m: Positive | None = Field(
         None, description="the pose repeatability of ISO 9283 in m, more than 0"
     )
-    source: str = Field(min_length=1, description="where the figures come from")
+    source: str | None = Field(None, min_length=1, description="where the figures come from")
     convention: Literal["standard", "modified"] = Field(
         "standard", description='"standard" (classic rows) or "modified" (Craig\'s rows)'
     )
@@ -78,6 +88,9 @@ def arm_from_dh(path: Path) -> Arm:
     Rz(offset_{i+1}), L_n = Tz(d_n); in the body frame centres of mass are Tz(d) com.
 
     With `base_m_rad` = B and `flange_m_rad` = E, as calibrated arms have, T_base_flange = B Π … E.
+
+    What a row may leave out is said in `Arm.notes`, as of a URDF: masses (none), limits (±360°),
+    torques (infinite).
 
     Raises:
         InputError: unreadable file, unknown or missing key, bad value.
@@ -103,12 +116,18 @@ def arm_from_dh(path: Path) -> Arm:
         links=links,
         masses=np.array([row.mass_kg for row in rows]),
         coms=np.array(coms),
-        q_min=np.radians([row.q_min_deg for row in rows]),
-        q_max=np.radians([row.q_max_deg for row in rows]),
-        torque_max=np.array([row.torque_max_Nm for row in rows]),
-        payload=table.payload_kg,
+        q_min=np.radians([row.range_deg[0] for row in rows]),
+        q_max=np.radians([row.range_deg[1] for row in rows]),
+        torque_max=np.array([row.torque_max_Nm or math.inf for row in rows]),
+        payload=table.payload_kg or math.inf,
         joint_names=tuple(row.name for row in rows),
-        source=table.source,
+        source=table.source or f"DH rows of {path.name}",
+        notes=missing(
+            path.name,
+            any(row.mass_kg for row in rows),
+            [row.name for row in rows if row.q_min_deg is None],
+            [row.name for row in rows if row.torque_max_Nm is None],
+        ),
         repeatability=table.repeatability_m,
     )
     try:

@@ -17,18 +17,12 @@ import pinocchio as pin
 from hilcal import limits
 from hilcal.errors import InputError
 from hilcal.names import check_name
-from hilcal.robot.arm import Arm
+from hilcal.robot.arm import Arm, missing
 from hilcal.robot.mimic import mimics, with_mimics
 from hilcal.toml import suggest
 from hilcal.types import Floats
 
 _WHOLE_TURN = 2.0 * math.pi
-NO_MASSES = (
-    "the URDF has no masses: the arm's own weight makes no torque in the model. Compliance is "
-    "right from deflections (loaded minus unloaded), and from absolute readings of poses under "
-    "several loads, where the weight is estimated; under one load it comes out too soft by "
-    "(weight + load)/load"
-)
 
 
 def arm_from_urdf(path: Path, base_link: str | None = None, tip_link: str | None = None) -> Arm:
@@ -95,27 +89,15 @@ def _arm(model: pin.Model, base: pin.SE3, tip: pin.SE3, path: Path) -> Arm:
         payload=math.inf,
         joint_names=names,
         source=f"URDF {path.name}",
-        notes=tuple(_missing(model, masses)),
+        notes=_missing(model, masses),
     )
 
 
-def _missing(model: pin.Model, masses: Floats) -> Iterator[str]:
-    """Yield what a description lacks, and what that means."""
-    if not np.any(masses):
-        yield NO_MASSES
-    open_ended = [str(model.names[j]) for j in range(1, model.njoints) if _no_limits(model, j)]
-    if open_ended:
-        yield f"no limits in the URDF for {', '.join(open_ended)}: ±360° is assumed"
-    weak = [
-        str(model.names[j])
-        for j in range(1, model.njoints)
-        if not model.upperEffortLimit[model.joints[j].idx_v]
-    ]
-    if weak:
-        yield (
-            f"no effort in the URDF for {', '.join(weak)}: plans have no torque limit there, and "
-            "what compliance counts as ordinary is taken from 150 N·m"
-        )
+def _missing(model: pin.Model, masses: Floats) -> tuple[str, ...]:
+    joints = [(str(model.names[j]), j) for j in range(1, model.njoints)]
+    open_ended = [name for name, j in joints if _no_limits(model, j)]
+    weak = [n for n, j in joints if not model.upperEffortLimit[model.joints[j].idx_v]]
+    return missing("the URDF", bool(np.any(masses)), open_ended, weak)
 
 
 def _no_limits(model: pin.Model, joint: int) -> bool:

@@ -18,7 +18,7 @@ from hilcal.report.charts import error_per_revision, measured_predicted, misfit,
 from hilcal.report.charts.added_variable import added_variable
 from hilcal.report.charts.law import law
 from hilcal.report.charts.residual_over import residual_over
-from hilcal.report.verdict_words import message
+from hilcal.report.verdict_words import headline, message
 from hilcal.workbench.elements import button, chart, number, plain, point, title
 from hilcal.workbench.next_card import next_measurement
 from hilcal.workbench.snapshot import RevisionRow, Snapshot
@@ -101,7 +101,7 @@ def verdict(view: View, d: Snapshot) -> None:
             ):
                 ui.label(line).classes("bad")
         mark = "✓" if good else "!"
-        said = numbers.sentence(text_refine.VERDICTS[found.verdict])
+        said = numbers.sentence(headline(found))
         ui.html(
             f"<h2 class='verdict {'good' if good else 'bad'}'>{mark} {plain(said)}</h2>",
             sanitize=False,

@@ -59,6 +59,21 @@ def test_bad_options(cell: Path, capsys: Capsys, option: str, value: str, said: 
     assert said in line
 
 
+def test_a_goal_needs_readings_that_show_it(there: Drawn, cell: Path, capsys: Capsys) -> None:
+    """Deflections know nothing of the unloaded arm, however well the model predicts them."""
+    p = there.procedure
+    for command in (
+        ("calibrate", cell, "-o", cell.with_name("run.hilcal"), "--rehearse", "--yes"),
+        ("calibrate", p.run.with_name("cell.toml"), "-o", p.run, "--resume"),
+    ):
+        line = refused(capsys, 2, *command, "--goal", "0.1 mm")
+        assert 'readings = "absolute"' in line
+    assert not cell.with_name("run.hilcal").exists()
+    told = " ".join(ok(capsys, *command, "--limit", "1 mm").out.split())
+    assert "PASSED for deflections: " in told
+    assert "geometry is not calibrated" in told
+
+
 def test_the_plain_command_says_what_is_there(there: Drawn, capsys: Capsys) -> None:
     path = there.procedure.run
     line = refused(capsys, 2, "calibrate", path.with_name("cell.toml"), "-o", path, "--yes")

@@ -73,7 +73,7 @@ def test_identify_reports_what_the_contract_asks_for(campaign: Path, capsys: Cap
 
 
 def test_identify_in_words(campaign: Path, capsys: Capsys) -> None:
-    words = ok(capsys, "identify", campaign).out
+    words = ok(capsys, "identify", campaign, "--details").out
     for part in ("µrad/(N·m)", "Condition number", "widened", "Not determined", "noise alone"):
         assert part in words
     assert max(map(len, words.splitlines())) <= 100

@@ -11,6 +11,7 @@ import pytest
 
 from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.readings import Readings
+from hilcal.errors import InputError
 from tests.support.cli_cases import CELL, ok, refused, rehearsal, run, start, table
 
 Capsys = pytest.CaptureFixture[str]
@@ -327,3 +328,18 @@ def test_what_cannot_be_hidden_is_refused_before_anything_is_planned(
     if command == "simulate":
         option = refused(capsys, 2, command, CELL, "-o", tmp_path / "out", "--hide", "foo")
         assert option == line
+
+
+@pytest.mark.parametrize(("hidden", "said"), [("transmission_error", True), ("backlash", False)])
+def test_it_is_said_that_deflections_do_not_show_what_is_hidden(
+    hidden: str, said: bool, tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def started(*_: object) -> None:
+        raise InputError("no devices here")
+
+    monkeypatch.setattr("hilcal.cli.simulating.simulated_cell", started)
+    path, words = tmp_path / "CELL.toml", CELL.read_text(encoding="utf-8")
+    path.write_text(words.replace("[planning]", "[planning]\nagainst = []"), encoding="utf-8")
+    told = run(capsys, "simulate", path, "-o", tmp_path / "out", "--hide", hidden)
+    warned = f'{hidden} cancels in them; set readings = "absolute"' in " ".join(told.err.split())
+    assert warned == said

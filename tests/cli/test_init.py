@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig, load_config
 from hilcal.config.reference import tables
 from hilcal.config.template import SHOWN
@@ -66,9 +67,40 @@ def test_check_reads_the_file_and_asks_for_what_was_left_open(
     assert "[robot] driver is missing" in refused(capsys, 2, "check", path)
 
 
+def test_what_is_fitted_is_stated_and_absolute_unless_asked(tmp_path: Path, capsys: Capsys) -> None:
+    path = tmp_path / "CELL.toml"
+    loaded = ("--robot", "ur10e", "--load", "5 kg")
+    for options, readings, geometry in (
+        (("--robot", "ur5e"), "absolute", True),
+        (loaded, "absolute", True),
+        ((*loaded, "--readings", "deflection"), "deflection", False),
+    ):
+        ok(capsys, "init", path, *options, "--force")
+        c = load_config(path)
+        assert "readings" in c.planning.model_fields_set
+        assert (c.planning.readings, c.fitted) == (readings, readings)
+        assert ("encoder_offset" in c.planning.model) == geometry
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["60 mm, 20 mm, 120 mm", "60mm 20mm 120mm", "60, 20, 120 mm", "6 cm, 20 mm, 0.12 m"],
+)
+def test_units_are_read_as_people_write_them(words: str, tmp_path: Path, capsys: Capsys) -> None:
+    path = tmp_path / "CELL.toml"
+    loads = ("--load", "pull x = 80 N, 0 N, 0 N", "--load", "500 g", "--tool-mass", "800 g")
+    ok(capsys, "init", path, "--robot", "ur10e", "--target", words, "--floor", "50 mm", *loads)
+    c = load_config(path)
+    assert c.tool.target_m == (0.06, 0.02, 0.12)
+    assert c.tool.mass_kg == 0.8
+    assert c.limits.workspace_min_m is not None
+    assert c.limits.workspace_min_m[2] == 0.05
+    assert [(x.mass_kg, x.force_N[0]) for x in c.loads] == [(0.0, 80.0), (0.5, 0.0)]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("options", "poses"), [(OPTIONS, 1), (("--robot", "ur5e"), 6)], ids=["whole", "least"]
+    ("options", "poses"), [(OPTIONS, 6), (("--robot", "ur5e"), 6)], ids=["whole", "least"]
 )
 def test_the_file_is_planned_without_an_edit(
     options: tuple[str, ...], poses: int, tmp_path: Path, capsys: Capsys
@@ -97,11 +129,15 @@ WRONG = {
     "robot": (("--robot", "ur10f"), '--robot "ur10f": unknown robot "ur10f" (did you mean'),
     "driver": (("--robot", "ur3", "--tracker", "geocam"), 'is unknown (did you mean "geocom"?)'),
     "port alone": (("--robot", "ur3", "--force-port", "x"), "--force-port without --force-sensor"),
-    "vector": (("--robot", "ur3", "--target", "1,2"), "--target \"1,2\": '1,2' are 2 numbers"),
+    "vector": (("--robot", "ur3", "--target", "1,2"), "--target \"1,2\": '1,2' is 2 numbers"),
     "number": (("--robot", "ur3", "--floor", "low"), "'low' is no number; valid: one in m"),
     "mm": (("--robot", "ur3", "--target", "60,20,120"), "is it in m?"),
     "load": (("--robot", "ur3", "--load", "five"), "'five' is no load; valid: e.g. \"5 kg\""),
     "load twice": (("--robot", "ur3", "--load", "5 kg", "--load", "5kg"), "names must differ"),
+    "some units": (("--robot", "ur3", "--target", "60 mm, 20, 120"), "valid: all or one"),
+    "other unit": (("--robot", "ur3", "--target", "1 in, 2 in, 3 in"), "the unit in; valid: m, mm"),
+    "other arm": (("--robot", "kr10"), "a .urdf file, or of a .toml file with DH rows"),
+    "unshown": (("--robot", "ur3", "--readings", "deflection"), '"deflection" needs a load'),
     "zero": (("--robot", "ur3", "--load", "0 kg"), "is zero"),
 }
 
@@ -120,20 +156,23 @@ def test_a_person_is_asked_and_wrong_answers_are_explained(tmp_path: Path) -> No
         for question, answer, reply in (
             ("Which arm?", "ur10f", 'did you mean "ur10"?'),
             ("Which arm?", "ur10e", "Address of its controller"),
-            ("Address of its controller", "", "Which tracker?"),
+            ("Address of its controller", "", "What pose repeatability"),
+            ("What pose repeatability", "0.05 mm", "Which tracker?"),
             ("Which tracker?", "laser", 'Not so: [tracker] driver = "laser" is unknown'),
             ("Which tracker?", "geocom", "Serial ports here: "),
-            ("Its serial port", "", "Which force sensor"),
+            ("Its serial port", "", "How accurate is the tracker?"),
+            ("How accurate is the tracker?", "8 um + 3 um/m", "Which force sensor"),
             ("Which force sensor", "", "Where does the target sit?"),
             ("Where does the target sit?", "60, 20, 120", "is it in m?"),
-            ("Where does the target sit?", "0.06, 0.02, 0.12", "Where do loads act?"),
+            ("Where does the target sit?", "60 mm, 20 mm, 120 mm", "Where do loads act?"),
             ("Where do loads act?", "", "Mass of the tool"),
             ("Mass of the tool", "0.8", "Its centre of mass"),
             ("Its centre of mass", "", "Which loads are at hand?"),
             ("Which loads are at hand?", "banana", "'banana' is no load"),
             ("Which loads are at hand?", "5 kg", "Another one"),
             ("Another one", "pull y = 0, 60, 0 N", "Another one"),
-            ("Another one", "", "What height"),
+            ("Another one", "", "What is to be calibrated?"),
+            ("What is to be calibrated?", "", "What height"),
             ("What height", "0.05", "Where does the tracker stand"),
             ("Where does the tracker stand", "", "Written: CELL.toml"),
         ):
@@ -151,6 +190,10 @@ def test_a_person_is_asked_and_wrong_answers_are_explained(tmp_path: Path) -> No
     )
     assert [load.name for load in c.loads] == ["5kg", "pull y"]
     assert c.force_sensor is None
+    assert (c.robot.repeatability_m, cell_from_config(c).arm.repeatability) == (5e-5, 5e-5)
+    assert (c.tracker.range_std_m, c.tracker.transverse_std_per_m) == (8e-6, 3e-6)
+    assert "readings" in c.planning.model_fields_set
+    assert c.planning.readings == "absolute"
 
 
 def test_a_person_decides_whether_a_file_is_replaced(tmp_path: Path) -> None:

@@ -98,7 +98,7 @@ def test_every_command_in_order(
         if words[0] == "plan" and not Path("other.hilcal").exists():
             draw(config, ["run", "CELL.toml", "--plan", words[3], "-o", "other.hilcal"], 7)
     told = said(shown, "plan CELL.toml -o plan.json")
-    assert "joint_compliance.j1 not determined" in told
+    assert "joint_compliance.j1: not determined" in told
     assert "joint 1 needs a side pull" in told
     assert "it is not the accuracy of the robot" in told
     assert "joint_compliance.j1" in said(shown, "identify run.hilcal")

@@ -109,12 +109,11 @@ def test_what_is_not_determined_yet_is_not_met() -> None:
     assert told(c.readings, last=False).met
 
 
-@pytest.mark.parametrize("what", ["deflection", "position"])
-def test_no_deflection_is_predicted_before_the_loads_are_read(what: str) -> None:
+def test_no_deflection_is_predicted_before_the_loads_are_read() -> None:
     """Unloaded readings say nothing of it, and a load at one pose not enough."""
     c = campaign(mode="deflection", poses=8)
     work = plan(3, 7).states.q[::5].tolist()
-    told = rule(f"{what} std < 20 um", c, work_q_rad=work)
+    told = rule("deflection std < 20 um", c, work_q_rad=work)
     free = c.readings.unloaded
     one = (c.readings.pose == 0) & (c.readings.load <= 1)
     for some in (free, free | one, one):
@@ -132,10 +131,14 @@ def test_no_deflection_is_predicted_before_the_loads_are_read(what: str) -> None
     assert "predicted deflection under each load" in full_words(status)
 
 
-def test_a_deflection_needs_a_plan_of_deflections() -> None:
+@pytest.mark.parametrize(
+    ("what", "mode", "valid"),
+    [("deflection", "absolute", "position"), ("position", "deflection", "deflection")],
+)
+def test_a_goal_is_of_what_the_readings_show(what: str, mode: str, valid: str) -> None:
     c = campaign(mode="absolute", poses=6)
-    with pytest.raises(InputError, match="valid: position"):
-        rule("deflection std < 20 um", c, readings="absolute", work_q_rad=[[0.0] * 6])
+    with pytest.raises(InputError, match=f"valid: {valid}"):
+        rule(f"{what} std < 20 um", c, readings=mode, work_q_rad=[[0.0] * 6])
 
 
 def test_an_estimated_uncertainty_must_do_twice() -> None:
@@ -192,7 +195,7 @@ def test_an_unloaded_reading_by_itself_is_no_news(monkeypatch: pytest.MonkeyPatc
         ("joint < 2 %", "not understood; valid: "),
         ("joint_tilt_compliance std < 2 %", "is not in the model; valid: position, "),
         ("j2 std < 2 mm", r"is in rad/\(N·m\)"),
-        ("position std < 20 um", "work_q_rad"),
+        ("deflection std < 20 um", "work_q_rad"),
     ],
 )
 def test_a_goal_that_cannot_be_is_refused(text: str, why: str) -> None:

@@ -77,3 +77,28 @@ def test_the_words_of_lists_and_plans_stay_whole(
     ok(capsys, "effects")
     ok(capsys, "plan", "cell.toml", "-o", "plan.json")
     whole(pages)
+
+
+def test_what_commands_print_unasked_is_one_screen(
+    readings: Path, home: Path, capsys: Capsys, pages: dict[int, io.StringIO]
+) -> None:
+    run, many = (
+        "run.hilcal",
+        "joint_compliance,link_geometry,transmission_error,joint_tilt_compliance",
+    )
+    Path("cell.toml").write_text(TOML.replace("against = []\n", ""), encoding="utf-8")
+    ok(capsys, "import", readings, "--config", CELL, "-o", run)
+    for command in (
+        ("plan", "cell.toml", "-o", "plan.json"),
+        ("identify", run, "--readings", "absolute", "--effects", many),
+        ("refine", run),
+    ):
+        printed = []
+        for more in ((), ("--details",)):
+            for stream in pages.values():
+                stream.seek(0)
+                stream.truncate()
+            ok(capsys, *command, *more)
+            printed.append(pages[80].getvalue().count("\n"))
+        assert printed[0] <= 40, command
+        assert printed[1] > printed[0] or command[0] == "refine"

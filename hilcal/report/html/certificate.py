@@ -182,11 +182,10 @@ def not_tested(m: ReportContent) -> Iterator[str]:
         yield "Orientation of the tool: positions alone were measured."
     yield "The arm in motion: all readings were taken at rest."
     d = m.diagnosis
-    hidden = () if d is None else tuple(
-        x.effect for x in d.suspects if not x.passes and not x.least.visible
-    )  # fmt: skip
-    if hidden:
-        yield f"These readings cannot show, however strong: {numbers.names(list(hidden))}."
+    if fit.mode == "deflection":
+        yield "Geometry: deflections were fitted, in which it cancels."
+    if d is not None and d.not_shown:
+        yield f"At no plausible size would these readings show {numbers.names(d.not_shown, 'or')}."
 
 
 def _instruments(m: ReportContent) -> Iterator[Part]:

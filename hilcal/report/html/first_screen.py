@@ -12,7 +12,7 @@ from hilcal.identify.fit import Fit, all_left_out
 from hilcal.identify.full_prediction import full_prediction
 from hilcal.report import numbers, text
 from hilcal.report.html.content import ReportContent
-from hilcal.report.verdict_words import message
+from hilcal.report.verdict_words import UNCALIBRATED, message
 from hilcal.types import Floats
 
 
@@ -71,6 +71,8 @@ def headline_of(d: Diagnosis | None) -> tuple[str, str]:
         return "Not judged: only a model fitted with scaling gc can be", "doubt"
     lead = d.lead.effect if d.lead is not None else ""
     if d.verdict == "adequate":
+        if d.fit.mode == "deflection":
+            return f"The model is good for deflections; {UNCALIBRATED}", "good"
         return "The model is good: what is left is noise", "good"
     if d.verdict == "missing_effect":
         return f"The model is incomplete: {lead} is missing", "bad"

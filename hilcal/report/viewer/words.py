@@ -202,7 +202,7 @@ def limits(r: StoryRevision) -> str:
             "",
         ]
     if hidden:
-        lines.append(f"These readings cannot show {', '.join(hidden)}, however strong.")
+        lines.append(f"At no plausible size would these readings show {', '.join(hidden)}.")
     return "\n".join(lines)
 
 

@@ -22,7 +22,8 @@ from hilcal.identify.fit import Fit, fit
 from hilcal.identify.linearisation import linearise
 from hilcal.refine import add
 from hilcal.report.diagnosis_document import to_json
-from hilcal.report.verdict_words import message
+from hilcal.report.text_seen import could_have_been_seen
+from hilcal.report.verdict_words import headline, message
 from tests.support.campaigns import Campaign, campaign, noiseless, plan, with_noise
 
 MODES = ("absolute", "deflection")
@@ -105,7 +106,28 @@ def test_nothing_hidden_is_adequate(mode):
         d = diagnose(fit_of(campaign("none", mode, seed, poses=12)))
         assert d.verdict == "adequate", message(d)
         assert d.significant == ()
-        assert "no effect of the catalogue is missing" in message(d)
+        of = "of the catalogue" if mode == "absolute" else "that deflections show"
+        if d.not_shown and mode == "absolute":
+            of = "that these readings could show"
+        assert f"no effect {of} is missing" in message(d)
+
+
+def test_what_deflections_cannot_show_is_part_of_the_verdict():
+    """Errors of geometry cancel in deflections: they are adequate, and the arm is off by them."""
+    for effect in ("link_geometry", "transmission_error"):
+        c = hidden(effect, "absolute", 0, strength=10.0)
+        assert diagnose(fit_of(c)).verdict != "adequate"
+        d = diagnose(fit_of(replace(c, mode="deflection")))
+        assert d.verdict == "adequate", message(d)
+        assert effect in d.not_shown
+        assert headline(d) == "adequate for deflections; geometry is not calibrated"
+        assert "geometry is not calibrated" in message(d)
+        assert "no effect of the catalogue" not in message(d)
+        told = to_json(d)
+        assert effect in told["not_shown"]
+        assert {s["effect"] for s in told["suspects"] if not s["shown"]} >= set(d.not_shown)
+        table = "\n".join(str(x) for x in could_have_been_seen(d) if isinstance(x, str))
+        assert effect in table.partition("At no plausible size would these readings show")[2]
 
 
 # --- something is ---------------------------------------------------------------------------

@@ -1,5 +1,7 @@
 """Candidate poses: none ever breaks a limit, and what leaves nothing is named."""
 
+import re
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +14,7 @@ from hilcal.config import CellConfig
 from hilcal.data.plan import UNLOADED
 from hilcal.errors import CannotAnswerError
 from hilcal.plan.draw import draw
-from hilcal.plan.feasible import REASONS, Space
+from hilcal.plan.feasible import PLANNED, REASONS, Space
 from tests.support.space_cases import (
     TABLE,
     along,
@@ -215,7 +217,7 @@ NOTHING = {
     ),
     "walled in": (
         {"obstacles": [{"name": "block", "center_m": [0, 0, 1], "size_m": [4, 4, 4]}]},
-        r"0 are clear of obstacles \(\[\[obstacles\]\]",
+        r"0 are clear of obstacles \(.+ and block touch in \d+ % of the others; look at \[\[obst",
     ),
     "no regular pose": ({"planning": {"singularity": 0.9}}, r"0 are not singular \(\[planning\] "),
     "weak": ({"limits": {"torque_share": 0.001}}, r"0 keep the joint torques \(\[limits\] torque_"),
@@ -253,6 +255,18 @@ def test_what_leaves_nothing_is_named(sections: dict[str, Any], message: str) ->
         drawn_of(cell(**sections))
     assert raised.value.exit_code == 4
     assert "\n" not in str(raised.value)
+
+
+def test_bodies_that_touch_are_named_with_what_to_look_at() -> None:
+    c = cell()
+    space = Space(cell_from_config(c), c, replace(PLANNED, itself=3.0))
+    with pytest.raises(CannotAnswerError) as raised:
+        draw(space, 10, np.random.default_rng(0))
+    assert re.search(
+        r"0 do not touch themselves \(\w.* and \w.* touch in \d+ % of the others; look at \[tool\] "
+        r"target_m, load_point_m",
+        str(raised.value),
+    )
 
 
 def test_too_few_is_told_by_what_takes_most() -> None:

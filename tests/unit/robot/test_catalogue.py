@@ -149,6 +149,21 @@ def test_a_dh_table_of_ones_own(tmp_path: Path) -> None:
     assert arm.name == "mine"
 
 
+def test_dh_rows_alone_are_an_arm(tmp_path: Path) -> None:
+    """Masses, limits, torques, payload, title and source may be left out, as in a URDF."""
+    needed = ("[[joints]]", "name", "a_m", "d_m", "alpha_deg")
+    lines = (configs_dir() / "robots" / "ur5e.toml").read_text().splitlines()
+    rows = [x for x in lines[lines.index("[[joints]]") :] if x.startswith(needed)]
+    (tmp_path / "mine.toml").write_text("\n".join(rows))
+    arm, q = load_arm("mine.toml", tmp_path), np.array([0.3, -1.0, 1.2, 0.1, 0.5, 2.0])
+    np.testing.assert_allclose(flange(arm, q), flange(load_arm("ur5e"), q), rtol=0, atol=1e-12)
+    assert not arm.masses.any()
+    assert np.all(np.isinf(arm.torque_max))
+    assert [note.split(" ", 2)[:2] for note in arm.notes] == [
+        ["mine.toml", "has"], ["no", "limits"], ["no", "torque"]
+    ]  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -159,7 +174,8 @@ def test_a_dh_table_of_ones_own(tmp_path: Path) -> None:
         ),
         ("q_min_deg = -360.0", "q_min_deg = 400.0", "q_min_deg = 400.0 must be less than"),
         ("a_m = 0.0", "a_mm = 0.0", r'number 1 has no key "a_mm".*did you mean "a_m".*d_m'),
-        ("payload_kg = 5.0", "", 'lacks "payload_kg"'),
+        ("d_m = 0.1625", "", 'lacks "d_m"'),
+        ("q_min_deg = -360.0", "", "q_min_deg and q_max_deg: give both or neither"),
     ],
 )
 def test_a_wrong_dh_table_is_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
