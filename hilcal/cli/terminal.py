@@ -20,6 +20,9 @@ WIDTH = 100
 Json = Annotated[
     bool, typer.Option("--json", help="One JSON document on stdout; words and progress on stderr.")
 ]
+Details = Annotated[
+    bool, typer.Option("--details", help="Everything that is known of it, not one screen.")
+]
 Run = Annotated[Path, typer.Argument(metavar="RUN.hilcal", help="The campaign file.")]
 Revision = Annotated[
     int | None,

@@ -88,6 +88,7 @@ def relax(
     share = min(budget / float(units.cost.sum()), cap)
     spread = prior + total_information(units, np.full(len(units), share))
     criterion.require(spread, names)
+    criterion = criterion.relevant(units, prior, budget)
     if share == cap and criterion.monotone:
         value = float(criterion.value(spread))  # all there is
         all_of_them = np.arange(len(units))

@@ -238,11 +238,12 @@ def reordered(
         space.cell, space.config, list(names.values()), of.candidates.q[poses], reference, chosen,
         space.passable, rng, how,
     )  # fmt: skip
-    information = made.asked.prior + of.units.information(counts.astype(float))
+    asked = made.asked
+    information = asked.prior + asked.units.information(counts.astype(float))
     design = replace(
         made.design,
         counts=counts[usable],
-        value=float(made.asked.criterion.value(information)),
+        value=float(asked.criterion.value(information)),
         information=information,
         cost=float(counts @ of.units.cost),
     )

@@ -23,6 +23,8 @@ CRITERIA = {
     "separate": "power to separate the leading suspects (T-optimality)",
 }
 BAR = 30
+UNCERTAIN = 1e-3
+"""Least certified efficiency that tells anything. A choice: the last digit that is printed."""
 LIKE = 1.1
 """A number of poses is enough where the end of the curve is not better by more than this factor.
 A choice."""
@@ -81,6 +83,8 @@ def plan_report(s: PlanSummary) -> Iterator[RenderableType]:
 
 def certified(efficiency: float) -> str:
     """Return a certified efficiency in words; rounded down, it is a bound."""
+    if efficiency < UNCERTAIN:
+        return "of the plan: not certified, since the bound of the best plan did not close"
     return f"of the plan: at least {_floor(efficiency)} (certified lower bound); not accuracy"
 
 
