@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.plan.approximate_design import ApproximateDesign, relax
+from hilcal.plan.approximate_design import KINKED_TOLERANCE, ApproximateDesign, relax
 from hilcal.plan.candidate_set import CandidateSet
 from hilcal.plan.criteria import A, D, MeanVariance
 from hilcal.plan.criterion import Criterion
@@ -113,8 +113,9 @@ def choose(
 
 def promising(asked: Objective, budget: float) -> tuple[Ints, ApproximateDesign]:
     """Return the units that a plan is likely to be made of, those of the best prices, and why."""
+    tolerance = min(KINKED_TOLERANCE, LOOSE) if asked.criterion.kinked else LOOSE
     found = relax(
-        asked.units, asked.criterion, budget, asked.prior, names=asked.names, tolerance=LOOSE
+        asked.units, asked.criterion, budget, asked.prior, names=asked.names, tolerance=tolerance
     )
     count = min(2 * len(found.index), len(asked.units))
     best_first = np.argsort(-found.price / asked.units.cost, kind="stable")

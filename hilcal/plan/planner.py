@@ -168,8 +168,8 @@ def make(
     first, relaxed = promising(only(asked, usable), loads.budget)
     usable &= ~np.isin(pose_of, _unreachable(space, of, home, np.flatnonzero(usable)[first]))
     for _ in range(ROUNDS):
-        known_optimum = relaxed if np.array_equal(usable, before) else None
-        design = choose(only(asked, usable), loads.budget, rng, request.effort, known_optimum)
+        optimum = relaxed.among(usable[before])
+        design = choose(only(asked, usable), loads.budget, rng, request.effort, optimum)
         units = np.flatnonzero(usable)[np.flatnonzero(design.counts)]
         lost = _unreachable(space, of, home, units)
         if not len(lost):
