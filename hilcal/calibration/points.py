@@ -239,7 +239,9 @@ def _mapped(path: Path, arm: Arm, loads: Mapping[str, Floats], mapping: TableMap
     found = {"position_m": r.value[:, :3]}
     if r.m == 6:
         found["rotation_rad"] = r.value[:, 3:]
-    names = tuple(f"{r.pose_names[p]} {r.load_names[k]}" for p, k in zip(r.pose, r.load, strict=True))
+    names = tuple(
+        f"{r.pose_names[p]} {r.load_names[k]}" for p, k in zip(r.pose, r.load, strict=True)
+    )
     return Points(names, s.q, _poses(found, s.q, arm), wrench)
 
 

@@ -189,9 +189,7 @@ def _calibration(path: Path, catalogue: Catalogue, revision: int | None) -> Cali
         return run.calibration(revision)
 
 
-def _task(
-    path: Path, calibration: Calibration, tool: str | None, leave: bool, kind: str
-) -> _Task:
+def _task(path: Path, calibration: Calibration, tool: str | None, leave: bool, kind: str) -> _Task:
     """Read what is to be compensated.
 
     Raises:

@@ -209,7 +209,9 @@ def _explained(m: Floats, model: Ints, rest: Ints) -> Floats:
     """Return (N, R, R) what the model explains of the rest of matrices M: M_rm M_mm⁻ M_mr."""
     cross = m[:, model[:, None], rest]
     # one by one: of large blocks that is faster than all at once
-    seen = np.stack([inverse_root(b) @ c for b, c in zip(m[:, model[:, None], model], cross, strict=True)])
+    seen = np.stack(
+        [inverse_root(b) @ c for b, c in zip(m[:, model[:, None], model], cross, strict=True)]
+    )
     return np.asarray(np.swapaxes(seen, -1, -2) @ seen)
 
 

@@ -94,7 +94,7 @@ def _settled(o: Campaign, d: Diagnosis) -> str:
     if d.verdict == "adequate":
         return (
             f"{head} the model is adequate; to sharpen it, plan on with: hilcal plan CELL.toml "
-            f"--after {quoted(o.path)}, or separate named effects with --suspects A,B"
+            f"-o PLAN.json --after {quoted(o.path)}, or separate named effects with --suspects A,B"
         )
     if d.verdict == "noise_misjudged":
         return (
@@ -104,7 +104,8 @@ def _settled(o: Campaign, d: Diagnosis) -> str:
     if d.reason == "background":
         return (
             f"{head} effects of the background are not told apart one by one; measure more poses, "
-            f"spread over all joints, with: hilcal plan CELL.toml --after {quoted(o.path)}"
+            f"spread over all joints, with: hilcal plan CELL.toml "
+            f"-o PLAN.json --after {quoted(o.path)}"
         )
     if d.verdict == "missing_effect":
         lead = d.suspects[0]
