@@ -1,8 +1,8 @@
 """Points to put the tool at, as a table states them.
 
-One row per point, with a header; separator and decimal mark are those that the file has. A table of
-readings as `import` takes it, of the exchange format or by a mapping, is a table of points too: what
-is not listed here (covariances, cycles, actual joints, columns `x_…`) is passed over.
+One row per point, with a header; separator and decimal mark are those that the file has. A table
+of readings as `import` takes it, of the exchange format or by a mapping, is a table of points too:
+what is not listed here (covariances, cycles, actual joints, columns `x_…`) is passed over.
 
 - `pose`: its name; numbered without.
 - `q1_rad` … or `q1_deg` …: joint values. Alone, the point is where the nominal arm has the tool
@@ -205,8 +205,9 @@ def _nearest(
     if not np.isfinite(far).any():
         k = int(np.argmin(solved.residual_m / arm.reach + solved.residual_rad))
         raise InputError(
-            f"point {name}: the nominal arm does not reach it from anywhere; {1e3 * solved.residual_m[k]:.3g} mm "
-            f"and {np.degrees(solved.residual_rad[k]):.3g} degrees are left"
+            f"point {name}: the nominal arm does not reach it from anywhere; "
+            f"{1e3 * solved.residual_m[k]:.3g} mm and "
+            f"{np.degrees(solved.residual_rad[k]):.3g} degrees are left"
         )
     return np.asarray(q[int(np.argmin(far))])
 
