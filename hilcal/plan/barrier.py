@@ -77,13 +77,13 @@ class Program:
         out = np.zeros((n, n))
         for c, x, y in smooth.products:
             out -= c * _product(self.rows, x, y)
-        for c, v in smooth.squares:
-            if isinstance(c, float):
-                price = prices(self.rows, v)
-                out -= c * np.outer(price, price)
-            else:
+        for factor, v in smooth.squares:
+            if isinstance(factor, np.ndarray):
                 each = np.sum((flat @ v).reshape(n, size, -1) ** 2, axis=1)
-                out -= each @ c @ each.T
+                out -= each @ factor @ each.T
+            else:
+                price = prices(self.rows, v)
+                out -= factor * np.outer(price, price)
         return np.asarray(0.5 * (out + out.T))
 
 
