@@ -23,6 +23,7 @@ from hilcal.identify.parameter_differences import Differences, parameter_differe
 from hilcal.identify.posterior import Posterior
 from hilcal.identify.registration import register
 from hilcal.identify.remeasured import setting
+from hilcal.names import quoted
 from hilcal.revisions import mode_of
 
 
@@ -118,7 +119,7 @@ def _unseen(run: Campaign, later: Campaign, fit: Fit, number: int | None) -> tup
         raise InputError(
             f"{later.path}: no loaded reading, and {run.path} was fitted to deflections: they "
             "cannot be compared; measure with a load, or fit absolute readings: hilcal identify "
-            f"{run.path} --readings absolute"
+            f"{quoted(run.path)} --readings absolute"
         )
     known, fresh = never_fitted(there, fit.readings, deflections)
     if not fresh.any():

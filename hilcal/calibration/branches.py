@@ -25,6 +25,9 @@ a choice."""
 SAME = 1e-6
 """Joint values that are the same solution, rad: far above the residual of one, far below what is
 between two."""
+AS_NEAR = 0.05
+"""What another solution must be farther for this one to be the nearest by any measure, rad; a
+choice."""
 NEAREST = "another branch of the arm is as near; joint values in place of the pose say which"
 STRAIGHT = "a straight motion from the waypoint before ends on another branch of the arm; use movej"
 UNKNOWN = "the branch of the waypoint before it is not known"
@@ -68,7 +71,8 @@ def _nearest(arm: Arm, tool: Floats, near: Floats, q: Floats) -> Bools:
         other = found.solved & (np.abs(_turn(found.q - q)).max(axis=1) > SAME)
         theirs = _turn(found.q - near)
         for order in (1, 2, np.inf):
-            farther = np.linalg.norm(theirs, order, axis=1) > np.linalg.norm(mine, order, axis=1)
+            least = np.linalg.norm(mine, order, axis=1) + AS_NEAR
+            farther = np.linalg.norm(theirs, order, axis=1) > least
             out &= ~other | farther
     return out
 

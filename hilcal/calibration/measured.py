@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from hilcal.data.ranges import Range, ranges_of, turning_variables, variables
+from hilcal.data.ranges import Range, angle_name, ranges_of, turning_variables, variables
 from hilcal.data.readings import States
 from hilcal.identify.extrapolation import FAR
 from hilcal.identify.predictive import Predictive
@@ -53,6 +53,11 @@ class Measured:
         """
         spread = noise * p.leverage / (1 - p.leverage)
         return cls(ranges_of(states), float(np.sqrt(FAR * np.quantile(spread, 0.99))))
+
+    def middle(self, n: int) -> Floats:
+        """(n,) joint values in the middle of what was measured, rad; zero where that is unknown."""
+        known = {r.variable: 0.5 * (r.low + r.high) for r in self.ranges}
+        return np.array([known.get(angle_name(j), 0.0) for j in range(n)])
 
     def outside(self, states: States, std_m: Floats | None, turns: Bools) -> list[Outside]:
         """Return what points leave, by variable.

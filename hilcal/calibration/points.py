@@ -1,34 +1,45 @@
 """Points to put the tool at, as a table states them.
 
-One row per point, with a header; separator "," and decimal point:
+One row per point, with a header; separator and decimal mark are those that the file has. A table
+of readings as `import` takes it, of the exchange format or by a mapping, is a table of points too:
+what is not listed here (covariances, cycles, actual joints, columns `x_…`) is passed over.
 
 - `pose`: its name; numbered without.
 - `q1_rad` … or `q1_deg` …: joint values. Alone, the point is where the nominal arm has the tool
   there; together with a position they say on which branch.
 - `x_m`, `y_m`, `z_m` (or `x_mm` …) and `rx_rad`, `ry_rad`, `rz_rad` (or `rx_deg` …), a rotation
-  vector: the pose of the tool in base axes.
+  vector: the pose of the tool in base axes. A position alone, beside joint values, has the
+  orientation that the nominal arm has there.
 - `load`: the name of a load, or `fx_N` … `mz_Nm`: force and moment at the load point, base axes, or
   `sensor_fx_N` … `sensor_mz_Nm`: the force sensor's reading with the load less that without it, at
   this point, sensor axes.
 - `air_degC`, `joint1_degC` …, `load_time_s`, `time_s`, `approach1` …: where the model needs them.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
+from hilcal import limits
 from hilcal.calibration.compensation import Pose, invert
 from hilcal.data.columns import (
+    OWN_PREFIX,
     POSITION,
     ROTATION,
     WRENCH,
     approach_columns,
     joint_columns,
+    known_columns,
     temperature_columns,
 )
-from hilcal.data.csvfile import CsvTable, read_columns
+from hilcal.data.covariance import TrackerNoise
+from hilcal.data.csvfile import CsvTable, Dialect, read_columns
+from hilcal.data.grid import SEPARATORS
+from hilcal.data.mapped import import_mapped
+from hilcal.data.mapping import Mapping as TableMapping
+from hilcal.data.sniff import sniff
 from hilcal.errors import InputError
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
@@ -38,6 +49,12 @@ from hilcal.types import Floats, Ints
 NO_LOAD = "none"
 
 
+NEAR = 0.5
+"""rad; a solution as near as this to where it was sought is taken for the nearest. A choice."""
+STARTS = 300
+"""Joint values from which all branches are sought; a choice: an arm of six joints has up to 16."""
+BEYOND = 1e3
+"""rad; what a solution beyond the joints' limits counts farther than any within."""
 LARGEST = 4.0 * np.pi
 """rad; a choice, twice what the joints of most arms turn: degrees in a column of rad are beyond."""
 
@@ -64,25 +81,30 @@ class Points:
     recorded: Mapping[str, Floats] = field(default_factory=dict)
 
 
-def read_points(path: Path, arm: Arm, loads: Mapping[str, Floats]) -> Points:
+def read_points(
+    path: Path, arm: Arm, loads: Mapping[str, Floats], mapping: TableMapping | None = None
+) -> Points:
     """Read a table of points.
 
     Args:
-        path: a CSV file.
+        path: a CSV file; with a mapping, any table that `import` reads by it.
         arm: the arm.
         loads: (6,) wrench by the name of the load.
+        mapping: what its columns hold, where they are not called as above.
 
     Raises:
         InputError: no such file, an unknown column, an incomplete group, an unknown load.
     """
+    if mapping is not None:
+        return _mapped(path, arm, loads, mapping)
     groups = _groups(arm.n)
     header: list[str] = []
 
     def choose(given: list[str]) -> tuple[Sequence[str], Sequence[str]]:
         header.extend(given)
-        return _checked(path, given, groups)
+        return _checked(path, given, groups, arm)
 
-    table = read_columns(path, choose)
+    table = read_columns(path, choose, _dialect(path))
     found = {key: table.matrix(names) for key, names in groups.items() if names[0] in header}
     q = found.pop("q_rad", None)
     if "q_deg" in found:
@@ -98,7 +120,7 @@ def read_points(path: Path, arm: Arm, loads: Mapping[str, Floats]) -> Points:
     wrench, sensed = found.pop("wrench", None), found.pop("sensed", None)
     if "load" in table.text:
         wrench = np.stack([_load(table, k, loads) for k in range(len(table.rows))])
-    wanted = _poses(found)
+    wanted = _poses(found, q, arm)
     if q is None and wanted is None:
         raise InputError(
             f"{path}: neither joint values nor poses; valid: columns q1_rad … q{arm.n}_rad, or "
@@ -113,8 +135,8 @@ def read_points(path: Path, arm: Arm, loads: Mapping[str, Floats]) -> Points:
 def on_branch(points: Points, arm: Arm, tool: Floats, near: Floats | None) -> Floats:
     """Return the joint values (N, n) at which the nominal arm has the tool at the points.
 
-    Those of a pose are on the branch of the joint values that are given with it, else of the point
-    before it.
+    Of all solutions of a pose, that nearest to the joint values that are given with it, else to
+    those of the point before it.
 
     Args:
         points: the points.
@@ -141,17 +163,87 @@ def on_branch(points: Points, arm: Arm, tool: Floats, near: Floats | None) -> Fl
                 f"point {name} is a pose without joint values; give joint columns, or --near with "
                 "the joint values that the first pose is near to"
             )
-        if np.isfinite(goal).all():
-            solved = invert(arm, poses, start[None], goal[None, :3, :3], goal[None, :3, 3])
-            if not solved.solved[0]:
-                raise InputError(
-                    f"point {name}: the nominal arm does not reach it from the joint values "
-                    f"before, {1e3 * solved.residual_m[0]:.3g} mm and "
-                    f"{np.degrees(solved.residual_rad[0]):.3g} degrees are left"
-                )
-            start = solved.q[0]
+        if np.isfinite(goal[:3, 3]).all():
+            if not np.isfinite(goal).all():  # turned as the nominal arm has it
+                goal = se3.matrix(poses(start[None], np.zeros(1, int))[0][0], goal[:3, 3])
+            start = _nearest(arm, poses, name, start, goal)
         found.append(start)
     return np.stack(found)
+
+
+def _nearest(
+    arm: Arm, poses: Callable[[Floats, Ints], Pose], name: str, near: Floats, goal: Floats
+) -> Floats:
+    """Return of all joint values (n,) of a pose those nearest to given ones.
+
+    The solution that Newton's method finds from there, where it is near; else the nearest of those
+    that it finds from everywhere.
+
+    Raises:
+        InputError: the arm does not reach the pose.
+    """
+    starts = near[None]
+    for _ in range(2):
+        rotation, position = (
+            np.broadcast_to(x, (len(starts), *x.shape)) for x in (goal[:3, :3], goal[:3, 3])
+        )
+        solved = invert(arm, poses, starts, rotation, position)
+        q = solved.q
+        if arm.coupling is None and arm.mimic is None:  # whole turns on it is the same pose
+            q = q + 2 * np.pi * np.round((near - q) / (2 * np.pi))
+            q = np.where((q < arm.q_min) | (q > arm.q_max), solved.q, q)
+        inside = ((q >= arm.q_min) & (q <= arm.q_max)).all(axis=1)
+        far = np.linalg.norm(q - near, axis=1) + np.where(inside, 0.0, BEYOND)
+        far = np.where(solved.solved, far, np.inf)
+        if far.min() < NEAR:
+            break
+        if len(starts) == 1:
+            low, high = np.maximum(arm.q_min, -np.pi), np.minimum(arm.q_max, np.pi)
+            spread = np.random.default_rng(0).random((STARTS, arm.n))
+            spread = arm.complete(low + spread * (high - low))
+            starts = np.concatenate([near[None], spread])
+    if not np.isfinite(far).any():
+        k = int(np.argmin(solved.residual_m / arm.reach + solved.residual_rad))
+        raise InputError(
+            f"point {name}: the nominal arm does not reach it from anywhere; "
+            f"{1e3 * solved.residual_m[k]:.3g} mm and "
+            f"{np.degrees(solved.residual_rad[k]):.3g} degrees are left"
+        )
+    return np.asarray(q[int(np.argmin(far))])
+
+
+def _dialect(path: Path) -> Dialect | None:
+    """Return how a table is written where it is no plain CSV file."""
+    try:
+        with path.open(encoding="utf-8", errors="replace") as stream:
+            header = stream.readline(limits.LINE)
+    except OSError:
+        return None  # said by who reads it
+    if not any(mark in header for mark in (";", "\t", "|")):
+        return None
+    how = sniff(path).how
+    separator = str(how.get("separator", ","))
+    if separator == "," and "decimal" not in how:
+        return None
+    return Dialect(SEPARATORS.get(separator, separator), str(how.get("decimal", ".")))
+
+
+def _mapped(path: Path, arm: Arm, loads: Mapping[str, Floats], mapping: TableMapping) -> Points:
+    """Return the states of a table of readings as points, their positions in base axes."""
+    # the noise weighs nothing here
+    r = import_mapped(path, mapping, arm, TrackerNoise(1e-5, 0.0, 1e-5, 0.0, 1e-4)).readings
+    s = r.states
+    wrench = s.wrench.copy()
+    for k, load in enumerate(r.load_names):
+        if not s.wrench[r.load == k].any() and load in loads:
+            wrench[r.load == k] = loads[load]
+    found = {"position_m": r.value[:, :3]}
+    if r.m == 6:
+        found["rotation_rad"] = r.value[:, 3:]
+    names = tuple(
+        f"{r.pose_names[p]} {r.load_names[k]}" for p, k in zip(r.pose, r.load, strict=True)
+    )
+    return Points(names, s.q, _poses(found, s.q, arm), wrench)
 
 
 def _groups(n: int) -> dict[str, tuple[str, ...]]:
@@ -175,7 +267,7 @@ def _groups(n: int) -> dict[str, tuple[str, ...]]:
 
 
 def _checked(
-    path: Path, header: list[str], groups: Mapping[str, tuple[str, ...]]
+    path: Path, header: list[str], groups: Mapping[str, tuple[str, ...]], arm: Arm
 ) -> tuple[Sequence[str], Sequence[str]]:
     """Check a header; returns its text and its number columns.
 
@@ -183,9 +275,14 @@ def _checked(
         InputError: an unknown or double column, an incomplete group, or one in two units.
     """
     known = [name for names in groups.values() for name in names]
+    exchanged = set(known_columns(arm.n))
     for name in header:
-        if name not in (*known, "pose", "load"):
-            raise InputError(f"{path}: unknown column '{name}'; valid: {', '.join(known[:8])}, …")
+        if name not in (*known, "pose", "load", *exchanged) and not name.startswith(OWN_PREFIX):
+            valid = ", ".join(("pose", "load", *known))
+            raise InputError(
+                f"{path}: unknown column '{name}'; valid: {valid}, columns of the exchange table, "
+                "and x_…; other tables: --format MAPPING, as for import"
+            )
         if header.count(name) > 1:
             raise InputError(f"{path}: column '{name}' is there twice")
     for names in groups.values():
@@ -203,7 +300,7 @@ def _checked(
     if len(told) > 1:
         raise InputError(f"{path}: both {told[0]} and {told[1]}; give one of them")
     text = [name for name in ("pose", "load") if name in header]
-    return text, [name for name in header if name not in text]
+    return text, [name for name in header if name in known]
 
 
 def _load(table: CsvTable, row: int, loads: Mapping[str, Floats]) -> Floats:
@@ -221,11 +318,11 @@ def _load(table: CsvTable, row: int, loads: Mapping[str, Floats]) -> Floats:
     return loads[name]
 
 
-def _poses(found: dict[str, Floats]) -> Floats | None:
+def _poses(found: dict[str, Floats], q: Floats | None, arm: Arm) -> Floats | None:
     """(N, 4, 4) poses, taken out of what was found; None where there are none.
 
     Raises:
-        InputError: a position without an orientation, or the other way round.
+        InputError: a position without an orientation or joint values, or an orientation alone.
     """
     position, rotation = found.pop("position_m", None), found.pop("rotation_rad", None)
     if "position_mm" in found:
@@ -234,8 +331,11 @@ def _poses(found: dict[str, Floats]) -> Floats | None:
         rotation = np.radians(found.pop("rotation_deg"))
     if position is None and rotation is None:
         return None
-    if position is None or rotation is None:
+    if position is None or (rotation is None and q is None):
         raise InputError(
-            "a pose is x_m, y_m, z_m together with rx_rad, ry_rad, rz_rad; one half is missing"
+            "a pose is x_m, y_m, z_m together with rx_rad, ry_rad, rz_rad, or with joint values "
+            "that say how the tool is turned; one half is missing"
         )
+    if rotation is None:
+        return se3.matrix(np.full((len(position), 3, 3), np.nan), position)
     return se3.matrix(se3.rotation(rotation), position)

@@ -25,6 +25,7 @@ from hilcal.campaign import Campaign
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.terminal import Json, Revision, Terminal, terminal
 from hilcal.data.columns import joint_columns
+from hilcal.data.mapping import find_mapping
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.fit_document import plain
@@ -115,6 +116,10 @@ def compensate(
     ] = False,
     revision: Revision = None,
     effects_from: EffectsFrom = None,
+    kind: Annotated[
+        str,
+        typer.Option("--format", metavar="FORMAT", help="table, or a mapping, as for import."),
+    ] = "table",
     force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
     as_json: Json = False,
 ) -> None:
@@ -126,12 +131,13 @@ def compensate(
         say(f"reading {model}")
         calibration = _calibration(model, catalogue, revision)
         arm = calibration.model.cell.arm
-        task = _task(points, calibration, tool, leave)
+        task = _task(points, calibration, tool, leave, kind)
         given = _wrench(task.points, calibration, load, wrench)
         start = None if near is None else np.radians(_numbers(near, arm.n, "--near"))
         say(f"compensating {len(task.points.names)} points")
         on_flange = calibration.tool_pose(task.tool)
-        q = on_branch(task.points, arm, on_flange, start)
+        begin = calibration.measured.middle(arm.n) if start is None and not task.program else start
+        q = on_branch(task.points, arm, on_flange, begin)
         understood = [w for w in task.waypoints if not w.left]
         uncertain = doubts(arm, on_flange, understood, q, start) or [""] * len(q)
         sensed = task.points.sensed
@@ -183,7 +189,7 @@ def _calibration(path: Path, catalogue: Catalogue, revision: int | None) -> Cali
         return run.calibration(revision)
 
 
-def _task(path: Path, calibration: Calibration, tool: str | None, leave: bool) -> _Task:
+def _task(path: Path, calibration: Calibration, tool: str | None, leave: bool, kind: str) -> _Task:
     """Read what is to be compensated.
 
     Raises:
@@ -211,9 +217,13 @@ def _task(path: Path, calibration: Calibration, tool: str | None, leave: bool) -
         return _Task(points, given if own is None else own, program, every)
     if leave:
         raise InputError(f"{path}: --leave is for waypoints of a program; valid: without it")
-    if path.suffix != ".csv":
-        raise InputError(f"{path}: valid: a table .csv or a UR program {' or '.join(PROGRAMS)}")
-    return _Task(read_points(path, arm, calibration.loads), given)
+    mapping = None if kind == "table" else find_mapping(kind)
+    if path.suffix != ".csv" and mapping is None:
+        raise InputError(
+            f"{path}: valid: a table .csv, a UR program {' or '.join(PROGRAMS)}, or any table with "
+            "--format MAPPING"
+        )
+    return _Task(read_points(path, arm, calibration.loads, mapping), given)
 
 
 def _only(task: _Task, kept: list[int], refused: list[str]) -> _Task:

@@ -282,7 +282,7 @@ def _write_geometry(found: Calibration, wanted: Geometry) -> Iterator[str]:
     cell, beyond = found.model.cell, None
     nominal = cell.arm
     note = f"{nominal.name} as calibrated with hilcal, {found.source['campaign']}"
-    base = base_line(cell, found.frames)
+    base = base_line(cell, found.frames, found.mode)
     holds = ", ".join(arm.within) or "the nominal geometry"
     said: list[str] = []
     write: list[Callable[[], object]] = []

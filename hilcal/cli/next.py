@@ -11,7 +11,7 @@ from hilcal.cli.files import check_record, effect_names, fit_of
 from hilcal.cli.plan_output import Csv, Output, Quick, Seed, generator, write
 from hilcal.cli.planning import read_cell
 from hilcal.cli.prior import Drift, Prior, PriorOf, PriorOptions, fitted_with
-from hilcal.cli.terminal import Json, Record, Revision, Run, Terminal, terminal
+from hilcal.cli.terminal import Details, Json, Record, Revision, Run, Terminal, terminal
 from hilcal.diagnose.doubt import MOST
 from hilcal.diagnose.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue
@@ -23,7 +23,7 @@ from hilcal.procedure.next_plan import doubt_to_settle, next_plan
 from hilcal.procedure.separate import Doubt, without
 from hilcal.report import numbers as words_of
 from hilcal.report.progress import Say, working
-from hilcal.report.text_next import next_report, poses_report
+from hilcal.report.text_next import brief_plan, next_report, poses_report
 from hilcal.report.text_plan import plan_report
 
 
@@ -55,6 +55,7 @@ def next_(
     drift: Drift = None,
     record: Record = None,
     effects_from: EffectsFrom = None,
+    details: Details = False,
     as_json: Json = False,
 ) -> None:
     """Plan the measurements that separate the leading suspects; exit 4 where none are in doubt."""
@@ -67,14 +68,15 @@ def next_(
     with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
         given = None if cell is None else read_cell(cell)
         doubt = _without_suspects(t, o, revision, _named(suspects, catalogue), say, carried)
-        n = next_plan(o, doubt, poses, rng, say, cell=given, quick=quick)
+        compare = (details or as_json) and not quick
+        n = next_plan(o, doubt, poses, rng, say, cell=given, compare=compare)
         config, numbers = (o.config, o.cell) if given is None else given
     found, made, effects = n.found, n.made, doubt.suspects
     write(t, numbers, config, made, output, csv, record, found.powers)
     t.show(f"In doubt: {words_of.names(effects, 'or')}.\n")
     report = next_report if doubt.alone is None else poses_report
-    t.show(report(found, made.summary.poses, made.summary.readings))
-    t.show(plan_report(made.summary))
+    t.show(report(found, made.summary.poses, made.summary.readings, details))
+    t.show(plan_report(made.summary) if details else brief_plan(made.summary))
     t.show(f"The plan is in {output}. Measure it into the same campaign with:")
     t.show(
         f"  hilcal run {quoted(cell or 'CELL.toml')} -o {quoted(run)} --append "

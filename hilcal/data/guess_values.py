@@ -42,9 +42,13 @@ def is_quaternion(values: Floats) -> bool:
 
 def sentinels(position: Floats) -> list[float]:
     """Return numbers that stand for a missing point: all three the same, or made of nines."""
-    found = set()
     same = (position[:, 0] == position[:, 1]) & (position[:, 1] == position[:, 2])
-    found |= {float(v) for v in position[same, 0] if v != 0}
+    return sorted({float(v) for v in position[same, 0] if v != 0} | set(nines(position)))
+
+
+def nines(position: Floats) -> list[float]:
+    """Return numbers of four nines or more, which stand for a missing value."""
+    found = set()
     for v in np.unique(position[np.isfinite(position)]):
         digits = f"{abs(v):.0f}"
         if len(digits) >= 4 and set(digits) == {"9"} and float(digits) == abs(v):

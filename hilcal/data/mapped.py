@@ -12,6 +12,7 @@ from hilcal.data.covariance import TrackerNoise
 from hilcal.data.csvfile import CsvTable
 from hilcal.data.following import own_columns
 from hilcal.data.grid import Grid
+from hilcal.data.guess_values import nines
 from hilcal.data.imported import ImportResult
 from hilcal.data.mapping import Mapping
 from hilcal.data.mapping_sections import Column
@@ -153,14 +154,23 @@ def _raw(grid: Grid, mapping: Mapping, arm: Arm) -> dict[str, Floats]:
 
 
 def _nowhere(grid: Grid, mapping: Mapping, raw: dict[str, Floats]) -> list[str]:
-    """Take positions of exactly 0, 0, 0 for missing, which instruments write for no measurement."""
+    """Take positions that instruments write for no measurement for missing.
+
+    Exactly 0, 0, 0, and numbers of nines that are a position three times over, as −9999.
+    """
     names = [grid.name(column) for column in mapping.position.columns]
-    bad = np.asarray((_block(raw, grid, names) == 0).all(axis=1))
-    if not bad.any():
-        return []
-    for name in names:
-        raw[name][bad] = np.nan
-    return [f"positions of exactly 0, 0, 0 ({int(bad.sum())} of {len(bad)} rows) count as missing"]
+    position, notes = _block(raw, grid, names), []
+    for value in (0.0, *nines(position)):
+        bad = np.asarray((position == value).all(axis=1))
+        if not bad.any():
+            continue
+        for name in names:
+            raw[name][bad] = np.nan
+        listed = ", ".join([f"{value:g}"] * 3)
+        notes.append(
+            f"positions of exactly {listed} ({int(bad.sum())} of {len(bad)} rows) count as missing"
+        )
+    return notes
 
 
 def _complete(grid: Grid, raw: dict[str, Floats]) -> tuple[Bools, list[str]]:

@@ -49,7 +49,8 @@ def earlier_fit(fit: Fit) -> Earlier:
     """
     if fit.scaling != "gc":
         raise InputError(
-            f"the earlier fit has scaling {fit.scaling}; a comparison needs gc: run hilcal identify"
+            f"the earlier fit has scaling {fit.scaling}; a comparison needs gc: run hilcal "
+            "identify again"
         )
     kept = fit.readings[~fit.outlier]
     w = fit.whitening

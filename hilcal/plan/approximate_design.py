@@ -11,7 +11,7 @@ from hilcal.plan.barrier import Optimum, Program
 from hilcal.plan.bound import best_first, prices, total_information, upper_bound
 from hilcal.plan.candidate_set import CandidateSet
 from hilcal.plan.criterion import Criterion, Smooth, square
-from hilcal.types import Floats, Ints
+from hilcal.types import Bools, Floats, Ints
 
 TOLERANCE = 1e-7
 """Relative gap between the continuous optimum and its bound."""
@@ -47,7 +47,14 @@ class ApproximateDesign:
     @property
     def gap(self) -> float:
         """Relative distance of value and bound."""
-        return self.bound / self.value - 1.0
+        return self.bound / self.value - 1.0 if self.value > 0.0 else np.inf
+
+    def among(self, kept: Bools) -> "ApproximateDesign | None":
+        """Return the same optimum over some (K,) of the units; None where one of weight is lost."""
+        if not kept[self.index].all():
+            return None
+        place = np.cumsum(kept) - 1
+        return replace(self, index=place[self.index], price=self.price[kept])
 
 
 def relax(
@@ -88,6 +95,7 @@ def relax(
     share = min(budget / float(units.cost.sum()), cap)
     spread = prior + total_information(units, np.full(len(units), share))
     criterion.require(spread, names)
+    criterion = criterion.relevant(units, prior, budget)
     if share == cap and criterion.monotone:
         value = float(criterion.value(spread))  # all there is
         all_of_them = np.arange(len(units))

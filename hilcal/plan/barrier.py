@@ -8,7 +8,7 @@ import numpy as np
 import scipy.linalg as sl
 
 from hilcal.plan.bound import prices, upper_bound
-from hilcal.plan.criterion import Criterion, Smooth
+from hilcal.plan.criterion import Criterion, Root, Smooth
 from hilcal.types import Floats
 
 # Choices, usual in interior-point methods (Wright 1997); none has a study of its own.
@@ -75,23 +75,19 @@ class Program:
         n, size, p = self.rows.shape
         flat = self.rows.reshape(-1, p)
         out = np.zeros((n, n))
-        thin = [(c, x, y) for c, x, y in smooth.products if x.ndim == 1]
-        if thin:  # tr(x xᵀ H_k Y H_l) = (H_k x)ᵀ Y H_l x
-            seen = (flat @ np.stack([x for _, x, _ in thin], axis=1)).reshape(n, size, -1)
-            moved = np.matmul(seen.transpose(0, 2, 1), self.rows)
-            for k, (c, _, y) in enumerate(thin):
-                v = moved[:, k]
-                out -= c * (v @ y @ v.T)
         for c, x, y in smooth.products:
-            if x.ndim == 2:
-                out -= c * _product(self.rows, x, y)
-        for c, v in smooth.squares:
-            price = prices(self.rows, v)
-            out -= c * np.outer(price, price)
+            out -= c * _product(self.rows, x, y)
+        for factor, v in smooth.squares:
+            if isinstance(factor, np.ndarray):
+                each = np.sum((flat @ v).reshape(n, size, -1) ** 2, axis=1)
+                out -= each @ factor @ each.T
+            else:
+                price = prices(self.rows, v)
+                out -= factor * np.outer(price, price)
         return np.asarray(0.5 * (out + out.T))
 
 
-def _product(rows: Floats, x: Floats, y: Floats) -> Floats:
+def _product(rows: Floats, x: Floats | Root, y: Floats | Root) -> Floats:
     """Return (n, n) tr(X H_k Y H_l) of (n, R, P) rows, for semidefinite X and Y (P, P)."""
     n, size = rows.shape[:2]
     flat = rows.reshape(n * size, -1)
@@ -117,8 +113,10 @@ def _gram(t: Floats) -> Floats:
     return upper + np.triu(upper, 1).T
 
 
-def _root(x: Floats) -> Floats:
+def _root(x: Floats | Root) -> Floats:
     """Return L (P, r) of a semidefinite X = L Lᵀ."""
+    if isinstance(x, Root):
+        return x.matrix
     size = np.sqrt(np.diag(x))
     there = np.flatnonzero(size > 0.0)
     unit = x[np.ix_(there, there)] / np.outer(size[there], size[there])

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.plan.approximate_design import relax
+from hilcal.plan.approximate_design import KINKED_TOLERANCE, ApproximateDesign, relax
 from hilcal.plan.candidate_set import CandidateSet
 from hilcal.plan.criteria import A, D, MeanVariance
 from hilcal.plan.criterion import Criterion
@@ -15,7 +15,7 @@ from hilcal.plan.eigenvalue_criteria import E, K
 from hilcal.plan.information import Problem
 from hilcal.plan.optimum import Design, best
 from hilcal.plan.prediction_poses import PredictionPoses
-from hilcal.plan.t_optimality import Separate
+from hilcal.plan.t_optimality import Separate, condensed
 from hilcal.types import Bools, Floats, Ints
 
 CRITERIA = ("D", "A", "E", "K", "I", "separate")
@@ -40,7 +40,7 @@ class Objective:
         criterion: φ.
         units: the units by the parameters that φ is of.
         prior: (P, P) prior information of these.
-        names: of the parameters.
+        names: of the parameters; none where they are combinations.
     """
 
     criterion: Criterion
@@ -79,7 +79,8 @@ def objective_of(problem: Problem, name: str, work: PredictionPoses | None) -> O
         return replace(whole, criterion=MeanVariance(work.matrix(len(names))))
     if name == "separate":
         apart = discriminated_pairs(problem)
-        return replace(whole, criterion=Separate(apart.pairs), prior=apart.prior)
+        units, pairs, prior = condensed(problem.units, apart.pairs, apart.prior)
+        return Objective(Separate(pairs), units, prior, ())
     if name == "E":
         return replace(whole, criterion=E(unknown(problem)))
     if name == "K":  # of the model alone: more information, also of the others, may make it worse
@@ -97,12 +98,17 @@ def unknown(problem: Problem) -> Ints:
 
 
 def choose(
-    asked: Objective, budget: float, rng: np.random.Generator, effort: int = EFFORT
+    asked: Objective,
+    budget: float,
+    rng: np.random.Generator,
+    effort: int = EFFORT,
+    relaxed: ApproximateDesign | None = None,
 ) -> Design:
     """Return the exact design; see `optimum.best`."""
     return best(
-        asked.units, asked.criterion, budget, asked.prior, rng, names=asked.names, effort=effort
-    )
+        asked.units, asked.criterion, budget, asked.prior, rng, names=asked.names, effort=effort,
+        relaxed=relaxed,
+    )  # fmt: skip
 
 
 def choose_poses(
@@ -158,14 +164,15 @@ def choose_poses(
     return replace(found, counts=counts, bound=bound, cost=cost, relaxed=relaxed)
 
 
-def promising(asked: Objective, budget: float) -> Ints:
-    """Return the units that a plan is likely to be made of: those of the best prices."""
+def promising(asked: Objective, budget: float) -> tuple[Ints, ApproximateDesign]:
+    """Return the units that a plan is likely to be made of, those of the best prices, and why."""
+    tolerance = min(KINKED_TOLERANCE, LOOSE) if asked.criterion.kinked else LOOSE
     found = relax(
-        asked.units, asked.criterion, budget, asked.prior, names=asked.names, tolerance=LOOSE
+        asked.units, asked.criterion, budget, asked.prior, names=asked.names, tolerance=tolerance
     )
     count = min(2 * len(found.index), len(asked.units))
     best_first = np.argsort(-found.price / asked.units.cost, kind="stable")
-    return np.union1d(found.index, best_first[:count])
+    return np.union1d(found.index, best_first[:count]), found
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,8 +212,10 @@ def worthwhile(
     sample = np.isin(poses, few)
     keep = tuple(name for name in problem.candidates.loads[1:] if _uses(problem, name).any())
     left: list[tuple[str, float]] = []
+    if len(keep) < 2 or change <= 0:
+        return Loads(keep, float(np.floor(budget + 1e-9)), ())
     now = _value(asked, problem, sample, keep, budget)
-    while len(keep) > 1 and change > 0 and now > 0:
+    while len(keep) > 1 and now > 0:
         tried = [
             (_value(asked, problem, sample, tuple(k for k in keep if k != name), budget + change),
              name)

@@ -7,8 +7,20 @@ from typing import Protocol
 import numpy as np
 
 from hilcal.errors import CannotAnswerError, InputError
+from hilcal.plan.candidate_set import CandidateSet
 from hilcal.regression.schur import DETERMINED
 from hilcal.types import Bools, Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Root:
+    """A semidefinite matrix L Lᵀ (P, P), where its root is known.
+
+    Attributes:
+        matrix: (P, r) L.
+    """
+
+    matrix: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,16 +34,17 @@ class Smooth:
     Attributes:
         value: f(M).
         gradient: (P, P) of f.
-        products: terms of its curvature; a vector x (P,) in the place of X stands for x xᵀ.
-        squares: terms of its curvature.
+        products: terms of its curvature.
+        squares: terms of its curvature; (C, V) with matrices C (r, r) and V (P, r) of columns v_a
+            stands for Σ C_ab tr(v_a v_aᵀ H_k) tr(v_b v_bᵀ H_l).
         above: (P, P) Z such that φ(N) ≤ tr(Z N) for every information N ⪰ 0,
         below: or with Y (P, P): φ(N) ≤ tr(Z N) / tr(Y N).
     """
 
     value: float
     gradient: Floats
-    products: tuple[tuple[float, Floats, Floats], ...]
-    squares: tuple[tuple[float, Floats], ...]
+    products: tuple[tuple[float, Floats | Root, Floats | Root], ...]
+    squares: tuple[tuple[float | Floats, Floats], ...]
     above: Floats
     below: Floats | None = None
 
@@ -64,6 +77,10 @@ class Criterion(Protocol):
         It is near φ / φ(m), or log φ, so that its changes are relative. It returns None for
         an M at which it does not exist.
         """
+
+    def relevant(self, units: CandidateSet, prior: Floats, budget: float) -> "Criterion":
+        """Return φ without what is decided: equal near the optimum of the plans of a budget."""
+        return self
 
     def require(self, m: Floats, names: Sequence[str] | None) -> None:
         """Refuse an M, the information of all candidates, that does not determine φ.

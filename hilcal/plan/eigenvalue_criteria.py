@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.plan.criterion import Criterion, Smooth, soft_least
+from hilcal.plan.criterion import Criterion, Root, Smooth, soft_least
 from hilcal.regression.schur import (
     SchurComplement,
     differentiable_schur_complement,
@@ -110,11 +110,15 @@ def _least(s: SchurComplement, width: float) -> Smooth:
     """Return the smooth least eigenvalue of S as a function of M."""
     part = _part(*np.linalg.eigh(s.matrix), width)
     gradient = s.embed(part.gradient)
-    products = tuple((c, s.embed(x), s.embed(y)) for c, x, y in part.products)
+    products = tuple((c, _embedded(s, x), _embedded(s, y)) for c, x, y in part.products)
     if s.inverse is not None:
         products = (*products, (-2.0, gradient, s.inverse))
     squares = tuple((c, s.embed(v)) for c, v in part.squares)
     return Smooth(part.value, gradient, products, squares, gradient)
+
+
+def _embedded(s: SchurComplement, x: Floats | Root) -> Floats | Root:
+    return Root(s.lift @ x.matrix) if isinstance(x, Root) else s.embed(x)
 
 
 def _part(values: Floats, vectors: Floats, width: float) -> Smooth:

@@ -26,6 +26,8 @@ from hilcal.plan.planner import Planned, Request, Say, make
 from hilcal.plan.predicted import predicted
 from hilcal.plan.run_order import Chosen, Ordering, order_plan
 from hilcal.plan.t_optimality import Pair
+from hilcal.regression.power import family_power
+from hilcal.regression.schur import schur_complement
 from hilcal.robot.chain import evaluate
 from hilcal.types import Floats, Ints
 
@@ -157,8 +159,11 @@ def expected(
         betas: (E,) parameters of the effect, in the problem's units.
         information: (P, P) of all readings, with `DiscriminatedPairs.prior`.
     """
-    each = [power(pair_of(problem, names, b), information) for b in betas]
-    return float(np.mean(each)) if each else LEVEL
+    if not len(betas):
+        return LEVEL
+    pair = pair_of(problem, names, betas[0])
+    s = schur_complement(information, pair.effect, pair.nuisance)
+    return float(np.mean([family_power(s, beta, LEVEL) for beta in betas]))
 
 
 def _pair_powers(
@@ -238,11 +243,12 @@ def reordered(
         space.cell, space.config, list(names.values()), of.candidates.q[poses], reference, chosen,
         space.passable, rng, how,
     )  # fmt: skip
-    information = made.asked.prior + of.units.information(counts.astype(float))
+    asked = made.asked
+    information = asked.prior + asked.units.information(counts.astype(float))
     design = replace(
         made.design,
         counts=counts[usable],
-        value=float(made.asked.criterion.value(information)),
+        value=float(asked.criterion.value(information)),
         information=information,
         cost=float(counts @ of.units.cost),
     )

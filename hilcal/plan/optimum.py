@@ -54,6 +54,7 @@ def best(
     names: Sequence[str] | None = None,
     tolerance: float | None = None,
     effort: int | None = None,
+    relaxed: ApproximateDesign | None = None,
 ) -> Design:
     """Return a plan with Σ n_k c_k ≤ B whose φ(M0 + Σ n_k A_kᵀA_k) is nearly the largest.
 
@@ -67,6 +68,7 @@ def best(
         names: of the parameters, for messages.
         tolerance: relative gap of the continuous optimum; `TOLERANCE` by default.
         effort: of the search for whole numbers; see `exact`.
+        relaxed: the continuous optimum, where it is known.
 
     Raises:
         InputError: a budget that takes no unit, or arrays that do not fit.
@@ -75,9 +77,13 @@ def best(
     rng = np.random.default_rng(0) if rng is None else rng
     if tolerance is None:
         tolerance = KINKED_TOLERANCE if criterion.kinked else TOLERANCE
-    relaxed = relax(units, criterion, budget, prior, most=most, names=names, tolerance=tolerance)
-    counts = exact(units, criterion, budget, prior, relaxed, rng, most=most, effort=effort)
+    if relaxed is None or relaxed.gap > tolerance:
+        relaxed = relax(
+            units, criterion, budget, prior, most=most, names=names, tolerance=tolerance
+        )
     known = checked(units, budget, prior, most)
+    felt = criterion.relevant(units, known, budget)
+    counts = exact(units, felt, budget, prior, relaxed, rng, most=most, effort=effort)
     used = np.flatnonzero(counts)
     information = known + units.information(counts[used].astype(float), used)
     value = float(criterion.value(information))

@@ -174,13 +174,15 @@ def make(
     usable = within(of, loads.names)
     say(f"choosing poses by criterion {criterion}")
     pose_of = np.array([pose for pose, _ in of.what])
-    first = np.flatnonzero(usable)[promising(only(asked, usable), loads.budget)]
-    usable &= ~np.isin(pose_of, _unreachable(space, of, home, first))
+    before = usable.copy()
+    first, relaxed = promising(only(asked, usable), loads.budget)
+    usable &= ~np.isin(pose_of, _unreachable(space, of, home, np.flatnonzero(usable)[first]))
     for _ in range(ROUNDS):
         if whole:
             design = choose_poses(asked, of, usable, request.poses, rng, request.effort)
         else:
-            design = choose(only(asked, usable), loads.budget, rng, request.effort)
+            optimum = relaxed.among(usable[before])
+            design = choose(only(asked, usable), loads.budget, rng, request.effort, optimum)
         units = np.flatnonzero(usable)[np.flatnonzero(design.counts)]
         lost = _unreachable(space, of, home, units)
         if not len(lost):

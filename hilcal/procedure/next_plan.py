@@ -45,7 +45,7 @@ def next_plan(
     say: Say,
     *,
     cell: tuple[CellConfig, Cell] | None = None,
-    quick: bool = False,
+    compare: bool = False,
 ) -> NextPlan:
     """Plan the measurements that settle a doubt, and check every motion in a dry run.
 
@@ -56,7 +56,7 @@ def next_plan(
         rng: generator.
         say: takes progress, one line each.
         cell: configuration and cell, where they are not the campaign's any more.
-        quick: without comparing criteria and numbers of poses.
+        compare: whether to compare criteria and numbers of poses as well, which takes longer.
 
     Raises:
         InputError: suspects that cannot be, or a plan that may not be run.
@@ -64,7 +64,7 @@ def next_plan(
     """
     config, numbers = (o.config, o.cell) if cell is None else cell
     found = separating(numbers, config, doubt, poses, rng, say, reference_in(o.file), POSES)
-    compare = not quick and not doubt.alone
+    compare = compare and not doubt.alone
     summary = summarise(found.planned, config, rng, say, compare=compare)
     say("checking every motion in a dry run")
     made = checked(numbers, config, plan_of(found, doubt.suspects), summary)
@@ -94,7 +94,7 @@ def _settled(o: Campaign, d: Diagnosis) -> str:
     if d.verdict == "adequate":
         return (
             f"{head} the model is adequate; to sharpen it, plan on with: hilcal plan CELL.toml "
-            f"--after {quoted(o.path)}, or separate named effects with --suspects A,B"
+            f"-o PLAN.json --after {quoted(o.path)}, or separate named effects with --suspects A,B"
         )
     if d.wrong_figures:
         return (
@@ -108,7 +108,8 @@ def _settled(o: Campaign, d: Diagnosis) -> str:
     if d.reason == "background":
         return (
             f"{head} effects of the background are not told apart one by one; measure more poses, "
-            f"spread over all joints, with: hilcal plan CELL.toml --after {quoted(o.path)}"
+            f"spread over all joints, with: hilcal plan CELL.toml "
+            f"-o PLAN.json --after {quoted(o.path)}"
         )
     if d.verdict == "missing_effect":
         lead = d.suspects[0]

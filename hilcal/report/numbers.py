@@ -18,6 +18,9 @@ _UNITS: dict[str, tuple[tuple[str, float, float], ...]] = {
     "1": (("ppm", 1e6, 1e-3), ("%", 1e2, math.inf)),
 }
 
+LEAST_LENGTH = 1e-9
+"""m; what is less is the rounding of a computation, and no length that anything measures."""
+
 
 def unit_for(unit: str, values: Sequence[float]) -> tuple[str, float]:
     """Unit for people, and its factor, for values that stand in one column."""
@@ -43,8 +46,10 @@ def sizes(of: Iterable[tuple[str, float]]) -> str:
 
 
 def length(metres: float) -> str:
-    """Return a length: µm below 1 mm, then mm, then m; three digits."""
+    """Return a length: µm below 1 mm, then mm, then m; three digits, but no less than 1 nm."""
     size = abs(metres)
+    if 0.0 < size < LEAST_LENGTH:
+        return "< 0.001 µm"
     if size < 1e-3:
         return f"{digits(1e6 * metres)} µm"
     return f"{digits(1e3 * metres)} mm" if size < 1.0 else f"{digits(metres)} m"

@@ -12,6 +12,7 @@ from hilcal.diagnose.misfit_breakdown import Group, MisfitShare
 from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.identify.background import background_of
 from hilcal.identify.before import error_before
+from hilcal.identify.errors import error_block
 from hilcal.identify.fit import Fit
 from hilcal.identify.fit_document import notes
 from hilcal.identify.full_prediction import FullPrediction, full_prediction
@@ -224,7 +225,11 @@ def remarks(fit: Fit) -> Iterator[RenderableType]:
         yield note[0].upper() + note[1:] + "."
     gross = gross_errors(fit)
     if gross:
-        yield f"{len(gross)} readings set aside as gross errors (pose/load):"
+        kept = error_block(fit.raw, fit.whitening)
+        yield (
+            f"{len(gross)} readings set aside as gross errors (pose/load); the errors above count "
+            f"them, without them the fit is off by {numbers.length(kept.rms_m)} rms:"
+        )
         yield from (f"  {g.pose}/{g.load}: {g.reason}" for g in gross[:GROSS])
         if len(gross) > GROSS:
             yield f"  ... and {len(gross) - GROSS} more; --json lists all"

@@ -78,7 +78,7 @@ def report(
         f"{numbers.length(float(later.max()))}; expected {numbers.length(_rms(c.after.std_m))} rms"
     )
     yield f"  the latter includes {', '.join(_parts(calibration))}"
-    yield f"  {base_line(calibration.model.cell, calibration.frames)}"
+    yield f"  {base_line(calibration.model.cell, calibration.frames, calibration.mode)}"
     out = text.table("point", "before", "after, 95 %", "largest correction")
     order = np.argsort(-now, kind="stable")[:MOST]
     for k in sorted(order):

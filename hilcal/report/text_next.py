@@ -7,7 +7,10 @@ from rich.text import Text
 
 from hilcal.data.plan import UNLOADED
 from hilcal.plan.next import SURE, Next, PairPower
+from hilcal.plan.summary import PlanSummary
 from hilcal.report import numbers, text
+from hilcal.report.text_plan import certified, load_name
+from hilcal.report.text_run import spoken
 
 _STRETCHED = 1.15
 _MOST_LOADS = 2
@@ -16,17 +19,20 @@ _LEAST_SHARE = 0.1
 POWER_COLUMNS = ("if this is there", "this is ruled out", "now", "then")
 
 
-def next_report(found: Next, poses: int, readings: int) -> Iterator[RenderableType]:
-    """Yield the powers of all pairs, now and then, and what makes the difference.
+def next_report(
+    found: Next, poses: int, readings: int, details: bool = True
+) -> Iterator[RenderableType]:
+    """Yield the powers of the pairs, now and then, and what makes the difference.
 
     Args:
         found: the plan and what it tells.
         poses: of the plan, beside the reference.
         readings: of the plan.
+        details: all pairs, not the one of each suspect that is separated least.
     """
     yield text.heading("Telling the suspects apart")
     out = text.table(*POWER_COLUMNS, left=(0, 1))
-    for row in power_rows(found.powers):
+    for row in power_rows(found.powers if details else weakest(found.powers)):
         out.add_row(*row)
     yield out
     yield Text(
@@ -39,13 +45,35 @@ def next_report(found: Next, poses: int, readings: int) -> Iterator[RenderableTy
         yield f"note: {note}"
 
 
-def poses_report(found: Next, poses: int, readings: int) -> Iterator[RenderableType]:
+def weakest(powers: Sequence[PairPower]) -> tuple[PairPower, ...]:
+    """Return of each effect that may be there the pair that is separated least."""
+    least: dict[str, PairPower] = {}
+    for t in powers:
+        if t.effect not in least or t.then < least[t.effect].then:
+            least[t.effect] = t
+    return tuple(least.values())
+
+
+def brief_plan(s: PlanSummary) -> str:
+    """Say in two sentences what a plan costs and how good it is."""
+    loads = numbers.names([load_name(name) for name in s.loads])
+    certain = "" if s.efficiency is None else f" Efficiency {certified(s.efficiency)}."
+    return (
+        f"Plan: {s.readings} readings at {s.poses} poses and the reference, {loads}; takes about "
+        f"{spoken(s.duration.total)}.{certain} --details shows the rest.\n"
+    )
+
+
+def poses_report(
+    found: Next, poses: int, readings: int, details: bool = True
+) -> Iterator[RenderableType]:
     """Yield what further poses tell of a misfit that depends on the pose alone.
 
     Args:
         found: the plan and the powers.
         poses: of the plan, beside the reference.
         readings: of the plan.
+        details: all pairs, not the one of each suspect that is told least.
     """
     yield text.heading("Poses where nothing was read yet")
     yield (
@@ -54,7 +82,7 @@ def poses_report(found: Next, poses: int, readings: int) -> Iterator[RenderableT
     )
     if found.powers:
         out = text.table("if this is there", "and this is fitted", "now", "then", left=(0, 1))
-        for row in power_rows(found.powers):
+        for row in power_rows(found.powers if details else weakest(found.powers)):
             out.add_row(*row)
         yield out
         yield Text(

@@ -25,6 +25,8 @@ CRITERIA = {
 BAR = 30
 SCREEN = 4
 """Remarks on the first screen; the most important come first."""
+UNCERTAIN = 1e-3
+"""Least certified efficiency that tells anything. A choice: the last digit that is printed."""
 LIKE = 1.1
 """A number of poses is enough where the end of the curve is not better by more than this factor.
 A choice."""
@@ -127,6 +129,8 @@ def plan_report(s: PlanSummary) -> Iterator[RenderableType]:
 
 def certified(efficiency: float) -> str:
     """Return a certified efficiency in words; rounded down, it is a bound."""
+    if efficiency < UNCERTAIN:
+        return "of the plan: not certified, since the bound of the best plan did not close"
     return f"of the plan: at least {_floor(efficiency)} (certified lower bound); not accuracy"
 
 

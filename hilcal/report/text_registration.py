@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from hilcal.cell import Cell
+from hilcal.data.whitening import Mode
 from hilcal.identify.fit import Fit
 from hilcal.identify.other_arm import OtherArm
 from hilcal.identify.registration import Registration, Undetermined, register
@@ -13,6 +14,8 @@ from hilcal.report import numbers
 from hilcal.robot import se3
 from hilcal.types import Bools, Floats
 
+PLACES = 5, 4
+"""Decimals of a position in m and of an angle in degrees. A choice."""
 ALONG = 0.98
 """Share of its length that one element must have for a direction to be named after that axis."""
 
@@ -40,21 +43,31 @@ def other_arm_line(found: OtherArm) -> str:
 def fitted_lines(fit: Fit) -> Iterator[str]:
     """Yield where the robot's base is, and the targets that were unknown."""
     roles = [e.role for e in fit.model.effects]
-    yield base_line(fit.model.cell, fit.frames)
+    yield base_line(fit.model.cell, fit.frames, fit.mode)
     if "target" in roles:
         yield f"As fitted, {_targets(fit.model.cell.with_targets(fit.frames.targets))}."
     if "target" in roles or "registration" in roles:
         yield from undetermined_lines(register(fit.model.cell, fit.readings))
 
 
-def base_line(cell: Cell, found: RobotFrames) -> str:
-    """Return where the robot's base is, which poses, exports and errors are counted from."""
-    if not found.base_stated:
-        why = "the nominal arm on it has the axis of joint 1 where the readings have it"
-        return f"The robot's base: {_at(found.base)}; {why}."
-    if np.array_equal(found.base, np.eye(4)):
+def base_line(cell: Cell, found: RobotFrames, mode: Mode = "absolute") -> str:
+    """Return where the robot's base is, which poses, exports and errors are counted from.
+
+    Args:
+        cell: the cell.
+        found: its frames.
+        mode: kind of readings that they were fitted to; of deflections the base is that of the
+            nominal arm, and is written to 1 mm.
+    """
+    if np.array_equal(found.base, np.eye(4)) and found.base_stated:
         return "The robot's base: the axes that the positions are given in."
-    return f"The robot's base: {_at(found.base)}; as the cell states it."
+    if found.base_stated:
+        return f"The robot's base: {_at(found.base)}; as the cell states it."
+    why = "the nominal arm on it has the axis of joint 1 where the readings have it"
+    if mode == "deflection":
+        why += "; deflections tell it no better"
+    places = (3, 2) if mode == "deflection" else PLACES
+    return f"The robot's base: {_at(found.base, places)}; {why}."
 
 
 def undetermined_lines(found: Registration) -> Iterator[str]:
@@ -120,8 +133,8 @@ def _base(t: Floats) -> str:
     return f"the base is {_at(t)}"
 
 
-def _at(t: Floats) -> str:
-    return f"at {_place(t)} in the tracker frame"
+def _at(t: Floats, places: tuple[int, int] = PLACES) -> str:
+    return f"at {_place(t, places)} in the tracker frame"
 
 
 def _targets(cell: Cell) -> str:
@@ -131,10 +144,10 @@ def _targets(cell: Cell) -> str:
     return "; ".join(f"target {name} is at {_place(t)} on the flange" for name, t in named)
 
 
-def _place(t: Floats) -> str:
-    place = ", ".join(f"{x:.5f}" for x in t[:3, 3])
+def _place(t: Floats, places: tuple[int, int] = PLACES) -> str:
+    place = ", ".join(f"{x:.{places[0]}f}" for x in t[:3, 3])
     turn = np.degrees(se3.rotation_vector(t[:3, :3]))
     if not np.any(np.abs(turn) > 1e-9):
         return f"({place}) m"
-    words = ", ".join(f"{x:.4f}" for x in turn)
+    words = ", ".join(f"{x:.{places[1]}f}" for x in turn)
     return f"({place}) m, turned by the rotation vector ({words})°"

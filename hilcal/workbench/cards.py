@@ -151,7 +151,7 @@ def missing(view: View, d: Snapshot) -> None:
     title("What is missing")
     rows = suspects(d.diagnosis)
     if not rows:
-        ui.label("No effect of the catalogue is needed: none passes the tests.").classes("soft")
+        ui.label(none_passes(d.diagnosis)).classes("soft")
     else:
         columns = [
             {"name": "effect", "label": "effect", "field": "effect", "align": "left"},
@@ -210,6 +210,13 @@ def missing(view: View, d: Snapshot) -> None:
             value=view.tab.suspect,
             on_change=lambda e: view.choose(e.value),
         ).props("dense outlined options-dense").style("width: 100%")
+
+
+def none_passes(d: Diagnosis) -> str:
+    """Say why no suspects are listed; whether an effect is missing is the verdict's to say."""
+    if d.verdict == "adequate":
+        return "No effect of the catalogue is needed: none passes the tests."
+    return "No single effect of the catalogue passes the tests; the verdict says what is known."
 
 
 def suspects(d: Diagnosis) -> list[Suspect]:

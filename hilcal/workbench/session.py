@@ -168,7 +168,7 @@ class Session:
             poses: as many readings as so many poses take; what the doubt needs where None.
             output: the plan's file; it must not exist.
             say: takes progress, one line each.
-            quick: without comparing criteria and numbers of poses, as `hilcal next --quick`.
+            quick: without comparing criteria and numbers of poses, as `hilcal next` does.
 
         Raises:
             InputError: a file that cannot be written, or a plan that may not be run.
@@ -180,7 +180,7 @@ class Session:
         with self._open(read_only=True) as o:
             doubt = doubt_to_settle(o, snapshot.diagnosis, say)
             rng = np.random.default_rng(0)
-            found = next_plan(o, doubt, poses, rng, say, quick=quick)
+            found = next_plan(o, doubt, poses, rng, say, compare=not quick)
         found.made.save(output)
         self.planned = found, output
         return found

@@ -63,7 +63,7 @@ def test_next_in_json_and_in_words(ambiguous: Path, tmp_path: Path, capsys: Caps
     assert "ruled out" in result.err  # words are on stderr
 
     again = tmp_path / "again.json"
-    words = ok(capsys, "next", ambiguous, "-o", again, "--quick", "--poses", "8").out
+    words = ok(capsys, "next", ambiguous, "-o", again, "--quick", "--poses", "8", "--details").out
     assert again.read_bytes() == plan.read_bytes()
     for part in (
         f"In doubt: {BASE} or {TILT}.",
@@ -131,6 +131,22 @@ def test_a_misfit_of_the_pose_alone_asks_for_new_poses(tmp_path: Path, capsys: C
     assert {e for e, _, _ in d["separates"]} == {"transmission_error"}
     assert all(0.0 <= p <= 1.0 for _, _, p in (*d["separates"], *d["separates_now"]))
     assert "unloaded readings at 10 poses" in " ".join(result.err.split())
+
+
+def test_four_suspects_fit_one_screen(tmp_path: Path, capsys: Capsys) -> None:
+    """By default the pair of each suspect that is separated least; all under --details."""
+    path = stored(tmp_path / "run.hilcal", TILT, 1)
+    ok(capsys, "identify", path)
+    suspects = ("--suspects", f"{TILT},{LINK},{BASE},load_point", "--poses", "4")
+    brief = ok(capsys, "next", path, "-o", tmp_path / "n.json", *suspects).out
+    assert len(brief.splitlines()) <= 25
+    assert "Efficiency of the plan: at least " in " ".join(brief.split())
+    assert "at least 0.0 %" not in brief
+    full = ok(capsys, "next", path, "-o", tmp_path / "m.json", *suspects, "--details").out
+    assert full.count("load_point  ") > brief.count("load_point  ")
+    for heading in ("Predicted standard uncertainty", "Comparison of criteria", "Sample-size"):
+        assert heading in full
+        assert heading not in brief
 
 
 def test_named_suspects_need_no_diagnosis(tmp_path: Path, capsys: Capsys) -> None:

@@ -287,6 +287,48 @@ def test_what_is_said_of_an_accepted_revision_that_will_not_do_leads_on(
         assert len(o.fit().readings) == len(o.readings)
 
 
+@pytest.mark.parametrize(
+    "asked",
+    [
+        ("accept", "{run}"),
+        ("export", "{run}", "--urdf", "{out}/arm.urdf"),
+        ("report", "{run}", "-o", "{out}/r.html"),
+        ("compensate", "{run}", "{out}/points.csv"),
+        ("next", "{run}", "-o", "{out}/p.json"),
+        ("view", "{run}", "--record", "{out}/v.rrd"),
+    ],
+    ids=lambda x: x[0],
+)
+def test_every_step_that_is_named_leads_on(
+    fresh: bytes, cell: Path, tmp_path: Path, capsys: Capsys, asked: tuple[str, ...]
+) -> None:
+    """From a campaign without a fit: the step is taken until the command is done, or a plan is."""
+    run = tmp_path / "run.hilcal"
+    run.write_bytes(fresh)
+    (tmp_path / "points.csv").write_text(
+        "q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg\n0,-80,90,-90,-80,5\n"
+    )
+    arguments = [part.format(run=run, out=tmp_path) for part in asked]
+    said: list[str] = []
+    for _ in range(4):
+        result = command(capsys, *arguments)
+        if result.code == 0:
+            return
+        said.append(result.err.splitlines()[-1])
+        assert said.count(said[-1]) == 1, "the step changes nothing"
+        steps = re.findall(r"hilcal ([a-z]+)((?: (?!or |first|again)[^\s,;]+)*)", said[-1])
+        assert steps or "--allow-outside" in said[-1], said
+        if not steps:
+            arguments.append("--allow-outside")
+            continue
+        name, rest = steps[0]
+        rest = rest.replace("CELL.toml", str(cell)).replace("PLAN.json", f"{tmp_path}/p.json")
+        ok(capsys, name, *(rest.replace("RUN", str(run)).split() or [run]))
+        if name == "plan":
+            return
+    pytest.fail(f"no end: {said}")
+
+
 def test_what_cannot_be_accepted_is_refused(run: Path, fresh: bytes, capsys: Capsys) -> None:
     assert "there are 1 to 3" in refused(capsys, 2, "accept", run, "7")
     assert "there are 1 to 3" in refused(capsys, 2, "accept", run, "0")

@@ -215,7 +215,7 @@ def _instruments(m: ReportContent) -> Iterator[Part]:
         ("", ""),
         (
             ("Robot", o.config.robot.model),
-            ("Base", base_line(m.fit.model.cell, m.fit.frames)),
+            ("Base", base_line(m.fit.model.cell, m.fit.frames, m.fit.mode)),
             ("Operator", m.operator or "not stated"),
             ("Campaign", f"{m.name}, made {o.created[:19].replace('T', ' ')} UTC"),
             ("SHA-256 of the file", m.sha256),

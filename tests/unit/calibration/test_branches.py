@@ -79,10 +79,10 @@ def test_near_to_two_branches_is_uncertain() -> None:
 
 
 def test_what_is_certain_is_the_nearest_of_all_solutions() -> None:
-    """Of 60 such cases, Newton's method found another solution than the nearest in two."""
+    """Of 60 such cases, Newton's method from there finds another solution in the last two."""
     cases = np.random.default_rng(0).normal(size=(60, 2, 6)) * [[0.4], [0.5]]
     starts = np.random.default_rng(1).uniform(-np.pi, np.pi, (60, 6))
-    for k, whether in ((0, True), (1, True), (35, False), (57, False)):
+    for k in (0, 1, 35, 57):
         near = A + cases[k, 0]
         goal = near + cases[k, 1]
         (why,), q = told(f"movej(get_inverse_kin({pose(goal)}, qnear={joints(near)}))")
@@ -92,5 +92,5 @@ def test_what_is_certain_is_the_nearest_of_all_solutions() -> None:
         )
         turns = (every.q[every.solved] - near + np.pi) % (2 * np.pi) - np.pi
         mine = np.linalg.norm((q[0] - near + np.pi) % (2 * np.pi) - np.pi)
-        assert (mine <= np.linalg.norm(turns, axis=1).min() + 1e-6) == whether
-        assert why == ("" if whether else NEAREST)
+        assert mine <= np.linalg.norm(turns, axis=1).min() + 1e-6
+        assert why == ""

@@ -7,6 +7,7 @@ import pytest
 
 from hilcal.calibration.points import on_branch, read_points
 from hilcal.calibration.urscript import movej_program, program_points, waypoints, with_joints
+from hilcal.data.mapping import find_mapping
 from hilcal.errors import InputError
 from hilcal.robot import se3
 from hilcal.robot.catalogue import load_arm
@@ -69,6 +70,60 @@ def test_poses_follow_the_branch_of_the_point_before(tmp_path: Path, metric: boo
     assert p.names == ("1", "2")
     with pytest.raises(InputError, match=r"point 1 is a pose without joint values.*--near"):
         on_branch(p, ARM, TOOL, None)
+
+
+def test_of_all_branches_the_nearest_is_taken(tmp_path: Path) -> None:
+    """From joint values from which Newton's method goes to another branch, or nowhere."""
+    rng = np.random.default_rng(3)
+    for q in rng.uniform(-2.0, 2.0, (6, 6)):
+        goal = poses(q[None])
+        near = q + rng.uniform(-1.0, 1.0, 6)
+        rows = np.hstack([goal[:, :3, 3], se3.rotation_vector(goal[:, :3, :3])])
+        text = "x_m,y_m,z_m,rx_rad,ry_rad,rz_rad\n" + ",".join(f"{v:.15g}" for v in rows[0]) + "\n"
+        found = on_branch(read_points(written(tmp_path, text), ARM, LOADS), ARM, TOOL, near)
+        np.testing.assert_allclose(poses(found), goal, atol=1e-8)
+        assert np.linalg.norm(found[0] - near) <= np.linalg.norm(q - near) + 1e-6
+
+
+def test_tables_as_import_takes_them(tmp_path: Path) -> None:
+    """Semicolons, decimal commas, columns of the exchange table, positions alone; a mapping."""
+    goal = poses(Q)
+    wanted = goal[:, :3, 3] + [0.001, 0.0, -0.002]
+    header = f"pose,load,{JOINTS},x_m,y_m,z_m,cov_x_x,cycle,x_note"
+    rows = [
+        ",".join([f"p{k}", "10kg", *(f"{v:.12f}" for v in (*Q[k], *wanted[k])), "1e-10", "1", "7"])
+        for k in range(2)
+    ]
+    plain = read_points(written(tmp_path, "\n".join([header, *rows]) + "\n"), ARM, LOADS)
+    q = on_branch(plain, ARM, TOOL, None)
+    np.testing.assert_allclose(poses(q)[:, :3, 3], wanted, atol=1e-8)
+    np.testing.assert_allclose(poses(q)[:, :3, :3], goal[:, :3, :3], atol=1e-8)
+    german = "\n".join([header, *rows]).replace(",", ";").replace(".", ",") + "\n"
+    again = read_points(written(tmp_path, german, "g.csv"), ARM, LOADS)
+    np.testing.assert_array_equal(again.q, plain.q)
+    mapping = written(
+        tmp_path,
+        "[position]\ncolumns = ['X', 'Y', 'Z']\nunit = 'mm'\n"
+        "[joints]\ncolumns = ['A1', 'A2', 'A3', 'A4', 'A5', 'A6']\nunit = 'deg'\n"
+        "[load]\ncolumn = 'Last'\n[file]\nseparator = ';'\ndecimal = ','\n",
+        "m.toml",
+    )
+    table = "A1;A2;A3;A4;A5;A6;X;Y;Z;Last\n" + "".join(
+        ";".join(f"{v:.9f}" for v in (*np.degrees(Q[k]), *1e3 * wanted[k])).replace(".", ",")
+        + ";10kg\n"
+        for k in range(2)
+    )
+    mapped = read_points(written(tmp_path, table, "k.csv"), ARM, LOADS, find_mapping(mapping))
+    np.testing.assert_allclose(on_branch(mapped, ARM, TOOL, None), q, atol=1e-8)
+    assert mapped.wrench is not None
+    np.testing.assert_array_equal(mapped.wrench[:, 2], [-98.0665, -98.0665])
+
+
+def test_an_unknown_column_names_all_that_are_valid(tmp_path: Path) -> None:
+    with pytest.raises(InputError) as error:
+        read_points(written(tmp_path, f"{JOINTS},temperature\n1,1,1,1,1,1,1\n"), ARM, LOADS)
+    for name in ("air_degC", "sensor_fx_N", "rx_rad", "approach6", "load", "--format"):
+        assert name in str(error.value)
 
 
 def test_a_pose_out_of_reach_is_named(tmp_path: Path) -> None:
