@@ -314,7 +314,7 @@ def plan(
     """Choose poses, loads and their order by optimal design, with a certificate.
 
     >>> plan = hc.plan(hc.Cell.load(CELL), poses=6)
-    >>> plan.efficiency > 0.9
+    >>> plan.efficiency > 0.8
     True
 
     Args:

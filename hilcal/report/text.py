@@ -24,7 +24,7 @@ from hilcal.report.word_table import WordTable
 from hilcal.types import Ints
 
 ALL_ROWS = 60
-SCREEN = 8
+SCREEN = 6
 """Parameters on the first screen."""
 STRONGEST = 5
 DIRECTIONS = 8

@@ -31,7 +31,7 @@ def test_wrong_readings_are_listed_and_the_others_fitted(tmp_path: Path, capsys:
     r = readings
     names = sorted((r.pose_names[r.pose[k]], r.load_names[r.load[k]]) for k in wrong)
     assert sorted((o["pose"], o["load"]) for o in d["outliers"]) == names
-    words = ok(capsys, "identify", run, "--readings", "absolute").out
+    words = ok(capsys, "identify", run, "--readings", "absolute", "--details").out
     assert f"{len(wrong)} readings set aside as gross errors" in words
 
 
