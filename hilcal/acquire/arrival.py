@@ -81,8 +81,8 @@ class ArrivalReader:
                 held, *others = self._cell.target_names
                 self._watcher.notify(
                     Remark(
-                        f"only target {held} is read until four readings have located the "
-                        f"tracker; {', '.join(others)} after that"
+                        f"only target {held} is read until the first positions have located "
+                        f"the tracker; {', '.join(others)} after that"
                     )
                 )
                 self._said = True

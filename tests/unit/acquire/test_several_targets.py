@@ -32,8 +32,9 @@ TOOL = Tool(
     mass_kg=0.8,
     com_m=(0.01, 0.0, 0.06),
 )
-BOOTSTRAP = 4
-"""Stops at which only the first target is read: four readings tell where the tracker stands."""
+BOOTSTRAP = 3
+"""Stops at which only the first target is read: with the positions beside the reference and at it,
+these readings tell where the tracker stands."""
 
 
 def places(world: World) -> Floats:
@@ -163,7 +164,7 @@ def test_all_targets_of_an_arrival_that_was_leaned_on_are_kept_as_doubted(tmp_pa
         doubted = [e for e in RunLog(file).events() if e["kind"] == "doubted"]
     assert [e["reading"]["target"] for e in doubted] == list(NAMES)
     words = event_words(doubted[0])
-    assert "reading of p4, none, R1 kept as doubted: the force sensor feels" in words
+    assert "reading of p3, none, R1 kept as doubted: the force sensor feels" in words
 
 
 @pytest.mark.parametrize("call", [("tracker.aim", 8), ("tracker.measure", 60)])

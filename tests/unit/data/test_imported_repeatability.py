@@ -44,7 +44,7 @@ def test_repeatability_is_added_to_an_imported_table(
     np.testing.assert_allclose(full, expected, rtol=1e-12)
     assert np.all(np.trace(full, axis1=1, axis2=2) > np.trace(stored, axis1=1, axis2=2))
     np.testing.assert_allclose(hc.read_table(table, cell).covariance, full, rtol=1e-12)
-    assert "[repeatability]" in ok(capsys, "identify", run).out
+    assert "[repeatability]" in ok(capsys, "identify", run, "--details").out
 
 
 def test_what_was_exported_is_not_added_again(table: Path, tmp_path: Path, capsys: Capsys) -> None:
