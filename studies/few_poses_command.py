@@ -23,6 +23,7 @@ from hilcal.cli.terminal import Json, terminal
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import whitening
 from hilcal.engine.engine import open_engine
+from hilcal.identify.arm_scatter import with_arm_scatter
 from hilcal.identify.baseline import baseline
 from hilcal.identify.predictive import predictive
 from hilcal.library import read_table
@@ -143,6 +144,8 @@ def refined(case: Case) -> Found:
         f.holdout.rms_sigma,
     )  # fmt: skip
     prediction = f.model.predict(test.states, f.theta)
+    if f.readings.arm_scatter is not None:
+        test = with_arm_scatter(f.model.cell, test, f.readings.arm_scatter)
     total = known.of_reading(prediction, whitening(test, "absolute", "gc"))[:, :3, :3]
     off = test.value[:, :3] - prediction.observation.position
     square = np.einsum("ni,nij,nj->n", off, np.linalg.inv(total), off)

@@ -17,7 +17,7 @@ from hilcal.cell import cell_from_config
 from hilcal.cli.asking import agreed, somebody_there
 from hilcal.cli.terminal import Json, Terminal, terminal
 from hilcal.config import CellConfig
-from hilcal.config.planning import GEOMETRY
+from hilcal.config.planning import GEOMETRY, LOADED
 from hilcal.config.template import cell_text
 from hilcal.data.quantities import LENGTHS
 from hilcal.effects.catalogue import installed
@@ -465,7 +465,7 @@ def _shortly(error: InputError) -> str:
 def _complete(draft: Draft) -> None:
     """Add what a plan and a rehearsal need, and check the whole."""
     if draft.data.setdefault("planning", {}).setdefault("readings", "absolute") == "absolute":
-        loaded = () if not draft.data.get("loads") else ("joint_compliance",)
+        loaded = () if not draft.data.get("loads") else LOADED
         draft.set("planning", model=[*GEOMETRY, *loaded])
     draft.set("simulation", clock=CLOCK)
     config = check_section(draft.data, CellConfig, "the cell")

@@ -12,6 +12,8 @@ _Name = Annotated[str, Field(min_length=1)]
 _Joints = Annotated[tuple[Number, ...], Field(min_length=1)]
 _BOX = ("center_m", "size_m")
 _CYLINDER = ("bottom_m", "radius_m", "height_m")
+LOADED = ("joint_compliance",)
+"""What loads show, and what is planned for unless the cell says otherwise."""
 GEOMETRY = ("encoder_offset",)
 """What a first plan of absolute readings is for, beside what loads do."""
 
@@ -20,7 +22,7 @@ class Planning(Section):
     """[planning]: what the measurements are for, and what is known of them."""
 
     model: tuple[_Name, ...] = Field(
-        ("joint_compliance",),
+        LOADED,
         min_length=1,
         description='the effects that are assumed, a list of names, e.g. ["joint_compliance"], '
         'with options as in ["joint_compliance(joints=2-6)"]',

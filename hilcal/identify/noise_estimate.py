@@ -10,6 +10,10 @@ orientations, are the default's times factors that the readings tell; so is the 
 They are variance components, estimated by restricted maximum likelihood together with the frames
 and with every effect of the catalogue as random effects (see `hilcal.mixed`), so that no effect
 counts as noise, nor noise as an effect. Gross errors are left out.
+
+Where the readings show several effects at once, as those of most real arms do, few of them tell
+noise from effects: the default stays then, and a fit of all effects estimates the noise with them
+(see `identify.background`).
 """
 
 import json
@@ -38,7 +42,9 @@ from hilcal.identify.mixed_fit import (
     variances_with_noise,
     with_all_effects,
 )
+from hilcal.mixed.evidence import evidence
 from hilcal.mixed.families import KNOWN, LogStdPrior
+from hilcal.mixed.variances import Variances
 from hilcal.model import Model
 from hilcal.types import Floats
 
@@ -54,8 +60,10 @@ FEWEST_POSES = 10
 """Poses below which frames and effects leave nothing to estimate a noise from; a choice."""
 ROUNDS = 3
 """Most estimates, each after a new test for gross errors; a choice."""
+SEVERAL = 0.05
+"""Chance of finding several effects where there is one at most; a choice."""
 SEED = 20251125
-"""Of the poses that are chosen."""
+"""Of the poses that are chosen, and of simulated likelihood ratios."""
 NOISE = "noise"
 """Key among the texts about a campaign: the estimate, as JSON; absent where the noise is stated."""
 ALONG, ACROSS, ORIENTATION, STATED = "along", "across", "orientation", "arm as stated"
@@ -104,7 +112,8 @@ def with_estimated_noise(
 
     Returns:
         The import, and the estimate: None where the noise is stated, where the readings are fewer
-        than `FEWEST_POSES`, or where nothing can be fitted to them as they are described.
+        than `FEWEST_POSES` or show several effects, or where nothing can be fitted to them as they
+        are described.
     """
     readings, station = found.readings, config.tracker.station_m
     if found.noise_stated or len(np.unique(readings.pose)) < FEWEST_POSES:
@@ -114,6 +123,8 @@ def with_estimated_noise(
         model = baseline(cell, _some(readings), usual_mode(readings))
         factors = _factors(model, _some(readings), station, stated)
     except HilcalError:  # what cannot be fitted is said where it is fitted
+        return found, None
+    if factors is None:
         return found, None
     size = {
         p.name: factors[p.name]
@@ -148,8 +159,11 @@ def _some(readings: Readings) -> Readings:
 
 def _factors(
     model: Model, readings: Readings, station: Sequence[float] | None, joint_std: Floats
-) -> dict[str, float]:
-    """Standard deviations of the components, in those of the default and of `SCATTER_RAD`."""
+) -> dict[str, float] | None:
+    """Standard deviations of the components, in those of the default and of `SCATTER_RAD`.
+
+    None where the readings show effects beside the largest.
+    """
     mode = usual_mode(readings)
     whole = with_all_effects(model, readings.states, HARMONICS)
     used = ~fit(model, readings, mode).outlier
@@ -163,6 +177,8 @@ def _factors(
         else:
             arm = scatter_part(model, kept)
         found, theta = variances_with_noise(whole, kept, mode, instrument, arm)
+        if _shows_several(found):
+            return None
         std = np.exp(found.log_std[-len(instrument) - 1 :])
         names = (*(p.name for p in instrument), arm.name)
         factors = dict(zip(names, std.tolist(), strict=True))
@@ -179,6 +195,21 @@ def _factors(
             break
         used = now
     return factors
+
+
+def _shows_several(found: Variances) -> bool:
+    """Whether the readings show effects beside the one that moves them most."""
+    e = found.equations
+    problem, moved = e.problem, e.rows[:, e.problem.flat :] * e.c[e.problem.flat :]
+    families = problem.families.random
+    of = {f.effect: np.isin(problem.family, [k for k, g in enumerate(families)
+          if g.effect == f.effect]) for f in families}  # fmt: skip
+    if len(of) < 2:
+        return False
+    largest = max(of, key=lambda name: float(np.sum(moved[:, of[name]].sum(axis=1) ** 2)))
+    others = [k for k, f in enumerate(families) if f.effect != largest]
+    rng = np.random.default_rng(SEED)
+    return evidence(problem, others, rng, found.log_std).p_value < SEVERAL
 
 
 def _by_effect(model: Model, std: Floats) -> dict[str, Floats]:
