@@ -6,7 +6,14 @@ from dataclasses import dataclass, replace
 from hilcal import limits
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode
-from hilcal.diagnose.background_evidence import TOGETHER, is_better, proved, together
+from hilcal.diagnose.background_evidence import (
+    MUCH,
+    TOGETHER,
+    WORTH,
+    is_better,
+    proved,
+    together,
+)
 from hilcal.diagnose.diagnosis import Diagnosis, History, Verdict
 from hilcal.diagnose.effect_ranking import LEAST_SHARE
 from hilcal.diagnose.evidence import Evidence
@@ -21,6 +28,7 @@ from hilcal.identify.arm_scatter import with_arm_scatter, with_prior_scatter
 from hilcal.identify.background import allows_background, with_background
 from hilcal.identify.carried_evidence import carried_effects
 from hilcal.identify.fit import Fit, fit
+from hilcal.identify.mixed_fit import FEW_ROWS
 from hilcal.model import Model
 from hilcal.threads import later
 
@@ -304,10 +312,10 @@ class Path:
         """Fit all other effects of the catalogue together, where the model leaves more than noise.
 
         They stay as the background of the model where the readings prove effects together and the
-        error on poses left out falls; where the verdict is `unknown_effect`, by more than it
-        scatters from pose to pose, since effects of the catalogue may resemble one that it does not
-        have. Those that the readings prove beside all others are then named, in the order of their
-        evidence, whatever was added before.
+        error on poses left out falls, or where it falls by much; where the verdict is
+        `unknown_effect`, by more than it scatters from pose to pose, since effects of the catalogue
+        may resemble one that it does not have. Those that the readings prove beside all others are
+        then named, in the order of their evidence, whatever was added before.
         Returns whether anything was changed.
         """
         last = self.steps[-1]
@@ -316,11 +324,14 @@ class Path:
         if tried or not self._room or d.residual_is_noise or d.wrong_figures:
             return False
         self._background_tried = True
-        if not allows_background(last.fit) or together(last.fit) > TOGETHER:
+        if not allows_background(last.fit):
+            return False
+        proved_together = together(last.fit) <= TOGETHER
+        if not proved_together and len(last.fit.white) > FEW_ROWS:
             return False
         self._say("fitting all effects of the catalogue together")
         found = with_background(last.fit, self._given)
-        if not is_better(last.fit, found):
+        if not is_better(last.fit, found, WORTH if proved_together else MUCH):
             return False
         unknown = last.diagnosis.verdict == "unknown_effect"
         if unknown and not predicts_better(last.fit, found):

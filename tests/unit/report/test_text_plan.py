@@ -134,7 +134,13 @@ def test_a_parameter_without_uncertainty_is_named() -> None:
 
 @pytest.mark.parametrize(
     ("efficiency", "words"),
-    [(0.98768, "98.7 %"), (0.9999, "99.9 %"), (1.0, "100.0 %"), (1 + 1e-12, "100.0 %"), (0, "0.0")],
+    [
+        (0.98768, "98.7 %"),
+        (0.9999, "99.9 %"),
+        (1.0, "100.0 %"),
+        (1 + 1e-12, "100.0 %"),
+        (0, "not certified"),
+    ],
 )
 def test_a_certificate_is_never_rounded_up(efficiency: float, words: str) -> None:
     assert words in certified(efficiency)
