@@ -30,6 +30,7 @@ from hilcal.library import read_table
 from hilcal.refine import refine
 from hilcal.report.progress import counting
 from hilcal.robot.catalogue import configs_dir
+from hilcal.whole_file import replace_file
 from studies.records import Figure, Keep, keep
 
 TEST = 500
@@ -174,8 +175,8 @@ def _series(path: Path) -> tuple[Cell, Readings]:
         plain[f"{axis}_m"] = 1e-3 * (table[f"{axis}_t"] + table[f"{axis}_dif"])
     with tempfile.TemporaryDirectory() as folder:
         cell_file, table_file = Path(folder, "cell.toml"), Path(folder, "table.csv")
-        cell_file.write_text(UR5, encoding="utf-8")
-        plain.to_csv(table_file, index=False)
+        replace_file(cell_file, UR5)
+        replace_file(table_file, plain.to_csv(index=False))
         cell = Cell.load(cell_file)
         return cell, read_table(table_file, cell)
 

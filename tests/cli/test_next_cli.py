@@ -133,16 +133,20 @@ def test_a_misfit_of_the_pose_alone_asks_for_new_poses(tmp_path: Path, capsys: C
     assert "unloaded readings at 10 poses" in " ".join(result.err.split())
 
 
-def test_four_suspects_fit_one_screen(tmp_path: Path, capsys: Capsys) -> None:
+def test_four_suspects_fit_one_screen(
+    tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """By default the pair of each suspect that is separated least; all under --details."""
-    path = stored(tmp_path / "run.hilcal", TILT, 1)
+    stored(tmp_path / "run.hilcal", TILT, 1)
+    monkeypatch.chdir(tmp_path)  # names of files are short, as people have them
+    path = "run.hilcal"
     ok(capsys, "identify", path)
     suspects = ("--suspects", f"{TILT},{LINK},{BASE},load_point", "--poses", "4")
-    brief = ok(capsys, "next", path, "-o", tmp_path / "n.json", *suspects).out
+    brief = ok(capsys, "next", path, "-o", "n.json", *suspects).out
     assert len(brief.splitlines()) <= 25
     assert "Efficiency of the plan: at least " in " ".join(brief.split())
     assert "at least 0.0 %" not in brief
-    full = ok(capsys, "next", path, "-o", tmp_path / "m.json", *suspects, "--details").out
+    full = ok(capsys, "next", path, "-o", "m.json", *suspects, "--details").out
     assert full.count("load_point  ") > brief.count("load_point  ")
     for heading in ("Predicted standard uncertainty", "Comparison of criteria", "Sample-size"):
         assert heading in full
