@@ -176,7 +176,8 @@ def _series(path: Path) -> tuple[Cell, Readings]:
     with tempfile.TemporaryDirectory() as folder:
         cell_file, table_file = Path(folder, "cell.toml"), Path(folder, "table.csv")
         replace_file(cell_file, UR5)
-        replace_file(table_file, plain.to_csv(index=False))
+        rows = [plain.columns.tolist(), *plain.astype(str).to_numpy().tolist()]
+        replace_file(table_file, "".join(f"{','.join(row)}\n" for row in rows))
         cell = Cell.load(cell_file)
         return cell, read_table(table_file, cell)
 
