@@ -164,10 +164,12 @@ def refined(case: Case) -> Found:
 
 def _series(path: Path) -> tuple[Cell, Readings]:
     """The cell and all readings of a series."""
-    table = pd.read_csv(path)
-    if "x_dif" not in table:
+    with path.open(encoding="utf-8") as stream:
+        header = stream.readline()
+    if "x_dif" not in header:
         cell = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
         return cell, read_table(path, cell, "ipa-ur10")
+    table = pd.read_csv(path)
     plain = pd.DataFrame({"pose": [f"P{k + 1}" for k in range(len(table))], "load": "none"})
     for j in range(1, 7):
         plain[f"q{j}_rad"] = np.radians(table[f"joint_{j}"])

@@ -250,7 +250,7 @@ class Factored:
         out[self.at] = self.own.T @ b
         for s, columns, places in self._runs():
             found = self.coefficient[:, columns].T @ self._along(s, b)
-            out[places] = found.reshape(-1, *b.shape[1:])
+            out[places] = found.reshape(len(found), *b.shape[1:])
         return out
 
     def _runs(self) -> list[tuple[int, slice, Places]]:
