@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 
 from hilcal.diagnose.effect_ranking import Suspect
+from hilcal.errors import CannotAnswerError
 from hilcal.identify.fit import Fit, fit, with_outliers
 from hilcal.identify.linearisation import LEAST_MISFIT, linearise
 from hilcal.identify.residual import residual
@@ -123,10 +124,14 @@ class _Figure:
 def wrong_figures(of: Fit, suspects: Sequence[Suspect]) -> tuple[WrongFigure, ...]:
     """Return the figures that explain the misfit, the best first; any one of several does.
 
+    None of a model with a background: that was asked before it was fitted.
+
     Args:
         of: a fit.
         suspects: effects that could be missing, as they are scored.
     """
+    if of.model.background:
+        return ()
     best = min((s.score.delta_bic for s in suspects if s.score.rank), default=0.0)
     tried = [(figure, *_first(of, figure)) for figure in _figures(of)]
     most = max((share for _, _, share in tried), default=0.0)
@@ -134,14 +139,10 @@ def wrong_figures(of: Fit, suspects: Sequence[Suspect]) -> tuple[WrongFigure, ..
     for figure, step, share in tried:
         if share < max(PROMISING, AS_PROMISING * most):
             continue
-        by, now = np.zeros(figure.size), of
-        for _ in range(STEPS):
-            by = figure.further(by, step)
-            changed = figure.changed(of, by)
-            now = fit(changed.model, changed.readings, of.mode, start=now.theta)
-            step = _step(now, figure)[0]
-            if np.abs(step).max() < SMALL * STEP[figure.kind]:
-                break
+        try:
+            by, now = _refitted(of, figure, step)
+        except CannotAnswerError:  # no equilibrium with it: it explains nothing
+            continue
         bic = _criterion(of, now, figure.size)
         if bic is not None and figure.off(by) and bic < min(best, -MARGIN):
             found.append((bic, figure, by, now))
@@ -149,6 +150,23 @@ def wrong_figures(of: Fit, suspects: Sequence[Suspect]) -> tuple[WrongFigure, ..
     return tuple(
         _named(of, figure, by, now) for bic, figure, by, now in found if bic <= found[0][0] + MARGIN
     )
+
+
+def _refitted(of: Fit, figure: _Figure, step: Floats) -> tuple[Floats, Fit]:
+    """Return the change (k,) of a figure that fits best, and the fit with it.
+
+    Raises:
+        CannotAnswerError: the arm has no equilibrium with it.
+    """
+    by, now = np.zeros(figure.size), of
+    for _ in range(STEPS):
+        by = figure.further(by, step)
+        changed = figure.changed(of, by)
+        now = fit(changed.model, changed.readings, of.mode, start=now.theta)
+        step = _step(now, figure)[0]
+        if np.abs(step).max() < SMALL * STEP[figure.kind]:
+            break
+    return by, now
 
 
 def _criterion(before: Fit, after: Fit, size: int) -> float | None:
