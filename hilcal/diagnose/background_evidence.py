@@ -30,6 +30,9 @@ MUCH = 0.25
 """The same of few readings that do not prove other effects: named ones that are fitted flat to so
 few predict far worse than all together. A choice: of 30 poses of arms with one effect and nothing
 but scatter it fell by 2 to 15 %."""
+UNSURE = 2.0
+"""Factor to which few readings tell a standard deviation: it may be so much more than plausible; a
+choice."""
 TOGETHER = 0.05
 """Chance of trying a background where nothing but noise of another size, or the arm's scatter, is
 there; a choice: the error on poses left out has to fall, too."""
@@ -100,7 +103,7 @@ def is_better(before: Fit, after: Fit, worth: float = WORTH) -> bool:
     """
     random, known = after.model.random, before.model.named
     new = (e for e in after.model.effects if e.name in random and e.name not in known)
-    plausible = all(np.all(random[e.name] <= e.most() * e.magnitudes) for e in new)
+    plausible = all(np.all(random[e.name] <= UNSURE * e.most() * e.magnitudes) for e in new)
     if not plausible:
         return False
     raw, w = all_left_out(after)
