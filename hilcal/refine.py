@@ -10,9 +10,9 @@ from hilcal.diagnose.background_evidence import (
     MUCH,
     TOGETHER,
     WORTH,
-    is_better,
+    background_is_better,
+    p_value_of_others,
     proved,
-    together,
 )
 from hilcal.diagnose.diagnosis import Diagnosis, History, Verdict
 from hilcal.diagnose.effect_ranking import LEAST_SHARE
@@ -326,12 +326,12 @@ class Path:
         self._background_tried = True
         if not allows_background(last.fit):
             return False
-        proved_together = together(last.fit) <= TOGETHER
+        proved_together = p_value_of_others(last.fit) <= TOGETHER
         if not proved_together and len(last.fit.white) > FEW_ROWS:
             return False
         self._say("fitting all effects of the catalogue together")
         found = with_background(last.fit, self._given)
-        if not is_better(last.fit, found, WORTH if proved_together else MUCH):
+        if not background_is_better(last.fit, found, WORTH if proved_together else MUCH):
             return False
         unknown = last.diagnosis.verdict == "unknown_effect"
         if unknown and not predicts_better(last.fit, found):

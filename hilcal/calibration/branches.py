@@ -26,8 +26,8 @@ SAME = 1e-6
 """Joint values that are the same solution, rad: far above the residual of one, far below what is
 between two."""
 AS_NEAR = 0.05
-"""What another solution must be farther for this one to be the nearest by any measure, rad; a
-choice."""
+"""What another solution must be farther for this one to be the nearest by any measure, rad; no
+study set it. More of it leaves more waypoints uncertain, which are not corrected."""
 NEAREST = "another branch of the arm is as near; joint values in place of the pose say which"
 STRAIGHT = "a straight motion from the waypoint before ends on another branch of the arm; use movej"
 UNKNOWN = "the branch of the waypoint before it is not known"

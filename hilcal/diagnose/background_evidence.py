@@ -67,7 +67,7 @@ class BackgroundEffect:
     step: Floats
 
 
-def together(of: Fit) -> float:
+def p_value_of_others(of: Fit) -> float:
     """p-value of all other effects of the catalogue together, beside a noise of any size.
 
     They are tested at the fit of the named ones, by one multiple of their ordinary sizes.
@@ -89,7 +89,7 @@ def together(of: Fit) -> float:
     return evidence(problem, numbers, np.random.default_rng(SEED)).p_value
 
 
-def is_better(before: Fit, after: Fit, worth: float = WORTH) -> bool:
+def background_is_better(before: Fit, after: Fit, worth: float = WORTH) -> bool:
     """Whether a background belongs to the model.
 
     The error on poses left out must fall by a share, both weighted by the noise of the latter, and

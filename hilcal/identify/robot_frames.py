@@ -30,6 +30,7 @@ from hilcal.robot import se3
 from hilcal.types import Floats
 
 TRIALS = 8
+"""Random states at which a deviation is asked whether it is constant; a choice."""
 SAME = 1e-15
 """By how much a constant deviation may differ between states, m and rad: rounding."""
 

@@ -1,5 +1,6 @@
 """A load's or the tool's mass that was entered wrongly is asked before any effect is named."""
 
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,8 @@ import hilcal as hc
 from hilcal.cell import Cell
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode
+from hilcal.diagnose.wrong_figures import wrong_figures
+from hilcal.errors import CannotAnswerError
 from hilcal.identify.baseline import baseline
 from hilcal.refine import refine
 from hilcal.report.diagnosis_document import to_json
@@ -47,6 +50,22 @@ def test_a_load_at_twice_its_weight_is_named(
     assert figure.found == pytest.approx((true,), rel=0.15)
     assert message(d).startswith(said)
     assert not d.suspects
+
+
+def test_a_figure_without_an_equilibrium_explains_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A trial that does not settle ends no diagnosis."""
+    c = campaign(NOTHING, "absolute", 1, poses=20)
+    spoilt = doubled(c.readings, "5kg")
+    found = hc.fit(baseline(c.cell, spoilt, "absolute"), spoilt, "absolute")
+    tried = []
+
+    def unsettled(*args: object, **more: object) -> None:
+        tried.append(args)
+        raise CannotAnswerError("no static equilibrium")
+
+    monkeypatch.setattr(sys.modules[wrong_figures.__module__], "fit", unsettled)
+    assert wrong_figures(found, ()) == ()
+    assert tried
 
 
 def test_a_tool_at_twice_its_mass_is_named_and_refine_adds_nothing() -> None:
