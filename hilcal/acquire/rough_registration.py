@@ -4,9 +4,10 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.data.covariance import joint_scatter
+from hilcal.data.plan import Step
 from hilcal.robot import chain as chains
 from hilcal.robot.chain import drive_jacobian
-from hilcal.types import Bools, Floats
+from hilcal.types import Floats
 
 ENOUGH = 4
 WITNESSES = 2
@@ -15,6 +16,10 @@ SPREAD_M = 0.05
 """Second extent of a cloud of positions that fixes a rotation, m."""
 PLAUSIBLE_M = 0.1
 """A reading so far from where the nominal arm holds the target is not believed, m."""
+FITS_M = 0.02
+"""So far from it, a reading does not fit a registration, m; what the nominal arm lacks is less."""
+APART_M = 0.05
+"""A distance between two readings is that of the nominal positions to this, m."""
 STUCK_M = 1e-5
 """Two readings so close to each other at poses that are not are one old reading, m."""
 STUCK_SHARE = 0.2
@@ -36,11 +41,14 @@ class RoughRegistration:
         self._held: list[Floats] = []
         self._seen: list[Floats] = []
         self._target: list[int] = []
+        self._step: list[Step | None] = []
+        self._doubted: list[int] = []
 
-    def add(self, q: Floats, position: Floats, target: int = 0) -> None:
+    def add(self, q: Floats, position: Floats, target: int = 0, step: Step | None = None) -> None:
         """Take note of a reading: joint angles (n,) and position (3,), sensor axes, m.
 
-        One that repeats an earlier one is left out; older versions stored such.
+        One that repeats an earlier one is left out; older versions stored such. `step` is the one
+        that it was stored for, None at the positions of the start.
         """
         held = self._positions(q)[target]
         if self._stuck(held, position, target) is not None:
@@ -48,6 +56,27 @@ class RoughRegistration:
         self._held.append(held)
         self._seen.append(np.asarray(position))
         self._target.append(target)
+        self._step.append(step)
+
+    def late_doubts(self) -> list[tuple[Step, str]]:
+        """Return the stored readings that cannot be of their target, each once, and why.
+
+        They were stored while nothing told where the tracker stands. Empty until it is known.
+        """
+        pose = self.pose()
+        if pose is None:
+            return []
+        far = _far(pose, np.array(self._held), np.array(self._seen))
+        out = []
+        for k, step in enumerate(self._step):
+            known = self._cell.known_targets[self._target[k]]
+            if far[k] > PLAUSIBLE_M and known and k not in self._doubted:
+                self._doubted.append(k)
+                why = (
+                    f"its target was {far[k]:.3g} m from where the arm held it; another reflector?"
+                )
+                out += [] if step is None else [(step, why)]
+        return out
 
     def pose(self) -> tuple[Floats, Floats] | None:
         """Return rotation (3, 3) and translation (3,) of T_sensor_base; None while unknown.
@@ -58,17 +87,19 @@ class RoughRegistration:
         known = self._cell.registration
         if self._cell.registration_known:
             return known[:3, :3], known[:3, 3]
-        agree = self._agreeing()
-        if agree.sum() < ENOUGH:
-            return None
-        held, seen = np.array(self._held)[agree], np.array(self._seen)[agree]
-        h, s = held - held.mean(axis=0), seen - seen.mean(axis=0)
-        if np.linalg.svd(h, compute_uv=False)[1] < SPREAD_M:
-            return None
-        u, _, vt = np.linalg.svd(s.T @ h)
-        flip = np.diag([1.0, 1.0, np.linalg.det(u @ vt)])
-        rotation = u @ flip @ vt
-        return rotation, seen.mean(axis=0) - rotation @ held.mean(axis=0)
+        held, seen = (
+            np.delete(np.array(x), self._doubted, axis=0) for x in (self._held, self._seen)
+        )
+        while len(held) >= ENOUGH:
+            found = _kabsch(held, seen)
+            if found is None or _far(found, held, seen).max() <= FITS_M:
+                return found
+            without = [
+                (np.delete(held, k, axis=0), np.delete(seen, k, axis=0)) for k in range(len(held))
+            ]
+            worst = [np.inf if (p := _kabsch(*x)) is None else _far(p, *x).max() for x in without]
+            held, seen = without[int(np.argmin(worst))]
+        return None
 
     def expected(self, q: Floats) -> Floats | None:
         """Return (T, 3) where the targets are expected, sensor axes, m; None while unknown."""
@@ -87,7 +118,7 @@ class RoughRegistration:
             off = self._apart(self._positions(q)[target], position)
         else:
             off = float(np.linalg.norm(position - places[target]))
-        if off <= PLAUSIBLE_M:
+        if off <= (APART_M if places is None else PLAUSIBLE_M):
             return None
         least = " or more" if places is None else ""
         return (
@@ -118,28 +149,18 @@ class RoughRegistration:
         )
 
     def _apart(self, held: Floats, position: Floats) -> float:
-        """By how much a distance from the readings that agree is not that of the arm, m.
+        """By how much most distances from the other readings are not those of the arm, m.
 
-        Zero where fewer than two agree: it is not known then which reading is of the target.
+        The median; zero with fewer than two, of which one may be wrong itself.
         """
-        agree = self._agreeing()
-        if agree.sum() < WITNESSES:
+        if len(self._held) - len(self._doubted) < WITNESSES:
             return 0.0
-        seen = np.linalg.norm(np.array(self._seen)[agree] - position, axis=1)
-        moved = np.linalg.norm(np.array(self._held)[agree] - held, axis=1)
-        return float(np.abs(seen - moved).max())
-
-    def _agreeing(self) -> Bools:
-        """Return which readings (K,) are of the target: the most that agree with one of them.
-
-        Two agree whose distance is that of the nominal positions to `PLAUSIBLE_M`.
-        """
-        held, seen = np.array(self._held), np.array(self._seen)
-        if not len(held):
-            return np.zeros(0, dtype=np.bool_)
-        apart = [np.linalg.norm(x[:, None] - x, axis=2) for x in (held, seen)]
-        agree = np.abs(apart[0] - apart[1]) <= PLAUSIBLE_M
-        return np.asarray(agree[int(np.argmax(agree.sum(axis=1)))])
+        others = (np.delete(np.array(x), self._doubted, axis=0) for x in (self._held, self._seen))
+        moved, seen = (
+            np.linalg.norm(x - y, axis=1) for x, y in zip(others, (held, position), strict=True)
+        )
+        off = np.sort(np.abs(seen - moved))
+        return float(off[(len(off) - 1) // 2])
 
     def repeatability(self, q: Floats, joint_std: Floats) -> Floats:
         """Return the (3, 3) covariance that the joints' scatter adds to a position, sensor axes.
@@ -158,3 +179,19 @@ class RoughRegistration:
         """(T, 3) nominal positions of the targets, base axes, m."""
         chain = chains.evaluate(self._cell.arm, np.asarray(q)[None])
         return np.array([chain.point(t[:3, 3])[0] for t in self._cell.all_targets])
+
+
+def _kabsch(held: Floats, seen: Floats) -> tuple[Floats, Floats] | None:
+    """Rotation (3, 3) and translation (3,) that take positions to positions (K, 3) best."""
+    h, s = held - held.mean(axis=0), seen - seen.mean(axis=0)
+    if np.linalg.svd(h, compute_uv=False)[1] < SPREAD_M:
+        return None
+    u, _, vt = np.linalg.svd(s.T @ h)
+    flip = np.diag([1.0, 1.0, np.linalg.det(u @ vt)])
+    rotation = u @ flip @ vt
+    return rotation, seen.mean(axis=0) - rotation @ held.mean(axis=0)
+
+
+def _far(pose: tuple[Floats, Floats], held: Floats, seen: Floats) -> Floats:
+    """(K,) how far readings are from where a registration expects them, m."""
+    return np.asarray(np.linalg.norm(seen - held @ pose[0].T - pose[1], axis=1))

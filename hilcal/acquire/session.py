@@ -318,6 +318,7 @@ class Session:
             )
             if shift is not None:
                 self._tell_drift(step, shift)
+        self._look_back()
         return first, sum(one.measured.settling for one in found)
 
     def _check(self, found: Sequence[TargetReading], details: list[dict[str, Any]]) -> None:
@@ -334,6 +335,14 @@ class Session:
             for told in details:
                 self._event("doubted", {"why": str(wrong), "reading": told})
             raise wrong
+
+    def _look_back(self) -> None:
+        """Tell of stored readings that are seen to be doubtful now."""
+        for step, why in self._state.registration.late_doubts():
+            self._event("doubted", {"why": why, "reading": asdict(step), "stored": True})
+            self._watcher.notify(
+                Remark(f"{step}, stored before: {why} A fit sets gross errors aside")
+            )
 
     def _doubt(self, one: TargetReading) -> DeviceError | None:
         """Why a reading cannot be of its target under its load, or None."""

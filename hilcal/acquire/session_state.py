@@ -54,7 +54,7 @@ class SessionState:
         position = value[:3]
         self.last_q = q
         scatter = self.registration.repeatability(q, self._joint_std)
-        self.registration.add(q, position, target)
+        self.registration.add(q, position, target, step)
         if step.load != UNLOADED:
             return None
         self._unloaded[step.pose, step.cycle, target] = position

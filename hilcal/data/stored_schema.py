@@ -79,7 +79,7 @@ class Detail(_Document):
 
 
 class _Doubtful(Detail):
-    """A reading that was measured and not used."""
+    """A reading that was measured and cannot be of its target under its load."""
 
     pose: Text
     load: Text
@@ -137,6 +137,7 @@ class _Load(_Happened):
 class _Doubted(_Happened):
     why: Text
     reading: _Doubtful
+    stored: bool = False  # among the readings: it was seen too late to be doubtful
 
 
 class _Start(_Happened):

@@ -143,7 +143,8 @@ def event_words(e: Mapping[str, Any]) -> str:
     if kind == "doubted":
         r = e["reading"]
         of = f", {r['target']}" if r.get("target") else ""
-        return f"reading of {r['pose']}, {r['load']}{of} kept as doubted: {e['why']}"
+        how = "stored, doubted later" if e.get("stored") else "kept as doubted"
+        return f"reading of {r['pose']}, {r['load']}{of} {how}: {e['why']}"
     if kind == "finished":
         return f"finished, {e['readings']} readings"
     if kind == "goal":

@@ -21,6 +21,7 @@ from tests.support.force_cases import (
     instruments,
     opened,
     readers,
+    settled,
     simulated,
     steady,
     truth_of,
@@ -58,7 +59,7 @@ def test_no_frame_is_lost_at_full_rate(kind, simulated):
         rate = simulated.admin("state")["rate"]
         first, dropped = sensor.losses().frames, simulated.admin("state")["dropped"]
         sample = steady(sensor, 2.0)
-        count = sensor.losses()
+        count = settled(sensor, lambda count: count.lost == 0)
         assert count.lost == count.corrupt == count.skipped == 0
         assert simulated.admin("state")["dropped"] == dropped
         assert sample.frames <= count.frames - first

@@ -11,7 +11,7 @@ from hilcal.acquire.rough_registration import RoughRegistration
 from hilcal.acquire.run import HOW_ON, run
 from hilcal.cell import Cell
 from hilcal.config import Limits
-from hilcal.data.plan import Plan
+from hilcal.data.plan import Plan, Step
 from hilcal.errors import DeviceError, InputError
 from hilcal.robot import chain as chains
 from hilcal.robot.catalogue import configs_dir
@@ -230,3 +230,26 @@ def test_another_reflector_is_noticed_before_the_registration_is_known() -> None
         noticed += told is not None
         assert told is None or "does it follow another reflector" in told
     assert noticed > 25
+
+
+def test_a_reading_of_another_reflector_is_told_as_soon_as_the_tracker_has_its_place() -> None:
+    """0.2 m off on the sphere about the first position, where distances cannot tell it."""
+    cell = Cell.load(configs_dir() / "cells" / "demo_ur10e.toml")
+    cell = replace(cell, registration_known=False, target_known=True)
+    rng = np.random.default_rng(3)
+    for _ in range(10):
+        known = RoughRegistration(cell)
+        joints = np.array([0.0, -1.2, 1.4, -1.7, -1.5, 0.0]) + rng.uniform(-0.7, 0.7, (9, 6))
+        chain = chains.evaluate(cell.arm, joints)
+        places = chain.point(cell.target[:3, 3]) @ cell.registration[:3, :3].T
+        way = places[1] - places[0]
+        aside = np.cross(way, rng.standard_normal(3))
+        stray = places[1] + 0.25 * aside / np.linalg.norm(aside)
+        told = []
+        for k, q in enumerate(joints):
+            known.add(q, stray if k == 1 else places[k], step=Step(f"p{k}", "none"))
+            told += [str(step) for step, _ in known.late_doubts()]
+        assert told == ["p1, none, cycle 0"]
+        pose = known.pose()
+        assert pose is not None
+        assert np.allclose(pose[0], cell.registration[:3, :3], atol=1e-9)
