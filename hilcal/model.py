@@ -25,7 +25,6 @@ from hilcal.robot.chain import Chain
 from hilcal.robot.deviation import Deviation
 from hilcal.robot.geometric_stiffness import geometric_stiffness
 from hilcal.robot.statics import Load, slot_wrenches
-from hilcal.threads import in_threads
 from hilcal.types import Floats, Ints
 
 if TYPE_CHECKING:  # a value that a model only carries along; fits know what it means
@@ -256,12 +255,10 @@ class Model:
         units = None if scale is None else scale[live]
         out = np.empty((count, m, len(live)))
 
-        def fill(rows: slice) -> None:
+        for rows in chunks(count, m * len(live)):
             moves = self._fill(out[rows], effects, places, prediction[rows], theta, units)
             if drives is not None:
                 drives[rows] = moves.drives
-
-        in_threads(fill, chunks(count, m * len(live)), count * m)
         return out
 
     def _fill(

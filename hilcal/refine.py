@@ -30,7 +30,6 @@ from hilcal.identify.carried_evidence import carried_effects
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.mixed_fit import FEW_ROWS
 from hilcal.model import Model
-from hilcal.threads import later
 
 __all__ = ["Refinement", "Step", "add", "predicts_better", "refine", "remove"]
 
@@ -165,16 +164,12 @@ def refine_from(
     background: bool = True,
 ) -> Refinement:
     """Refine a fit with its noise correlated as it is in its covariance; see `refine`."""
-    with later() as ahead:
-        # Its error on poses left out decides next; it is computed beside the refits that follow.
-        path = Path(
-            first, say, history, laws, seen, lambda of: ahead(lambda: of.left_out, len(of.white))
-        )
-        changed = True
-        while changed:
-            path.extend()
-            changed = path.reconsider()
-            changed = changed or (background and path.take_background()) or path.take_scatter()
+    path = Path(first, say, history, laws, seen)
+    changed = True
+    while changed:
+        path.extend()
+        changed = path.reconsider()
+        changed = changed or (background and path.take_background()) or path.take_scatter()
     return Refinement(tuple(path.steps))
 
 
@@ -188,7 +183,6 @@ class Path:
         before: History = NOTHING,
         laws: LawSearch | None = None,
         seen: Callable[[Step], None] = lambda step: None,
-        likely: Callable[[Fit], None] = lambda fit: None,
     ) -> None:
         """Begin with a fit, the effects of which stay.
 
@@ -198,11 +192,10 @@ class Path:
             before: how its model was reached.
             laws: searches laws.
             seen: takes each step.
-            likely: takes a fit that is most likely to be tried next.
         """
         self.steps: list[Step] = []
         self._given, self._before, self._say = first.model.named, before, say
-        self._laws, self._seen, self._likely = laws, seen, likely
+        self._laws, self._seen = laws, seen
         self._rejected, self._removed = [*before.rejected], [*before.removed]
         self._refits, self._regressions = Refits(), Regressions()
         self._background_tried = False
@@ -225,9 +218,7 @@ class Path:
 
     def append(self, found: Fit, added: str | None, removed: str | None = None) -> None:
         """Judge a fit and append it."""
-        self._evidence = Evidence(
-            found, self._refits.add, self._say, self._regressions, self._likely
-        )
+        self._evidence = Evidence(found, self._refits.add, self._say, self._regressions)
         diagnosis = judge(self._evidence, self._history(found))
         self.steps.append(Step(found, diagnosis, added, removed))
         self._seen(self.steps[-1])

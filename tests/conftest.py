@@ -8,8 +8,6 @@ from pathlib import Path
 import hypothesis
 import pytest
 
-from hilcal import threads
-
 ROOT = Path(__file__).resolve().parents[1]
 
 # Shared machines are slow at times: no deadlines, and the same examples on every run.
@@ -54,10 +52,6 @@ def pytest_configure() -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
         signal.signal(signal.SIGHUP, signal.SIG_DFL)
-    if "PYTEST_XDIST_WORKER" in os.environ:
-        # All processors are busy with other tests: threads would only take them from each other.
-        # Results have the same bits (test_threads).
-        threads.cores = lambda: 1
 
 
 LONG = (

@@ -174,18 +174,12 @@ def execute(make: Callable[[], typer.Typer], name: str, arguments: Sequence[str]
 
 @contextmanager
 def _computing() -> Iterator[None]:
-    """Limit BLAS to one thread: more gain nothing on small matrices, and cost on a busy machine.
-
-    Freed memory is kept for the next arrays (see `memory`).
-    """
+    """Limit BLAS to one thread: more gain nothing on small matrices, and cost on a busy machine."""
     if "numpy" not in sys.modules:  # --help, --version: nothing is computed
         yield
         return
     from threadpoolctl import threadpool_limits
 
-    from hilcal.cli.memory import keep_freed_memory
-
-    keep_freed_memory()
     with threadpool_limits(limits=1, user_api="blas"):
         yield
 

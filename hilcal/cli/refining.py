@@ -53,7 +53,6 @@ from hilcal.report.text_prior import prior_lines
 from hilcal.report.text_registration import fitted_lines, other_arm_line
 from hilcal.report.text_unknown import curves
 from hilcal.report.verdict_words import message
-from hilcal.threads import later
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -260,14 +259,10 @@ def refine(
                 nonlocal first
                 number = next(numbers_to_be) if first is None else first.number
                 first = None
-                of, suspects = step.fit, step.diagnosis.suspects
-                ahead(lambda: of.uncertainty, len(of.white))
-                ahead(lambda: [(s.holdout_share, s.least) for s in suspects], len(of.white))
                 if live is not None:
                     live.revised(chapter_of(number, step))
 
-            with later() as ahead:
-                found = refine_model(model, fitted, mode, say, how, laws, seen, background)
+            found = refine_model(model, fitted, mode, say, how, laws, seen, background)
             if laws is not None:
                 laws.write(found.names)
             rows: list[Row] = []

@@ -29,7 +29,6 @@ from hilcal.data.readings import Readings
 from hilcal.errors import InputError
 from hilcal.robot import se3
 from hilcal.robot.batch import chunks
-from hilcal.threads import in_threads
 from hilcal.types import Floats, Ints
 
 Scaling = Literal["none", "gu", "gc"]
@@ -241,14 +240,11 @@ class Whitening:
         start = 0
         for b in self.buckets:
             size = b.factor.shape[-1]
-
-            def scale(groups: slice, b: Bucket = b, size: int = size, begin: int = start) -> None:
+            for groups in chunks(len(b.loaded), size * width):
                 factor = b.factor[groups]
-                rows = slice(begin + groups.start * size, begin + groups.stop * size)
+                rows = slice(start + groups.start * size, start + groups.stop * size)
                 block = flat[rows].reshape(len(factor), size, -1)
                 to[rows] = (factor @ block).reshape(len(factor) * size, -1)
-
-            in_threads(scale, chunks(len(b.loaded), size * width), len(out))
             start += len(b.loaded) * size
         return out
 

@@ -32,10 +32,6 @@ MOST_REFITS = 2
 MOST_TOGETHER = 6
 
 
-class NotWantedError(Exception):
-    """The answer is not asked for any more."""
-
-
 @dataclass(frozen=True, slots=True)
 class ForwardSelection:
     """The residual of a model with all significant effects of the catalogue, by algebra.
@@ -98,8 +94,6 @@ def insufficiency(
     refit: Callable[[Fit, str], Fit],
     say: Callable[[str], None] = lambda text: None,
     regressions: Regressions | None = None,
-    likely: Callable[[Fit], None] = lambda fit: None,
-    wanted: Callable[[], bool] = lambda: True,
 ) -> Insufficiency | None:
     """Return what the whole catalogue leaves of a misfit; None where that is noise.
 
@@ -108,11 +102,6 @@ def insufficiency(
         refit: returns a fit with one more effect.
         say: takes progress, one line each.
         regressions: those that were made.
-        likely: takes the fit with the best effect, which a refinement is most likely to try next.
-        wanted: whether the answer is still asked for.
-
-    Raises:
-        NotWantedError: it is not.
     """
     regressions = Regressions() if regressions is None else regressions
     current = fit
@@ -125,15 +114,9 @@ def insufficiency(
             return None
         if not found.effects or len(names) == MOST_REFITS:
             break
-        if not wanted():
-            raise NotWantedError
         say(f"testing the whole catalogue: adding {found.effects[0]}")
         current = refit(current, found.effects[0])
         names.append(found.effects[0])
-        if len(names) == 1:
-            likely(current)
-    if not wanted():
-        raise NotWantedError
     regression = regressions.of(linearise(current))
     noise = judge_noise(current, pure_error(current), regression.share > PREDICTABLE)
     if noise.misjudged or not noise.off:

@@ -13,7 +13,7 @@ effect is implausible, and the size that it would need is stated.
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -36,7 +36,6 @@ from hilcal.identify.linearisation import HeldOut, Linearisation, linearise
 from hilcal.regression.evidence import FamilyScore
 from hilcal.regression.factored import Tall
 from hilcal.regression.spectrum import Spectrum, spectrum
-from hilcal.threads import once
 from hilcal.types import Floats
 
 SAME_EVIDENCE = 3.0
@@ -64,7 +63,7 @@ class Detection:
 
     _compute: Callable[[], Strength]
 
-    @once
+    @cached_property
     def least(self) -> Strength:
         """The smallest strength that these readings would reveal."""
         return self._compute()
@@ -80,7 +79,7 @@ class LeftOut:
 
     _compute: Callable[[], HeldOut]
 
-    @once
+    @cached_property
     def found(self) -> HeldOut:
         """The reduction."""
         return self._compute()
@@ -197,7 +196,6 @@ def rank_suspects(
     effects: Sequence[Effect],
     level: float = FALSE_ALARM,
     refit: Callable[[Fit, str], Fit] = add,
-    likely: Callable[[], None] = lambda: None,
 ) -> tuple[Suspect, ...]:
     """Score all effects; best first, see `ranked`.
 
@@ -206,7 +204,6 @@ def rank_suspects(
         effects: that are not in the model.
         level: of the test over all of them together.
         refit: returns a fit with one more effect.
-        likely: called where a suspect passes, before what it promises is tried.
     """
     small: dict[str, EffectColumns] = {}
     found = []
@@ -229,7 +226,6 @@ def rank_suspects(
                     geometry = geometry_columns(p, effects)
                 s = replace(s, refuted=not beyond_geometry(p, own, geometry, SAME_EVIDENCE))
             if s.passes:
-                likely()
                 s = replace(s, kept=kept(p, own, s.score, refit))
         out.append(s)
     return ranked(out)

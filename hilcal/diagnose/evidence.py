@@ -1,9 +1,8 @@
 """What the readings say of a fit, each part computed when it is first needed, and once."""
 
-from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Collection
+from functools import cached_property
 
-from hilcal import threads
 from hilcal.data.arm_scatter import ArmScatter
 from hilcal.diagnose.arm_repeatability import instrument_instead
 from hilcal.diagnose.background_evidence import BackgroundEffect, background_evidence
@@ -31,7 +30,6 @@ from hilcal.identify.fit import Fit, fit
 from hilcal.identify.linearisation import Linearisation, linearise
 from hilcal.regression.distributions import chi2
 from hilcal.regression.evidence import FamilyScore
-from hilcal.threads import once
 
 
 class Evidence:
@@ -43,7 +41,6 @@ class Evidence:
         refit: Callable[[Fit, str], Fit] = add,
         say: Callable[[str], None] = lambda text: None,
         regressions: Regressions | None = None,
-        likely: Callable[[Fit], None] = lambda fit: None,
     ) -> None:
         """Take a fit.
 
@@ -52,99 +49,76 @@ class Evidence:
             refit: returns a fit with one more effect.
             say: takes progress, one line each.
             regressions: of residuals, those that were made.
-            likely: takes a fit that is most likely to be tried next, see `insufficiency`.
 
         Raises:
             InputError: for a fit whose residual is not whitened.
         """
         if fit.scaling != "gc":
             raise InputError(f"diagnosis needs scaling gc, this fit has {fit.scaling}")
-        self.fit, self._refit, self._say, self._likely = fit, refit, say, likely
+        self.fit, self._refit, self._say = fit, refit, say
         self._regressions = Regressions() if regressions is None else regressions
         self._known: dict[tuple[str, frozenset[str]], Alternative] = {}
         self._eliminated: dict[str, FamilyScore] = {}
-        self._wanted = True
-        self._lead_likely: Callable[[], None] = lambda: None
 
-    @once
+    @cached_property
     def linearisation(self) -> Linearisation:
         """The fitted model's part of the regression."""
         return linearise(self.fit)
 
-    @once
+    @cached_property
     def effects(self) -> tuple[Effect, ...]:
         """Effects that are not in the model and can be computed."""
         return candidates(self.fit)
 
-    @contextmanager
-    def later(self) -> Iterator[Callable[[Callable[[], object]], None]]:
-        """Compute parts of the evidence beside the block, as it asks for them; they are kept.
-
-        As soon as a suspect is likely to pass all tests, the insufficiency of the catalogue is
-        computed too. It is given up at the end of the block if it has not been needed.
-        """
-        _ = self.linearisation.left_out  # all parts need it
-        try:
-            with threads.later() as ahead:
-                self._lead_likely = lambda: ahead(lambda: self.insufficiency, len(self.fit.white))
-                try:
-                    yield lambda part: ahead(part, len(self.fit.white))
-                finally:
-                    self._wanted, self._lead_likely = False, lambda: None
-        finally:
-            self._wanted = True
-
-    @once
+    @cached_property
     def suspects(self) -> tuple[Suspect, ...]:
         """All of them scored."""
-        return rank_suspects(
-            self.linearisation, self.effects, refit=self._refit, likely=self._lead_likely
-        )
+        return rank_suspects(self.linearisation, self.effects, refit=self._refit)
 
-    @once
+    @cached_property
     def wrong_figures(self) -> tuple[WrongFigure, ...]:
         """Figures of the cell that seem to be entered wrongly."""
         if self.misfit or self.fit.outlier.any() or not self.fit.readings.noise_stated:
             return wrong_figures(self.fit, self.suspects)
         return ()
 
-    @once
+    @cached_property
     def background(self) -> tuple[BackgroundEffect, ...]:
         """The effects of the model's background, each tested beside all others."""
         return background_evidence(self.fit)
 
-    @once
+    @cached_property
     def misfit_breakdown(self) -> tuple[MisfitShare, ...]:
         """Variables that the misfit follows, largest share first."""
         return misfit_breakdown(self.linearisation)
 
-    @once
+    @cached_property
     def pure_error(self) -> PureError | None:
         """The scatter of repeated readings; None without repeats."""
         return pure_error(self.fit)
 
-    @once
+    @cached_property
     def misfit(self) -> bool:
         """Whether χ² is larger than the stated noise allows."""
         return float(chi2.sf(self.fit.chi2, self.fit.dof)) < MISFIT_ALARM
 
-    @once
+    @cached_property
     def regression(self) -> ResidualRegression:
         """What smooth laws, or trees, predict of the misfit on poses left out."""
         return self._regressions.of(self.linearisation)
 
-    @once
+    @cached_property
     def arm_scatter(self) -> ArmScatter | None:
         """The arm's scatter, if it is what is left; None where the residual shows none."""
         return estimate_arm_scatter(self.fit)
 
-    @once
+    @cached_property
     def pose_alone(self) -> PoseAlone | None:
         """A misfit that is the same under every load of a pose."""
         level = FALSE_ALARM / max(len(self.effects), 1)
         return pose_alone(self.linearisation, self.effects, level, LEAST_SHARE)
 
-    @once
+    @cached_property
     def by_arrivals(self) -> "Evidence | None":
         """The evidence with the arm's estimated scatter in the covariance; None where it is this.
 
@@ -163,24 +137,17 @@ class Evidence:
         found = fit(model, scattered, mode, start=start)
         return Evidence(found, self._refit, self._say, self._regressions)
 
-    @once
+    @cached_property
     def redundant(self) -> tuple[str, ...]:
         """Effects of the model without which the readings are explained as well."""
         found = backward_elimination(self.fit, self._eliminated)
         needless = tuple(n.effect for n in found)
         return (*spoken_against(self.fit), *needless)
 
-    @once
+    @cached_property
     def insufficiency(self) -> Insufficiency | None:
         """What all effects of the catalogue together leave, where it is not noise."""
-        return insufficiency(
-            self.fit,
-            self._refit,
-            self._say,
-            self._regressions,
-            self._likely,
-            lambda: self._wanted,
-        )
+        return insufficiency(self.fit, self._refit, self._say, self._regressions)
 
     def tree_share(self, beyond: float) -> float:
         """Return the share of the misfit that trees predict, where that is more than another."""

@@ -10,6 +10,7 @@ beside it.
 """
 
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
@@ -20,7 +21,6 @@ from hilcal.regression.evidence import LARGE_FAMILY, FamilyScore, score_family
 from hilcal.regression.leave_out import FamilyFolds
 from hilcal.regression.paired_test import improves
 from hilcal.regression.spectrum import Spectrum
-from hilcal.threads import once
 from hilcal.types import Floats
 
 DRAWS = 16
@@ -106,7 +106,7 @@ class SuspectTests:
         self.p, self._x, self._s = p, of.white, s
         self._level, self._least_share, self._largest = level, least_share, largest
 
-    @once
+    @cached_property
     def _folds(self) -> tuple[FamilyFolds, FamilyFolds]:
         """The model without each fold, without the family and with it."""
         p = self.p

@@ -36,7 +36,6 @@ from hilcal.identify.linearisation import Linearisation, by_pose
 from hilcal.regression.block_selection import BlockSelection, block_evidence
 from hilcal.regression.paired_test import improves
 from hilcal.regression.schur import positive_solve
-from hilcal.threads import in_threads
 from hilcal.types import Bools, Floats, Ints
 
 FOLDS = 5
@@ -225,7 +224,7 @@ def smooth_laws(p: Linearisation) -> ResidualRegression:
         return chosen, refits.without(f, [])[0], *refits.without(f, chosen)
 
     each = range(count if count > 1 else 0)  # one pose: nothing to learn from
-    for f, (chosen, plain, step, coefficients) in enumerate(in_threads(left, each, len(white))):
+    for f, (chosen, plain, step, coefficients) in enumerate(map(left, each)):
         mine = of_row == f
         bare = white[mine] - p.rows[mine] @ plain
         base = white[mine] - p.rows[mine] @ step
@@ -277,7 +276,7 @@ def _dependences(
         return _curve(p, v, way, laws.ways[way], share * value / total)
 
     ordered = sorted(names.items(), key=lambda item: -item[1])
-    found = in_threads(dependence, ordered, len(p.rows))
+    found = map(dependence, ordered)
     return tuple(d for d in found if d is not None)
 
 

@@ -12,7 +12,6 @@ from hilcal.identify.fit import Fit, fit
 from hilcal.identify.linearisation import left_out_by_pose
 from hilcal.model import Model
 from hilcal.regression.paired_test import LEAST_GAIN, improves
-from hilcal.threads import once
 from hilcal.types import Floats
 
 
@@ -41,22 +40,13 @@ class Refits:
 
     def __init__(self) -> None:
         """Begin with none."""
-        self._made: dict[tuple[int, str], _Refit] = {}
+        self._made: dict[tuple[Fit, str], Fit] = {}
 
     def add(self, before: Fit, effect: str) -> Fit:
         """Return what `add` returns."""
-        return self._made.setdefault((id(before), effect), _Refit(before, effect)).fit
-
-
-class _Refit:
-    """A fit with one more effect."""
-
-    def __init__(self, before: Fit, effect: str) -> None:
-        self._before, self._effect = before, effect
-
-    @once
-    def fit(self) -> Fit:
-        return add(self._before, self._effect)
+        if (before, effect) not in self._made:
+            self._made[before, effect] = add(before, effect)
+        return self._made[before, effect]
 
 
 def remove(before: Fit, effect: str) -> Fit:

@@ -13,7 +13,6 @@ from hilcal.identify.fit import Fit
 from hilcal.identify.linearisation import eliminate_effect, model_columns
 from hilcal.regression.evidence import FamilyScore
 from hilcal.regression.forward_selection import families_beside, forward_selection
-from hilcal.regression.products import cross, gram
 
 MOST_TOGETHER = 3
 """Effects that are tried together in place of one; a choice."""
@@ -62,7 +61,7 @@ class StepwiseAlternatives:
         """Compute the columns of the model and of all effects that are not in it."""
         self._fit, self._model = fit, model_columns(fit)
         self._x, self._columns, self._most = catalogue_columns(fit)
-        self._gram, self._products = gram(self._x), cross(self._model.white, self._x)
+        self._gram, self._products = self._x.T @ self._x, self._model.white.T @ self._x
         self.eliminated: dict[str, FamilyScore] = {}
         """Score of each effect that `of` was asked for, against the model without it."""
 

@@ -176,17 +176,9 @@ def _with_arrivals(e: Evidence, history: History) -> Diagnosis:
 def _judged(e: Evidence, history: History) -> Diagnosis:
     """Judge by the evidence as it is."""
     added = tuple(n for n in history.added if n not in e.fit.model.random)
-    with e.later() as ahead:
-        ahead(lambda: e.misfit_breakdown)
-        ahead(lambda: (e.alternatives(added, history.removed), e.redundant))
-        suspects = ranked(e.suspects, history.rejected)
-        lead = suspects[0] if suspects and suspects[0].passes else None
-        insufficiency = None
-        if lead is not None:
-            share = lead.holdout_share
-            if e.misfit:
-                ahead(lambda: e.tree_share(share))
-            insufficiency = e.insufficiency
+    suspects = ranked(e.suspects, history.rejected)
+    lead = suspects[0] if suspects and suspects[0].passes else None
+    insufficiency = None if lead is None else e.insufficiency
     noise, scatter = None, e.fit.readings.arm_scatter
     rivals: tuple[Separability, ...] = ()
     reason: Reason

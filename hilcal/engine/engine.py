@@ -11,6 +11,7 @@ which computes what:
 A worker that dies costs no result: what it held is computed again. Ctrl-C leaves no process.
 """
 
+import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -22,7 +23,6 @@ from hilcal.engine.cluster import Cluster, cluster
 from hilcal.engine.processes import Processes, processes
 from hilcal.engine.tasks import Task, compute, versions
 from hilcal.errors import InputError
-from hilcal.threads import cores
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -110,7 +110,7 @@ def open_engine(workers: int | None = None, scheduler: str | None = None) -> Ite
         with cluster(scheduler) as there:
             yield Engine(there)
         return
-    count = cores() if workers is None else workers
+    count = len(os.sched_getaffinity(0)) if workers is None else workers
     if count < 1:
         raise InputError(f"--workers {count}; valid: a whole number from 1")
     if count == 1:

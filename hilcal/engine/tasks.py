@@ -14,7 +14,6 @@ from threadpoolctl import threadpool_limits
 
 from hilcal import __version__
 from hilcal.errors import HilcalError, InputError
-from hilcal.threads import one_thread
 
 Versions = tuple[tuple[str, str], ...]
 
@@ -80,7 +79,6 @@ class Task:
                     "workers from an environment of the same lock"
                 )
         one_blas_thread()
-        one_thread()
         return compute(self.function, item, seed)
 
 

@@ -32,7 +32,6 @@ from hilcal.regression.variance_components import (
     VarianceComponents,
     variance_components,
 )
-from hilcal.threads import in_threads
 from hilcal.types import Floats, Ints
 
 MOST_ROWS = 4000
@@ -139,8 +138,7 @@ def estimate_arm_scatter(fit: Fit) -> ArmScatter | None:
         parts = [data.component(f) for f in factors(cell, data.readings, kind)]
         return variance_components(data.blocks(parts), ridge)
 
-    *by_kind, noisier = in_threads(maximised, (*KINDS, None), len(data.y))
-    found = dict(zip(KINDS, by_kind, strict=True))
+    found, noisier = {kind: maximised(kind) for kind in KINDS}, maximised(None)
     evidence = {kind: v.log_likelihood - len(v.variance) * price for kind, v in found.items()}
     best = max(KINDS, key=lambda kind: evidence[kind])
     variance = found[best].variance

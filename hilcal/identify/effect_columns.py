@@ -6,6 +6,7 @@ transmission error, is kept by its factors (`wide_suspects`).
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -14,7 +15,6 @@ from hilcal.effects.protocol import Effect
 from hilcal.identify.fit import Fit
 from hilcal.identify.wide_suspects import WideColumns, wide_effect
 from hilcal.regression.factored import Tall, written
-from hilcal.threads import once
 from hilcal.types import Bools, Floats
 
 TOGETHER = 8_000_000
@@ -67,14 +67,14 @@ class EffectColumns:
         of = self.of_readings
         return of.numbers if isinstance(of, WideColumns) else of.size
 
-    @once
+    @cached_property
     def motion(self) -> Floats:
         """(D, 3, P) displacement of each measured position, m."""
         of = self.of_readings
         moved = of.readings(slice(None)) if isinstance(of, WideColumns) else of
         return self.whitening.raw(moved[:, :3])
 
-    @once
+    @cached_property
     def unloaded(self) -> Floats:
         """(U, 3, P) displacement of the target in each unloaded reading, sensor axes, m."""
         of = self.of_readings

@@ -25,7 +25,6 @@ from hilcal.identify.uncertainty import Uncertainty, uncertainty
 from hilcal.identify.variance_factor import WithVarianceFactor
 from hilcal.model import Model
 from hilcal.observe import Observation
-from hilcal.threads import once
 from hilcal.types import Bools, Floats, Ints
 
 Frame = Literal["sensor", "base"]
@@ -88,17 +87,17 @@ class Fit(WithVarianceFactor):
     error: ErrorBlock
     disagreement: Disagreement | None = None
 
-    @once
+    @cached_property
     def left_out(self) -> Floats:
         """(D, m) residual of each measurement, predicted without its pose."""
         return leave_out(self.model, self.solution, random_folds(self.pose), self.fitted)
 
-    @once
+    @cached_property
     def holdout(self) -> ErrorBlock:
         """Error block of whole poses left out."""
         return error_block(*all_left_out(self))
 
-    @once
+    @cached_property
     def uncertainty(self) -> Uncertainty:
         """Standard uncertainties and identifiable parameters."""
         kept = self.readings[~self.outlier]
@@ -106,7 +105,7 @@ class Fit(WithVarianceFactor):
             self.model, kept, self.fitted, self.solution, self.pose, self.chi2, self.dof
         )
 
-    @once
+    @cached_property
     def conflicts(self) -> tuple[Conflict, ...]:
         """How far a carried prior and the readings disagree, worst first; empty without one."""
         return conflicts(self.model, self.solution, self.whitening)

@@ -22,7 +22,6 @@ from hilcal.identify.wide_effects import whitened_columns
 from hilcal.model import Model, Prediction
 from hilcal.regression.factored import Tall, written
 from hilcal.regression.normal_equations import Basis, NormalEquations
-from hilcal.regression.products import gram
 from hilcal.regression.projection import Projection, projection
 from hilcal.types import Bools, Floats, Ints
 
@@ -164,7 +163,7 @@ def solve(
     # Formed anew at the solution, so that folds can be taken out of them exactly.
     basis = over_all_parameters(by.basis, live, model.size)
     target = point.white + rows @ prior_coordinates(basis, point.y, by.prior)
-    equations = NormalEquations(basis, gram(rows), rows.T @ target)
+    equations = NormalEquations(basis, rows.T @ rows, rows.T @ target)
     return Solution(
         theta=point.theta,
         y=point.y,

@@ -6,6 +6,7 @@ both use it, so that the planner's power and the diagnosis's test are of the sam
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -16,7 +17,6 @@ from hilcal.identify.gauss_newton import columns_of
 from hilcal.identify.holdout import folds_of
 from hilcal.identify.priors import scales_of
 from hilcal.identify.wide_effects import whitened_columns
-from hilcal.regression import products
 from hilcal.regression.backward_elimination import ReducedModel, eliminate_columns
 from hilcal.regression.evidence import FamilyScore, score_family
 from hilcal.regression.factored import Tall, gram, scaled, written
@@ -30,7 +30,6 @@ from hilcal.regression.leave_out import (
 from hilcal.regression.paired_test import improves
 from hilcal.regression.projection import Projection
 from hilcal.regression.spectrum import Spectrum
-from hilcal.threads import once
 from hilcal.types import Floats, Ints
 
 LEAST_MISFIT = 3.0
@@ -69,12 +68,12 @@ class Linearisation:
         """(R, K) whitened Jacobian of the model by identifiable coordinates."""
         return self.projection.rows
 
-    @once
+    @cached_property
     def rss(self) -> float:
         """‖r‖²."""
         return float(self.residual @ self.residual)
 
-    @once
+    @cached_property
     def left_out(self) -> Floats:
         """(poses,) squared whitened residual of each pose, predicted without it.
 
@@ -84,7 +83,7 @@ class Linearisation:
         white = left_out_residual(self.folds, self.projection, self.fit.white)
         return by_pose(self.fit, white)
 
-    @once
+    @cached_property
     def folds(self) -> tuple[Fold, ...]:
         """The model without each fold of poses."""
         fit = self.fit
@@ -129,7 +128,7 @@ class Linearisation:
         """
         own = np.column_stack([self.rows, self.residual])
         together = next((of.together for of in columns if of.together is not None), None)
-        of_all = None if together is None else products.cross(own, together)
+        of_all = None if together is None else own.T @ together
         out = []
         for of in columns:
             if of_all is not None and of.together is together:

@@ -20,7 +20,6 @@ from hilcal.regression.normal_equations import (
     flat_triangle,
     normal_equations,
 )
-from hilcal.regression.products import submatrix
 from hilcal.types import Floats, Ints
 
 NOISE_STEPS = 50
@@ -67,7 +66,7 @@ class LinearProblem:
         kept = prior[self.live] > 0
         if kept.all():
             return self
-        gram = submatrix(self.gram, np.flatnonzero(kept))
+        gram = self.gram[np.ix_(kept, kept)]
         same = self.rows is self.a
         a = keep_columns(self.a, kept)
         rows = a if same else keep_columns(self.rows, kept)
@@ -218,7 +217,7 @@ def _family_priors(
     of_family = np.append(np.zeros(len(basis.singular), dtype=bool), family[p.live[basis.held]])
     order = np.argsort(of_family, kind="stable")
     others = int(np.sum(~of_family))
-    gram = submatrix(equations.gram, order)
+    gram = equations.gram[np.ix_(order, order)]
     gram[np.arange(others), np.arange(others)] += beta * basis.prior_precision[order[:others]]
     found = maximise_evidence(
         gram,

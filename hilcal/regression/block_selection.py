@@ -18,7 +18,6 @@ import numpy as np
 from hilcal.regression.evidence import log_evidence
 from hilcal.regression.schur import positive_solve
 from hilcal.regression.spectrum import visible
-from hilcal.threads import in_threads
 from hilcal.types import Bools, Floats, Ints
 
 SPANNED = 1e-6
@@ -85,7 +84,7 @@ class BlockSelection:
         self._x = x.reshape(len(y), -1)
         self._fold = fold
         folds = range(int(fold.max()) + 1)
-        self._of = in_threads(lambda f: self._sums(fold == f), folds, len(y))
+        self._of = [self._sums(fold == f) for f in folds]
         self._all = reduce(_Sums.plus, self._of)
 
     def _sums(self, rows: Bools) -> _Sums:

@@ -18,11 +18,10 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+import scipy.linalg as sl
 from scipy.special import exp1
 
-from hilcal.regression import lapack
 from hilcal.regression.distributions import chi2
-from hilcal.regression.products import submatrix
 from hilcal.regression.schur import eliminate
 from hilcal.types import Floats, Ints
 
@@ -85,7 +84,7 @@ def maximise_evidence(
     active = (variance > 0) & (reach > 0)
     effective = 0.0
     keep = np.flatnonzero(active[groups])
-    g, b = submatrix(g, keep), b[keep]
+    g, b = g[np.ix_(keep, keep)], b[keep]
     room = np.empty(g.size)
     for iteration in range(ITERATIONS):
         if not len(keep):
@@ -116,7 +115,7 @@ def maximise_evidence(
         variance, active = updated, active & ~gone
         left = active[group]
         if not left.all():
-            keep, g, b = keep[left], submatrix(g, np.flatnonzero(left)), b[left]
+            keep, g, b = keep[left], g[np.ix_(left, left)], b[left]
         if not weighty.any() or change[weighty].max() < TOLERANCE:
             break
     std_all = np.sqrt(np.where(active, variance, 0.0))[groups]
@@ -178,8 +177,8 @@ def _inverse_root(g: Floats, std: Floats, beta: float, room: Floats) -> Floats:
     h *= std[:, None]
     up = h.T  # in LAPACK's order, not turned over in memory
     up[np.diag_indices_from(up)] += 1.0
-    if lapack.factorise(up, lower=False):
-        lapack.invert(up, lower=False)  # less time than that of a lower triangle
-        return np.asarray(up.T)
+    up, failed = sl.lapack.dpotrf(up, lower=0, clean=1, overwrite_a=1)
+    if not failed:
+        return np.asarray(sl.lapack.dtrtri(up, lower=0, overwrite_c=1)[0].T)
     values, vectors = np.linalg.eigh(g * (std / beta) * std[:, None])
     return np.asarray((vectors / np.sqrt(1.0 + np.maximum(values, 0.0))).T)

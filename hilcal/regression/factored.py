@@ -16,8 +16,6 @@ from itertools import groupby
 
 import numpy as np
 
-from hilcal.regression import products
-from hilcal.threads import in_threads
 from hilcal.types import Bools, Floats, Ints
 
 Places = slice | Ints
@@ -192,30 +190,19 @@ class Factored:
     def gram(self) -> Floats:
         """Return AᵀA (P, P)."""
         out = np.empty((self.shape[1], self.shape[1]))
-        out[np.ix_(self.at, self.at)] = products.gram(self.own)
+        out[np.ix_(self.at, self.at)] = self.own.T @ self.own
         runs = self._runs()
 
-        def fill(pair: tuple[int, int]) -> None:
-            (s, one, rows), (t, other, columns) = runs[pair[0]], runs[pair[1]]
-            v = self.direction
-            weight = np.einsum("di,di->d", v[:, :, s], v[:, :, t])[:, None]
-            if pair[0] == pair[1]:
-                part = self.coefficient[:, one] * np.sqrt(weight)
-                _put(out, rows, columns, part.T @ part)  # symmetric: half the work
-                return
-            found = self.coefficient[:, one].T @ (self.coefficient[:, other] * weight)
-            _put(out, rows, columns, found)
-            _put(out, columns, rows, found.T)
-
-        def beside(k: int) -> None:
-            s, columns, places = runs[k]
-            found = self._along(s, self.own).T @ self.coefficient[:, columns]
-            _put(out, self.at, places, found)
-            _put(out, places, self.at, found.T)
-
-        pairs = [(a, b) for a in range(len(runs)) for b in range(a, len(runs))]
-        in_threads(fill, pairs, len(self))
-        in_threads(beside, range(len(runs)), len(self))
+        for k, (s, one, rows) in enumerate(runs):
+            found = self._along(s, self.own).T @ self.coefficient[:, one]
+            _put(out, self.at, rows, found)
+            _put(out, rows, self.at, found.T)
+            for t, other, columns in runs[k:]:
+                v = self.direction
+                weight = np.einsum("di,di->d", v[:, :, s], v[:, :, t])[:, None]
+                found = self.coefficient[:, one].T @ (self.coefficient[:, other] * weight)
+                _put(out, rows, columns, found)
+                _put(out, columns, rows, found.T)
         return out
 
     def forms(self, root: Floats) -> Floats:
@@ -226,7 +213,7 @@ class Factored:
         to_runs = [np.ascontiguousarray(root[:, places].T) for _, _, places in runs]
         out = np.empty((count, m, m))
 
-        def fill(start: int) -> None:
+        for start in range(0, count, TOGETHER):
             some = slice(start, min(start + TOGETHER, count))
             along = np.zeros((some.stop - start, sites, size))
             for (s, columns, _), to in zip(runs, to_runs, strict=True):
@@ -234,8 +221,6 @@ class Factored:
             seen = (self.own[m * start : m * some.stop] @ to_own).reshape(-1, m, size)
             seen += self.direction[some] @ along
             np.matmul(seen, np.swapaxes(seen, 1, 2), out=out[some])
-
-        in_threads(fill, range(0, count, TOGETHER), len(self))
         return out
 
     def _along(self, site: int, b: Floats) -> Floats:
@@ -283,20 +268,20 @@ Tall = Floats | Factored
 
 def gram(a: Tall) -> Floats:
     """Return AᵀA (P, P)."""
-    return a.gram() if isinstance(a, Factored) else products.gram(a)
+    return a.gram() if isinstance(a, Factored) else np.asarray(a.T @ a)
 
 
 def forms(a: Tall, root: Floats, m: int) -> Floats:
     """Return A_d TᵀT A_dᵀ (D, m, m) of each m rows of A (R, P), T a root (K, P)."""
     if isinstance(a, Factored):
         return a.forms(root)
-    seen = products.times(a, root.T).reshape(-1, m, len(root))
+    seen = (a @ root.T).reshape(-1, m, len(root))
     return np.asarray(seen @ np.swapaxes(seen, 1, 2))
 
 
 def keep_columns(a: Tall, kept: Bools) -> Tall:
-    """Return the columns of A (R, P) that are kept; the memory of an array is used up."""
-    return a.restricted(kept) if isinstance(a, Factored) else products.keep_columns(a, kept)
+    """Return the columns of A (R, P) that are kept."""
+    return a.restricted(kept) if isinstance(a, Factored) else np.asarray(a[:, kept])
 
 
 def ordered(a: Tall, order: Ints) -> Tall:

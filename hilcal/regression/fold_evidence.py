@@ -16,12 +16,11 @@ from dataclasses import dataclass, replace
 from functools import reduce
 
 import numpy as np
+import scipy.linalg as sl
 
-from hilcal.regression import lapack
 from hilcal.regression.empirical_bayes import EmpiricalPrior, maximise_evidence
 from hilcal.regression.factored import Tall, gram, of_rows
 from hilcal.regression.schur import inverse_root
-from hilcal.threads import in_threads
 from hilcal.types import Bools, Floats, Ints
 
 
@@ -56,7 +55,7 @@ def solutions(p: FamilyProblem, fold: Ints) -> Floats:
         fold: (R,) fold of each row, from 0.
     """
     flat, count_of = len(p.pull), np.bincount(fold)
-    parts = in_threads(lambda f: _products(p, fold == f), range(len(count_of)), len(fold))
+    parts = [_products(p, fold == f) for f in range(len(count_of))]
     whole, rhs = (reduce(np.add, of) for of in zip(*parts, strict=True))
     whole[:flat, :flat] += p.ridge
     rhs[:flat] += p.pull
@@ -72,7 +71,7 @@ def solutions(p: FamilyProblem, fold: Ints) -> Floats:
         last = rest.maximised(np.flatnonzero(start), p.groups, start, first.beta, count)
         return rest.solution(last.std, last.beta)
 
-    return np.array(in_threads(without, range(len(parts)), len(fold)))
+    return np.array([without(f) for f in range(len(parts))])
 
 
 def _products(p: FamilyProblem, rows: Bools) -> tuple[Floats, Floats]:
@@ -142,11 +141,9 @@ class _Rest:
         out, live = np.flatnonzero(std == 0), np.flatnonzero(std > 0)
         if not len(out):
             return std
-        h = lapack.column_major(self.gram(live, live))
-        h[np.diag_indices_from(h)] += beta / std[live] ** 2
-        _factorise(h)
-        x = lapack.column_major(np.column_stack([self.gram(live, out), self.beside[live]]))
-        lapack.solve_triangle(h, x)
+        h = self.gram(live, live) + np.diag(beta / std[live] ** 2)
+        x = np.column_stack([self.gram(live, out), self.beside[live]])
+        x = sl.solve_triangular(sl.cholesky(h, lower=True), x, lower=True)
         at = self.flat + out
         size = self.whole[at, at] - self.own[at, at] - np.sum(self.cross[:, out] ** 2, axis=0)
         free = np.maximum(size - np.sum(x[:, :-1] ** 2, axis=0), 1e-300)
@@ -167,21 +164,8 @@ class _Rest:
         kept = std > 0
         live = np.concatenate([np.arange(self.flat), self.flat + np.flatnonzero(kept)])
         at = np.ix_(live, live)
-        h = lapack.column_major(self.whole[at] - self.own[at])
-        h[np.diag_indices_from(h)] += np.concatenate([np.zeros(self.flat), beta / std[kept] ** 2])
-        _factorise(h)
+        ridge = np.concatenate([np.zeros(self.flat), beta / std[kept] ** 2])
+        h = self.whole[at] - self.own[at] + np.diag(ridge)
         u = np.zeros(len(self.rhs))
-        found = self.rhs[live]
-        lapack.solve_factored(h, found)
-        u[live] = found
+        u[live] = sl.cho_solve(sl.cho_factor(h), self.rhs[live])
         return u
-
-
-def _factorise(h: Floats) -> None:
-    """Overwrite H (K, K) by its Cholesky factor.
-
-    Raises:
-        LinAlgError: H is not positive definite.
-    """
-    if not lapack.factorise(h):
-        raise np.linalg.LinAlgError("the normal equations without a fold are not positive definite")

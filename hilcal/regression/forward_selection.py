@@ -9,12 +9,12 @@ compare.
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
 from hilcal.regression.evidence import FamilyScore, score_family
 from hilcal.regression.schur import eliminate
-from hilcal.threads import once
 from hilcal.types import Floats
 
 
@@ -106,7 +106,7 @@ class Addition:
     scores: Mapping[str, FamilyScore]
     before: Families
 
-    @once
+    @cached_property
     def after(self) -> Families:
         """Return the families beside the model with it."""
         return self.before.with_family(self.name, self.score)

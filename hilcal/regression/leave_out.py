@@ -21,7 +21,6 @@ from hilcal.regression.factored import Factored, Tall, of_rows
 from hilcal.regression.normal_equations import NormalEquations
 from hilcal.regression.projection import Projection
 from hilcal.regression.schur import inverse_root, positive_solve
-from hilcal.threads import MANY, in_threads
 from hilcal.types import Bools, Floats, Ints
 
 ROUNDING = 1e-6
@@ -40,17 +39,15 @@ class Fold:
         out: (R,) rows of the fold.
         inverse_root: (K, K) T with Tᵀ T = H⁻¹ without them.
         rhs: (K,) right-hand side without them, for a step from the fit.
-        copied: the model's columns in these rows; None where they are too many to be kept.
     """
 
     out: Bools
     inverse_root: Floats
     rhs: Floats
-    copied: Floats | None
 
     def rows(self, p: Projection) -> Floats:
         """Return the model's columns in the rows of the fold."""
-        return np.asarray(p.rows[self.out]) if self.copied is None else self.copied
+        return np.asarray(p.rows[self.out])
 
     def solve(self, rhs: Floats) -> Floats:
         """Return H⁻¹ times (K,) or (K, P)."""
@@ -97,10 +94,9 @@ def folds(
         mine = fold == f
         rows = p.rows[mine]
         root = inverse_root(h - rows.T @ rows)
-        kept = rows if len(white) <= MANY else None
-        return Fold(mine, root, rhs - rows.T @ white[mine], kept)
+        return Fold(mine, root, rhs - rows.T @ white[mine])
 
-    return tuple(in_threads(without, range(int(fold.max()) + 1), len(white)))
+    return tuple(without(f) for f in range(int(fold.max()) + 1))
 
 
 def left_out_residual(
@@ -163,7 +159,7 @@ def family_products(
         own, y = fold.rows(p), white[fold.out]
         return [_Products.of(own, of_rows(x, fold.out), y) for x in every]
 
-    by_fold = in_threads(products, folds, len(white))
+    by_fold = [products(fold) for fold in folds]
     return [
         FamilyProducts(x, parts, _Products.sum(parts))
         for x, parts in zip(every, zip(*by_fold, strict=True), strict=True)
@@ -187,13 +183,11 @@ def left_out_of_families(
     found = [np.zeros(len(white)) for _ in families]
     small = [_in_all_folds(folds, of, ridge) for of, ridge in families]
 
-    def predict(f: int) -> None:
-        out, own = folds[f].out, folds[f].rows(p)
+    for f, fold in enumerate(folds):
+        out, own = fold.out, fold.rows(p)
         for (of, ridge), left, known in zip(families, found, small, strict=True):
-            back, step = known[f] if known else _without(folds[f], of.whole, of.parts[f], ridge)
+            back, step = known[f] if known else _without(fold, of.whole, of.parts[f], ridge)
             left[out] = white[out] - own @ back - of_rows(of.x, out) @ step
-
-    in_threads(predict, range(len(folds)), len(white))
     return found
 
 

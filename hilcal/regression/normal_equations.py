@@ -19,7 +19,6 @@ import numpy as np
 import scipy.linalg as sl
 
 from hilcal.regression.factored import Factored, Tall, written
-from hilcal.regression.products import submatrix
 from hilcal.regression.schur import inverse_root, positive_solve
 from hilcal.regression.triangle import Triangle
 from hilcal.types import Bools, Floats, Ints
@@ -247,7 +246,7 @@ def normal_equations(
         return NormalEquations(basis, full, of.target)
     full[:flat, flat:] = of.all[:, held] * sigma
     full[flat:, :flat] = full[:flat, flat:].T
-    inner = submatrix(gram, held)
+    inner = gram[np.ix_(held, held)]
     inner *= sigma
     np.multiply(inner, sigma[:, None], out=full[flat:, flat:])
     return NormalEquations(basis, full, np.concatenate([of.target, sigma * of.columns[held]]))

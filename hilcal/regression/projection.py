@@ -14,7 +14,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.regression import products
 from hilcal.regression.schur import inverse_root
 from hilcal.types import Floats
 
@@ -48,8 +47,8 @@ class Projection:
             x: (R, P) whitened columns.
             gram: (P, P) XᵀX where it is known.
         """
-        own = products.gram(x) if gram is None else gram
-        return self.schur(own, products.cross(self.rows, x))
+        own = x.T @ x if gram is None else gram
+        return self.schur(own, self.rows.T @ x)
 
     def schur(self, gram: Floats, cross: Floats) -> Floats:
         """Return Xᵀ M X (P, P) from XᵀX (P, P) and BᵀX (K, P)."""
@@ -79,7 +78,7 @@ class Projection:
 
     def root(self) -> Floats:
         """Return Q (R, K) with M = 1 − Q Qᵀ."""
-        return products.times(self.rows, self.inverse_root.T)
+        return np.asarray(self.rows @ self.inverse_root.T)
 
 
 def projection(rows: Floats, ridge: Floats, gram: Floats | None = None) -> Projection:
@@ -90,5 +89,5 @@ def projection(rows: Floats, ridge: Floats, gram: Floats | None = None) -> Proje
         ridge: Λ, at least zero.
         gram: (K, K) BᵀB where it is known.
     """
-    h = (products.gram(rows) if gram is None else gram) + np.diag(ridge)
+    h = (rows.T @ rows if gram is None else gram) + np.diag(ridge)
     return Projection(rows, ridge, inverse_root(h))

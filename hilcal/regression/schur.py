@@ -21,7 +21,6 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg as sl
 
-from hilcal.regression import lapack
 from hilcal.types import Bools, Floats, Ints
 
 DETERMINED = 1e-12
@@ -58,14 +57,8 @@ def inverse_root(block: Floats) -> Floats:
 def _triangular(scaled: Floats) -> tuple[Floats, Bools]:
     """Inverse Cholesky factors of blocks (N, F, F), and which of them serve."""
     if len(scaled) == 1:
-        # The transpose, in LAPACK's order, is not turned over in memory.
-        low = lapack.column_major(scaled[0].T)
-        failed = not lapack.factorise(low)
-        if failed:
-            low[:] = 0.0
-        else:
-            lapack.invert(low)
-        out = low[None]
+        low, failed = sl.lapack.dpotrf(scaled[0].T, lower=1, clean=1)
+        out = (np.zeros_like(low) if failed else sl.lapack.dtrtri(low, lower=1)[0])[None]
     else:
         try:
             out = np.linalg.inv(np.linalg.cholesky(scaled))
@@ -88,14 +81,12 @@ def positive_solve(m: Floats, rhs: Floats) -> Floats:
         scaled = m / scale
         scaled /= scale[:, None]
         norm = float(np.abs(scaled).sum(axis=0).max())
-        low = scaled.T if scaled.flags.c_contiguous else lapack.column_major(scaled.T)
-        if lapack.factorise(low):
+        low, failed = sl.lapack.dpotrf(scaled.T, lower=1)
+        if not failed:
             condition, _ = sl.lapack.dpocon(low, norm, uplo="L")
             if condition * norm > len(m) * DETERMINED / _SOUND:
                 by = scale if rhs.ndim == 1 else scale[:, None]
-                out = lapack.column_major(rhs / by)
-                lapack.solve_factored(low, out)
-                return np.asarray(out / by)
+                return np.asarray(sl.lapack.dpotrs(low, rhs / by, lower=1)[0] / by)
     root = inverse_root(m)
     return np.asarray(root.T @ (root @ rhs))
 

@@ -23,11 +23,6 @@ BUDGET = 1 << 20
 """Numbers of a chunk's largest array, 8 MB; a choice by timing."""
 LEAST_CHUNK = 256
 """States of a chunk, at least: Python's share of the time grows with the number of chunks."""
-_LARGEST = (32 << 20) - (64 << 10)
-"""Bytes. The C library (glibc) hands freed memory back to the system beyond twice the largest block
-freed so far, if that was below 32 MiB. Without a block of this size freed first, the temporaries of
-each chunk are handed back and taken anew, page by page: a third of the time of a Jacobian. Source:
-mallopt(3), M_MMAP_THRESHOLD."""
 
 
 class Record(Protocol):
@@ -62,8 +57,6 @@ def chunks(count: int, numbers: int = 0) -> Iterator[slice]:
         numbers: that are computed for each state, where they are many: chunks are smaller then.
     """
     size = CHUNK if numbers == 0 else max(LEAST_CHUNK, min(CHUNK, BUDGET // numbers))
-    if count > size:
-        np.empty(_LARGEST, dtype=np.uint8)  # freed at once
     for start in range(0, max(count, 1), size):
         yield slice(start, min(start + size, count))
 
