@@ -9,12 +9,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import stats
 
 from hilcal.acquire.devices import TrackerSample
 from hilcal.data.covariance import covariance_of_mean
 from hilcal.data.whitening import inverse_root
 from hilcal.errors import DeviceError
-from hilcal.regression import distributions
 from hilcal.robot import se3
 from hilcal.types import Bools, Floats
 
@@ -118,7 +118,7 @@ def _trace_test(residuals: Floats, prior: Floats) -> tuple[float, float]:
     count, m = residuals.shape
     white = residuals @ inverse_root(prior).T
     total, dof = float(np.sum(white**2)), m * (count - 1)
-    return total / dof, float(distributions.chi2.sf(total, dof))
+    return total / dof, float(stats.chi2.sf(total, dof))
 
 
 def _not_gross(values: Floats, stated: Floats) -> Bools:
@@ -126,8 +126,8 @@ def _not_gross(values: Floats, stated: Floats) -> Bools:
     m = values.shape[1]
     white = deviations(values)[1] @ inverse_root(stated).T
     square = np.sum((white - np.median(white, axis=0)) ** 2, axis=1)
-    usual = max(1.0, float(np.median(square) / distributions.chi2.median(m)))
-    return np.asarray(distributions.chi2.logsf(square / usual, m) > _LOG_GROSS)
+    usual = max(1.0, float(np.median(square) / stats.chi2.median(m)))
+    return np.asarray(stats.chi2.logsf(square / usual, m) > _LOG_GROSS)
 
 
-_LOG_GROSS = float(np.log(2) + distributions.norm.logsf(GROSS_SIGMA))
+_LOG_GROSS = float(np.log(2) + stats.norm.logsf(GROSS_SIGMA))

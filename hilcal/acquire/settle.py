@@ -22,11 +22,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import stats
 
 from hilcal.acquire.average import deviations
 from hilcal.acquire.devices import TrackerSample
 from hilcal.data.whitening import inverse_root
-from hilcal.regression import distributions
 from hilcal.types import Floats
 
 DRIFT_P = 0.04
@@ -113,9 +113,9 @@ class SettleWindow:
             return True
         m, drift = len(trend.slope), trend.moment * float(np.sum(trend.white_slope**2))
         if noise == 1.0:
-            p = float(distributions.chi2.sf(drift, m))
+            p = float(stats.chi2.sf(drift, m))
         else:
-            p = float(distributions.f.sf(drift / (m * noise), m, trend.dof))
+            p = float(stats.f.sf(drift / (m * noise), m, trend.dof))
         self._has_drifted = self._has_drifted or p <= DRIFT_P
         return bool(p > (AFTER_DRIFT_P if self._has_drifted else DRIFT_P))
 
@@ -129,7 +129,7 @@ class SettleWindow:
         first = _trend(self._samples[:half], self._scale)
         second = _trend(self._samples[-half:], self._scale)
         ratio = first.scatter / max(second.scatter, np.finfo(float).tiny)
-        return bool(distributions.f.sf(ratio, first.dof, second.dof) < SHRINKING_P)
+        return bool(stats.f.sf(ratio, first.dof, second.dof) < SHRINKING_P)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -167,5 +167,5 @@ def _trend(samples: Sequence[TrackerSample], scale: float) -> _Trend:
     about = (residuals - np.outer(time, slope)) @ root.T
     dof = residuals.shape[1] * (len(samples) - 2)
     total = float(np.sum(about**2))
-    scatter, p = (total / dof, float(distributions.chi2.sf(total, dof))) if dof else (0.0, 1.0)
+    scatter, p = (total / dof, float(stats.chi2.sf(total, dof))) if dof else (0.0, 1.0)
     return _Trend(slope, root @ slope, moment, span, scatter, p, dof)

@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import chi2
 
 from hilcal.calibration.measured import Outside
 from hilcal.errors import InputError
-from hilcal.regression.distributions import chi2
 from hilcal.robot import se3
 from hilcal.types import Floats
 

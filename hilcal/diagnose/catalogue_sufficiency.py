@@ -15,6 +15,8 @@ The algebra alone decides where it leaves noise: then no refit is made.
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from scipy.stats import chi2
+
 from hilcal.diagnose.effect_ranking import FALSE_ALARM, catalogue_columns
 from hilcal.diagnose.noise import pure_error
 from hilcal.diagnose.noise_verdict import MISFIT_ALARM, PREDICTABLE, NoiseVerdict, judge_noise
@@ -22,7 +24,6 @@ from hilcal.diagnose.residual_regression import Dependence, Regressions
 from hilcal.identify.fit import Fit
 from hilcal.identify.linearisation import linearise
 from hilcal.regression import forward_selection as selection
-from hilcal.regression.distributions import chi2
 from hilcal.regression.forward_selection import families_beside
 
 LEAST_REMAINDER = 0.02

@@ -19,6 +19,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import f as f_distribution
 
 from hilcal.diagnose.change_candidates import Candidate, candidates
 from hilcal.diagnose.change_found import Change, Changes, Limit, Size
@@ -26,7 +27,6 @@ from hilcal.diagnose.effect_ranking import SAME_EVIDENCE
 from hilcal.errors import CannotAnswerError
 from hilcal.identify.earlier import Earlier
 from hilcal.identify.remeasured import Remeasured, Setting, remeasure
-from hilcal.regression.distributions import f as f_distribution
 from hilcal.regression.evidence import FamilyScore, log_evidence, score_family
 from hilcal.regression.power import noncentrality_of_power
 from hilcal.regression.spectrum import visible

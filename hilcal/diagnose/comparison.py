@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import f as f_distribution
 
 from hilcal.data.whitening import Mode
 from hilcal.diagnose.change_found import Changes
@@ -12,7 +13,6 @@ from hilcal.identify.fit import Fit
 from hilcal.identify.parameter_differences import Differences
 from hilcal.identify.remeasured import Setting, beside_frames, frames_alone, remeasure
 from hilcal.identify.validation import Validation
-from hilcal.regression.distributions import f as f_distribution
 
 
 @dataclass(frozen=True, slots=True, eq=False)

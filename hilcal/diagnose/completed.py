@@ -10,6 +10,8 @@ the beam than across it, and as a multiple of that noise it would look like a ch
 
 from collections.abc import Callable, Collection
 
+from scipy.stats import chi2
+
 from hilcal.diagnose.effect_ranking import SAME_EVIDENCE
 from hilcal.diagnose.stepwise import add
 from hilcal.errors import HilcalError
@@ -18,7 +20,6 @@ from hilcal.identify.effect_columns import effect_columns
 from hilcal.identify.fit import Fit
 from hilcal.identify.fit import fit as solve
 from hilcal.identify.linearisation import linearise
-from hilcal.regression.distributions import chi2
 
 LEVEL = 0.01
 """Level of the test, over all effects together; a choice."""

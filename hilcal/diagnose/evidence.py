@@ -3,6 +3,8 @@
 from collections.abc import Callable, Collection
 from functools import cached_property
 
+from scipy.stats import chi2
+
 from hilcal.data.arm_scatter import ArmScatter
 from hilcal.diagnose.arm_repeatability import instrument_instead
 from hilcal.diagnose.background_evidence import BackgroundEffect, background_evidence
@@ -28,7 +30,6 @@ from hilcal.errors import InputError
 from hilcal.identify.arm_scatter import estimate_arm_scatter, with_arm_scatter
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.linearisation import Linearisation, linearise
-from hilcal.regression.distributions import chi2
 from hilcal.regression.evidence import FamilyScore
 
 

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from scipy.stats import chi2
 
 from hilcal.diagnose.pose_constants import pose_constants
 from hilcal.identify.linearisation import Linearisation
 from hilcal.observe import motion
-from hilcal.regression.distributions import chi2
 from hilcal.types import Floats
 
 POLYNOMIAL = 3

@@ -12,12 +12,12 @@ and the rest of χ² is lack of fit.
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import f as f_distribution
 
 from hilcal.diagnose.noise_where import NoiseWhere, noise_where
 from hilcal.diagnose.repeats import contrasts
 from hilcal.identify.fit import Fit
 from hilcal.identify.variance_factor import variance_interval
-from hilcal.regression.distributions import f as f_distribution
 
 FEWEST = 10
 """Degrees of freedom of pure error below which it is not used; a guess."""

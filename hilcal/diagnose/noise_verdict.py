@@ -13,9 +13,10 @@ whole names none. What remains is a χ² that is too large or too small:
 from dataclasses import dataclass
 from typing import Literal
 
+from scipy.stats import chi2
+
 from hilcal.diagnose.noise import PureError
 from hilcal.identify.fit import Fit
-from hilcal.regression.distributions import chi2
 
 MISFIT_ALARM = 0.0005
 """Chance of calling the variance factor wrong where it is right, each side."""

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from scipy.stats import chi2
 
 from hilcal.diagnose.repeats import Contrasts
 from hilcal.identify.fit import Fit
-from hilcal.regression.distributions import chi2
 from hilcal.types import Floats
 
 Kind = Literal["axis", "joint", "load"]

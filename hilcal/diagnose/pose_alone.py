@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import chi2
 
 from hilcal.diagnose.more_poses import enough
 from hilcal.diagnose.noise_verdict import MISFIT_ALARM
@@ -23,7 +24,6 @@ from hilcal.diagnose.pose_constants import pose_constants
 from hilcal.effects.protocol import Effect
 from hilcal.identify.effect_columns import effect_columns
 from hilcal.identify.linearisation import Linearisation
-from hilcal.regression.distributions import chi2
 
 LEAST = 0.9
 """Share of the misfit that pose constants must take; a choice, they take 0.99 of a transmission

@@ -19,9 +19,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.stats import f as f_distribution
 
 from hilcal.identify.linearisation import Linearisation
-from hilcal.regression.distributions import f as f_distribution
 from hilcal.regression.projection import Projection
 from hilcal.types import Floats, Ints
 

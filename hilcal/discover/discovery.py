@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from scipy.stats import chi2
 
 from hilcal.diagnose.noise_verdict import MISFIT_ALARM, PREDICTABLE
 from hilcal.diagnose.residual_regression import Dependence, residual_regression
@@ -37,7 +38,6 @@ from hilcal.discover.write_effect import source_of_form
 from hilcal.errors import HilcalError, InputError
 from hilcal.identify.fit import Fit
 from hilcal.identify.linearisation import left_out_by_pose, linearise
-from hilcal.regression.distributions import chi2
 from hilcal.regression.evidence import score_family
 from hilcal.types import Floats
 

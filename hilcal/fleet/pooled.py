@@ -11,13 +11,13 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from scipy.stats import norm
 
 from hilcal.data.ranges import Range
 from hilcal.data.revision import seconds_of, utc_now
 from hilcal.errors import CannotAnswerError
 from hilcal.fleet.members import Member
 from hilcal.identify.posterior import LearntEffect, Posterior, Source
-from hilcal.regression.distributions import norm
 from hilcal.regression.hierarchy import (
     FALSE_ALARM,
     UNDETERMINED,

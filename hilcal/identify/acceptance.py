@@ -4,11 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import chi2
 
 from hilcal.data.whitening import Mode
 from hilcal.identify.extrapolation import Extrapolation
 from hilcal.identify.validation import Validation
-from hilcal.regression.distributions import chi2
 from hilcal.types import Bools, Floats, Ints
 
 BAND = 0.95

@@ -13,6 +13,7 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
+from scipy.stats import binom, chi2
 
 from hilcal.data.reading_groups import deflection_groups
 from hilcal.data.readings import Readings
@@ -26,7 +27,6 @@ from hilcal.identify.robust_start import MOST, nearest, robust_start, variance
 from hilcal.identify.single_site import along_one_site, site_columns
 from hilcal.identify.smooth_nuisance import smooth_nuisance_columns
 from hilcal.model import Model, Prediction
-from hilcal.regression.distributions import binom, chi2
 from hilcal.robot import se3
 from hilcal.types import Bools, Floats, Ints
 

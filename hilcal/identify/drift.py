@@ -24,6 +24,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg as sl
+from scipy.stats import norm
 
 from hilcal.data.whitening import Whitening
 from hilcal.identify.carried import CarriedPrior, Group
@@ -31,7 +32,6 @@ from hilcal.identify.coordinates import coordinates_of
 from hilcal.identify.gauss_newton import Solution, whitened_jacobian
 from hilcal.identify.priors import names_of
 from hilcal.model import Model
-from hilcal.regression.distributions import norm
 from hilcal.regression.quadratic_form import ratio_tail
 from hilcal.regression.schur import inverse_root
 from hilcal.types import Floats

@@ -17,10 +17,10 @@ Source: Mandel and Paule, Analytical Chemistry 42 (1970) 1194-1197.
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import chi2
 
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Mode, Whitening
-from hilcal.regression.distributions import chi2
 from hilcal.types import Floats
 
 CHANCE = 0.0005

@@ -3,11 +3,11 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import chi2
 
 from hilcal.data.readings import Readings
 from hilcal.identify.fit import Fit
 from hilcal.identify.full_prediction import FullPrediction, full_prediction, names
-from hilcal.regression.distributions import chi2
 from hilcal.types import Floats
 
 ALIKE = 1e-3

@@ -1,8 +1,8 @@
 """Limit of the squared Mahalanobis distance from which on a reading is a gross error."""
 
 import numpy as np
+from scipy.stats import chi2
 
-from hilcal.regression.distributions import chi2
 from hilcal.types import Floats
 
 FALSE_ALARMS = 1e-3

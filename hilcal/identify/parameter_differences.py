@@ -20,9 +20,9 @@ Source: Anderson and Duffin, *Series and parallel addition of matrices*, J. Math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import chi2
 
 from hilcal.identify.posterior import Posterior
-from hilcal.regression.distributions import chi2
 from hilcal.regression.normal_equations import INFORMATION
 from hilcal.regression.schur import schur_complement
 from hilcal.types import Floats, Ints

@@ -14,7 +14,6 @@ from functools import cached_property
 import numpy as np
 
 from hilcal.data.whitening import inverse_root
-from hilcal.regression.small_forms import quadratic_forms
 from hilcal.types import Bools, Floats, Ints
 
 SINGULAR = 1e-9
@@ -126,7 +125,10 @@ class ReadingModel:
             root, offset = self.root[own], self._offset_covariance(used)[self.group[own]]
             spread[own] += root @ offset @ root.swapaxes(1, 2)
         a = np.eye(self.m) + np.where(used, -1.0, 1.0)[:, None, None] * spread
-        return quadratic_forms(a, r, np.full(len(a), LEVERAGE))
+        values, vectors = np.linalg.eigh(a)
+        c = np.einsum("nij,ni->nj", vectors, r)
+        kept = values > LEVERAGE
+        return np.asarray(np.sum(np.where(kept, c**2 / np.where(kept, values, 1.0), 0.0), axis=1))
 
     def near(self, delta: Floats) -> tuple[Floats, Bools]:
         """Squared distances (N,) from the model with δ (K,), and which readings are centres (N,).

@@ -15,10 +15,10 @@ Knowledge Discovery 12 (2006) 29-45.
 from typing import Protocol, Self, TypeVar
 
 import numpy as np
+from scipy.stats import chi2
 
 from hilcal.errors import CannotAnswerError
 from hilcal.identify.reading_model import ReadingModel
-from hilcal.regression.distributions import chi2
 from hilcal.types import Bools, Floats, Ints
 
 MOST = 0.45

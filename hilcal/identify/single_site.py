@@ -12,12 +12,12 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
+from scipy.stats import beta, binom, chi2
 
 from hilcal.data.readings import Readings
 from hilcal.identify.off_alike import SAME
 from hilcal.model import Model, Prediction
 from hilcal.observe import motion
-from hilcal.regression.distributions import beta, binom, chi2
 from hilcal.robot import se3
 from hilcal.types import Bools, Floats, Ints
 
@@ -69,9 +69,9 @@ def along_one_site(shift: Floats, columns: Floats, pose: Ints) -> Bools:
     beside = np.maximum(square[:, None] - along**2, 0.0)
     mine = beside <= (chi2.isf(CHANCE, m - 1) + ROUGH**2 * square)[:, None]
     p = np.where(mine, beta.cdf(beside / square[:, None], (m - 1) / 2, 0.5), 1.0)
-    nearest = np.sort(p[_different(shift, pose)], axis=0)
+    nearest: Floats = np.sort(p[_different(shift, pose)], axis=0)
     count = len(nearest)
-    so_many = binom.sf(np.arange(count)[:, None], count, nearest)
+    so_many = np.asarray(binom.sf(np.arange(count)[:, None], count, nearest))
     law = [
         k
         for k, least in enumerate(np.argmin(so_many, axis=0))

@@ -16,6 +16,7 @@ Source: Efron and Tibshirani, *An Introduction to the Bootstrap*, chapter 11.
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import chi2
 
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import Whitening
@@ -26,7 +27,6 @@ from hilcal.identify.holdout import changes
 from hilcal.identify.priors import prior_of, scales_of
 from hilcal.identify.wide_effects import whitened_columns
 from hilcal.model import Model
-from hilcal.regression.distributions import chi2
 from hilcal.regression.hyperparameter_uncertainty import (
     dropped_group_factors,
     hyperparameter_factors,

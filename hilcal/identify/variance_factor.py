@@ -1,6 +1,6 @@
 """The variance factor of a fit, χ²/dof, and its confidence interval."""
 
-from hilcal.regression.distributions import chi2
+from scipy.stats import chi2
 
 CONFIDENCE = 0.95
 

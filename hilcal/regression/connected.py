@@ -12,19 +12,13 @@ that takes as long to load as a thousand poses to group."""
 def connected(a: Ints, b: Ints, count: int) -> Ints:
     """Return the number (count,) of the group of each of `count` things; a[k], b[k] are joined.
 
-    Groups are numbered by their first things. Each thing takes the least number of those that it
-    is joined with, and then that thing's own, until nothing changes.
+    Groups are numbered by their first things.
     """
-    label = np.arange(count)
-    while True:
-        least = np.minimum(label[a], label[b])
-        new = label.copy()
-        np.minimum.at(new, a, least)
-        np.minimum.at(new, b, least)
-        new = new[new]
-        if np.array_equal(new, label):
-            return np.asarray(np.unique(label, return_inverse=True)[1])
-        label = new
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    joined = coo_array((np.ones(len(a)), (a, b)), shape=(count, count))
+    return np.asarray(connected_components(joined, directed=False)[1], dtype=np.int64)
 
 
 def _by_cells(points: Floats, distance: float) -> tuple[Ints, Ints]:

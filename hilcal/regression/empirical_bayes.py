@@ -20,8 +20,8 @@ from functools import cache
 import numpy as np
 import scipy.linalg as sl
 from scipy.special import exp1
+from scipy.stats import chi2
 
-from hilcal.regression.distributions import chi2
 from hilcal.regression.schur import eliminate
 from hilcal.types import Floats, Ints
 

@@ -34,8 +34,8 @@ Houwelingen, *Testing against a high dimensional alternative*, J. R. Stat. Soc. 
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import f as f_distribution
 
-from hilcal.regression.distributions import f as f_distribution
 from hilcal.regression.quadratic_form import ratio_tail
 from hilcal.regression.spectrum import Spectrum, spectrum
 from hilcal.types import Floats

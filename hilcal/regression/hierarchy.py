@@ -18,8 +18,8 @@ Sources: Laird and Ware, *Random-effects models for longitudinal data*, Biometri
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import t as student
 
-from hilcal.regression.distributions import t as student
 from hilcal.types import Bools, Floats, Ints
 
 STEPS = 400

@@ -7,9 +7,9 @@ noise is known (ν infinite) the test is the χ² test.
 """
 
 import numpy as np
+from scipy.stats import chi2, ncf, ncx2
+from scipy.stats import f as f_distribution
 
-from hilcal.regression.distributions import chi2, ncf, ncx2
-from hilcal.regression.distributions import f as f_distribution
 from hilcal.regression.spectrum import visible
 from hilcal.types import Floats
 
@@ -37,8 +37,8 @@ def power_of_test(noncentrality: float, rank: int, rest: float, level: float) ->
     if noncentrality <= 0.0:
         return level
     if np.isinf(rest):
-        return ncx2.sf(float(chi2.isf(level, rank)), rank, noncentrality)
-    return ncf.sf(float(f_distribution.isf(level, rank, rest)), rank, rest, noncentrality)
+        return float(ncx2.sf(chi2.isf(level, rank), rank, noncentrality))
+    return float(ncf.sf(f_distribution.isf(level, rank, rest), rank, rest, noncentrality))
 
 
 def noncentrality_of_power(rank: int, rest: float, level: float, power: float) -> float:

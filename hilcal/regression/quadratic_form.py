@@ -9,8 +9,8 @@ variables*, Biometrika 86 (1999) 929-935; Lugannani and Rice, Adv. Appl. Prob. 1
 
 import numpy as np
 from scipy.special import log_ndtr
+from scipy.stats import norm
 
-from hilcal.regression.distributions import norm
 from hilcal.types import Floats
 
 NEAR_MEAN = 2e-3

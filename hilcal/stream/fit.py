@@ -17,6 +17,7 @@ from functools import partial
 from typing import ClassVar, TypeVar
 
 import numpy as np
+from scipy.stats import chi2
 
 from hilcal.cell import Cell
 from hilcal.data import columns
@@ -48,7 +49,6 @@ from hilcal.identify.uncertainty import (
 )
 from hilcal.identify.variance_factor import WithVarianceFactor
 from hilcal.model import Model
-from hilcal.regression.distributions import chi2
 from hilcal.regression.factored import written
 from hilcal.regression.normal_equations import NormalEquations
 from hilcal.regression.triangle import combined

@@ -12,13 +12,13 @@ from dataclasses import asdict, dataclass
 from functools import partial
 
 import numpy as np
+from scipy import stats
 from scipy.linalg import solve_triangular
 
 from hilcal.data.readings import Readings
 from hilcal.data.whitening import SCALINGS, Scaling, Whitening, whitening
 from hilcal.engine.engine import ALONE, Advance, Engine
 from hilcal.errors import InputError
-from hilcal.regression import distributions
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm
 from hilcal.study.scaling_design import Design, bound, make_design, make_readings
@@ -251,9 +251,9 @@ def _fit(w: Whitening, blocks: Floats, noise: Floats) -> _Fit:
     dof = w.rank - len(r)
     factor = (np.sum(e * e, axis=0) - np.sum(projected * projected, axis=0)) / dof
     if w.scaling == "none":  # no noise is stated: the residual's own variance
-        half = distributions.t.ppf((1 + LEVEL) / 2, dof) * spread * np.sqrt(factor)
+        half = stats.t.ppf((1 + LEVEL) / 2, dof) * spread * np.sqrt(factor)
         return _Fit(error, half, None)
-    half = np.broadcast_to(distributions.norm.ppf((1 + LEVEL) / 2) * spread, error.shape)
+    half = np.broadcast_to(stats.norm.ppf((1 + LEVEL) / 2) * spread, error.shape)
     return _Fit(error, half, float(factor.mean()))
 
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 import plotly.graph_objects as go
+from scipy.stats import norm
 
 from hilcal.identify.fit import Fit
-from hilcal.regression.distributions import norm
 from hilcal.report.charts import style
 
 RANGE, MOST = 5.0, 50.0

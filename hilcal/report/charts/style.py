@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import plotly.graph_objects as go
+from scipy import stats
 
 from hilcal.names import escaped
-from hilcal.regression import distributions
 from hilcal.types import Floats, Ints
 
 MEASURED = "#3a96d0"
@@ -109,12 +109,12 @@ def empty(words: str) -> go.Figure:
 
 def levels(norm2: Floats) -> Ints:
     """Level (N,) of squared Mahalanobis distances, 3 dof: 0 noise, 1 doubtful, 2 outside."""
-    return np.digitize(norm2, distributions.chi2.ppf(LIMITS, 3)).astype(np.int64)
+    return np.digitize(norm2, stats.chi2.ppf(LIMITS, 3)).astype(np.int64)
 
 
 def sigma_limits() -> tuple[float, float]:
     """Mahalanobis distances from which a reading is doubtful, and outside."""
-    low, high = np.sqrt(distributions.chi2.ppf(LIMITS, 3))
+    low, high = np.sqrt(stats.chi2.ppf(LIMITS, 3))
     return float(low), float(high)
 
 

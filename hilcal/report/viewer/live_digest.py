@@ -4,10 +4,10 @@ import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy import stats
 
 from hilcal.acquire.progress import LiveResidual, ReadingStored
 from hilcal.data.plan import UNLOADED, Step
-from hilcal.regression import distributions
 from hilcal.report.live_messages import Measuring
 from hilcal.report.viewer import style
 from hilcal.robot.body import body_poses
@@ -150,7 +150,7 @@ class LiveDigest:
     @property
     def wrong(self) -> bool:
         """Whether more readings are outside than noise leaves there, see `ALARM`."""
-        chance = distributions.binom.sf(self.outside - 1, self.judged, 1.0 - style.INSIDE_P)
+        chance = stats.binom.sf(self.outside - 1, self.judged, 1.0 - style.INSIDE_P)
         return self.outside > 0 and bool(chance < ALARM)
 
     @property

@@ -4,8 +4,8 @@ import math
 import re
 
 import numpy as np
+from scipy import stats
 
-from hilcal.regression import distributions
 from hilcal.report import numbers
 from hilcal.types import Floats, Ints
 
@@ -28,8 +28,8 @@ LEVEL_NAMES = ("inside", "doubtful", "outside")
 INSIDE_P = 0.99  # grey up to here: the noise ball drawn
 OUTSIDE_P = 0.9999  # red beyond: noise does this once in 10,000 readings
 _NICE = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)
-_LIMITS = distributions.chi2.ppf([INSIDE_P, OUTSIDE_P], 3)
-BALL_SIGMAS = float(np.sqrt(distributions.chi2.ppf(INSIDE_P, 3)))
+_LIMITS = stats.chi2.ppf([INSIDE_P, OUTSIDE_P], 3)
+BALL_SIGMAS = float(np.sqrt(stats.chi2.ppf(INSIDE_P, 3)))
 
 # Greek letters and these signs are in the viewer's fonts; a missing glyph ends the viewer.
 _SIGNS = "■●▲→µ²³±×√Δ✓✗⚠°"

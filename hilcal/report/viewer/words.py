@@ -3,8 +3,8 @@
 import math
 
 import numpy as np
+from scipy import stats
 
-from hilcal.regression import distributions
 from hilcal.report import numbers
 from hilcal.report.story import StoryLimit, StoryParameter, StoryRevision, StoryRival
 from hilcal.report.viewer import style
@@ -50,7 +50,7 @@ def place(d: Digest, r: StoryRevision) -> str:
 
 def details(d: Digest, r: StoryRevision) -> str:
     """Return what the verdict rests on: rivals, what carries the misfit, the worst, the model."""
-    outside = float(np.mean(r.whitened_norm2 > distributions.chi2.ppf(style.INSIDE_P, 3)))
+    outside = float(np.mean(r.whitened_norm2 > stats.chi2.ppf(style.INSIDE_P, 3)))
     lines = [
         f"### {title(r)}",
         f"Model: {model(r)}.",

@@ -8,13 +8,11 @@ import pytest
 from hilcal.config import load_config
 from hilcal.data.whitening import Mode
 from hilcal.diagnose.catalogue_sufficiency import (
-    NotWantedError,
     forward_selection,
     insufficiency,
 )
 from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.diagnose.effect_ranking import candidates
-from hilcal.diagnose.evidence import Evidence
 from hilcal.diagnose.stepwise import Refits, add
 from hilcal.diagnose.verdict import diagnose
 from hilcal.identify.baseline import baseline
@@ -59,30 +57,6 @@ def test_a_law_that_only_resembles_an_effect_is_unknown(
         if d.lead is not None:
             check_insufficiency(d)
     assert led > 0
-
-
-def test_what_is_not_needed_any_more_is_given_up_before_a_refit() -> None:
-    found = fitted("absolute", "coupled joint", seed=0)
-
-    def refit(before: Fit, effect: str) -> Fit:
-        raise AssertionError(effect)
-
-    with pytest.raises(NotWantedError):
-        insufficiency(found, refit, wanted=lambda: False)
-
-
-def test_what_was_given_up_is_computed_where_it_is_needed_after_all() -> None:
-    e = Evidence(fitted("absolute", "coupled joint", seed=0))
-    with pytest.raises(NotWantedError):
-        given_up(e)
-    assert e.insufficiency is not None
-
-
-def given_up(e: Evidence) -> None:
-    """Fail in a judgement, after which nothing is wanted."""
-    with e.later():
-        e._wanted = False
-        _ = e.insufficiency
 
 
 def check_insufficiency(d: Diagnosis) -> None:

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import binom
 
 from hilcal.data.readings import Readings
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import fit
 from hilcal.identify.single_site import CHANCE, along_one_site, site_columns
 from hilcal.model import Model
-from hilcal.regression.distributions import binom
 from hilcal.types import Floats
 from studies.gross_errors import spoil
 from tests.support.campaigns import campaign
