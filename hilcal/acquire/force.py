@@ -8,11 +8,11 @@ from hilcal.acquire.devices import ForceSensorDevice, WrenchSample
 from hilcal.acquire.tool_load import (
     PARAMETERS,
     ToolLoad,
-    compare,
     identify_tool_load,
     shift,
     tare,
 )
+from hilcal.acquire.weighing import compare
 from hilcal.cell import Cell
 from hilcal.config import ForceSensor as Settings
 from hilcal.config import Load, Operator

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.acquire.weighing import compare as compare
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.robot import se3
 from hilcal.types import Floats

@@ -21,7 +21,8 @@ from tests.support.campaign_site import Site, site
 LONG = 900.0
 """A whole campaign may take so long, s."""
 STARVED = re.compile(
-    r"no new data over RTDE|no answer within|by its watchdog|too busy|nothing came for"
+    r"no new data over RTDE|no answer within|by its watchdog|too busy|nothing came for|"
+    r"nobody watched its motion"
 )
 """What a run says, too, where this computer has given one of the processes no turn for long."""
 TRIES = 3
