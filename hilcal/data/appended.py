@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from hilcal.data.checks import SAME_POSE
 from hilcal.data.plan import REFERENCE, Plan, Step
+from hilcal.data.readings import SAME_POSE
 from hilcal.errors import InputError
 
 

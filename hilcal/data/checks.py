@@ -3,15 +3,16 @@
 import numpy as np
 
 from hilcal.data.columns import POSITION, ROTATION, WRENCH
+from hilcal.data.covariance import smallest_correlation
 from hilcal.data.csvfile import CsvTable
+from hilcal.data.readings import SAME_POSE
 from hilcal.errors import InputError
 from hilcal.robot.arm import Arm
-from hilcal.types import Bools, Floats, Ints
+from hilcal.types import Floats, Ints
 
 MAX_DISTANCE = 100.0  # m; no instrument measures an arm from further away
 MAX_STD = 3e-3  # m; cameras do better; micrometres given 1000 times too large are above it
 MAX_ANGLE_STD = 0.05  # rad, 3°; the same for an orientation, a choice
-SAME_POSE = 1e-6  # rad; commanded joints of one pose agree to this
 _LIMIT_MARGIN = 1e-4  # rad; rounding of a limit written with few digits
 _TRACKING = 0.1  # rad; actual and commanded joints of an arm at rest are closer
 _G = 9.80665
@@ -144,30 +145,6 @@ def check_covariances(table: CsvTable, covariance: Floats) -> None:
             f"{table.at(int(i))}: a standard deviation of {turn[i]:.3g} rad cannot calibrate an "
             f"arm; covariances must be in m², m·rad and rad² (1 deg² = 3.05e-4 rad²)"
         )
-
-
-def smallest_correlation(covariance: Floats) -> Floats:
-    """Return the smallest eigenvalue (N,) of the correlation matrices of covariances (N, m, m).
-
-    −∞ where a variable without variance has a covariance with another, a variance is negative, or a
-    correlation is beyond ±1 (its eigenvalues need not be computable).
-    """
-    variance = np.diagonal(covariance, axis1=1, axis2=2)
-    scale = 1.0 / np.sqrt(np.where(variance > 0, variance, 1.0))
-    correlation = scale[:, :, None] * covariance * scale[:, None, :]
-    beyond = ~(np.abs(correlation) <= 1.0 + 1e-9)
-    undefined = ((variance <= 0)[:, :, None] & (covariance != 0)) | beyond
-    correlation = np.where(undefined, 0.0, correlation)
-    smallest = np.linalg.eigvalsh(correlation)[:, 0]
-    return np.where(np.any(undefined, axis=(1, 2)), -np.inf, smallest)
-
-
-def is_covariance(covariance: Floats) -> Bools:
-    """Return (N,) whether matrices (N, m, m) are symmetric and positive semi-definite."""
-    std = np.sqrt(np.abs(np.diagonal(covariance, axis1=1, axis2=2)))
-    differs = np.abs(covariance - np.swapaxes(covariance, 1, 2))
-    symmetric = np.all(differs <= 1e-9 * std[:, :, None] * std[:, None, :], axis=(1, 2))
-    return np.asarray(symmetric & (smallest_correlation(covariance) >= -1e-9))
 
 
 def check_wrenches(table: CsvTable, wrench: Floats, load: Ints, names: list[str], arm: Arm) -> None:

@@ -27,7 +27,7 @@ import numpy as np
 
 from hilcal.config import Tracker
 from hilcal.errors import InputError
-from hilcal.types import Floats
+from hilcal.types import Bools, Floats
 
 COVERS = "covariance"
 """Key among the texts about a campaign: what the stored covariances cover."""
@@ -182,3 +182,27 @@ def scatter_factor(jacobian: Floats, joint_std: Floats, rotation: Floats, m: int
     moved = jacobian * joint_std
     turned = np.concatenate([rotation @ moved[..., :3, :], rotation @ moved[..., 3:, :]], axis=-2)
     return np.asarray(turned[..., :m, :])
+
+
+def smallest_correlation(covariance: Floats) -> Floats:
+    """Return the smallest eigenvalue (N,) of the correlation matrices of covariances (N, m, m).
+
+    −∞ where a variable without variance has a covariance with another, a variance is negative, or a
+    correlation is beyond ±1 (its eigenvalues need not be computable).
+    """
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    scale = 1.0 / np.sqrt(np.where(variance > 0, variance, 1.0))
+    correlation = scale[:, :, None] * covariance * scale[:, None, :]
+    beyond = ~(np.abs(correlation) <= 1.0 + 1e-9)
+    undefined = ((variance <= 0)[:, :, None] & (covariance != 0)) | beyond
+    correlation = np.where(undefined, 0.0, correlation)
+    smallest = np.linalg.eigvalsh(correlation)[:, 0]
+    return np.where(np.any(undefined, axis=(1, 2)), -np.inf, smallest)
+
+
+def is_covariance(covariance: Floats) -> Bools:
+    """Return (N,) whether matrices (N, m, m) are symmetric and positive semi-definite."""
+    std = np.sqrt(np.abs(np.diagonal(covariance, axis1=1, axis2=2)))
+    differs = np.abs(covariance - np.swapaxes(covariance, 1, 2))
+    symmetric = np.all(differs <= 1e-9 * std[:, :, None] * std[:, None, :], axis=(1, 2))
+    return np.asarray(symmetric & (smallest_correlation(covariance) >= -1e-9))

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from hilcal.data import column_names as words
-from hilcal.data.checks import SAME_POSE
 from hilcal.data.guess_values import time_unit
 from hilcal.data.guesser import REPORTED, SHOWN, Guesser
 from hilcal.data.mapping_sections import UNLOADED
+from hilcal.data.readings import SAME_POSE
 from hilcal.data.units import ANGLES
 
 

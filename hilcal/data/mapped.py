@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hilcal.data import checks, columns, units
+from hilcal.data import columns, units
 from hilcal.data.clock import seconds
 from hilcal.data.covariance import TrackerNoise
 from hilcal.data.csvfile import CsvTable
@@ -17,6 +17,7 @@ from hilcal.data.imported import ImportResult
 from hilcal.data.mapping import Mapping
 from hilcal.data.mapping_sections import Column
 from hilcal.data.orientation import defect, rotations
+from hilcal.data.readings import SAME_POSE
 from hilcal.data.sheets import open_tables
 from hilcal.data.stated import stated_covariance
 from hilcal.data.stated_noise import check_joint_rounding, rounding_variance
@@ -337,7 +338,7 @@ def _poses(grid: Grid, mapping: Mapping, q: Floats) -> list[str]:
                 f"[pose], rows of the same joints are one pose"
             )
         return names
-    keys = np.rint(q / (10 * checks.SAME_POSE)).astype(np.int64)
+    keys = np.rint(q / (10 * SAME_POSE)).astype(np.int64)
     first: dict[tuple[int, ...], int] = {}
     out = []
     for row, key in zip(grid.rows.tolist(), map(tuple, keys.tolist()), strict=True):

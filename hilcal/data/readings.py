@@ -9,6 +9,9 @@ from hilcal.data.arm_scatter import ArmScatter
 from hilcal.data.serial_noise import SerialNoise, symmetric_root
 from hilcal.types import Bools, Floats, Ints
 
+SAME_POSE = 1e-6
+"""Commanded joints of one pose agree to this, rad."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class States:

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from hilcal import limits
-from hilcal.data.checks import SAME_POSE, is_covariance
-from hilcal.data.readings import Readings
+from hilcal.data.covariance import is_covariance
+from hilcal.data.readings import SAME_POSE, Readings
 from hilcal.data.records import Layout, pack, unpack
 from hilcal.errors import InputError
 from hilcal.names import check_name, check_names

@@ -10,7 +10,7 @@ import pytest
 
 from hilcal.calibration.urscript import program_points
 from hilcal.config import CellConfig
-from hilcal.data.checks import is_covariance
+from hilcal.data.covariance import is_covariance
 from hilcal.data.mapping import load_mapping
 from hilcal.data.plan import read_plan
 from hilcal.errors import HilcalError, InputError
