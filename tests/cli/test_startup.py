@@ -14,9 +14,6 @@ SLOW = (
     "asyncio",
     "plotly",
     "rerun",
-    "scipy.interpolate",
-    "scipy.optimize",
-    "scipy.stats",
     "sklearn",
 )
 """Libraries that few commands need, each a tenth of a second or more to load."""
