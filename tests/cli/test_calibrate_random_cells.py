@@ -17,7 +17,7 @@ SMALL = ("--poses", "4", "--validation", "3", "--rehearse", "--yes", "--json")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", range(5))
 def test_a_random_cell_is_calibrated_to_an_end(
     seed: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -26,6 +26,11 @@ def test_a_random_cell_is_calibrated_to_an_end(
     cell.write_text(tomli_w.dumps(random_cell(rng)), encoding="utf-8")
     options = (*random_options(rng), *SMALL)
     found = rehearsed(capsys, cell, *options)
+    if "or leave out --goal" in found.err:  # of the position, which deflections do not show
+        assert found.code == 2
+        k = options.index("--goal")
+        options = (*options[:k], *options[k + 2 :])
+        found = rehearsed(capsys, cell, *options)
     assert found.code in ENDS, found.err
     document = json.loads(found.out)
     assert ("error" in document) == bool(found.code)
