@@ -61,9 +61,11 @@ def random_cell(rng: np.random.Generator) -> dict[str, Any]:
     if some():
         out["motion"] = {"speed_rad_s": one_of((0.3, 0.6)), "acceleration_rad_s2": 0.8}
     if some():
-        out["acquire"] = {"samples": one_of((1, 3)), "drift_limit_sigma": one_of((4.0, 8.0))}
+        out["acquire"] = {"samples": one_of((3, 8)), "drift_limit_sigma": one_of((4.0, 8.0))}
     if some(0.3):
-        out["sight"] = {"tracker_m": [3.0, 0.5, 0.9], "clearance_m": 0.02}
+        out["sight"] = {"clearance_m": 0.02}
+        if "base_xyz_m" not in out.get("tracker", {}):
+            out["sight"]["tracker_m"] = [3.0, 0.5, 0.9]
     if some(0.3):
         box = {"name": "box", "center_m": [0.9, -0.9, 0.4], "size_m": [0.3, 0.3, 0.8]}
         out["obstacles"] = [box]
