@@ -279,6 +279,7 @@ def refine(
         t.show(options_line(rows[-1].fit))
         if o.noise is not None:
             t.show(numbers.sentence(covariance_words(o.covariance_parts, o.noise)))
+        t.show(text.set_aside(found.fit, details))
         t.show(text_refine.verdict_line(found.diagnosis))
         t.show([*fitted_lines(found.fit)][: None if details else 1])
         t.show(prior_lines(found.fit))
