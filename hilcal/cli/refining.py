@@ -272,7 +272,9 @@ def refine(
                     number = latest.number
                 else:
                     parent = rows[-1].number if rows else None
-                    number = o.store(step.fit, step.diagnosis, step.added, step.removed, parent)
+                    number = o.store_once(
+                        step.fit, step.diagnosis, step.added, step.removed, parent
+                    )
                 rows.append(Row(number, step.fit, step.diagnosis.verdict, step.added, step.removed))
         t.show(text_refine.revisions_table([r.shown for r in rows]))
         t.show(text_refine.key())

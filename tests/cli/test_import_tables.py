@@ -408,3 +408,22 @@ def test_loads_that_a_table_only_names_act_as_the_cell_states_them(
     notes = " ".join(found.document["notes"])
     assert "load 10 kg: its force is that of [[loads]]" in notes
     assert "load box: its force is not stated by the table, nor by [[loads]]" in notes
+
+
+def test_one_coordinate_of_nines_is_no_unit_and_the_way_out_is_one(
+    tmp_path: Path, capsys: Capsys
+) -> None:
+    position = 1e3 * C.position
+    position[5, 1] = -9999
+    text = lines(["Point", *NAMES, "X", "Y", "Z"], [f"P{k}" for k in range(12)], np.rad2deg(C.q),
+                 position)  # fmt: skip
+    path, mapping = write(tmp_path / "t.csv", text), tmp_path / "m.toml"
+    own = MAPPING.split("[std]")[0]
+    arguments = ("import", path, "--config", CELL, "-o", tmp_path / "r.hilcal", "--format", mapping)
+    mapping.write_text(own, encoding="utf-8")
+    said = refused(capsys, 2, *arguments)
+    assert "row 7" in said
+    assert "name them as missing in a mapping" in said
+    assert "millimetres" not in said
+    mapping.write_text(own.replace("[file]", "[file]\nmissing = [-9999]"), encoding="utf-8")
+    assert ok(capsys, *arguments, "--json").document["n_readings"] == 11
