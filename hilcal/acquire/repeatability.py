@@ -48,9 +48,9 @@ class RepeatabilityEstimate:
 
     @property
     def shown(self) -> bool:
-        """Whether the arm scatters beyond what the instrument does by chance, by 2 u."""
+        """Whether the arm scatters beyond what the instrument does by chance, about 1 in 100."""
         total, noise = self.scatter**2, self.instrument**2
-        return bool(total - noise > 2.0 * max(total, noise) * np.sqrt(2.0 / (3.0 * self.dof)))
+        return bool(total - noise > 3.0 * noise * np.sqrt(2.0 / (3.0 * self.dof)))
 
     def words(self, configured: Floats) -> str:
         """Return it for people, beside the configured standard deviations (n,), rad."""
