@@ -10,12 +10,12 @@ from hilcal.calibration.calibration import Calibration
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
 from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.command_line import typed_now
+from hilcal.data.command_line import COMMAND, typed_now
 from hilcal.data.covariance import COVERS, INSTRUMENT, WHOLE
 from hilcal.data.purpose import refuse_fitting
 from hilcal.data.readings import Readings
 from hilcal.data.records import content_hash
-from hilcal.data.revision import STORED, RevisionRecord
+from hilcal.data.revision import STORED, RevisionRecord, to_text
 from hilcal.data.robot_file import ROBOT_FILE, check_robot
 from hilcal.data.whitening import Mode, usual_mode
 from hilcal.diagnose.diagnosis import Diagnosis, History
@@ -353,6 +353,20 @@ class Campaign:
         """
         return self.file.append_revision(self.record(found, diagnosis, added, removed, parent))
 
+    def store_once(
+        self,
+        found: Fit,
+        diagnosis: Diagnosis | None = None,
+        added: str | None = None,
+        removed: str | None = None,
+        parent: int | None = None,
+    ) -> int:
+        """Do so, unless the latest revision is the same to the last bit: then return its number."""
+        record, last = self.record(found, diagnosis, added, removed, parent), self.latest()
+        if last is not None and _content(last) == _content(record):
+            return last.number
+        return self.file.append_revision(record)
+
     def record(
         self,
         found: Fit,
@@ -424,3 +438,9 @@ class Campaign:
                 judged = diagnose(found, self.history(record.number), say)
             out.append(Chapter(record.number, record.added, found, judged, record.removed))
         return out
+
+
+def _content(record: RevisionRecord) -> str:
+    """Text of a revision without when, and by which command, it was made."""
+    options = {k: v for k, v in record.options.items() if k != COMMAND}
+    return to_text(replace(record, options=options, created="", parent=None))

@@ -391,7 +391,7 @@ class Path:
             trials.append(self._refits.add(trials[-1], name))
         found = trials[-1]
         if last.diagnosis.residual_is_noise and not rest:
-            if found.holdout.rms_sigma > last.fit.holdout.rms_sigma:
+            if found.holdout_of_all.rms_sigma > last.fit.holdout_of_all.rms_sigma:
                 return False
         elif not predicts_better(last.fit, found):
             return False

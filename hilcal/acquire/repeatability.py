@@ -46,13 +46,20 @@ class RepeatabilityEstimate:
     joint_std: float
     iso_9283: float
 
+    @property
+    def shown(self) -> bool:
+        """Whether the arm scatters beyond what the instrument does by chance, about 1 in 100."""
+        total, noise = self.scatter**2, self.instrument**2
+        return bool(total - noise > 3.0 * noise * np.sqrt(2.0 / (3.0 * self.dof)))
+
     def words(self, configured: Floats) -> str:
         """Return it for people, beside the configured standard deviations (n,), rad."""
         told = float(np.sqrt(np.mean(configured**2)))
+        joints = f"is about {self.joint_std:.1g}" if self.shown else "does not show beside it"
         return (
             f"{self.dof} returns to {self.poses} poses scatter by {1e6 * self.scatter:.0f} µm, "
-            f"{1e6 * self.instrument:.0f} µm of it the instrument's: joint_std_rad is about "
-            f"{self.joint_std:.1g}, configured {told:.1g}"
+            f"the instrument alone by {1e6 * self.instrument:.0f} µm: joint_std_rad {joints}, "
+            f"configured {told:.1g}"
         )
 
 

@@ -9,6 +9,8 @@ C the covariance of the parameters, what a family does at places that nobody mea
 metres; s² what the positions' residuals have beyond the noise, where χ² is larger than chance
 allows; Σ_q the arm's scatter from one arrival to the next.
 
+What points do not tell of their state has a further share, see `calibration.conditions`.
+
 Of a fit to deflections only what the load does is known: errors are then counted from the unloaded
 arm.
 """
@@ -24,6 +26,7 @@ import numpy as np
 from hilcal.calibration.compensated import Compensation
 from hilcal.calibration.compensation import Inverse, Pose, invert
 from hilcal.calibration.compiled import Compiled, compiled
+from hilcal.calibration.conditions import Condition, conditions_of, needed
 from hilcal.calibration.learnt import Learnt
 from hilcal.calibration.measured import Measured
 from hilcal.calibration.poses import ToolPoses
@@ -68,6 +71,7 @@ class Calibration:
         source: what it is from, for people.
         sensor: where the force sensor stands; None without one.
         learnt: what the covariance follows from, where it does.
+        conditions: what is taken where points lack a column of `States`, by column.
     """
 
     model: Model
@@ -81,6 +85,7 @@ class Calibration:
     source: Mapping[str, Any]
     sensor: SensorMount | None = None
     learnt: Learnt | None = None
+    conditions: Mapping[str, Condition] = field(default_factory=dict)
     _tracked: Tool = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -110,7 +115,7 @@ class Calibration:
         # A deflection is the difference of two readings.
         readings = 2 if found.mode == "deflection" else 1
         loads = () if model.cell.config is None else model.cell.config.loads
-        return cls(
+        made = cls(
             model=replace(model, readings=None, prior=None),
             theta=found.theta,
             mode=found.mode,
@@ -131,6 +136,7 @@ class Calibration:
                 kappa,
             ),
         )
+        return replace(made, conditions=conditions_of(model, used.states, made._moves))
 
     @classmethod
     def load(cls, path: str | Path, catalogue: Catalogue | None = None) -> "Calibration":
@@ -170,13 +176,16 @@ class Calibration:
                 where None.
             tool: (4, 4) T_flange_tool; the tracked target where None.
             std: also state the uncertainty, and whether points lie far from what was measured.
-            recorded: other columns of `States` by name: `air_temperature`, `load_time`, ...
+            recorded: other columns of `States` by name: `air_temperature`, `load_time`, ...; those
+                that the model needs and are not given are taken as in the middle of what was
+                measured, see `calibration.conditions`.
 
         Raises:
-            InputError: another shape, or a column is missing that the model needs.
+            InputError: another shape, or a column is missing that the model needs, and that the
+                calibration knows nothing of.
         """
-        states, of = self._states(q, wrench, recorded), self._tool(tool)
-        return self.poses(of, states, self.nominal(of, states), std)
+        (states, untold), of = self._states(q, wrench, recorded), self._tool(tool)
+        return self.poses(of, states, self.nominal(of, states), std, untold)
 
     def compensate(
         self,
@@ -202,7 +211,7 @@ class Calibration:
         Raises:
             InputError: as for `predict`.
         """
-        states, of = self._states(q, wrench, recorded), self._tool(tool)
+        (states, untold), of = self._states(q, wrench, recorded), self._tool(tool)
         goal = None
         if wanted is not None:
             given = np.broadcast_to(np.asarray(wanted, dtype=float), (len(states), 4, 4))
@@ -213,7 +222,7 @@ class Calibration:
             inverse = Inverse(found, left[:, 0], left[:, 1])
         else:
             inverse = self._invert(of, states, goal or self.nominal(of, states))
-        return Compensation(inverse, self, of, states, goal, std)
+        return Compensation(inverse, self, of, states, goal, std, untold)
 
     @cached_property
     def _compiled(self) -> Compiled | tuple[str, ...]:
@@ -253,7 +262,7 @@ class Calibration:
         """
         if self.sensor is None:
             raise InputError("the campaign's cell has no [force_sensor]: its place is not known")
-        at = self._states(q, None, None).q
+        at = self._states(q, None, None)[0].q
         reading = np.asarray(reading, dtype=float)
         if reading.shape not in ((6,), (len(at), 6)) or not np.isfinite(reading).all():
             raise InputError(f"reading: valid: finite, of shape (6,) or ({len(at)}, 6)")
@@ -290,8 +299,8 @@ class Calibration:
 
     def _states(
         self, q: Floats, wrench: Floats | None, recorded: Mapping[str, Floats] | None
-    ) -> States:
-        """Return the points as states; raises as `predict` does."""
+    ) -> tuple[States, tuple[str, ...]]:
+        """Return points as states, and which columns were not told; raises as `predict` does."""
         n, every = self.model.cell.arm.n, one_of_each(self.model.cell)
         q = np.array(q, dtype=float, order="C", ndmin=2)
         if q.shape[1:] != (n,) or not len(q):
@@ -310,24 +319,33 @@ class Calibration:
             if not np.isfinite(column).all():
                 raise InputError(f"{name} has values that are not finite")
         states = States(q, **columns)
+        untold = tuple(c for c in needed(self.model, states) if c in self.conditions)
+        for name in untold:
+            mean = self.conditions[name].mean
+            columns[name] = np.broadcast_to(mean, (len(q), *mean.shape)).copy()
+        states = States(q, **columns)
         for e in self.model.effects:
             if not e.computable(states):
                 raise InputError(
                     f"the model has {e.name}, which needs {', '.join(e.needs)}; give it"
                 )
-        return states
+        return states, untold
 
     def nominal(self, of: Tool, states: States) -> tuple[Floats, Floats]:
         """Orientation and position of the tool that errors are counted from."""
         if self.mode == "deflection":
-            unloaded = replace(states, wrench=np.zeros((len(states), 6)))
-            return tool_poses(of, of.model.predict(unloaded, of.theta))
+            return tool_poses(of, of.model.predict(_unloaded(states), of.theta))
         chain = evaluate(of.model.cell.arm, states.q)
         rotation = se3.product(chain.rotation[-1], of.nominal[:3, :3])
         return rotation, chain.point(of.nominal[:3, 3])
 
     def poses(
-        self, of: Tool, states: States, nominal: tuple[Floats, Floats], std: bool
+        self,
+        of: Tool,
+        states: States,
+        nominal: tuple[Floats, Floats],
+        std: bool,
+        untold: tuple[str, ...] = (),
     ) -> ToolPoses:
         """Return where a tool is.
 
@@ -336,6 +354,7 @@ class Calibration:
             states: N points.
             nominal: orientation (N, 3, 3) and position (N, 3) that errors are counted from.
             std: also state the uncertainty.
+            untold: columns of the states that are means of `conditions`.
         """
         prediction = of.model.predict(states, of.theta)
         rotation, position = tool_poses(of, prediction)
@@ -345,7 +364,8 @@ class Calibration:
             turn, chain = of.base[:3, :3], prediction.situation.chain
             at = (position - of.base[:3, 3]) @ turn
             scatter = self.scatter.covariance(of.model.cell, chain, at)
-            covariance = turn @ (known + scatter) @ turn.T + self.misfit * np.eye(3)
+            rest = self.misfit + sum(self.conditions[name].variance for name in untold)
+            covariance = turn @ (known + scatter) @ turn.T + rest * np.eye(3)
             known = np.sqrt(np.trace(known, axis1=1, axis2=2))
         outside = tuple(self.measured.outside(states, known, self.turns))
         return ToolPoses(position, rotation, nominal[1], nominal[0], covariance, outside)
@@ -362,12 +382,25 @@ class Calibration:
         """(N, 3, 3) κ J C Jᵀ of the position, axes of the chain, m²."""
         spread = self._spread(of, prediction)
         if self.mode == "deflection":
-            unloaded = replace(states, wrench=np.zeros((len(states), 6)))
-            spread = spread - self._spread(of, of.model.predict(unloaded, of.theta))
+            spread = spread - self._spread(of, of.model.predict(_unloaded(states), of.theta))
         return spread @ np.swapaxes(spread, 1, 2)
+
+    def _moves(self, states: States) -> tuple[Floats, Floats]:
+        """Position (N, 3) of the tool and J R (N, 3, K); in deflections what the load does."""
+        of = self._tracked
+        prediction = of.model.predict(states, of.theta)
+        position, spread = tool_poses(of, prediction)[1], self._spread(of, prediction)
+        if self.mode == "deflection" and states.wrench.any():
+            free = self._moves(_unloaded(states))
+            position, spread = position - free[0], spread - free[1]
+        return position, spread
 
     def _spread(self, of: Tool, prediction: Prediction) -> Floats:
         """(N, 3, K) J R of the position, axes of the chain."""
         jacobian = of.model.jacobian(prediction, of.theta, 3)
         jacobian = np.swapaxes(prediction.observation.axes, 1, 2) @ jacobian
         return np.asarray(jacobian @ self.covariance_root[of.kept])
+
+
+def _unloaded(states: States) -> States:
+    return replace(states, wrench=np.zeros((len(states), 6)))

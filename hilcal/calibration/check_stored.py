@@ -1,9 +1,10 @@
 """Whether what a calibration file holds can be a calibration."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from hilcal.calibration.conditions import WORDS, Condition
 from hilcal.calibration.measured import Measured
 from hilcal.calibration.scatter import Scatter
 from hilcal.cell import Cell
@@ -98,3 +99,16 @@ def check_spread(scatter: Scatter, measured: Measured, n: int) -> None:
         if not isinstance(r.variable, str) or not isinstance(r.unit, str):
             raise ValueError("a range without a name")
         check_numbers(f"range of {r.variable}", np.array([r.low, r.high], dtype=float), (2,))
+
+
+def check_conditions(conditions: Mapping[str, Condition], n: int) -> None:
+    """Refuse conditions that cannot be.
+
+    Raises:
+        ValueError: says why.
+    """
+    for name, c in conditions.items():
+        if name not in WORDS:
+            raise ValueError(f"{name!r} is no condition")
+        check_numbers(name, c.mean, (n,) if name in ("joint_temperature", "approach") else ())
+        check_numbers(f"variance by {name}", c.variance, least=0.0)

@@ -27,6 +27,7 @@ class Compensation:
 
     Attributes:
         inverse: joint values, and what is left.
+        untold: columns of `States` that the model needs and the points did not have.
     """
 
     inverse: Inverse
@@ -35,6 +36,7 @@ class Compensation:
     _states: States
     _wanted: tuple[Floats, Floats] | None
     _std: bool
+    untold: tuple[str, ...] = ()
 
     @property
     def q(self) -> Floats:
@@ -63,7 +65,7 @@ class Compensation:
     def after(self) -> ToolPoses:
         """The tool at the joint values that were found."""
         found = replace(self._states, q=self.q)
-        return self._calibration.poses(self._tool, found, self._goal, std=self._std)
+        return self._calibration.poses(self._tool, found, self._goal, self._std, self.untold)
 
     @property
     def limits(self) -> Bools:

@@ -17,7 +17,14 @@ import numpy as np
 
 from hilcal import __version__, limits
 from hilcal.calibration.calibration import Calibration
-from hilcal.calibration.check_stored import check_arm, check_cell, check_numbers, check_spread
+from hilcal.calibration.check_stored import (
+    check_arm,
+    check_cell,
+    check_conditions,
+    check_numbers,
+    check_spread,
+)
+from hilcal.calibration.conditions import Condition
 from hilcal.calibration.learnt import Learnt
 from hilcal.calibration.measured import Measured
 from hilcal.calibration.scatter import Scatter
@@ -103,6 +110,7 @@ def to_json(c: Calibration) -> dict[str, object]:
         "misfit_m2": c.misfit,
         "scatter": c.scatter.to_json(),
         "measured": c.measured.to_json(),
+        "conditions": {name: x.to_json() for name, x in c.conditions.items()},
         "loads": {name: wrench.tolist() for name, wrench in c.loads.items()},
         "force_sensor": None if c.sensor is None else c.sensor.to_json(),
     }
@@ -159,6 +167,8 @@ def from_json(content: Mapping[str, Any], catalogue: Catalogue | None = None) ->
         Measured.from_json(content["measured"]),
     )
     check_spread(scatter, measured, arm.n)
+    conditions = {k: Condition.from_json(x) for k, x in content.get("conditions", {}).items()}
+    check_conditions(conditions, arm.n)
     loads = {name: _array(wrench) for name, wrench in content["loads"].items()}
     for name, wrench in loads.items():
         check_numbers(f"load {name}", wrench, (6,))
@@ -177,6 +187,7 @@ def from_json(content: Mapping[str, Any], catalogue: Catalogue | None = None) ->
         loads=loads,
         source=content["source"],
         sensor=sensor,
+        conditions=conditions,
     )
 
 

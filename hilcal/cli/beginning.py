@@ -415,10 +415,10 @@ _OPTIONS = frozenset(
 
 
 def _lacking(draft: Draft) -> str:
-    """Say which devices have to be named before the cell can be measured."""
-    keys = {"host": "robot", "driver": "tracker"}
-    wanted = [f"[{s}] {key}" for key, s in keys.items() if key not in draft.data.get(s, {})]
-    return f", once {' and '.join(wanted)} are there" if wanted else ""
+    """Say which keys the cell still needs before it can be measured."""
+    keys = (("robot", "driver"), ("robot", "host"), ("tracker", "driver"), ("tracker", "port"))
+    wanted = [f"[{s}] {key}" for s, key in keys if key not in draft.data.get(s, {})]
+    return f", once it has {' and '.join(wanted)}" if wanted else ""
 
 
 def _from_option(draft: Draft, item: Item, words: str) -> None:

@@ -127,7 +127,7 @@ def identify(
                 fits[s] = with_serial_noise(fit(model, fitted, mode, s))
                 finish(fits[s], say)
             kept = fits[wanted[-1]]
-            number = o.store(kept, None, None)
+            number = o.store_once(kept)
     t.show(text.fit_report(kept, details))
     t.show(prior_lines(kept))
     if details or o.noise:

@@ -272,13 +272,16 @@ def refine(
                     number = latest.number
                 else:
                     parent = rows[-1].number if rows else None
-                    number = o.store(step.fit, step.diagnosis, step.added, step.removed, parent)
+                    number = o.store_once(
+                        step.fit, step.diagnosis, step.added, step.removed, parent
+                    )
                 rows.append(Row(number, step.fit, step.diagnosis.verdict, step.added, step.removed))
         t.show(text_refine.revisions_table([r.shown for r in rows]))
         t.show(text_refine.key())
         t.show(options_line(rows[-1].fit))
         if o.noise is not None:
             t.show(numbers.sentence(covariance_words(o.covariance_parts, o.noise)))
+        t.show(text.set_aside(found.fit, details))
         t.show(text_refine.verdict_line(found.diagnosis))
         t.show([*fitted_lines(found.fit)][: None if details else 1])
         t.show(prior_lines(found.fit))

@@ -87,10 +87,12 @@ def terminal(as_json: bool) -> Terminal:
     """Return the streams of a command.
 
     With `as_json`, `sys.stdout` becomes stderr until the command ends, see `hilcal.cli.execute`:
-    what a user's effect prints must not be in the document.
+    what a user's effect prints must not be in the document. Where both are a terminal they are one
+    console, which prints above what is in progress, not into its line.
     """
     progress, out = console(stderr=True), sys.stdout
-    people = progress if as_json else console(stderr=False)
+    one = as_json or (progress.is_terminal and out.isatty())
+    people = progress if one else console(stderr=False)
     if as_json:
         sys.stdout = sys.stderr
     return Terminal(as_json, people, progress, out)

@@ -1,5 +1,7 @@
 """What cannot be right in a table of readings: units, limits, covariances, names."""
 
+import re
+
 import numpy as np
 
 from hilcal.data.columns import POSITION, ROTATION, WRENCH
@@ -66,14 +68,15 @@ def check_positions(table: CsvTable, position: Floats, q: Floats, arm: Arm) -> N
         j = int(np.argmax(np.abs(position[i])))
         raise InputError(
             f"{table.at(i, POSITION[j])}: {position[i, j]:g} m cannot be right"
-            f"{_millimetres(distance[i])}; positions must be in m, within {MAX_DISTANCE:g} m"
+            f"{_looks_like(position[i], distance[i])}; positions must be in m, within "
+            f"{MAX_DISTANCE:g} m"
         )
     away = np.linalg.norm(position - np.median(position, axis=0), axis=1)
     if np.any(away > 5 * arm.reach):
         i = int(np.argmax(away))
         raise InputError(
             f"{table.at(i)}: position is {away[i]:.3g} m from the others, the reach of {arm.name} "
-            f"is {arm.reach:.3g} m{_millimetres(distance[i])}; positions must be in m"
+            f"is {arm.reach:.3g} m{_looks_like(position[i], distance[i])}; positions must be in m"
         )
     spread = float(away.max())
     travel = float(np.ptp(q, axis=0).max())
@@ -84,7 +87,10 @@ def check_positions(table: CsvTable, position: Floats, q: Floats, arm: Arm) -> N
         )
 
 
-def _millimetres(distance: float) -> str:
+def _looks_like(position: Floats, distance: float) -> str:
+    """Say what a position (3,) that cannot be may be: in millimetres, or a gap such as -9999."""
+    if any(re.fullmatch("9{4,}", f"{abs(v):.12g}".replace(".", "")) for v in position):
+        return " (nines for no value? leave the row out, or name them as missing in a mapping)"
     return " (looks like millimetres)" if 10.0 < distance < 1e3 * MAX_DISTANCE else ""
 
 

@@ -1,5 +1,6 @@
 """Import of a table in any of the formats, into the cell that it was measured in."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from hilcal.data.imported import ImportResult
 from hilcal.data.ipa_ur10 import read_ipa_ur10
 from hilcal.data.mapped import import_mapped
 from hilcal.data.mapping import Mapping, find_mapping, mapping_names
+from hilcal.data.plan import UNLOADED
 from hilcal.data.readings import Readings
 from hilcal.data.stated_noise import rounding_variance
 from hilcal.data.table import FROM_TRACKER, import_table
@@ -64,8 +66,8 @@ def import_readings(
     covers = WHOLE if stated and config.repeatability.in_tables else result.covers
     copied = _copies(result.readings)
     notes += _told(result.readings, copied)
-    kept = result.readings[~copied]
-    return ImportResult(kept, notes, covers, stated or tracker.states_noise)
+    kept, named = _named_loads(result.readings[~copied], config)
+    return ImportResult(kept, (*notes, *named), covers, stated or tracker.states_noise)
 
 
 def _mapping(form: str | Path) -> Mapping | None:
@@ -78,6 +80,29 @@ def _mapping(form: str | Path) -> Mapping | None:
             f"or the path of a mapping file (.toml)"
         )
     return find_mapping(form)
+
+
+def _named_loads(readings: Readings, config: CellConfig) -> tuple[Readings, tuple[str, ...]]:
+    """Let loads of a table that states no force act as `[[loads]]` has them by name; say which."""
+    s, gravity = readings.states, np.asarray(config.robot.gravity_m_s2)
+    loaded = [k for k in np.unique(readings.load) if readings.load_names[k] != UNLOADED]
+    if s.wrench.any() or not loaded:
+        return readings, ()
+    known = {_plain(load.name): load.wrench(gravity) for load in config.loads}
+    wrench, told = s.wrench.copy(), []
+    for k in loaded:
+        name = readings.load_names[k]
+        own = known.get(_plain(name))
+        where = "is not stated by the table, nor by [[loads]] of the cell: it is taken as none"
+        if own is not None:
+            wrench[readings.load == k] = own
+            where = "is that of [[loads]] of the cell, since the table states none"
+        told.append(f"load {name}: its force {where}")
+    return replace(readings, states=replace(s, wrench=wrench)), tuple(told)
+
+
+def _plain(name: str) -> str:
+    return "".join(name.split()).casefold()
 
 
 def _copies(readings: Readings) -> Bools:

@@ -106,5 +106,6 @@ def exchange(before: Fit, effect: str, other: str) -> Fit:
 def predicts_better(before: Fit, after: Fit) -> bool:
     """Whether the error on poses left out falls, by more than it scatters from pose to pose."""
     if np.any(before.outlier != after.outlier):
-        return after.holdout.rms_sigma < (1 - LEAST_GAIN) * before.holdout.rms_sigma
+        one, other = before.holdout_of_all.rms_sigma, after.holdout_of_all.rms_sigma
+        return other < (1 - LEAST_GAIN) * one
     return improves(left_out_by_pose(before), left_out_by_pose(after))

@@ -79,6 +79,7 @@ class Discovery:
         carried: where no law is found, recorded variables that the misfit depends on.
         refused: laws that predict the misfit and are not proposed, and why: their exact refits
             failed.
+        unfitted: effects of the catalogue that the exact model could not be fitted with, and why.
     """
 
     fit: Fit
@@ -93,6 +94,7 @@ class Discovery:
     curves: tuple[Curve, ...] = ()
     carried: tuple[Dependence, ...] = ()
     refused: tuple[tuple[str, str], ...] = ()
+    unfitted: tuple[tuple[str, str], ...] = ()
 
 
 def discover(
@@ -129,14 +131,17 @@ def discover(
     best = max(selections, key=lambda s: s.total)
     say("comparing with the catalogue")
     known = known_effects(fit)
-    names = instead_of_law(fit, problem, best, known)
-    if names:
-        return Discovery(fit, "catalogue", catalogue=names, candidates=found.candidates)
+    instead = instead_of_law(fit, problem, best, known)
+    if instead.names:
+        answer = Discovery(fit, "catalogue", catalogue=instead.names, candidates=found.candidates)
+        return replace(answer, unfitted=instead.unfitted)
     say("repeating the search without each fold of poses")
     folds = search_by_folds(found, MOST_TERMS)
     if not folds.sure or folds.share < LEAST_SHARE:
-        return _silent(fit, found, say, folds.share)
-    return _laws(fit, problem, selections, folds, known, say, name)
+        answer = _silent(fit, found, say, folds.share)
+    else:
+        answer = _laws(fit, problem, selections, folds, known, say, name)
+    return replace(answer, unfitted=instead.unfitted)
 
 
 def rival_sources(d: Discovery) -> dict[str, str]:

@@ -6,8 +6,7 @@ that acts 20 cm from where it is thought to, is not linear in its parameters, an
 beyond the linearisation looks like a law of its own.
 """
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -71,46 +70,63 @@ def known_effects(fit: Fit) -> KnownEffects:
     return KnownEffects(tuple(names), tuple(odds), tuple(left), x, columns)
 
 
-def instead_of_law(
-    fit: Fit, problem: Problem, law: Selection, known: KnownEffects
-) -> tuple[str, ...]:
-    """Return the effects that explain the misfit as well as a law, at odds of 20 : 1; or none."""
+@dataclass(frozen=True, slots=True)
+class Instead:
+    """What the catalogue has in the place of a law.
+
+    Attributes:
+        names: effects that explain the misfit as well; none where the law is preferred.
+        unfitted: effects that the exact model could not be fitted with, and why.
+    """
+
+    names: tuple[str, ...] = ()
+    unfitted: tuple[tuple[str, str], ...] = ()
+
+
+def instead_of_law(fit: Fit, problem: Problem, law: Selection, known: KnownEffects) -> Instead:
+    """Return the effects that explain the misfit as well as a law, at odds of 20 : 1; or none.
+
+    A law that the exact model cannot be fitted with is not preferred to effects that it can.
+    """
     if known.total > law.total - LEAST:
-        return known.names
+        return Instead(known.names)
     near = resembling(problem, law, known)
     if near and near[0].cosine >= SAME and not tells_more(problem, law, known, near[0].effect):
-        return known.names or (near[0].effect,)
-    total, names = max(_exact_effects(fit, known), key=lambda x: x[0], default=(-np.inf, ()))
+        return Instead(known.names or (near[0].effect,))
+    total, found = _exact_effects(fit, known)
     if total > law.total - LEAST and total > _exact_law(fit, problem, law) - LEAST:
-        return names
-    return ()
+        return found
+    return replace(found, names=())
 
 
-def _exact_effects(fit: Fit, known: KnownEffects) -> Iterable[tuple[float, tuple[str, ...]]]:
-    """Yield the odds of the first one, two, … effects by their exact refits, and their names.
+def _exact_effects(fit: Fit, known: KnownEffects) -> tuple[float, Instead]:
+    """Return the best odds of the first one, two, … effects by their exact refits, and which.
 
     A refit that sets further readings aside as gross errors does not explain these.
     """
-    after, total = fit, 0.0
+    after, odds, best, found = fit, 0.0, -np.inf, Instead()
     for k, name in enumerate(known.names):
         try:
             after = add(after, name)
-        except HilcalError:
-            return
-        total += known.odds[k]
+        except HilcalError as error:
+            return best, replace(found, unfitted=((name, str(error)),))
+        odds += known.odds[k]
         if np.any(after.outlier & ~fit.outlier):
             continue
-        yield total + _beyond(fit, known.left[k], after), known.names[: k + 1]
+        total = odds + _beyond(fit, known.left[k], after)
+        if total > best:
+            best, found = total, Instead(known.names[: k + 1])
+    return best, found
 
 
 def _exact_law(fit: Fit, problem: Problem, law: Selection) -> float:
-    """Return the odds of a law by its exact refit."""
+    """Return the odds of a law by its exact refit; -inf without one, as `discover` tells."""
     screen = problem.screen
     form = refine(screen, form_of(screen, law.terms))
     try:
         after, form, *_ = exact(screen, form, "law")
     except HilcalError:
-        return law.total
+        return -np.inf
     left = left_by(screen, form, fit.solution.prediction.situation)
     return law.total + _beyond(fit, left / max(fit.dof - form.count, 1.0), after)
 

@@ -8,7 +8,6 @@ from hilcal.data.whitening import whitening
 from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.identify.errors import ErrorBlock, error_block
 from hilcal.identify.fit import Fit
-from hilcal.identify.full_prediction import full_prediction
 from hilcal.identify.gauss_newton import solve
 from hilcal.identify.residual import residual
 from hilcal.model import Model
@@ -23,12 +22,10 @@ def error_before(fit: Fit) -> ErrorBlock:
     nominal arm alone: those of a fitted model make up for its other parameters, and are wrong for
     the nominal arm by as much.
     """
-    e = full_prediction(fit)
+    used, w = fit.readings[~fit.outlier], fit.whitening
     frames = tuple(x for x in fit.model.effects if x.role in FRAME_ROLES)
     rigid = Model(fit.model.cell, frames if fit.mode == "absolute" else (), fit.model.catalogue)
     theta = np.zeros(0)
     if rigid.effects:
-        used = fit.readings[~fit.outlier]
         theta = solve(rigid, used, whitening(used, fit.mode, fit.scaling), None, None).theta
-    predicted = rigid.predict(e.readings.states, theta)
-    return error_block(residual(e.readings, predicted, e.whitening), e.whitening)
+    return error_block(residual(used, rigid.predict(used.states, theta), w), w)

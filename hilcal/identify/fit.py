@@ -64,7 +64,7 @@ class Fit(WithVarianceFactor):
         outlier: (N,) readings that were set aside as gross errors.
         chi2: whitened sum of squares.
         dof: degrees of freedom.
-        error: error block of the fit.
+        error: error block of the fit; as `holdout`, of the readings that were not set aside.
         disagreement: readings that are far off and yet fitted; None where there are none.
 
     What takes long, and is of no use for a fit that is only tried, is computed when it is asked
@@ -95,6 +95,11 @@ class Fit(WithVarianceFactor):
     @cached_property
     def holdout(self) -> ErrorBlock:
         """Error block of whole poses left out."""
+        return error_block(self.left_out, self.whitening)
+
+    @cached_property
+    def holdout_of_all(self) -> ErrorBlock:
+        """The same with what was set aside, by which fits that set others aside are compared."""
         return error_block(*all_left_out(self))
 
     @cached_property
@@ -288,7 +293,7 @@ def _assemble(
     w = fitted if scaling == "gc" else whitening(kept, mode, "gc")
     white = w.whiten(raw).reshape(-1)
     total = float(white @ white)
-    found = Fit(
+    return Fit(
         model=model,
         readings=readings,
         mode=mode,
@@ -304,14 +309,10 @@ def _assemble(
         dof=max(w.rank - solution.effective, 1.0),
         error=error_block(raw, w),
     )
-    return replace(found, error=error_block(*with_outliers(found))) if outlier.any() else found
 
 
 def with_outliers(of: Fit) -> tuple[Floats, Whitening]:
-    """Residual of all readings, and their gc-scaling; of the fitted ones where they are all.
-
-    Readings that were set aside count in the errors: they are data, and took no part in the fit.
-    """
+    """Residual of all readings, and their gc-scaling; of the fitted ones where they are all."""
     if not of.outlier.any():
         return of.raw, of.whitening
     w = whitening(of.readings, of.mode, "gc")

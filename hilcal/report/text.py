@@ -12,7 +12,6 @@ from hilcal.diagnose.misfit_breakdown import Group, MisfitShare
 from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.identify.background import background_of
 from hilcal.identify.before import error_before
-from hilcal.identify.errors import error_block
 from hilcal.identify.fit import Fit
 from hilcal.identify.fit_document import notes
 from hilcal.identify.full_prediction import FullPrediction, full_prediction
@@ -77,13 +76,27 @@ def fit_report(fit: Fit, details: bool = True) -> Iterator[RenderableType]:
 def _short(fit: Fit) -> Iterator[str]:
     """Yield the remarks of the first screen."""
     yield _variance_factor(fit)
-    null, gross = [str(d) for d in fit.uncertainty.null], len(gross_errors(fit))
+    null = [str(d) for d in fit.uncertainty.null]
     if null:
         several = f"{len(null)} directions" if len(null) > 1 else "1 direction"
         yield f"{several} cannot be seen in these readings: {numbers.few(null, 1)}."
-    if gross:
-        yield f"{gross} readings are set aside as gross errors; --details lists them."
+    yield from set_aside(fit, details=False)
     yield from list(fitted_lines(fit))[:1]
+
+
+def set_aside(fit: Fit, details: bool) -> Iterator[str]:
+    """Yield how many readings were set aside, which are in no error of a fit, or which."""
+    gross = gross_errors(fit)
+    if not gross:
+        return
+    were = f"{len(gross)} readings are" if len(gross) > 1 else "1 reading is"
+    told = f"{were} set aside as gross error{'s' * (len(gross) > 1)}, and in none of these figures"
+    yield f"{told} (pose/load):" if details else f"{told}; --details lists them."
+    if not details:
+        return
+    yield from (f"  {g.pose}/{g.load}: {g.reason}" for g in gross[:GROSS])
+    if len(gross) > GROSS:
+        yield f"  ... and {len(gross) - GROSS} more; --json lists all"
 
 
 def parameters(fit: Fit, most: int = ALL_ROWS) -> Iterator[RenderableType]:
@@ -223,16 +236,7 @@ def remarks(fit: Fit) -> Iterator[RenderableType]:
     yield from fitted_lines(fit)
     for note in notes(fit):
         yield note[0].upper() + note[1:] + "."
-    gross = gross_errors(fit)
-    if gross:
-        kept = error_block(fit.raw, fit.whitening)
-        yield (
-            f"{len(gross)} readings set aside as gross errors (pose/load); the errors above count "
-            f"them, without them the fit is off by {numbers.length(kept.rms_m)} rms:"
-        )
-        yield from (f"  {g.pose}/{g.load}: {g.reason}" for g in gross[:GROSS])
-        if len(gross) > GROSS:
-            yield f"  ... and {len(gross) - GROSS} more; --json lists all"
+    yield from set_aside(fit, details=True)
 
 
 def _variance_factor(fit: Fit) -> str:

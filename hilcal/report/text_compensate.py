@@ -8,6 +8,7 @@ from rich.console import RenderableType
 
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.compensated import Compensation
+from hilcal.calibration.conditions import WORDS
 from hilcal.calibration.measured import Outside
 from hilcal.calibration.poses import BAND
 from hilcal.calibration.urscript import Waypoint
@@ -77,7 +78,7 @@ def report(
         f"  error after    {100 * BAND:.0f} % of the points within "
         f"{numbers.length(float(later.max()))}; expected {numbers.length(_rms(c.after.std_m))} rms"
     )
-    yield f"  the latter includes {', '.join(_parts(calibration))}"
+    yield f"  the latter includes {', '.join(_parts(calibration, c.untold))}"
     yield f"  {base_line(calibration.model.cell, calibration.frames, calibration.mode)}"
     out = text.table("point", "before", "after, 95 %", "largest correction")
     order = np.argsort(-now, kind="stable")[:MOST]
@@ -106,9 +107,12 @@ def _rms(values: Floats) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _parts(calibration: Calibration) -> list[str]:
+def _parts(calibration: Calibration, untold: Sequence[str]) -> list[str]:
     """What the stated error after compensation consists of."""
     parts = ["the parameters"]
+    for name in untold:
+        moved = numbers.length(float(np.sqrt(3 * calibration.conditions[name].variance)))
+        parts.append(f"{WORDS[name]}, which the points do not tell ({moved} rms)")
     if calibration.misfit > 0:
         left = numbers.length(float(np.sqrt(3 * calibration.misfit)))
         parts.append(f"what the model leaves ({left} rms)")

@@ -16,6 +16,7 @@ from hilcal.report import numbers, text, text_unknown
 FEW = 3
 LEAST_BINS = 3
 """Bins that make a curve; a choice."""
+NOT_TRIED = "could not be tried in the exact model"
 
 
 def discovery_report(d: Discovery) -> Iterator[RenderableType]:
@@ -34,10 +35,16 @@ def discovery_report(d: Discovery) -> Iterator[RenderableType]:
         yield from _law(law, d, first=k == 0)
         if k == 0:
             yield from curve_tables(d.curves)
+    for what, why in (*d.refused, *d.unfitted):
+        yield f"{what} {NOT_TRIED} ({why})."
 
 
 def silence(d: Discovery) -> str:
-    """Say why no law is proposed."""
+    """Say why no law is proposed, and what could not be tried."""
+    return _silence(d) + "".join(f"; {e} {NOT_TRIED} ({why})" for e, why in d.unfitted)
+
+
+def _silence(d: Discovery) -> str:
     tried = f"{d.candidates} candidates were tried"
     if d.reason == "adequate":
         return (
@@ -190,6 +197,7 @@ def to_json(d: Discovery) -> dict[str, object]:
         ],
         "laws": [law_json(law) for law in d.laws],
         "refused": [{"formula": formula, "why": why} for formula, why in d.refused],
+        "unfitted": [{"effect": effect, "why": why} for effect, why in d.unfitted],
         "curves": [curve_json(c) for c in d.curves],
     }
 

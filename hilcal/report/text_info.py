@@ -8,6 +8,7 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from hilcal.acquire.repeatability import RepeatabilityEstimate
 from hilcal.data.overview import Overview
 from hilcal.data.revision import RevisionRecord, change
 from hilcal.report import numbers, text
@@ -99,12 +100,13 @@ def _checks(o: Overview) -> Iterator[tuple[str, str]]:
         com = ", ".join(f"{1e3 * x + 0.0:z.1f}" for x in o.tool["com_m"])
         yield "tool", f"{o.tool['mass_kg']:.3f} kg, its centre at {com} mm in flange axes"
     if o.repeatability is not None:
-        r = o.repeatability
+        r = RepeatabilityEstimate(**o.repeatability)
+        joints = f"joints {numbers.digits(1e6 * r.joint_std, 2)} µrad"
         yield (
             "repeatability",
-            f"{r['dof']} returns to {r['poses']} poses scatter by "
-            f"{numbers.length(r['scatter'])}, {numbers.length(r['instrument'])} of it the "
-            f"instrument's; joints {numbers.digits(1e6 * r['joint_std'], 2)} µrad",
+            f"{r.dof} returns to {r.poses} poses scatter by {numbers.length(r.scatter)}, the "
+            f"instrument alone by {numbers.length(r.instrument)}; "
+            f"{joints if r.shown else 'the joints do not show beside it'}",
         )
 
 

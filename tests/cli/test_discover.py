@@ -1,23 +1,36 @@
 """`hilcal discover`: exit codes, the document, and the file that is written."""
 
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from drivers.simulated.injected_effects import nothing_hidden
+from drivers.simulated.rehearsal import measurement_noise, simulate
+from hilcal.cell import cell_from_config
 from hilcal.config import load_config
+from hilcal.config.write import to_toml
 from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.covariance import WHOLE
+from hilcal.data.readings import States
+from hilcal.data.table import write_table
 from hilcal.discover import shapes
 from hilcal.discover.amplitudes import Amplitude, Factor
 from hilcal.discover.discovery import Discovery
-from hilcal.discover.law import Coefficient, Form, Law, Part
+from hilcal.discover.law import Coefficient, Form, Part
+from hilcal.discover.law import Law as FoundLaw
 from hilcal.discover.sites import sites
 from hilcal.discover.variables import variables
 from hilcal.discover.write_effect import source_of_form
+from hilcal.effects.check import check_effect
 from hilcal.effects.example import example_cell, example_situation, example_states
 from hilcal.effects.from_file import read_effects
 from hilcal.identify.fit import Fit
-from studies.random_campaigns import rehearse
+from hilcal.types import Floats
+from studies.random_campaigns import rehearsal_states, rehearse
+from studies.unmodelled_laws import Law, UnmodelledLaw, shift
 from tests.support.cli_cases import CELL, ok, run
 
 SITUATION = example_situation(example_cell(), example_states(example_cell()))
@@ -53,7 +66,7 @@ def test_a_law_is_written_as_an_effect_and_told(
     campaign: Path, tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     form = Form((Part(sites(6)[1], Amplitude(()), 0),))
-    law = Law(
+    law = FoundLaw(
         "bent",
         form,
         (Coefficient("a", 1e-4, 1e-6, "rad"),),
@@ -137,6 +150,63 @@ def test_a_law_with_a_name_of_its_own_is_an_effect_everywhere(
     by_file = ok(capsys, "compensate", calibration, points, *use, *own).document
     assert by_run["points"][0]["q_rad"] == pytest.approx(by_file["points"][0]["q_rad"], abs=1e-9)
     assert "forearm_hose" in run(capsys, "compensate", calibration, points, *use).err
+
+
+SOFTENING = 1e-3 * np.array([-4.0, -0.5, 2.0, -1.2, -0.2, -4.0])
+"""Growth of each joint's compliance, at any size."""
+
+
+def softening(s: States, torque: Floats) -> Floats:
+    """dq_j = a_j τ_j t."""
+    assert s.time is not None
+    return np.hstack([SOFTENING * torque * s.time[:, None], np.zeros((len(s), 3))])
+
+
+def one_sided(s: States, torque: Floats) -> Floats:
+    """dq_3 = a max(τ_3, 0)^1.5."""
+    out = np.zeros((len(s), 9))
+    out[:, 2] = np.maximum(torque[:, 2], 0.0) ** 1.5
+    return out
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("motion", "formula"),
+    [(softening, r"dq_1 = a·τ_1·\(t .*dq_6 = "), (one_sided, r"dq_3 = a·max\(τ_3")],
+)
+def test_a_law_is_found_written_added_and_the_model_is_adequate(
+    motion: Law, formula: str, tmp_path: Path, capsys: Capsys
+) -> None:
+    """30 poses under 6 loads; what is found is added from its file."""
+    config, rng = load_config(CELL), np.random.default_rng(1)
+    pulls = ({"mass_kg": 3.0}, {"mass_kg": 6.0}, {"mass_kg": 9.0}, {"force_N": (60.0, 0.0, 0.0)},
+             {"force_N": (0.0, 60.0, 0.0)},
+             {"force_N": (-40.0, 40.0, 0.0), "moment_Nm": (0.0, 6.0, 6.0)})  # fmt: skip
+    loads = tuple(config.loads[0].model_copy(update={"name": f"w{k}", "mass_kg": 0.0} | pull)
+                  for k, pull in enumerate(pulls))  # fmt: skip
+    config = config.model_copy(update={"loads": loads})
+    cell = cell_from_config(config)
+    states, pose, load, cycle = rehearsal_states(
+        cell, 30, [(x.name, x.wrench(cell.gravity)) for x in loads], rng
+    )
+    std = config.repeatability.per_joint(6)
+    world = nothing_hidden(cell, rng, noise=measurement_noise(config), joint_std=std)
+    names = ("none", *(x.name for x in loads))
+    readings = simulate(world, states, pose, load, cycle, names, rng)
+    law = UnmodelledLaw("hidden", "", (), ("deflection",), motion)
+    moved = shift(law, world, states, 3.0, "deflection", pose, cycle)
+    write_table(replace(readings, value=readings.value + moved), tmp_path / "t.csv", WHOLE)
+    toml, campaign, found = (tmp_path / name for name in ("c.toml", "run.hilcal", "found.py"))
+    toml.write_text(to_toml(config), encoding="utf-8")
+    ok(capsys, "import", tmp_path / "t.csv", "--config", toml, "-o", campaign)
+    before = ok(capsys, "diagnose", campaign, "--json").document
+    assert before["verdict"] == "unknown_effect"
+    laws = ok(capsys, "discover", campaign, "-o", found, "--json").document["laws"]
+    assert re.search(formula, laws[0]["formula"])
+    check_effect(read_effects(found).effects[0])
+    added = ok(capsys, "add", campaign, "found", "--effects-from", found, "--json").document
+    assert added["verdict"] == "adequate"
+    assert added["revisions"][-1]["variance_factor"] < 0.4 * before["variance_factor"]
 
 
 def test_next_separates_a_law_from_what_readings_do_not_tell_from_it(

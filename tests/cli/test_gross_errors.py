@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import hilcal as hc
 from hilcal.data.covariance import WHOLE
 from hilcal.data.readings import Readings
 from hilcal.data.table import write_table
@@ -31,8 +32,33 @@ def test_wrong_readings_are_listed_and_the_others_fitted(tmp_path: Path, capsys:
     r = readings
     names = sorted((r.pose_names[r.pose[k]], r.load_names[r.load[k]]) for k in wrong)
     assert sorted((o["pose"], o["load"]) for o in d["outliers"]) == names
-    words = ok(capsys, "identify", run, "--readings", "absolute", "--details").out
-    assert f"{len(wrong)} readings set aside as gross errors" in words
+    told = f"{len(wrong)} readings are set aside as gross errors, and in none of these figures"
+    for command in (("identify",), ("refine",), ("identify", "--details"), ("refine", "--details")):
+        words = ok(capsys, command[0], run, "--readings", "absolute", *command[1:]).out
+        assert told in " ".join(words.split())
+        assert (f"  {names[0][0]}/{names[0][1]}: " in words) == ("--details" in command)
+
+
+def test_what_is_set_aside_is_in_no_figure_of_the_fit(tmp_path: Path, capsys: Capsys) -> None:
+    """One reading off by 5 mm: errors and bands are those of the readings that were fitted."""
+    readings = rehearsal("nothing").readings
+    value = readings.value.copy()
+    value[7] += [4e-3, 0.0, 3e-3]
+    found = {}
+    for name, r in (("good", readings), ("off", replace(readings, value=value))):
+        folder = tmp_path / name
+        folder.mkdir()
+        run, _ = imported(r, folder, capsys)
+        d = ok(capsys, "identify", run, "--readings", "absolute", "--json").document
+        with hc.Campaign.open(run, read_only=True) as opened:
+            q = opened.readings.states.q[::7] + 0.01
+            found[name] = d["error"], opened.calibration().predict(q).band_m
+    assert len(d["outliers"]) == 1
+    (good, band), (off, its) = found.values()
+    for key in ("before", "fit", "holdout"):
+        assert off[key]["rms_m"] == pytest.approx(good[key]["rms_m"], rel=0.1)
+        assert off[key]["max_m"] < 4e-3
+    np.testing.assert_allclose(its, band, rtol=0.2)
 
 
 def test_errors_of_centimetres_are_named_at_import(tmp_path: Path, capsys: Capsys) -> None:

@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hilcal.cell import cell_from_config
 from hilcal.cli import main
+from hilcal.config import load_config
 from hilcal.data.campaign_file import CampaignFile
 from tests.support.cli_cases import ok, refused
 from tests.support.foreign_tables import CELL, campaign, lines, write
@@ -384,3 +386,44 @@ def test_the_document_is_json_only(tmp_path: Path, capsys: Capsys) -> None:
     with pytest.raises(SystemExit):
         main(["import", str(path), "--preview", "--json"])
     assert json.loads(capsys.readouterr().out)["missing"] == []
+
+
+def test_loads_that_a_table_only_names_act_as_the_cell_states_them(
+    tmp_path: Path, capsys: Capsys
+) -> None:
+    """Else a load without a force is an error of the arm that follows the load."""
+    names = ["ohne", "10 kg", "pull x", "box"] * 3
+    header = ["Punkt", "Last", *NAMES, "X", "Y", "Z"]
+    text = lines(header, [f"P{k}" for k in range(12)], names, np.rad2deg(C.q), 1e3 * C.position)
+    path, mapping, run = write(tmp_path / "t.csv", text), tmp_path / "m.toml", tmp_path / "r.hilcal"
+    ok(capsys, "import", path, "--config", CELL, "--preview", "-o", mapping)
+    found = ok(capsys, "import", path, "--config", CELL, "--format", mapping, "-o", run, "--json")
+    with CampaignFile.open(run) as file:
+        r = file.readings()
+    cell = cell_from_config(load_config(CELL))
+    stated = {x.name: x.wrench(cell.gravity) for x in load_config(CELL).loads}
+    for name, of in (("none", None), ("10 kg", "10kg"), ("pull x", "pull x"), ("box", None)):
+        wrench = r.states.wrench[r.load == r.load_names.index(name)]
+        np.testing.assert_array_equal(wrench, [stated[of] if of else np.zeros(6)] * 3)
+    notes = " ".join(found.document["notes"])
+    assert "load 10 kg: its force is that of [[loads]]" in notes
+    assert "load box: its force is not stated by the table, nor by [[loads]]" in notes
+
+
+def test_one_coordinate_of_nines_is_no_unit_and_the_way_out_is_one(
+    tmp_path: Path, capsys: Capsys
+) -> None:
+    position = 1e3 * C.position
+    position[5, 1] = -9999
+    text = lines(["Point", *NAMES, "X", "Y", "Z"], [f"P{k}" for k in range(12)], np.rad2deg(C.q),
+                 position)  # fmt: skip
+    path, mapping = write(tmp_path / "t.csv", text), tmp_path / "m.toml"
+    own = MAPPING.split("[std]")[0]
+    arguments = ("import", path, "--config", CELL, "-o", tmp_path / "r.hilcal", "--format", mapping)
+    mapping.write_text(own, encoding="utf-8")
+    said = refused(capsys, 2, *arguments)
+    assert "row 7" in said
+    assert "name them as missing in a mapping" in said
+    assert "millimetres" not in said
+    mapping.write_text(own.replace("[file]", "[file]\nmissing = [-9999]"), encoding="utf-8")
+    assert ok(capsys, *arguments, "--json").document["n_readings"] == 11

@@ -5,12 +5,13 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import tomli_w
 
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig, load_config
 from hilcal.config.reference import tables
 from hilcal.config.template import SHOWN
-from tests.support.cli_cases import ok, refused
+from tests.support.cli_cases import ok, refused, run
 from tests.support.screen import AtTerminal
 
 Capsys = pytest.CaptureFixture[str]
@@ -59,12 +60,25 @@ def test_comments_and_examples_are_those_of_the_configuration(
     CellConfig.model_validate(tomllib.loads(used))
 
 
-def test_check_reads_the_file_and_asks_for_what_was_left_open(
-    tmp_path: Path, capsys: Capsys
+@pytest.mark.parametrize("options", [(), ("--tracker", "geocom"), ("--host", "127.0.0.1")])
+def test_what_a_cell_still_lacks_is_all_that_check_asks_for(
+    options: tuple[str, ...], tmp_path: Path, capsys: Capsys
 ) -> None:
     path = tmp_path / "CELL.toml"
-    ok(capsys, "init", path, "--robot", "ur5e", "--load", "5 kg")
-    assert "[robot] driver is missing" in refused(capsys, 2, "check", path)
+    said = " ".join(ok(capsys, "init", path, "--robot", "ur5e", *options).out.split())
+    told = re.search(r", once it has (.*?):", said)
+    assert told is not None
+    cell, answers = tomllib.loads(path.read_text("utf-8")), ("ur", "127.0.0.1", "geocom", "/no")
+    keys = ("[robot] driver", "[robot] host", "[tracker] driver", "[tracker] port")
+    for words, answer in zip(keys, answers, strict=True):
+        section, key = words.strip("[").split("] ")
+        if words in told[1]:
+            assert key not in cell.get(section, {})
+            path.write_text(tomli_w.dumps(cell), "utf-8")
+            assert run(capsys, "check", path).code == 2
+            cell.setdefault(section, {})[key] = answer
+    path.write_text(tomli_w.dumps(cell), "utf-8")
+    assert run(capsys, "check", path).code == 3  # every device is asked; nobody answers
 
 
 def test_what_is_fitted_is_stated_and_absolute_unless_asked(tmp_path: Path, capsys: Capsys) -> None:

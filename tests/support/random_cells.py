@@ -53,6 +53,24 @@ def random_cell(rng: np.random.Generator) -> dict[str, Any]:
     if some():
         hidden = HIDDEN if loads else (HIDDEN[0], HIDDEN[-1])
         out["simulation"]["hide"] = one_of(hidden)
+    if some(0.3):
+        out["robot"]["repeatability_m"] = 5e-5
+    if some(0.3):
+        known = {"base_xyz_m": [2.4, -1.6, -0.5], "base_rotvec_rad": [0.0, 0.0, 2.1]}
+        out["tracker"] = out.get("tracker", {}) | known
+    if some():
+        out["motion"] = {"speed_rad_s": one_of((0.3, 0.6)), "acceleration_rad_s2": 0.8}
+    if some():
+        out["acquire"] = {"samples": one_of((3, 8)), "drift_limit_sigma": one_of((4.0, 8.0))}
+    if some(0.3):
+        out["sight"] = {"clearance_m": 0.02}
+        if "base_xyz_m" not in out.get("tracker", {}):
+            out["sight"]["tracker_m"] = [3.0, 0.5, 0.9]
+    if some(0.3):
+        box = {"name": "box", "center_m": [0.9, -0.9, 0.4], "size_m": [0.3, 0.3, 0.8]}
+        out["obstacles"] = [box]
+    if some(0.3):
+        out["plausible"] = {"joint_compliance": one_of((5.0, 50.0))}
     return out
 
 

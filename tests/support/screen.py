@@ -34,11 +34,16 @@ class AtTerminal:
     """
 
     def __init__(
-        self, *arguments: str | Path, columns: int = 80, lines: int = 30, home: Path | None = None
+        self,
+        *arguments: str | Path,
+        columns: int = 80,
+        lines: int = 30,
+        home: Path | None = None,
+        paper: int | None = None,
     ) -> None:
-        """Start it, in the directory `home`."""
-        self.columns = columns
-        self._screen = pyte.HistoryScreen(columns, lines, history=HISTORY, ratio=1.0)
+        """Start it, in the directory `home`; on wider paper, lines that are too long show."""
+        self.columns = paper or columns
+        self._screen = pyte.HistoryScreen(self.columns, lines, history=HISTORY, ratio=1.0)
         self._stream = pyte.ByteStream(self._screen)
         self._silences: list[tuple[float, str]] = []
         self._heard = time.monotonic()
@@ -143,9 +148,9 @@ class AtTerminal:
         """Press keys."""
         os.write(self._master, keys.encode())
 
-    def ends(self) -> int:
-        """Wait for the end; returns the exit code."""
-        end = time.monotonic() + DEADLINE
+    def ends(self, within: float = DEADLINE) -> int:
+        """Wait for the end, so many s; returns the exit code."""
+        end = time.monotonic() + within
         while self.look(0.2):
             assert time.monotonic() < end, "it does not end:\n" + "\n".join(self.lines)
         return self.process.wait(10.0)

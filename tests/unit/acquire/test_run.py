@@ -252,7 +252,8 @@ def test_repeatability_is_estimated_at_the_end() -> None:
     assert found["dof"] == 33
     assert found["joint_std"] == pytest.approx(5e-5, rel=0.35)
     assert found["scatter"] > 3 * found["instrument"]
-    assert any("33 returns to 3 poses" in note.text for note in b.notes.of(Remark))
+    told = next(n.text for n in b.notes.of(Remark) if "33 returns to 3 poses" in n.text)
+    assert f"joint_std_rad is about {found['joint_std']:.1g}" in told
 
 
 def test_repeatability_law() -> None:
@@ -271,6 +272,17 @@ def test_repeatability_law() -> None:
         squares.append(found.joint_std**2)
     assert np.mean(squares) == pytest.approx(4.0, rel=0.1)
     assert repeatability([UnloadedVisit("a", np.zeros(3), np.eye(3), 1.0)]) is None
+
+
+def test_an_arm_that_does_not_scatter_is_seldom_said_to() -> None:
+    rng, said = np.random.default_rng(1), 0
+    for _ in range(200):
+        at = rng.normal(0.0, 1e-5, (8, 3))
+        found = repeatability([UnloadedVisit("ab"[k % 2], x, 1e-10 * np.eye(3), 1.0)
+                               for k, x in enumerate(at)])  # fmt: skip
+        assert found is not None
+        said += "joint_std_rad is about" in found.words(np.zeros(6))
+    assert said < 12
 
 
 def test_a_cell_without_a_tool() -> None:

@@ -1,19 +1,23 @@
 """When an effect of the catalogue is named, and when a law that is near one."""
 
+import sys
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
-from hilcal.discover.known_effects import instead_of_law, known_effects, tells_more
+from hilcal.discover.discovery import Discovery
+from hilcal.discover.known_effects import Instead, instead_of_law, known_effects, tells_more
 from hilcal.discover.problem import Problem
 from hilcal.discover.screen import screen
-from hilcal.discover.search import Selection
+from hilcal.discover.search import LEAST, Selection
 from hilcal.discover.terms import Term
 from hilcal.effects.spec import EffectSpec
+from hilcal.errors import CannotAnswerError
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.linearisation import linearise
+from hilcal.report.text_discover import silence, to_json
 from tests.unit.discover.test_discover import campaign
 
 
@@ -63,7 +67,31 @@ def test_a_large_effect_is_named_by_its_exact_refit(shift: float, named: tuple[s
     known = known_effects(fitted)
     assert known.names[0] == "load_point"
     law = Selection((term(p, 0.5),), (known.total + 20.0,))
-    assert instead_of_law(fitted, p, law, known) == named
+    assert instead_of_law(fitted, p, law, known) == Instead(named)
+
+
+def test_no_refit_fails_in_silence(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An effect that cannot be refitted is named; a law that cannot is not preferred to effects."""
+
+    def fails(*_: object) -> None:
+        raise CannotAnswerError("it finds no equilibrium")
+
+    fitted = _with_load_off(0.2)
+    p, known = Problem(screen(linearise(fitted))), known_effects(fitted)
+    law = Selection((term(p, 0.5),), (known.total + 20.0,))
+    module = sys.modules[instead_of_law.__module__]
+    with monkeypatch.context() as m:
+        m.setattr(module, "exact", fails)
+        assert instead_of_law(fitted, p, law, known).names == ()  # far less likely by algebra
+        near = Selection((term(p, 0.5),), (known.total + LEAST,))
+        m.setattr(module, "_exact_effects", lambda *_: (known.total + 1.0, Instead(known.names)))
+        assert instead_of_law(fitted, p, near, known).names == known.names
+    monkeypatch.setattr(module, "add", fails)
+    found = instead_of_law(fitted, p, law, known)
+    assert found == Instead((), ((known.names[0], "it finds no equilibrium"),))
+    answer = Discovery(fitted, "no_law", unfitted=found.unfitted)
+    assert "load_point could not be tried in the exact model (it finds no eq" in silence(answer)
+    assert to_json(answer)["unfitted"] == [{"effect": "load_point", "why": found.unfitted[0][1]}]
 
 
 def _with_load_off(shift: float) -> Fit:

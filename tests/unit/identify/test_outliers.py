@@ -50,8 +50,9 @@ def test_three_gross_errors_are_set_aside_and_listed(mode, size):
     r = c.readings
     assert names == {(r.pose_names[r.pose[k]], r.load_names[r.load[k]]) for k in rows}
     assert min(o["sigma"] for o in listed) > 5
-    # They are data all the same: the errors count them.
-    assert found.error.max_m > 0.9 * size
+    # No error of the fit counts them; those by which fits are compared do.
+    assert found.error.rms_m == pytest.approx(clean.error.rms_m, rel=1e-4)
+    assert found.holdout_of_all.max_m > 0.9 * size > 0.9 * found.holdout.max_m
 
 
 def test_a_gross_error_of_an_unloaded_reading_does_not_spoil_deflections():
