@@ -20,7 +20,7 @@ from hilcal.fleet.fleet import Fleet
 from hilcal.identify.fit import Fit, fit
 from hilcal.names import quoted
 from hilcal.procedure.state import IMPROVED, Files
-from hilcal.report.build_story import Chapter, build_story
+from hilcal.report.build_story import build_story, of_left_out
 from hilcal.report.html.content import ReportContent, Tested
 from hilcal.validate import validate
 from hilcal.whole_file import replace_file
@@ -54,6 +54,7 @@ class Asked:
     limit_m: float | None = None
     operator: str = ""
     revision: int | None = None
+    appendix: bool = False
 
 
 def report(
@@ -65,6 +66,7 @@ def report(
     limit_m: float | None = None,
     operator: str = "",
     revision: int | None = None,
+    appendix: bool = False,
     say: Say = lambda text: None,
 ) -> Path:
     """Write the story of a campaign as one HTML page, which needs neither hilcal nor a network.
@@ -84,13 +86,15 @@ def report(
             configuration, [limits] accuracy_m, where None.
         operator: who answers for the measurement.
         revision: what the page is about; the one in use where None.
+        appendix: add what only another expert asks for: plots of rejected suspects and of each
+            joint, correlations, the same model by each scaling, commands, hashes of revisions.
         say: takes progress, one line each.
 
     Raises:
         InputError: no such revision, the page cannot be written, or see `validate` and `compare`.
         CannotAnswerError: the readings do not determine the baseline, or see `validate`.
     """
-    asked = Asked(later, validation, limit_m, operator, revision)
+    asked = Asked(later, validation, limit_m, operator, revision, appendix)
     write_report(run, Path(path), asked, say)
     return Path(path)
 
@@ -105,8 +109,10 @@ def write_report(
     if not path.absolute().parent.is_dir():  # said before minutes of work
         raise InputError(f"{path}: cannot be written, there is no folder {path.absolute().parent}")
     if later is not None:
-        if validation is not None or asked.limit_m is not None:
-            raise InputError("a comparison of two campaigns takes neither --validation nor --limit")
+        if validation is not None or asked.limit_m is not None or asked.appendix:
+            raise InputError(
+                "a comparison of two campaigns takes no --validation, --limit or --appendix"
+            )
         from hilcal.compare import compare
         from hilcal.report.html import change
 
@@ -159,6 +165,7 @@ def content_of(
             found.shares,
         )
         commands.append(f"hilcal validate {name} {quoted(validation.path.name)}{number}")
+    story = build_story(chapters)
     return ReportContent(
         name=run.path.name,
         sha256=_sha256(run.path),
@@ -168,14 +175,16 @@ def content_of(
         covariance=run.covariance_parts,
         chapters=tuple(chapters),
         stored=record is not None,
-        story=build_story(chapters),
-        scalings=_scalings(last, chapters, say),
+        story=story,
+        left_out=of_left_out(story.revisions[-1], last),
+        scalings=_scalings(last, say) if asked.appendix else {},
         plan=_plan(run),
         tested=tested,
         corrected=_corrected(run, record),
         limit_m=limit,
         operator=asked.operator,
         commands=tuple(commands),
+        appendix=asked.appendix,
     )
 
 
@@ -190,7 +199,7 @@ def write_fleet_report(found: Fleet, directory: Path, path: Path) -> None:
     replace_file(path, page(found, directory.resolve().name, utc_now(), hilcal.__version__))
 
 
-def _scalings(last: Fit, chapters: list[Chapter], say: Say) -> dict[Scaling, Fit]:
+def _scalings(last: Fit, say: Say) -> dict[Scaling, Fit]:
     """Fit the last model with each scaling, where its own is gc."""
     if last.scaling != "gc":
         return {}

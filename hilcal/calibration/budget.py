@@ -1,78 +1,81 @@
 """Uncertainty budget of a calibration in the sense of the GUM (JCGM 100:2008).
 
-The measurand is where the tool is (in deflection mode: how far a load deflects it) less where the
-calibration predicts it. Its combined standard uncertainty is
+The measurand is a position (in deflection mode: a deflection) as the instrument measures it at a
+pose that was not fitted, less where the calibration predicts it. Its combined standard uncertainty
+is the root mean square over such poses,
 
-    u² = tr κ J C Jᵀ + tr F Fᵀ + 3 s²
+    u² = κ c² + e² + s² + n²
 
-of the parameters (the instrument's noise, and all that the readings leave open, enter by them), of
-the arm's scatter from one arrival to the next, and of what the model misses beyond the noise; see
-`calibration`. The expanded uncertainty is U = k u with k = 2. u is that of a 3-D distance: U
-contains at least about 95 % of positions, more where several axes contribute.
+of the parameters without the pose (see `identify.predictive`), of what the model misses beyond the
+noise, of the arm's scatter from one arrival to the next, and of the instrument. κ makes u at least
+what poses left out show. The expanded uncertainty is U = k u with k = 2.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.calibration.calibration import Calibration
-from hilcal.calibration.scatter import ScatterSource
-from hilcal.calibration.tool import tool_of
+from hilcal.calibration.scatter import ScatterSource, scatter_of
+from hilcal.errors import InputError
+from hilcal.identify.errors import noise_floor
 from hilcal.identify.fit import Fit
+from hilcal.identify.predictive import position_factor, predictive
 from hilcal.robot.chain import evaluate
-from hilcal.types import Floats
 
 COVERAGE = 2.0
 """Coverage factor k, as is usual (GUM, 6.3.3)."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True)
 class Budget:
-    """Standard uncertainties (D,) of the 3-D position of each fitted measurement, m.
+    """Standard uncertainties of a 3-D position or deflection at a pose that was not fitted, m.
 
     Attributes:
-        parameters: of the estimated parameters.
-        scatter: of the arm's own repeatability.
-        scatter_source: what that is from.
+        parameters: of the parameters, estimated without the pose.
         misfit: of what the model misses beyond the noise.
+        scatter: of the arm's own repeatability; of both arrivals of a deflection.
+        scatter_source: what that is from.
+        instrument: of the instrument's noise, as stated.
     """
 
-    parameters: Floats
-    scatter: Floats
+    parameters: float
+    misfit: float
+    scatter: float
     scatter_source: ScatterSource
-    misfit: Floats
+    instrument: float
 
     @property
-    def combined(self) -> Floats:
-        """(D,) combined standard uncertainty u, m."""
-        return np.sqrt(self.parameters**2 + self.scatter**2 + self.misfit**2)
+    def combined(self) -> float:
+        """Combined standard uncertainty u, m."""
+        return float(np.linalg.norm((self.parameters, self.misfit, self.scatter, self.instrument)))
 
     @property
-    def expanded(self) -> Floats:
-        """(D,) expanded uncertainty U = k u, m."""
+    def expanded(self) -> float:
+        """Expanded uncertainty U = k u, m."""
         return COVERAGE * self.combined
 
 
 def budget(fit: Fit) -> Budget:
-    """Return the uncertainty of what a fit predicts at its own poses and loads.
+    """Return the uncertainty of what a fit predicts at poses like its own that it has not seen.
 
     Raises:
         InputError: a fit of another scaling than gc.
     """
-    c = Calibration.of(fit)
-    states = fit.readings[~fit.outlier].states[fit.whitening.reading]
-    tool = tool_of(c.model, c.theta, None)
-    found = c.poses(tool, states, c.nominal(tool, states), std=True)
-    assert found.covariance is not None  # noqa: S101  (asked for by `std`)
-    arm = c.model.cell.arm
-    chain = evaluate(arm, states.q)
-    at = chain.point(tool.nominal[:3, 3])
-    total = np.trace(found.covariance, axis1=1, axis2=2)
-    scatter = np.trace(c.scatter.covariance(c.model.cell, chain, at), axis1=1, axis2=2)
-    misfit = np.full(len(total), 3 * c.misfit)
+    if fit.scaling != "gc":
+        raise InputError(f"an uncertainty budget needs scaling gc, this fit has {fit.scaling}")
+    used, cell = fit.readings[~fit.outlier], fit.model.cell
+    p = predictive(fit.model, fit.theta, fit.solution.prior, used, fit.mode, fit.holdout.rms_sigma)
+    of = scatter_of(fit)
+    chain = evaluate(cell.arm, used.states.q[fit.whitening.reading])
+    one = of.covariance(cell, chain, chain.point(cell.target[:3, 3]))
+    arrivals = 2 if fit.mode == "deflection" else 1
+    scatter = arrivals * float(np.trace(one, axis1=1, axis2=2).mean())
+    stated = noise_floor(fit.whitening.covariance) ** 2
+    inside = used.scatter_stated or used.arm_scatter is not None
     return Budget(
-        parameters=np.sqrt(np.maximum(total - scatter - misfit, 0.0)),
-        scatter=np.sqrt(scatter),
-        scatter_source=c.scatter.source,
-        misfit=np.sqrt(misfit),
+        parameters=float(np.sqrt(position_factor(p, fit.holdout.rms_m) * p.left_out_m2)),
+        misfit=float(np.sqrt(max(p.scatter_m2 - stated, 0.0))),
+        scatter=float(np.sqrt(scatter)),
+        scatter_source=of.source,
+        instrument=float(np.sqrt(max(stated - scatter, 0.0) if inside else stated)),
     )

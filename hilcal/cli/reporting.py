@@ -46,10 +46,18 @@ def report(
         str, typer.Option("--operator", metavar="NAME", help="Who answers for the measurement.")
     ] = "",
     revision: Revision = None,
+    appendix: Annotated[
+        bool,
+        typer.Option(
+            "--appendix",
+            help="Also what only another expert asks for: rejected suspects, each joint, "
+            "correlations, scalings, commands, hashes of revisions.",
+        ),
+    ] = False,
     effects_from: EffectsFrom = None,
     as_json: Json = False,
 ) -> None:
-    """Write the whole story as one HTML page, a certificate first; it prints to PDF."""
+    """Write the whole story as one HTML page, a certificate first; it prints on six pages."""
     from hilcal.write_report import Asked, write_report
 
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
@@ -63,7 +71,7 @@ def report(
             return stack.enter_context(Campaign.open(path, catalogue, read_only=True))
 
         first = stack.enter_context(Campaign.open(run, catalogue, read_only=True))
-        asked = Asked(opened(later), opened(validation), limit_m, operator, revision)
+        asked = Asked(opened(later), opened(validation), limit_m, operator, revision, appendix)
         done = write_report(first, output, asked, say)
     t.show(f"{done.headline}.")
     if done.limit:

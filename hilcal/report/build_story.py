@@ -4,7 +4,7 @@ import itertools
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from hilcal.diagnose.residual_regression import Dependence
 from hilcal.discover.drawn_law import drawn_laws
 from hilcal.discover.law import Coefficient
 from hilcal.errors import InputError
-from hilcal.identify.fit import Fit, mahalanobis2
+from hilcal.identify.fit import Fit, all_left_out, mahalanobis2
 from hilcal.identify.fit_document import finite
 from hilcal.identify.full_prediction import FullPrediction, full_prediction
 from hilcal.identify.linearisation import linearise
@@ -116,6 +116,18 @@ def build_story(chapters: Sequence[Chapter]) -> Story:
         target_names=readings.target_names,
         pose_names=tuple(readings.pose_names[k] for k in readings.pose[rows]),
         time_s=None if readings.states.time is None else readings.states.time[rows],
+    )
+
+
+def of_left_out(revision: StoryRevision, fit: Fit) -> StoryRevision:
+    """Return a revision with the errors of poses left out in place of those of its fit."""
+    raw, w = all_left_out(fit)
+    residual = raw[:, :3] @ fit.frames.base[:3, :3]
+    return replace(
+        revision,
+        residual=residual,
+        predicted=revision.predicted + revision.residual - residual,
+        whitened_norm2=mahalanobis2(raw[:, :3], w.covariance[:, :3, :3]),
     )
 
 

@@ -99,12 +99,15 @@ def set_aside(fit: Fit, details: bool) -> Iterator[str]:
         yield f"  ... and {len(gross) - GROSS} more; --json lists all"
 
 
-def parameters(fit: Fit, most: int = ALL_ROWS) -> Iterator[RenderableType]:
+def parameters(
+    fit: Fit, most: int = ALL_ROWS, where: str = "--details"
+) -> Iterator[RenderableType]:
     """Yield a table of parameters, and a summary of each large family.
 
     Args:
         fit: the fit.
         most: rows of the table; where there are more, those of frames come last.
+        where: the others are to be had, in words.
     """
     rows: list[tuple[str, ...]] = []
     frames: list[tuple[str, ...]] = []
@@ -128,7 +131,7 @@ def parameters(fit: Fit, most: int = ALL_ROWS) -> Iterator[RenderableType]:
         for row in [*frames, *rows] if rest <= 0 else [*rows, *frames][:most]:
             out.add_row(*row)
         yield out
-        more = f"{rest} more parameters: --details. " if rest > 0 else ""
+        more = f"{rest} more parameters: {where}. " if rest > 0 else ""
         yield Text(f"{more}±: standard uncertainty.\n", style="dim")
     yield from families
     if unseen:
@@ -162,7 +165,8 @@ def family(fit: Fit, effect: Effect, index: Ints) -> RenderableType:
     units = {p.unit for p in effect.parameters}
     unit, factor = numbers.unit_for(units.pop(), list(theta)) if len(units) == 1 else ("", 1.0)
     lines = [
-        f"{effect.name}: {int(live.sum())} of {len(index)} parameters kept, the rest are zero."
+        f"{effect.name}: {int(live.sum())} of {len(index)} parameters kept"
+        + ("." if live.all() else ", the rest are zero.")
     ]
     joints: dict[str, float] = {}
     for value, p in zip(theta, effect.parameters, strict=True):
@@ -213,12 +217,7 @@ def before_and_after(fit: Fit) -> str:
 def remarks(fit: Fit) -> Iterator[RenderableType]:
     """Yield a sentence for each thing that the numbers alone do not say."""
     yield _variance_factor(fit)
-    behind = background_of(fit)
-    if behind.effects:
-        yield (
-            f"Background: {len(behind.effects)} effects that are not named, together "
-            f"{numbers.length(behind.rms_m)} rms; all are predicted with."
-        )
+    yield from background_line(fit)
     scatter = fit.readings.arm_scatter
     if scatter is not None:
         yield f"The covariance has the arm's scatter as estimated: {sigmas(scatter)}."
@@ -237,6 +236,16 @@ def remarks(fit: Fit) -> Iterator[RenderableType]:
     for note in notes(fit):
         yield note[0].upper() + note[1:] + "."
     yield from set_aside(fit, details=True)
+
+
+def background_line(fit: Fit) -> Iterator[str]:
+    """Yield a sentence on the effects that a model predicts with and does not name."""
+    behind = background_of(fit)
+    if behind.effects:
+        yield (
+            f"Background: {len(behind.effects)} effects that are not named, together "
+            f"{numbers.length(behind.rms_m)} rms; all are predicted with."
+        )
 
 
 def _variance_factor(fit: Fit) -> str:

@@ -1,6 +1,6 @@
 """What `info` says of a campaign."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -44,7 +44,7 @@ def info_report(o: Overview, name: str, covariance: str) -> Iterator[RenderableT
     if not o.revisions:
         yield "None yet: hilcal identify or refine makes one."
         return
-    yield revisions_table(o)
+    yield from revisions_tables(o)
     yield Text(
         "fit, left out: rms of the 3-D position error, of the fitted poses and of poses left out, "
         "there in σ of the noise as well; v.f.: variance factor.",
@@ -157,16 +157,25 @@ def event_words(e: Mapping[str, Any]) -> str:
     return kind if reason in ("", kind) else f"{kind}: {reason}"
 
 
-def revisions_table(o: Overview) -> RenderableType:
-    """Return the table of all revisions; an arrow marks the one in use."""
+def revisions_tables(o: Overview) -> Iterator[RenderableType]:
+    """Yield the revisions of each kind of readings, whose errors do not compare, as a table."""
+    kinds = dict.fromkeys(str(r.options["readings"]) for r in o.revisions)
+    for kind in kinds:
+        if len(kinds) > 1:
+            yield f"Of {'deflections' if kind == 'deflection' else 'absolute readings'}:"
+        yield _revisions_table(o, [r for r in o.revisions if r.options["readings"] == kind])
+
+
+def _revisions_table(o: Overview, revisions: Sequence[RevisionRecord]) -> RenderableType:
+    """Return a table of revisions; an arrow marks the one in use."""
     branched = any(r.made_from not in (None, r.number - 1) for r in o.revisions)
     heads = ("fit", "left out", "σ", "v.f.", "verdict")
     first = ("rev.", "from", "model") if branched else ("rev.", "model")
     out = text.table(*first, *heads, left=(len(first) - 1, len(first) + 4))
-    words = [model_words(r) for r in o.revisions]
+    words = [model_words(r) for r in revisions]
     longest = max(len(word) for model in words for word in model.split())
     out.columns[len(first) - 1].min_width = longest
-    for r, model in zip(o.revisions, words, strict=True):
+    for r, model in zip(revisions, words, strict=True):
         fit = r.result_json["identify"]
         left_out = fit["error"]["holdout"]
         verdict = r.result_json.get("diagnose", {}).get("verdict", "")

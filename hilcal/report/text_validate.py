@@ -106,6 +106,15 @@ def _beyond(v: Beyond) -> str:
 
 def shares_report(found: Acceptance) -> Iterator[RenderableType]:
     """Yield errors by load, the worst poses, and whether a limit is kept."""
+    yield from loads_report(found)
+    yield from worst_report(found)
+    yield ""
+    if found.limit_m is not None:
+        yield _limit_words(found, found.limit_m)
+
+
+def loads_report(found: Acceptance) -> Iterator[RenderableType]:
+    """Yield errors by load."""
     limit = found.limit_m
     heads = ("n", "rms", "largest", "at", "stated", "z", "in 95 %")
     out = text.table("load", *heads, *(() if limit is None else ("limit",)), left=(0, 4))
@@ -116,14 +125,16 @@ def shares_report(found: Acceptance) -> Iterator[RenderableType]:
         f"in 95 %: share of the readings inside of their stated {100 * BAND:.0f} % region.\n",
         style="dim",
     )
+
+
+def worst_report(found: Acceptance) -> Iterator[RenderableType]:
+    """Yield the worst poses."""
+    limit = found.limit_m
     heads = ("n", "rms", "largest", "load", "stated", "z", "in 95 %")
     out = text.table("worst poses", *heads, *(() if limit is None else ("limit",)), left=(0, 4))
     for s in found.poses[:WORST]:
         out.add_row(*_cells(s), *_verdict(s, limit))
     yield out
-    yield ""
-    if limit is not None:
-        yield _limit_words(found, limit)
 
 
 def _cells(s: Share) -> tuple[str, ...]:

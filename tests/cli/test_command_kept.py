@@ -12,7 +12,7 @@ from hilcal.data.command_line import COMMAND, typed, typed_now
 from hilcal.data.overview import overview
 from hilcal.report.html.page import page
 from hilcal.robot.catalogue import configs_dir
-from hilcal.write_report import content_of
+from hilcal.write_report import Asked, content_of
 from tests.support.campaigns import campaign, configuration
 from tests.support.cli_cases import ok
 
@@ -38,13 +38,13 @@ def test_a_revision_keeps_its_command_and_the_page_shows_it(
         o.append(o.fit())  # by the library: nobody has typed anything
         assert COMMAND not in o.file.revision(2).options
         assert overview(o.file).command == ""
-        m = content_of(o)
+        m = content_of(o, Asked(appendix=True))
     html = page(m)
     assert "Commands as they were typed" in html
     assert "base_frame,joint_compliance" in html
     assert html.count("not kept: ") == 2  # the file, and revision 2
     assert m.limit_m == 2e-4  # of [limits] accuracy_m
-    assert "0.200 mm" in html
+    assert "within 200 µm" in html
 
 
 def test_a_campaign_keeps_the_command_that_made_it(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import hashlib
 from dataclasses import replace
+from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
@@ -72,7 +73,7 @@ def test_two_campaigns_of_one_arm_have_a_page_that_says_what_has_changed(
     [
         (("-o", "run.hilcal"), "this is the campaign itself"),
         (("-o", "nowhere/report.html"), "cannot be written"),
-        (("run.hilcal", "--limit", "1 mm"), "neither --validation nor --limit"),
+        (("run.hilcal", "--limit", "1 mm"), "no --validation, --limit or --appendix"),
         (("--limit", "1 apple"), "--limit"),
         (("--revision", "7"), "revision 7"),
     ],
@@ -102,3 +103,49 @@ def test_the_certificate_never_takes_the_arm_to_come_back_exactly(
     assert "type A: scatter of the repeated readings" in text
     assert "No reading was repeated" not in text
     assert "16 of 56 readings repeat an earlier one, too few to judge the noise" in text
+
+
+def test_deflection_and_absolute_revisions_stand_in_no_column_together(
+    tmp_path: Path, capsys: Capsys
+) -> None:
+    run = tmp_path / "run.hilcal"
+    write_campaign(run, poses=8)
+    for kind in ("deflection", "absolute", "deflection"):
+        ok(capsys, "identify", run, "--readings", kind, "--effects", "joint_compliance")
+    ok(capsys, "report", run, "--appendix")
+    found = Tables()
+    found.feed(run.with_suffix(".html").read_text(encoding="utf-8"))
+    kinds = {"1": "deflection", "2": "absolute", "3": "deflection"}
+    seen = []
+    for heads, rows in found.tables:
+        if "left out" in heads or "left out, rms" in heads:
+            own = {kinds[row[0].removeprefix("→ ")] for row in rows}
+            assert len(own) == 1, (heads, rows)
+            seen.append(own.pop())
+    assert sorted(seen) == ["absolute", "deflection", "deflection"]  # the story, then the file
+
+
+class Tables(HTMLParser):
+    """Headings and rows of the tables of a page, as text."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tables: list[tuple[list[str], list[list[str]]]] = []
+        self.rows: list[list[str]] | None = None
+
+    def handle_starttag(self, tag: str, attrs: object) -> None:
+        if tag == "table":
+            self.rows = []
+        elif self.rows is not None and tag == "tr":
+            self.rows.append([])
+        elif self.rows is not None and tag in ("th", "td"):
+            self.rows[-1].append("")
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag == "table" and self.rows is not None:
+            self.tables.append((self.rows[0], self.rows[1:]))
+            self.rows = None
+
+    def handle_data(self, data: str) -> None:
+        if self.rows and self.rows[-1]:
+            self.rows[-1][-1] += data.strip()

@@ -31,11 +31,11 @@ def write_campaign(path: Path, poses: int = 6) -> None:
 
 @cache
 def small_content(folder: Path) -> ReportContent:
-    """The content of a page on that campaign, without any revision, with a limit."""
+    """The content of a page on that campaign, without a revision, with limit and appendix."""
     path = folder / "a&<b>.hilcal"
     write_campaign(path)
     with Campaign.open(path) as run:
-        return content_of(run, Asked(limit_m=1e-3, operator=EVIL))
+        return content_of(run, Asked(limit_m=1e-3, operator=EVIL, appendix=True))
 
 
 @contextmanager

@@ -1,6 +1,4 @@
-"""How the error fell from revision to revision, on fitted and held-out poses: a waterfall."""
-
-import itertools
+"""How the error fell from revision to revision, on fitted poses and on poses left out."""
 
 import plotly.graph_objects as go
 
@@ -16,53 +14,38 @@ SERIES = (
 
 
 def error_per_revision(story: Story) -> go.Figure:
-    """Draw the rms error of each revision, what it took away, and what noise alone would leave."""
+    """Draw the rms error of each revision, the first on top, and what noise alone would leave."""
     first, *later = story.revisions
     names = [label(r, k == 0) for k, r in enumerate(story.revisions)]
     traces: list[object] = []
     for key, name, color in SERIES:
         rms = [1e6 * float(getattr(r, key)["rms_m"]) for r in story.revisions]
-        steps = [b - a for a, b in itertools.pairwise(rms)]
-        x, y, kind = list(names), [rms[0], *steps], ["absolute", *("relative" for _ in steps)]
-        hover = [f"{names[0]}: {rms[0]:.3g} µm, {name}"]
-        hover += [
-            f"{n}: {after - by:.3g} → {after:.3g} µm, {name}"
-            for n, by, after in zip(names[1:], steps, rms[1:], strict=True)
-        ]
-        if steps:
-            x, y, kind = [*x, "left now"], [*y, rms[-1]], [*kind, "total"]
-            hover.append(f"left now: {rms[-1]:.3g} µm, {name}")
         traces.append(
-            go.Waterfall(
-                x=x,
-                y=y,
-                measure=kind,
+            go.Bar(
+                x=rms,
+                y=names,
+                orientation="h",
                 name=name,
-                hovertext=hover,
-                hoverinfo="text",
-                text=[f"{v:.3g}" for v in (*rms, *(rms[-1:] if steps else ()))],
-                textposition="outside",
-                cliponaxis=False,
-                connector={"line": {"color": style.GREY, "width": 1}},
-                totals={"marker": {"color": color}},
-                decreasing={"marker": {"color": color}},
-                increasing={"marker": {"color": color}},
-                offsetgroup=key,
+                marker={"color": color},
+                text=[numbers.digits(v) for v in rms],
+                textposition="auto",
+                hovertemplate="%{y}: %{text} µm, " + name + "<extra></extra>",
             )
         )
     floor = 1e6 * story.noise_floor_m
     out = style.figure(
         _words(story, first, later),
-        y="3-D error, rms [µm]",
+        x="3-D error, rms [µm]",
         traces=traces,
-        waterfallgroupgap=0.15,
+        height=130 + 26 * len(names),
     )
     line = {"color": style.NOISE, "dash": "dash", "width": 2}
-    out.add_hline(floor, line=line, layer="below")
+    out.add_vline(floor, line=line, layer="below")
     # for the legend alone: a shape has no entry there
-    named = {"name": f"noise alone, {floor:.3g} µm", "mode": "lines", "line": line}
-    out.add_trace(go.Scatter(x=[names[0]], y=[None], hoverinfo="skip", **named))
-    out.update_yaxes(rangemode="tozero")
+    named = {"name": f"noise alone, {numbers.digits(floor)} µm", "mode": "lines", "line": line}
+    out.add_trace(go.Scatter(x=[None], y=[names[0]], hoverinfo="skip", **named))
+    out.update_yaxes(autorange="reversed")
+    out.update_xaxes(rangemode="tozero")
     return out
 
 

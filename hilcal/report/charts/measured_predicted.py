@@ -26,7 +26,7 @@ def measured_predicted(story: Story, revision: StoryRevision) -> go.Figure:
             x=ends,
             y=ends,
             mode="lines",
-            name="exactly predicted",
+            name="exact",
             line={"color": style.NOISE, "dash": "dash"},
             hoverinfo="skip",
         )
@@ -38,7 +38,7 @@ def measured_predicted(story: Story, revision: StoryRevision) -> go.Figure:
                 x=style.drawn(x[at, k]),
                 y=style.drawn(y[at, k]),
                 mode="markers",
-                name=f"along base {axis}",
+                name=f"base {axis}",
                 marker={"color": (style.MEASURED, style.HOLDOUT, style.AMBER)[k], "size": 6,
                         "symbol": style.SYMBOLS[k]},
                 text=list(d.names),

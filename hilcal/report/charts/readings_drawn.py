@@ -42,7 +42,7 @@ class Drawn:
         """What is said where not all readings are drawn; else empty."""
         if len(self.index) == self.of:
             return ""
-        worst = worst_count(MOST)
+        worst = worst_count(len(self.index))
         return (
             f" Of {self.of} readings {len(self.index)} are drawn: the {worst} furthest off and an "
             "even choice of the others."

@@ -11,16 +11,20 @@ from hilcal.report.charts.readings_drawn import Drawn, drawn, escaped
 from hilcal.report.story import Story, StoryRevision
 from hilcal.types import Floats
 
-MOST_POSES = 24
-"""Poses up to which all their names stand at the axis; a choice."""
+MOST_POSES = 16
+"""Poses up to which all their names stand at the axis; a choice, as is the next."""
+LONGEST_NAME = 12
+"""Characters of a name at the axis; of a longer one the end."""
 
 
 def residual_by_pose(story: Story, revision: StoryRevision) -> go.Figure:
     """Draw the residual of each reading in σ over its pose, poses in the order of their numbers."""
     d = drawn(story, revision)
     _, first, of = np.unique(story.pose, return_index=True, return_inverse=True)
-    out = chart(d, of.reshape(-1)[d.index].astype(float), "pose", _by(story, revision, "pose"))
-    names = [escaped(story.pose_name(int(i))) for i in first]
+    out = chart(d, of.reshape(-1)[d.index].astype(float), "", _by(story, revision, "pose"))
+    full = [story.pose_name(int(i)) for i in first]
+    short = [n if len(n) <= LONGEST_NAME else f"…{n[1 - LONGEST_NAME :]}" for n in full]
+    names = [escaped(n) for n in short]
     step = -(-len(names) // MOST_POSES)
     out.update_xaxes(tickvals=list(range(0, len(names), step)), ticktext=names[::step])
     return out

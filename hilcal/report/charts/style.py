@@ -26,8 +26,6 @@ LEVELS = (GREY, AMBER, RED)
 LEVEL_NAMES = ("inside the noise", "doubtful", "outside the noise")
 SYMBOLS = ("circle", "diamond", "x")
 """Marks of the levels, so that they are told apart without colours."""
-SYMBOLS_3D = ("circle", "diamond", "square")
-"""The same in space, where a cross needs a font that not every computer has."""
 LIMITS = (0.99, 0.9999)
 """Quantiles of χ²(3) from which a reading is doubtful, and outside: as in the viewer."""
 CONFIG: dict[str, object] = {"displayModeBar": False, "responsive": True, "scrollZoom": False}
@@ -43,17 +41,16 @@ def template(dark: bool) -> go.layout.Template:
         "linecolor": grid,
         "zerolinecolor": grid,
         "automargin": True,
+        "autotickangles": [0, 90],
         "title": {"standoff": 8, "font": {"size": 12}},
         "ticks": "",
     }
-    in_space = {"gridcolor": grid, "zerolinecolor": grid, "showbackground": False, "color": ink}
     layout = go.Layout(
         font={"color": ink, "family": "system-ui, sans-serif", "size": 13},
         paper_bgcolor="rgba(0,0,0,0)",
         plot_bgcolor="rgba(0,0,0,0)",
-        xaxis=axis,
+        xaxis={**axis, "ticklabelstandoff": 8},  # off the labels of the other axis
         yaxis=axis,
-        scene={"xaxis": in_space, "yaxis": in_space, "zaxis": in_space},
         hoverlabel={"align": "left", "bgcolor": DARK if dark else LIGHT, "font": {"color": ink}},
         legend={"orientation": "h", "y": 1.02, "yanchor": "bottom", "x": 0, "font": {"size": 12}},
         hovermode="closest",

@@ -1,4 +1,6 @@
-"""Where in the workspace the model fails: readings in space, with their residuals as arrows."""
+"""Where in the workspace the model fails: targets from above and from the side, with residuals."""
+
+from typing import Literal
 
 import numpy as np
 import plotly.graph_objects as go
@@ -14,48 +16,59 @@ MOST_ARROWS = 300
 _NICE = (1.0, 2.0, 5.0)
 
 
-def workspace(story: Story, revision: StoryRevision) -> go.Figure:
-    """Draw the target of each reading in base axes, coloured by its level, with its residual."""
+def workspace(
+    story: Story, revision: StoryRevision, plane: Literal["xy", "xz"] = "xy"
+) -> go.Figure:
+    """Draw the target of each reading in base axes, marked by its level, with its residual.
+
+    Args:
+        story: N readings.
+        revision: of the model.
+        plane: of the base's axes; "xy" is seen from above.
+    """
     d = drawn(story, revision, most=1000)
-    at = story.anchor[d.index]
-    residual = revision.residual[d.index]
+    axes = ["xyz".index(a) for a in plane]
+    at, residual = story.anchor[d.index][:, axes], revision.residual[d.index][:, axes]
     times = magnification(float(d.size_m.max(initial=0.0)))
     traces: list[object] = []
     for k, mine in d.by_level():
         worst = np.flatnonzero(mine)[np.argsort(-d.sigma[mine])][:MOST_ARROWS]
         start, end = at[worst], at[worst] + times * residual[worst]
         gap = np.full_like(start, np.nan)  # between one line and the next
-        lines = np.stack([start, end, gap], axis=1).reshape(-1, 3)
+        lines = np.stack([start, end, gap], axis=1).reshape(-1, 2)
         traces.append(
-            go.Scatter3d(
-                **dict(zip("xyz", style.drawn(lines).T.copy(), strict=True)),
+            go.Scatter(
+                **dict(zip("xy", style.drawn(lines).T.copy(), strict=True)),
                 mode="lines",
-                line={"color": style.LEVELS[k], "width": 4},
+                line={"color": style.LEVELS[k], "width": 2},
                 showlegend=False,
                 hoverinfo="skip",
             )
         )
         traces.append(
-            go.Scatter3d(
-                **dict(zip("xyz", style.drawn(at[mine]).T.copy(), strict=True)),
+            go.Scatter(
+                **dict(zip("xy", style.drawn(at[mine]).T.copy(), strict=True)),
                 mode="markers",
                 name=style.LEVEL_NAMES[k],
-                marker={"color": style.LEVELS[k], "size": 3, "symbol": style.SYMBOLS_3D[k]},
+                showlegend=False,
+                marker={"color": style.LEVELS[k], "size": 5, "symbol": style.SYMBOLS[k]},
                 text=d.named(mine),
                 hovertemplate="%{text}<extra></extra>",
             )
         )
     outside = int((style.levels(revision.whitened_norm2) == len(style.LEVELS) - 1).sum())
     says = (
-        f"Targets in base axes with their residuals, {times:g} times enlarged: {outside} of "
-        f"{len(story)} readings are outside the noise; the largest residual is "
+        f"Targets with their errors, {times:g} times enlarged: {outside} of {len(story)} readings "
+        f"are outside the noise (crosses, red); the largest error is "
         f"{numbers.length(float(d.size_m.max(initial=0.0)))}.{d.note}"
     )
-    axes = {f"{a}axis": {"title": {"text": f"base {a} [m]"}} for a in "xyz"}
-    camera = {"eye": {"x": 1.3, "y": 1.3, "z": 0.8}, "center": {"x": 0, "y": 0, "z": -0.22}}
-    scene = {**axes, "aspectmode": "data", "camera": camera}
-    legend = {"itemsizing": "constant"}
-    return style.figure(says, traces=traces, height=480, scene=scene, legend=legend)
+    if plane == "xz":
+        says = "The same from the side."
+    x, y = (f"base {a} [m]" for a in plane)
+    out = style.figure(says, x=x, y=y, traces=traces, height=280)
+    out.update_yaxes(scaleanchor="x", constrain="domain")
+    out.update_xaxes(constrain="domain")
+    return out
 
 
 def magnification(largest_m: float) -> float:

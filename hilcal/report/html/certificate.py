@@ -11,25 +11,23 @@ from hilcal.identify.fit import Fit, all_left_out
 from hilcal.report import numbers, text, text_validate
 from hilcal.report.covariance_words import covariance_words
 from hilcal.report.html.content import ReportContent
-from hilcal.report.html.first_screen import limit_words, mm
+from hilcal.report.html.first_screen import left_out_errors, limit_words
 from hilcal.report.html.parts import Items, Part, Section, Table, Words, from_terminal, table
 from hilcal.report.scatter_words import repeatability_source
 from hilcal.report.text_prior import prior_lines
 from hilcal.report.text_registration import base_line
 from hilcal.robot.arm import Arm
-from hilcal.types import Floats
 
 
 def certificate(m: ReportContent) -> Section:
     """Return the certificate for a quality manager."""
     fit = m.fit
-    parts: list[Part] = [Words(text.before_and_after(fit))]
-    parts += from_terminal([text.errors(fit)], "Error before and after")
+    parts = [*from_terminal([text.errors(fit)], "Error before and after")]
     if m.corrected is not None:
         parts.append(_corrected(m.corrected))
-    parts += [Words("Poses and loads", "heading"), *_conditions(m)]
-    parts += [Words("Limit", "heading"), *_limit(m)]
     parts += [Words("Uncertainty", "heading"), *_uncertainty(fit)]
+    parts += [Words("Limit", "heading"), *_limit(m)]
+    parts += [Words("Poses and loads", "heading"), *_conditions(m)]
     parts += [Words("What was not tested", "heading"), Items(tuple(not_tested(m)))]
     parts += [Words("Measured with", "heading"), *_instruments(m)]
     return Section("certificate", "Certificate", tuple(parts))
@@ -42,7 +40,7 @@ def _corrected(found: Mapping[str, Any]) -> Table:
         name = "unloaded" if part["name"] == UNLOADED else str(part["name"])
         sizes = [part[when][k] for when in ("before", "after") for k in ("rms_m", "max_m")]
         within = f"{part['inside']} of {part['count']}"
-        rows.append((name, str(part["count"]), *(mm(float(x)) for x in sizes), within))
+        rows.append((name, str(part["count"]), *(numbers.length(float(x)) for x in sizes), within))
     heads = ("load", "n", "before, rms", "largest", "corrected, rms", "largest", "in 95 % band")
     return table("Measured at uncorrected and at corrected joint targets", heads, rows)
 
@@ -57,6 +55,7 @@ def _conditions(m: ReportContent) -> Iterator[Part]:
     gross = f"; {set_aside} set aside as gross errors" if set_aside else ""
     yield Words(f"{count}{gross}. Loads (readings): {loads}.")
     yield from (Words(line.strip()) for line in prior_lines(m.fit))
+    yield Words(_choice(m))
     q = np.degrees(r.states.q)
     joints = range(q.shape[1])
     yield table(
@@ -67,14 +66,28 @@ def _conditions(m: ReportContent) -> Iterator[Part]:
             ("to", *(f"{q[:, j].max():.0f}°" for j in joints)),
         ),
     )
+    if m.tested is None:
+        yield _by_load(m)
+
+
+def _choice(m: ReportContent) -> str:
+    """Say what proves the choice of poses and loads."""
+    if m.plan is None:
+        return "The readings were imported; the file holds no plan, so nothing proves the choice."
+    efficiency, criterion = (m.plan.about.get(key) for key in ("efficiency", "criterion"))
+    if not isinstance(efficiency, int | float):
+        return "They were planned."
+    return (
+        f"This choice is at least {100 * efficiency:.1f} % as informative as the best possible "
+        f"one, by criterion {criterion}: a bound that the general equivalence theorem proves."
+    )
 
 
 def _limit(m: ReportContent) -> Iterator[Part]:
     words, passed = limit_words(m)
     if passed is None:
         yield Words(
-            "No limit was given, so nothing is passed or failed: hilcal report --limit LENGTH "
-            "states the largest 3-D error that is allowed."
+            "No limit was given (hilcal report --limit LENGTH), so nothing is passed or failed."
         )
     else:
         yield Words(words, "strong")
@@ -86,10 +99,8 @@ def _limit(m: ReportContent) -> Iterator[Part]:
             text_validate.validation_report(t.judged, t.prediction, t.beyond), "Validation"
         )
         yield from from_terminal(
-            text_validate.shares_report(t.shares), "Errors of the validation campaign"
+            text_validate.loads_report(t.shares), "Errors of the validation campaign"
         )
-    else:
-        yield _by_load(m)
 
 
 def _by_load(m: ReportContent) -> Table:
@@ -106,8 +117,8 @@ def _by_load(m: ReportContent) -> Table:
         row = [
             "unloaded" if name == UNLOADED else name,
             str(len(mine)),
-            mm(float(np.sqrt(np.mean(error[mine] ** 2)))),
-            mm(float(error[worst])),
+            numbers.length(float(np.sqrt(np.mean(error[mine] ** 2)))),
+            numbers.length(float(error[worst])),
             fit.readings.pose_names[pose[worst]],
         ]
         if m.limit_m is not None:
@@ -122,40 +133,37 @@ def _uncertainty(fit: Fit) -> Iterator[Part]:
         yield Words("No uncertainty is stated: the fit is not weighted by the full covariance.")
         return
     b = budget(fit)
-    u, big = b.combined, b.expanded
+    error = left_out_errors(fit)
+    inside = int(np.sum(error <= b.expanded))
     what = "deflection" if fit.mode == "deflection" else "position"
     yield Words(
-        f"Expanded uncertainty of a predicted {what} (3-D, k = {COVERAGE:.0f}, at least about "
-        f"95 %): U = {mm(_rms(big))} rms over what was measured, {mm(float(big.max()))} at most.",
+        f"Expected accuracy of a predicted {what} at a pose that was not fitted: expanded "
+        f"uncertainty U = {numbers.length(b.expanded)} (3-D, k = {COVERAGE:.0f}); {inside} of "
+        f"{len(error)} {what}s of poses left out are within it.",
         "strong",
     )
     yield table(
-        "Contributions (GUM): standard uncertainties of the 3-D position",
-        ("contribution", "evaluated by", "rms", "share of u²"),
+        "Contributions (GUM): standard uncertainties",
+        ("contribution", "evaluated by", "3-D", "share of u²"),
         (
-            (name, how, mm(_rms(part)), numbers.percent(float(np.mean(part**2) / np.mean(u**2))))
-            for name, how, part in _contributions(b, fit.model.cell.arm)
+            (name, how, numbers.length(u), numbers.percent((u / b.combined) ** 2))
+            for name, how, u in _contributions(b, fit.model.cell.arm)
         ),
     )
     yield Words(
-        "It contains the instrument's noise as stated (through the parameters), the arm's "
-        "repeatability and what the model misses at the measured poses. It does not contain what "
-        "no reading here can show: an error of scale or alignment of the instrument beyond its "
-        "stated covariance, temperatures and loads that were not measured, and changes of the arm "
-        "since.",
+        "This holds for poses and loads among those below. It does not contain what no reading "
+        "here can show: an error of scale or alignment of the instrument beyond its stated "
+        "covariance, temperatures and loads that were not measured, and changes of the arm since.",
         "note",
     )
 
 
-def _contributions(b: Budget, arm: Arm) -> Iterator[tuple[str, str, Floats]]:
-    yield "estimated parameters", "type A: covariance of the fit", b.parameters
+def _contributions(b: Budget, arm: Arm) -> Iterator[tuple[str, str, float]]:
+    yield "estimated parameters", "type A: errors of poses left out", b.parameters
+    yield "misfit at fitted poses", "type A: residuals beyond the noise", b.misfit
     yield "repeatability of the arm", repeatability_source(b.scatter_source, arm), b.scatter
-    yield "what the model misses", "type A: residuals beyond the noise", b.misfit
-    yield "combined", "", b.combined
-
-
-def _rms(x: Floats) -> float:
-    return float(np.sqrt(np.mean(x**2)))
+    yield "noise of the instrument", "type B: as stated", b.instrument
+    yield "combined, u", "", b.combined
 
 
 def not_tested(m: ReportContent) -> Iterator[str]:
@@ -218,7 +226,8 @@ def _instruments(m: ReportContent) -> Iterator[Part]:
             ("Base", base_line(m.fit.model.cell, m.fit.frames, m.fit.mode)),
             ("Operator", m.operator or "not stated"),
             ("Campaign", f"{m.name}, made {o.created[:19].replace('T', ' ')} UTC"),
-            ("SHA-256 of the file", m.sha256),
+            ("SHA-256", m.sha256),
+            *(() if m.tested is None else (("Validation SHA-256", m.tested.sha256),)),
             ("Revision", str(revision) if m.stored else "none stored: the baseline"),
             ("Report made", f"{m.made[:19].replace('T', ' ')} UTC by hilcal {m.version}"),
         ),

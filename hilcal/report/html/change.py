@@ -5,7 +5,7 @@ from hilcal.diagnose.comparison import Comparison
 from hilcal.names import quoted
 from hilcal.report import numbers
 from hilcal.report.charts.change import changes_chart, error_by_pose
-from hilcal.report.html.first_screen import Card, FirstScreen, mm
+from hilcal.report.html.first_screen import Card, FirstScreen
 from hilcal.report.html.page import render
 from hilcal.report.html.parts import Part, Section, Words, chart, from_terminal, table
 from hilcal.report.text_change import comparison_report, next_step, sentence
@@ -26,9 +26,9 @@ def page(c: Comparison, files: tuple[Named, Named], operator: str, made: str, ve
     (earlier, _), (later, _) = files
     arm = c.fit.model.cell.arm.name
     told: list[Part] = list(from_terminal(comparison_report(c, earlier, later)))
-    charts: list[Part] = [chart("Error today, by pose", error_by_pose(c), wide=True)]
+    charts: list[Part] = [chart("Error today, by pose", error_by_pose(c), wide=True, height=0)]
     if c.changes.found:
-        charts.append(chart("What each change moves", changes_chart(c), wide=True))
+        charts.append(chart("What each change moves", changes_chart(c), wide=True, height=0))
     rows = [(which, name, sha) for which, (name, sha) in zip(("earlier", "later"), files,
                                                              strict=True)]  # fmt: skip
     provenance = (
@@ -75,11 +75,15 @@ def first_screen(c: Comparison, earlier: str) -> FirstScreen:
     )
     what = " ".join(sentence(x) for x in found.found) or headline + "."
     cards = [
-        Card("Error today", mm(error.rms_m), f"rms; largest {mm(error.max_m)}"),
-        Card("Expected", mm(t.stated_m), "rms that the calibration states"),
+        Card(
+            "Error today",
+            numbers.length(error.rms_m),
+            f"rms; largest {numbers.length(error.max_m)}",
+        ),
+        Card("Expected", numbers.length(t.stated_m), "rms that the calibration states"),
     ]
     if t.drawing_m is not None:
-        cards.append(Card("Uncalibrated", mm(t.drawing_m), "rms of the arm as drawn"))
+        cards.append(Card("Uncalibrated", numbers.length(t.drawing_m), "rms of the arm as drawn"))
     answers = (
         ("Is the calibration still good?", good),
         ("What has changed?", what),

@@ -14,7 +14,7 @@ from hilcal.identify.fit import Fit
 from hilcal.identify.full_covariance import CovarianceParts
 from hilcal.identify.validation import Validation
 from hilcal.report.build_story import Chapter
-from hilcal.report.story import Story
+from hilcal.report.story import Story, StoryRevision
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,7 +52,8 @@ class ReportContent:
         chapters: the revisions, oldest first; the last is what the report is about.
         stored: whether they are in the file; else the baseline was fitted for the report alone.
         story: of the same revisions.
-        scalings: the last model fitted with each scaling.
+        left_out: the last of them with the errors of poses left out.
+        scalings: the last model fitted with each scaling; empty without an appendix.
         plan: what was planned; None where nothing was.
         tested: on readings that were never fitted; None without a validation campaign.
         corrected: error at uncorrected and at corrected joint targets, as `calibrate` measured it
@@ -60,6 +61,7 @@ class ReportContent:
         limit_m: the largest 3-D position error that is allowed, m; None without a limit.
         operator: who answers for the measurement; empty where nobody is named.
         commands: that lead to the same result.
+        appendix: whether the page has one.
     """
 
     name: str
@@ -71,6 +73,7 @@ class ReportContent:
     chapters: tuple[Chapter, ...]
     stored: bool
     story: Story
+    left_out: StoryRevision
     scalings: Mapping[Scaling, Fit]
     plan: Plan | None
     tested: Tested | None
@@ -78,6 +81,7 @@ class ReportContent:
     limit_m: float | None
     operator: str
     commands: tuple[str, ...]
+    appendix: bool
 
     @property
     def fit(self) -> Fit:

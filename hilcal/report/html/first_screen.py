@@ -9,7 +9,7 @@ from hilcal.data.plan import UNLOADED
 from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.identify.before import error_before
 from hilcal.identify.fit import Fit, all_left_out
-from hilcal.identify.full_prediction import full_prediction
+from hilcal.identify.full_prediction import names
 from hilcal.report import numbers, text
 from hilcal.report.html.content import ReportContent
 from hilcal.report.verdict_words import UNCALIBRATED, message
@@ -106,14 +106,12 @@ def where_wrong(m: ReportContent) -> str:
     d = m.diagnosis
     if d is not None and d.residual_is_noise:
         return "Nowhere beyond the noise: all poses and loads are predicted within it."
-    worst = text.worst_poses(full_prediction(m.fit), most=1)
-    places = "" if d is None else text.follows(d.misfit_breakdown)
-    at = ""
-    if worst:
-        w = worst[0]
-        load = "unloaded" if w.load == UNLOADED else f"under {w.load}"
-        at = f"Worst at pose {w.pose} {load}: off by {numbers.length(w.error_m)}. "
-    return f"{at}{places}".strip()
+    raw, w = all_left_out(m.fit)
+    error = np.linalg.norm(raw[:, :3], axis=1)
+    pose, load = names(m.fit.readings, int(w.reading[np.argmax(error)]))
+    at = "unloaded" if load == UNLOADED else f"under {load}"
+    said = f"Of the poses left out, {pose} {at} is furthest off: {numbers.length(error.max())}."
+    return said if d is None else f"{said} {text.follows(d.misfit_breakdown)}"
 
 
 def missing(d: Diagnosis | None) -> str:
@@ -170,40 +168,52 @@ def _cards(m: ReportContent, fit: Fit) -> Iterator[Card]:
         if fit.mode == "deflection"
         else "nominal arm, only its frames fitted"
     )
-    yield Card("Before", mm(before.rms_m), f"rms; largest {mm(before.max_m)}; {what}")
+    yield Card(
+        "Before",
+        numbers.length(before.rms_m),
+        f"rms; largest {numbers.length(before.max_m)}; {what}",
+    )
     if m.tested is not None:
         e = m.tested.prediction.error
         seen = "never fitted" if m.tested.judged.unseen else "fitted, so no test"
-        yield Card("After, validation", mm(e.rms_m), f"rms; largest {mm(e.max_m)}; {seen}")
+        yield Card(
+            "After, validation",
+            numbers.length(e.rms_m),
+            f"rms; largest {numbers.length(e.max_m)}; {seen}",
+        )
     if m.corrected is not None:
         e = m.corrected["error"]
-        before_m, after_m = (mm(float(e[k]["rms_m"])) for k in ("before", "after"))
+        before_m, after_m = (numbers.length(float(e[k]["rms_m"])) for k in ("before", "after"))
         yield Card(
             "Measured at corrected targets",
             after_m,
             f"rms; {before_m} without correction; {e['count']} points",
         )
     held = fit.holdout
-    yield Card("After, poses left out", mm(held.rms_m), f"rms; largest {mm(held.max_m)}")
-    yield Card("Noise alone", mm(m.story.noise_floor_m), "rms that no model can go below")
-
-
-def mm(metres: float) -> str:
-    """Return a length in mm, three digits or µm at the least."""
-    return f"{1e3 * metres:.3f} mm"
+    yield Card(
+        "After, poses left out",
+        numbers.length(held.rms_m),
+        f"rms; largest {numbers.length(held.max_m)}",
+    )
+    yield Card(
+        "Noise alone",
+        numbers.length(m.story.noise_floor_m),
+        "rms that the stated noise would leave",
+    )
 
 
 def limit_words(m: ReportContent) -> tuple[str, bool | None]:
     """Say whether the limit is kept, and by what that was judged."""
     if m.limit_m is None:
         return "", None
-    limit = mm(m.limit_m)
+    limit = numbers.length(m.limit_m)
     if m.tested is not None:
         a = m.tested.shares
         passed = bool(a.passed)
         head = "PASSED" if passed else "FAILED"
         so = f"{a.everything.count - a.over} of {a.everything.count} errors are within {limit}"
-        end = f" (campaign {m.tested.name}, never fitted; largest {mm(a.everything.max_m)})."
+        largest = numbers.length(a.everything.max_m)
+        end = f" (campaign {m.tested.name}, never fitted; largest {largest})."
         if a.undecided:
             end += " Noise alone exceeds the limit, so that these readings cannot tell."
         return f"{head}: {so}{end}", passed
@@ -212,8 +222,8 @@ def limit_words(m: ReportContent) -> tuple[str, bool | None]:
     head = "PASSED" if over == 0 else "FAILED"
     return (
         f"{head}: {len(error) - over} of {len(error)} errors are within {limit}, each pose "
-        f"predicted without itself (largest {mm(float(error.max()))}). No validation campaign was "
-        "given: an independent test is missing."
+        f"predicted without itself (largest {numbers.length(float(error.max()))}). No validation "
+        "campaign was given: an independent test is missing."
     ), over == 0
 
 

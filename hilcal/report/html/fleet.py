@@ -24,7 +24,7 @@ def page(fleet: "Fleet", directory: str, made: str, version: str) -> str:
     """
     sections = []
     for k, t in enumerate(fleet.types):
-        drawn: tuple[Part, ...] = (chart("Arms of the type", arms_chart(t), wide=True),)
+        drawn: tuple[Part, ...] = (chart("Arms of the type", arms_chart(t), wide=True, height=0),)
         told = from_terminal(list(type_report(t))[1:], f"Parameters of the {t.type}")
         sections.append(Section(f"type{k}", f"{t.type}: {len(t.arms)} arms", drawn + told))
     rows = [(m.name, m.arm, m.date[:10], m.verdict, numbers.length(m.rms_m)) for m in fleet.members]

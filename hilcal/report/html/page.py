@@ -10,6 +10,7 @@ from plotly.offline import get_plotlyjs
 
 from hilcal.names import escaped
 from hilcal.report.charts import style
+from hilcal.report.html.appendix import appendix
 from hilcal.report.html.certificate import certificate
 from hilcal.report.html.content import ReportContent
 from hilcal.report.html.first_screen import FirstScreen, first_screen
@@ -22,7 +23,8 @@ HERE = Path(__file__).parent
 def page(m: ReportContent) -> str:
     """Return the report of one campaign as HTML."""
     about = f"{m.overview.config.robot.model}, {m.name}, {m.made[:10]}"
-    return render("Calibration report", about, first_screen(m), (certificate(m), *sections(m)))
+    parts = (certificate(m), *sections(m), *(appendix(m) if m.appendix else ()))
+    return render("Calibration report", about, first_screen(m), parts)
 
 
 def render(title: str, about: str, first: FirstScreen, parts: tuple[Section, ...]) -> str:

@@ -1,7 +1,7 @@
 """What a page consists of: sections of words, tables, lists and charts; no markup in any of it."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import plotly.graph_objects as go
 from rich.console import RenderableType
@@ -10,6 +10,9 @@ from rich.text import Text
 
 from hilcal.names import escaped
 from hilcal.report.charts import style
+
+HEIGHT = 230
+"""Of a chart, CSS pixels: three rows of them are a printed page."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,11 +38,13 @@ class Table:
         caption: what it shows.
         heads: of the columns.
         rows: cells as text.
+        narrow: whether it stands beside another one where the page is wide.
     """
 
     caption: str
     heads: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
+    narrow: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,23 +71,30 @@ Part = Words | Items | Table | Chart
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A section; `details` is what is folded away on screen (a printed page shows it)."""
+    """A section."""
 
     id: str
     title: str
     parts: tuple[Part, ...]
-    details: tuple[Part, ...] = field(default=())
 
 
-def chart(title: str, figure: go.Figure, *, wide: bool = False) -> Chart:
-    """Return a figure as part of a page."""
+def chart(title: str, figure: go.Figure, *, wide: bool = False, height: int = HEIGHT) -> Chart:
+    """Return a figure as part of a page.
+
+    Args:
+        title: short.
+        figure: it.
+        wide: whether it takes the whole width of the page.
+        height: CSS pixels; 0 for the figure's own.
+    """
     bare = go.Figure(figure)
     bare.layout.template = None
+    bare.layout.height = height or figure.layout.height
     return Chart(
         title,
         in_script(bare.to_json()),
         style.says(figure),
-        int(figure.layout.height or 360),
+        int(bare.layout.height),
         wide,
     )
 
@@ -116,8 +128,7 @@ def from_terminal(parts: Iterable[RenderableType], caption: str = "") -> tuple[P
         words = part.plain if isinstance(part, Text) else str(part)
         styled = str(part.style) if isinstance(part, Text) else ""
         kind = {"bold": "heading", "dim": "note"}.get(styled, "text")
-        if words.strip():
-            out.append(Words(words.strip(), kind))
+        out += [Words(line.strip(), kind) for line in words.split("\n") if line.strip()]
     return tuple(out)
 
 
@@ -131,6 +142,8 @@ def _plain(cell: RenderableType) -> str:
     return cell.plain if isinstance(cell, Text) else str(cell)
 
 
-def table(caption: str, heads: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
+def table(
+    caption: str, heads: Sequence[str], rows: Iterable[Sequence[str]], *, narrow: bool = False
+) -> Table:
     """Return a table."""
-    return Table(caption, tuple(heads), tuple(tuple(r) for r in rows))
+    return Table(caption, tuple(heads), tuple(tuple(r) for r in rows), narrow)

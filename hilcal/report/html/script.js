@@ -32,10 +32,6 @@ function draw(at) {
   const figure = JSON.parse(at.parentElement.querySelector("script").textContent);
   figure.layout.template = look();
   figure.layout.autosize = true;
-  const eye = figure.layout.scene?.camera?.eye;
-  if (eye && at.clientWidth < at.clientHeight) { // else the axes are cut at both sides
-    for (const k of "xyz") eye[k] *= (1.45 * at.clientHeight) / at.clientWidth;
-  }
   Plotly.newPlot(at, figure.data, figure.layout, CONFIG);
 }
 
@@ -82,12 +78,8 @@ charts.forEach((at) => near.observe(at));
 dark.addEventListener("change", dress);
 afterPicture(load);
 
-const folded = [...document.querySelectorAll("details")];
-let wereOpen = [];
 function printing() {
   onPaper = true;
-  wereOpen = folded.map((d) => d.open);
-  folded.forEach((d) => { d.open = true; });
   document.documentElement.classList.add("printing");  // as wide as the paper
   drawAll();
   dress();
@@ -96,7 +88,6 @@ function printing() {
 window.addEventListener("beforeprint", printing);
 window.addEventListener("afterprint", () => {
   onPaper = false;
-  folded.forEach((d, k) => { d.open = wereOpen[k]; });
   document.documentElement.classList.remove("printing");
   dress();
   charts.forEach((at) => at.dataset.drawn && Plotly.Plots.resize(at));

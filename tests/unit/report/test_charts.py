@@ -10,19 +10,15 @@ from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.diagnose.verdict import diagnose
 from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
-from hilcal.report.build_story import Chapter, build_story, regressor
+from hilcal.report import numbers
+from hilcal.report.build_story import Chapter, build_story, of_left_out, regressor
 from hilcal.report.charts import style
 from hilcal.report.charts.added_variable import added_variable
+from hilcal.report.charts.correlations import correlations, parameter_correlations
 from hilcal.report.charts.error_per_revision import error_per_revision
 from hilcal.report.charts.measured_predicted import measured_predicted
 from hilcal.report.charts.misfit import misfit_curve, misfit_shares
 from hilcal.report.charts.noise_check import noise_check
-from hilcal.report.charts.parameters import (
-    correlations,
-    identifiability,
-    parameter_correlations,
-    parameters,
-)
 from hilcal.report.charts.readings_drawn import drawn
 from hilcal.report.charts.residuals import (
     residual_by_joint,
@@ -31,7 +27,6 @@ from hilcal.report.charts.residuals import (
     residual_by_time,
 )
 from hilcal.report.charts.scalings import scalings
-from hilcal.report.charts.suspects import evidence, suspects
 from hilcal.report.charts.workspace import LONGEST, magnification, workspace
 from tests.support.campaigns import campaign
 from tests.support.viewer_story import ANGLE, LOAD, story
@@ -52,23 +47,16 @@ def points(figure, axis: str) -> np.ndarray:
     return np.concatenate([np.asarray(getattr(t, axis), float) for t in figure.data if t.text])
 
 
-def test_the_waterfall_falls_to_the_last_error_and_shows_the_noise():
+def test_each_revision_has_a_bar_for_both_errors_and_the_noise_is_shown():
     told = story()
     figure = error_per_revision(told)
     for trace, key in zip(figure.data[:2], ("error_fit", "error_holdout"), strict=True):
         rms = [1e6 * getattr(r, key)["rms_m"] for r in told.revisions]
-        heights = np.cumsum(np.asarray(trace.y)[:-1])
-        np.testing.assert_allclose(heights, rms)
-        assert trace.measure[-1] == "total"
+        np.testing.assert_allclose(np.asarray(trace.x), rms)
+        assert list(trace.text) == [numbers.digits(v) for v in rms]
     (floor,) = figure.layout.shapes
-    assert floor.y0 == pytest.approx(1e6 * told.noise_floor_m)
+    assert floor.x0 == pytest.approx(1e6 * told.noise_floor_m)
     assert style.says(figure).startswith("The rms error fell from")
-
-
-def test_one_revision_is_one_bar():
-    told = story()
-    figure = error_per_revision(replace(told, revisions=told.revisions[:1]))
-    assert [list(t.measure) for t in figure.data[:2]] == [["absolute"], ["absolute"]]
 
 
 @pytest.mark.parametrize("mode", ["deflection", "absolute"])
@@ -76,7 +64,7 @@ def test_measured_over_predicted_differs_by_the_residual(mode: str):
     told = story(mode=mode)
     r = told.revisions[0]
     line, *axes = measured_predicted(told, r).data
-    assert line.name == "exactly predicted"
+    assert line.name == "exact"
     for k, trace in enumerate(axes):
         off = np.asarray(trace.y, float) - np.asarray(trace.x, float)
         np.testing.assert_allclose(off, 1e6 * r.residual[:, k], atol=1e-3)
@@ -119,19 +107,33 @@ def test_levels_have_a_colour_and_a_mark():
         assert ((y >= limits[k] - 1e-5) & (y <= limits[k + 1] + 1e-5)).all()
 
 
-def test_arrows_are_the_residuals_enlarged():
+@pytest.mark.parametrize("plane", ["xy", "xz"])
+def test_arrows_are_the_residuals_enlarged(plane: str):
     told = story()
     r = told.revisions[0]
-    figure = workspace(told, r)
+    figure = workspace(told, r, plane)
     times = magnification(float(np.linalg.norm(r.residual, axis=1).max()))
     assert 0.4 * LONGEST <= times * np.linalg.norm(r.residual, axis=1).max() <= LONGEST
     lengths = []
     for trace in figure.data:
         if trace.mode == "lines":
-            xyz = np.stack([np.asarray(getattr(trace, a), float) for a in "xyz"], 1)
-            lengths.append(np.linalg.norm(xyz[1::3] - xyz[::3], axis=1))
-    expected = times * np.linalg.norm(r.residual, axis=1)
+            xy = np.stack([np.asarray(getattr(trace, a), float) for a in "xy"], 1)
+            lengths.append(np.linalg.norm(xy[1::3] - xy[::3], axis=1))
+    seen = r.residual[:, ["xyz".index(a) for a in plane]]
+    expected = times * np.linalg.norm(seen, axis=1)
     np.testing.assert_allclose(np.sort(np.concatenate(lengths)), np.sort(expected), atol=1e-6)
+
+
+def test_errors_of_poses_left_out_take_the_place_of_the_residual():
+    f = fitted()
+    told = build_story([Chapter(1, None, f, None)])
+    fit_only = told.revisions[0]
+    r = of_left_out(fit_only, f)
+    size = np.linalg.norm(r.residual, axis=1)
+    assert np.sqrt(np.mean(size**2)) == pytest.approx(f.holdout.rms_m, rel=1e-9)
+    assert size.max() == pytest.approx(f.holdout.max_m, rel=1e-9)
+    np.testing.assert_allclose(told.measured - r.predicted, r.residual, atol=1e-12)
+    assert r.whitened_norm2.sum() > fit_only.whitened_norm2.sum()
 
 
 def test_of_very_many_readings_the_worst_are_drawn_and_it_is_said():
@@ -150,21 +152,6 @@ def test_a_pose_named_like_markup_stays_text():
     words = [*figure.layout.xaxis.ticktext, *(n for t in figure.data for n in t.text)]
     assert words
     assert not any("<" in w for w in words)
-
-
-def test_suspects_are_those_of_the_diagnosis():
-    d = judged()
-    figure = suspects(d)
-    (bar,) = figure.data
-    np.testing.assert_allclose(
-        np.asarray(bar.x, float), [100 * max(s.holdout_share, 0) for s in d.suspects[:10]]
-    )
-    assert bar.y[0] == "joint_tilt_compliance ✓"
-    assert "joint_tilt_compliance leads" in style.says(figure)
-    (bar,) = evidence(d).data
-    np.testing.assert_allclose(
-        np.asarray(bar.x, float), [s.score.log_evidence for s in d.suspects[:10]]
-    )
 
 
 def test_an_added_variable_plot_shows_its_slope():
@@ -191,17 +178,6 @@ def test_shares_and_curves_of_the_misfit():
         np.testing.assert_allclose(np.asarray(trace.error_y.array, float), curve.error)
 
 
-def test_parameters_stand_in_units_of_their_uncertainty():
-    f = fitted()
-    told = build_story([Chapter(1, None, f, None)])
-    figure = parameters(told.revisions[0])
-    known = [p for p in f.parameters if p.identifiable and p.std]
-    t = sorted(p.value / p.std for p in known)
-    x = np.asarray(figure.data[0].x, float)
-    drawn_t = 2 * np.sinh(x) if "asinh" in figure.layout.xaxis.title.text else x
-    np.testing.assert_allclose(np.sort(drawn_t), t, rtol=1e-9)
-
-
 def test_correlations_are_those_of_the_normal_equations():
     f = fitted()
     names, of = parameter_correlations(f)
@@ -224,8 +200,6 @@ def test_correlations_are_those_of_the_normal_equations():
     np.testing.assert_allclose(of, inverse / np.outer(std, std), atol=0.05)
     (heat,) = correlations(f).data
     assert np.asarray(heat.z).shape == (min(len(names), 30),) * 2
-    (bar,) = identifiability(f).data
-    assert all(0 <= v <= 100 for v in bar.x)
 
 
 def test_the_noise_check_counts_every_element():

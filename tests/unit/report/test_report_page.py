@@ -1,5 +1,6 @@
 """The report in a browser: whole on a desk and on a phone, light and dark, offline, on paper."""
 
+import base64
 import itertools
 import json
 import re
@@ -15,9 +16,13 @@ import pytest
 from playwright.sync_api import Browser
 
 from hilcal.calibration.budget import budget
+from hilcal.data.overview import Instrument
+from hilcal.report import numbers
 from hilcal.report.html.content import ReportContent
-from hilcal.report.html.first_screen import left_out_errors, limit_words, mm
+from hilcal.report.html.first_screen import first_screen, left_out_errors, limit_words
 from hilcal.report.html.page import page as page_of
+from hilcal.report.html.parts import Chart, Table
+from hilcal.report.html.sections import sections
 from tests.support.browser import DESKTOP, PHONE, needs_chromium, open_browser
 from tests.support.picture import pixels
 from tests.support.report_pages import EVIL, opened, small_content
@@ -32,6 +37,19 @@ CUT = (
     "t.getBoundingClientRect())).map((t) => [c.ariaLabel.split(':')[0], t.textContent]); })"
 )
 """Words of charts that are cut at their left or right edge."""
+OVERLAPPING = """() => charts.flatMap((c) => {
+  const shown = (t) => t.textContent && t.getBoundingClientRect().width;
+  const of = (kind) => [...c.querySelectorAll(kind)].filter(shown);
+  const labels = of('.xtick text, .ytick text, .xtitle, .ytitle, .legendtext, .annotation-text');
+  const boxes = labels.map((t) => [t.textContent, t.getBoundingClientRect()]);
+  const hit = (a, b) => Math.min(a.right, b.right) - Math.max(a.left, b.left) > 1
+    && Math.min(a.bottom, b.bottom) - Math.max(a.top, b.top) > 2;
+  return boxes.flatMap(([a, x], k) => boxes.slice(k + 1).filter(([, y]) => hit(x, y))
+    .map(([b]) => [c.ariaLabel.split(':')[0], a, b]));
+})"""
+"""Pairs of labels of charts that lie over each other; boxes have 2 pixels of leading."""
+MAIN = ["certificate", "revisions", "where", "evidence", "parameters"]
+MOST_PAGES = 6
 needs_poppler = pytest.mark.skipif(
     shutil.which("pdftoppm") is None, reason="no poppler: on Debian install poppler-utils"
 )
@@ -50,6 +68,36 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[ReportContent, Path]
 def browser() -> Iterator[Browser]:
     with open_browser() as found:
         yield found
+
+
+def plain(m: ReportContent) -> ReportContent:
+    """The same without its appendix."""
+    return replace(m, appendix=False, scalings={})
+
+
+def large(m: ReportContent) -> ReportContent:
+    """The same with many revisions, poses of long names, and instruments, with no appendix."""
+    told = m.story
+    last = told.revisions[-1]
+    many = tuple(
+        replace(last, revision=k, change="+ periodic_joint_compliance" if k else "", model=("a",))
+        for k in range(12)
+    )
+    named = tuple(f"calibration pose number {k:03d}" for k in range(len(told)))
+    story = replace(
+        told, revisions=many, pose_names=named, pose=np.arange(len(told)),
+        time_s=60.0 * np.arange(len(told)),
+    )  # fmt: skip
+    one = Instrument("tracker", "leica", "Leica AT960-MR", "750123", {"firmware": "3.1"}, m.made)
+    overview = replace(m.overview, instruments=(one,) * 5)
+    return replace(plain(m), story=story, overview=overview)
+
+
+def read(values: object) -> np.ndarray:
+    """Numbers of a chart, which plotly may write as base64."""
+    if isinstance(values, dict):
+        return np.frombuffer(base64.b64decode(values["bdata"]), dtype=values["dtype"])
+    return np.asarray(values, float)
 
 
 class Outline(HTMLParser):
@@ -82,8 +130,8 @@ def test_the_page_is_one_file_with_its_headings_tables_and_sentences(made) -> No
             assert found["href"] == "data:,"
     assert tags.count("table") == tags.count("caption")
     ids = [found["id"] for name, found in outline.tags if name == "section"]
-    assert ids[:3] == ["certificate", "measured", "where"]
-    assert {"evidence", "revisions", "parameters", "noise", "scalings", "plan"} < set(ids)
+    assert ids[: len(MAIN)] == MAIN
+    assert set(ids[len(MAIN) :]) == {"joints", "rejected", "all", "scalings", "provenance"}
     links = [found["href"] for name, found in outline.tags if name == "a"]
     assert links == [f"#{i}" for i in ids]
 
@@ -103,15 +151,51 @@ def test_numbers_of_the_certificate_are_those_of_the_fit(made) -> None:
     words, passed = limit_words(m)
     assert passed == bool(error.max() <= m.limit_m)
     assert words.startswith("PASSED" if passed else "FAILED")
-    assert mm(m.fit.holdout.rms_m) in text
+    assert numbers.length(m.fit.holdout.rms_m) in text
     failed, kept = limit_words(replace(m, limit_m=float(np.median(error))))
     assert not kept
     assert failed.startswith(f"FAILED: {(len(error) + 1) // 2} of {len(error)}")
     b = budget(m.fit)
-    np.testing.assert_allclose(
-        b.expanded**2 / 4, b.parameters**2 + b.scatter**2 + b.misfit**2, rtol=1e-12
-    )
-    assert f"U = {mm(float(np.sqrt(np.mean(b.expanded**2))))}" in text
+    assert f"U = {numbers.length(b.expanded)}" in text
+    assert b.combined >= m.fit.holdout.rms_m
+    inside = np.sum(error <= b.expanded)
+    assert f"{inside} of {len(error)} deflections of poses left out are within it" in text
+
+
+def test_what_is_said_to_be_wrong_is_of_poses_left_out(made) -> None:
+    """The pose that fits worst is not the one that is predicted worst."""
+    m, _ = made
+    error = left_out_errors(m.fit)
+    worst = f"furthest off: {numbers.length(error.max())}"
+    assert worst in first_screen(m).answers[1][1]
+    size = np.linalg.norm(m.left_out.residual, axis=1)
+    np.testing.assert_allclose(np.sort(size), np.sort(error), rtol=1e-9)
+    by_pose = next(p for p in sections(m)[1].parts if isinstance(p, Chart))
+    drawn = np.concatenate([read(t["y"]) for t in json.loads(by_pose.json)["data"]])
+    np.testing.assert_allclose(np.sort(drawn) ** 2, np.sort(m.left_out.whitened_norm2), rtol=1e-5)
+
+
+def test_without_an_appendix_the_page_has_the_parameters_and_nothing_else_of_it(made) -> None:
+    m, path = made
+    short, long = page_of(plain(m)), path.read_text(encoding="utf-8")
+    outline = Outline()
+    outline.feed(short)
+    assert [found["id"] for name, found in outline.tags if name == "section"] == MAIN
+    for words in ("Correlations", "SHA-256 of its readings", "Scaling none", "Over joint 1",
+                  "Other suspects", "Commands as they were typed"):  # fmt: skip
+        assert words in long
+        assert words not in short
+    rejected = [s.effect for s in m.diagnosis.suspects if not s.passes]
+    assert rejected
+    assert not any(f"Added variable: {name}" in short for name in rejected)
+    cells = [row for p in sections(m)[-1].parts if isinstance(p, Table) for row in p.rows]
+    known = [p for p in m.fit.parameters if p.identifiable]
+    assert len(cells) == len(known) > 5
+    for p in known:
+        (row,) = (r for r in cells if r[0] == p.name)
+        unit, factor = next((u, f) for u, f in [numbers.unit_for(p.unit, [p.value])])
+        assert float(row[1]) == pytest.approx(factor * p.value, rel=0.1) or row[3] != unit
+        assert row[1] in short
 
 
 @needs_chromium
@@ -152,6 +236,34 @@ def test_it_is_whole_in_a_browser(made, browser: Browser, size, scheme: str) -> 
         assert page.evaluate(f"({CUT})()") == []
         assert page.evaluate("window.harmed") is None
         assert bad == []
+
+
+@needs_chromium
+@pytest.mark.parametrize("of", [plain, large])
+def test_it_prints_on_six_pages_at_most(made, browser: Browser, tmp_path: Path, of) -> None:
+    path = tmp_path / "short.html"
+    path.write_text(page_of(of(made[0])), encoding="utf-8")
+    with opened(browser, path, viewport=DESKTOP) as (page, bad):
+        page.evaluate(f"window.onbeforeprint = () => {{ window.over = ({OVERLAPPING})(); }}")
+        pdf = page.pdf(prefer_css_page_size=True)
+        assert page.evaluate("window.over") == []
+        assert bad == []
+    assert 2 <= len(re.findall(rb"/Type\s*/Page\b", pdf)) <= MOST_PAGES
+
+
+@needs_chromium
+@pytest.mark.parametrize("width", [PHONE["width"], PAPER])
+@pytest.mark.parametrize("of", [lambda m: m, large], ids=["appendix", "large"])
+def test_no_label_of_a_chart_lies_over_another(
+    made, browser: Browser, tmp_path: Path, width: int, of
+) -> None:
+    path = tmp_path / "page.html"
+    path.write_text(page_of(of(made[0])), encoding="utf-8")
+    with opened(browser, path, viewport={"width": width, "height": 900}) as (page, _):
+        page.evaluate(DRAW_ALL)
+        page.wait_for_function("charts.every((c) => c._fullLayout && c.querySelector('svg'))")
+        assert page.evaluate("charts.length") > 6
+        assert page.evaluate(f"({OVERLAPPING})()") == []
 
 
 @needs_chromium
