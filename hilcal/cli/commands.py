@@ -123,7 +123,7 @@ COMMANDS = {
     ),
     "report": Command(
         "reporting:report",
-        "Write the whole story as one HTML page, a certificate first; it prints to PDF.",
+        "Write the whole story as one HTML page, a certificate first; it prints on six pages.",
     ),
     "view": Command("viewing:view", "Tell the story of the revisions in rerun."),
     "workbench": Command(

@@ -1,7 +1,10 @@
 """When a background is taken, on simulated arms: many effects at once, an unknown law, noise."""
 
+from dataclasses import replace
+
 import numpy as np
 
+from hilcal.calibration.budget import budget
 from hilcal.config import load_config
 from hilcal.identify.baseline import baseline
 from hilcal.refine import BACKGROUND, refine
@@ -31,6 +34,11 @@ def test_an_arm_that_errs_in_many_ways_is_predicted_from_few_poses() -> None:
     error = np.linalg.norm(found.fit.predict(fresh).position - true, axis=1).mean()
     before = np.linalg.norm(alone.fit.predict(fresh).position - true, axis=1).mean()
     assert error < 0.6 * before
+    stated = budget(found.fit)  # fitted poses are far nearer than any other is
+    assert stated.combined >= found.fit.holdout.rms_m > 3 * found.fit.error.rms_m
+    unloaded = replace(fresh, wrench=np.zeros_like(fresh.wrench))  # as what was fitted
+    off = found.fit.predict(unloaded).position - case.world.sight(unloaded).position
+    assert np.mean(np.linalg.norm(off, axis=1) <= stated.expanded) >= 0.9
     assert found.verdict in ("missing_effect", "ambiguous")
     assert set(found.fit.model.named) - {"base_frame"} <= set(HIDDEN)
 
