@@ -317,7 +317,7 @@ def report(name: str) -> str:
         chart(name, figure),
     )
     first = FirstScreen(name, "good", ((name, name),), (), name, True)
-    return page.render(name, name, first, (Section("a", name, parts, parts),))
+    return page.render(name, name, first, (Section("a", name, parts),))
 
 
 @settings(max_examples=12, deadline=None)
