@@ -7,7 +7,6 @@ from hilcal.diagnose.effect_ranking import LEAST_SHARE
 from hilcal.report import numbers, text, text_validate
 from hilcal.report.charts.correlations import correlations
 from hilcal.report.charts.residuals import residual_by_joint
-from hilcal.report.charts.scalings import scalings
 from hilcal.report.covariance_words import covariance_words
 from hilcal.report.html.content import ReportContent
 from hilcal.report.html.parts import Part, Section, Words, chart, from_terminal, table
@@ -59,7 +58,6 @@ def _parameters(m: ReportContent) -> Iterator[Part]:
 
 def _scalings(m: ReportContent) -> Iterator[Part]:
     if len(m.scalings) > 1:
-        yield chart("Scaling none, gu, gc", scalings(m.scalings), wide=True, height=0)
         yield from from_terminal(scalings_table(m.scalings), "The same model with each scaling")
 
 

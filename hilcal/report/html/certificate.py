@@ -227,7 +227,7 @@ def _instruments(m: ReportContent) -> Iterator[Part]:
             ("Operator", m.operator or "not stated"),
             ("Campaign", f"{m.name}, made {o.created[:19].replace('T', ' ')} UTC"),
             ("SHA-256", m.sha256),
-            *(() if m.tested is None else (("Validation SHA-256", m.tested.sha256),)),
+            *([("Validation SHA-256", m.tested.sha256)] if m.tested else []),
             ("Revision", str(revision) if m.stored else "none stored: the baseline"),
             ("Report made", f"{m.made[:19].replace('T', ' ')} UTC by hilcal {m.version}"),
         ),

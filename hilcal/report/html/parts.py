@@ -142,8 +142,6 @@ def _plain(cell: RenderableType) -> str:
     return cell.plain if isinstance(cell, Text) else str(cell)
 
 
-def table(
-    caption: str, heads: Sequence[str], rows: Iterable[Sequence[str]], *, narrow: bool = False
-) -> Table:
+def table(caption: str, heads: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
     """Return a table."""
-    return Table(caption, tuple(heads), tuple(tuple(r) for r in rows), narrow)
+    return Table(caption, tuple(heads), tuple(tuple(r) for r in rows))

@@ -26,7 +26,6 @@ from hilcal.report.charts.residuals import (
     residual_by_pose,
     residual_by_time,
 )
-from hilcal.report.charts.scalings import scalings
 from hilcal.report.charts.workspace import LONGEST, magnification, workspace
 from tests.support.campaigns import campaign
 from tests.support.viewer_story import ANGLE, LOAD, story
@@ -209,15 +208,6 @@ def test_the_noise_check_counts_every_element():
     step, width = float(normal.x[1] - normal.x[0]), float(bar.x[1] - bar.x[0])
     assert np.sum(normal.y) * step == pytest.approx(width * len(f.white), rel=1e-3)
     assert "larger than the stated noise" in style.says(noise_check(f))
-
-
-def test_scalings_side_by_side():
-    f = fitted()
-    others = {k: fit(f.model, f.readings, f.mode, k) for k in ("none", "gu")}
-    figure = scalings({**others, "gc": f})
-    assert list(figure.data[0].x) == ["none", "gu", "gc"]
-    assert figure.data[0].y[2] == pytest.approx(1e6 * f.error.rms_m)
-    assert figure.data[1].y[0] == pytest.approx(1e6 * others["none"].holdout.rms_m)
 
 
 def luminance(color: str) -> float:
