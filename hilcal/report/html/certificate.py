@@ -7,7 +7,7 @@ import numpy as np
 
 from hilcal.calibration.budget import COVERAGE, Budget, budget
 from hilcal.data.plan import UNLOADED
-from hilcal.identify.fit import Fit, all_left_out
+from hilcal.identify.fit import Fit
 from hilcal.report import numbers, text, text_validate
 from hilcal.report.covariance_words import covariance_words
 from hilcal.report.html.content import ReportContent
@@ -105,10 +105,9 @@ def _limit(m: ReportContent) -> Iterator[Part]:
 
 def _by_load(m: ReportContent) -> Table:
     """Errors of poses left out by load."""
-    fit = m.fit
-    raw, w = all_left_out(fit)
-    error = np.linalg.norm(raw[:, :3], axis=1)
-    load, pose = fit.readings.load[w.reading], fit.readings.pose[w.reading]
+    fit, error = m.fit, left_out_errors(m.fit)
+    kept = fit.readings[~fit.outlier][fit.whitening.reading]
+    load, pose = kept.load, kept.pose
     rows = []
     for k in np.unique(load):
         mine = np.flatnonzero(load == k)

@@ -8,7 +8,7 @@ import numpy as np
 from hilcal.data.plan import UNLOADED
 from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.identify.before import error_before
-from hilcal.identify.fit import Fit, all_left_out
+from hilcal.identify.fit import Fit
 from hilcal.identify.full_prediction import names
 from hilcal.report import numbers, text
 from hilcal.report.html.content import ReportContent
@@ -106,9 +106,9 @@ def where_wrong(m: ReportContent) -> str:
     d = m.diagnosis
     if d is not None and d.residual_is_noise:
         return "Nowhere beyond the noise: all poses and loads are predicted within it."
-    raw, w = all_left_out(m.fit)
-    error = np.linalg.norm(raw[:, :3], axis=1)
-    pose, load = names(m.fit.readings, int(w.reading[np.argmax(error)]))
+    fit, error = m.fit, left_out_errors(m.fit)
+    furthest = int(fit.whitening.reading[np.argmax(error)])
+    pose, load = names(fit.readings[~fit.outlier], furthest)
     at = "unloaded" if load == UNLOADED else f"under {load}"
     said = f"Of the poses left out, {pose} {at} is furthest off: {numbers.length(error.max())}."
     return said if d is None else f"{said} {text.follows(d.misfit_breakdown)}"
@@ -228,6 +228,5 @@ def limit_words(m: ReportContent) -> tuple[str, bool | None]:
 
 
 def left_out_errors(fit: Fit) -> Floats:
-    """Return the 3-D errors (D,) of measurements predicted without their pose, m."""
-    raw, _ = all_left_out(fit)
-    return np.asarray(np.linalg.norm(raw[:, :3], axis=1))
+    """Return the 3-D errors (D,) of fitted measurements predicted without their pose, m."""
+    return np.asarray(np.linalg.norm(fit.left_out[:, :3], axis=1))

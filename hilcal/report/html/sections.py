@@ -41,7 +41,10 @@ def sections(m: ReportContent) -> tuple[Section, ...]:
 def _where(m: ReportContent) -> Section:
     story, last, d = m.story, m.left_out, m.diagnosis
     parts: list[Part] = [
-        Words("Errors are those of poses left out: each is predicted by a fit to the others."),
+        Words(
+            "Errors are those of poses left out: each is predicted by a fit to the others."
+            + (" Readings set aside as gross errors are drawn, too." * bool(m.fit.outlier.any()))
+        ),
         chart("By pose", residual_by_pose(story, last), wide=True),
         chart("Measured against predicted", measured_predicted(story, last)),
     ]

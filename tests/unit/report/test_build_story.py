@@ -16,7 +16,8 @@ from hilcal.identify.fit import fit
 from hilcal.identify.full_prediction import full_prediction
 from hilcal.identify.linearisation import HeldOut
 from hilcal.refine import add
-from hilcal.report.build_story import Chapter, build_story, curve, pose_numbers
+from hilcal.report.build_story import Chapter, build_story, curve, of_left_out, pose_numbers
+from hilcal.report.html.first_screen import left_out_errors
 from hilcal.report.story import Story, StoryRevision, check
 from hilcal.robot.chain import evaluate
 from tests.support.campaigns import Campaign, campaign
@@ -214,6 +215,11 @@ def test_gross_errors_are_shown_as_well() -> None:
     check(story)
     assert len(story) == len(readings)
     assert int(np.argmax(story.revisions[0].whitened_norm2)) == 17
+    left = np.linalg.norm(of_left_out(story.revisions[0], found).residual, axis=1)
+    assert int(np.argmax(left)) == 17
+    kept = left_out_errors(found)
+    np.testing.assert_allclose(np.sort(left[~found.outlier]), np.sort(kept), rtol=1e-9)
+    assert kept.max() == pytest.approx(found.holdout.max_m)
 
 
 def test_other_readings_do_not_make_one_story() -> None:
