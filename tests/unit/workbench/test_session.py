@@ -13,6 +13,7 @@ from hilcal.diagnose.verdict import diagnose
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.carried import carried_prior
 from hilcal.report.diagnosis_document import to_json
+from hilcal.report.two_revisions import left_out_m, verdict_of
 from hilcal.workbench.session import Session
 from tests.support.bench_cases import BASE, few_effects, stored
 from tests.support.campaigns import campaign, configuration
@@ -33,7 +34,7 @@ def test_an_operator_adds_removes_and_goes_back(run: Path) -> None:
     session = Session(run, few_effects())
     snapshot = session.load()
     assert (run.read_bytes(), list(run.parent.iterdir())) == (before, [run])  # only looked at
-    assert (snapshot.number, snapshot.rows, snapshot.in_use) == (None, (), None)
+    assert (snapshot.number, snapshot.records, snapshot.in_use) == (None, (), None)
     with Campaign.open(run, few_effects(), read_only=True) as o:
         assert to_json(snapshot.diagnosis) == to_json(diagnose(o.fit_in_use()[1]))
     assert snapshot.diagnosis.significant[0] == BASE
@@ -57,12 +58,12 @@ def test_an_operator_adds_removes_and_goes_back(run: Path) -> None:
 
     added = session.add(snapshot, BASE)
     assert session.changed is not None
-    assert (added.number, [row.change for row in added.rows]) == (2, ["", f"+ {BASE}"])
+    assert (added.number, [r.added for r in added.records]) == (2, [None, BASE])
     assert added.fit.holdout.rms_m < 0.8 * snapshot.fit.holdout.rms_m
     assert [c.number for c in added.chapters] == [1, 2]
-    assert added.rows[1].left_out_m == added.fit.holdout.rms_m
-    assert added.rows[1].verdict == added.diagnosis.verdict
-    assert added.rows[0].verdict == snapshot.diagnosis.verdict
+    assert left_out_m(added.records[1]) == added.fit.holdout.rms_m
+    judged = [snapshot.diagnosis.verdict, added.diagnosis.verdict]
+    assert [verdict_of(r) for r in added.records] == [v.replace("_", " ") for v in judged]
 
     with pytest.raises(InputError, match="has gone on since that click; nothing was changed"):
         session.add(snapshot, BASE)  # the second of a double click
