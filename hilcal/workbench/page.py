@@ -25,6 +25,7 @@ TICK = 0.2
 LOOK = 2.0
 """How often it looks at the file, s."""
 CSS = Path(__file__).with_name("page.css")
+SCRIPT = Path(__file__).with_name("page.js")
 DARK = "matchMedia('(prefers-color-scheme: dark)').matches"
 
 
@@ -146,6 +147,7 @@ class View:
         """Make the parts that stay, and look for changes from time to time."""
         ui.colors(primary="#1f6f9f", positive="#00785a", negative="#c0274b", warning="#8a5a00")
         ui.add_css(CSS)
+        ui.add_body_html(f"<script>{SCRIPT.read_text(encoding='utf-8')}</script>")
         self.status = Status(self)
         self.body = ui.column().classes("bench")
         self.below = ui.column().classes("bench")

@@ -465,7 +465,7 @@ def came(page: Page, place: str, how: str, words: str) -> None:
     answer = page.locator(f"[data-answer={place}]")
     expect(answer).to_have_attribute("data-came", how, timeout=WAIT)
     expect(answer).to_contain_text(words)
-    assert answer.evaluate("e => e.getBoundingClientRect().top < innerHeight")  # it is in view
+    expect(answer).to_be_in_viewport()
 
 
 @needs_chromium
