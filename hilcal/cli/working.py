@@ -58,7 +58,7 @@ def workbench(
     effects_from: EffectsFrom = None,
     as_json: Json = False,
 ) -> None:
-    """Compare, add, remove, measure next on one page, which only this machine can open."""
+    """Compare, add, remove, change the cell, measure next on one page of this machine alone."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     require_nicegui()
     if config is not None:

@@ -101,7 +101,8 @@ class Snapshot:
 
 def figures_of(o: Campaign) -> tuple[Figure, ...]:
     """Return what can be changed in the cell of a campaign."""
-    fixed, found = o.unchangeable(), []
+    together = {"tracker": dict.fromkeys(INSTRUMENT_NOISE)}  # what needs a stated noise is shown
+    fixed, found = o.unchangeable(together), []
     for section, keys in CHANGEABLE.items():
         of = getattr(o.config, section)
         for key in keys:
