@@ -102,7 +102,7 @@ class Campaign:
         try:
             check_robot(file.path, file.config_json, file.about(ROBOT_FILE))
             number, records = file.accepted(), file.revisions()
-            used = records[-1:] if number is None else (file.revision(number),)
+            used = records[-1:] if number is None else records[number - 1 : number]
             changes = used[0].cell if used else {}
             return cls._of(file, catalogue or installed(), changes)
         except BaseException:

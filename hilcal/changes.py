@@ -11,7 +11,6 @@ from hilcal.diagnose.effect_ranking import Suspect, addition
 from hilcal.diagnose.serial_noise import with_serial_noise
 from hilcal.diagnose.verdict import NOTHING, diagnose
 from hilcal.effects.options import Options
-from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.effects.written import write_effect
 from hilcal.identify.arm_scatter import with_arm_scatter, with_prior_scatter
 from hilcal.identify.background import with_background
@@ -127,7 +126,7 @@ def _stored(
 def refit(o: Campaign, record: RevisionRecord, say: Say, history: History = NOTHING) -> Diagnosis:
     """Fit the model of a revision to all readings of a campaign, in its cell, and judge the fit.
 
-    Frames that the cell does not know are in it, whether or not they were. What the revision has
+    Frames that were unknown are in it where the cell does not know them now. What the revision has
     beside its effects it has again, estimated anew: another campaign's prior, a background, the
     arm's scatter. Nothing is stored.
 
@@ -142,7 +141,7 @@ def refit(o: Campaign, record: RevisionRecord, say: Say, history: History = NOTH
         CannotAnswerError: the readings do not determine the model.
     """
     mode = mode_of(record)
-    frames = {kind.name for kind in o.catalogue.with_role(*FRAME_ROLES)}
+    frames = o.catalogue.unknown_frames(o.at(record.cell).cell)
     names = [name for name in record.effects if name not in frames]
     options = {n: of for n, of in record.options["effects"].items() if n not in frames}
     say(f"fitting {' + '.join(names) or 'the nominal arm'} to {len(o.readings)} readings")

@@ -102,7 +102,8 @@ def _parameters(a: RevisionRecord, b: RevisionRecord) -> Iterator[Row]:
             continue
         difference = ""
         if first != second and not {first, second} & {NONE, UNSEEN}:
-            difference = numbers.digits(factor * (values[1] - values[0]), 2).replace("-", "−")
+            by = factor * (values[1] - values[0])
+            difference = ("+" * (by > 0) + numbers.digits(by, 2)).replace("-", "−")
         yield Row(f"{name} [{unit}]" if unit else name, first, second, difference)
 
 

@@ -469,7 +469,7 @@ def figure_field(view: View, f: Figure) -> None:
 
 def downloads(view: View, d: Snapshot) -> None:
     """Draw what can be had as a file."""
-    title("Take it with you")
+    title("Downloads")
     ui.label(
         f"Of {'the baseline' if d.number is None else f'revision {d.number}'}: the story as one "
         "page, the calibration for hilcal compensate, and the readings as an exchange table."
