@@ -100,7 +100,6 @@ class Campaign:
         """
         file = CampaignFile.open(path, read_only=read_only)
         try:
-            check_robot(file.path, file.config_json, file.about(ROBOT_FILE))
             number, records = file.accepted(), file.revisions()
             used = records[-1:] if number is None else records[number - 1 : number]
             changes = used[0].cell if used else {}
@@ -111,7 +110,12 @@ class Campaign:
 
     @classmethod
     def _of(cls, file: CampaignFile, catalogue: Catalogue, changes: Changes) -> Self:
-        config = changed(CellConfig.from_json(file.config_json), changes)
+        config = CellConfig.from_json(file.config_json)
+        try:
+            config = changed(config, changes)
+        except InputError as error:
+            raise InputError(f"{file.path}: a revision is damaged ({error})") from None
+        check_robot(file.path, file.config_json, file.about(ROBOT_FILE))
         cell = cell_from_config(config, None, file.about(ROBOT_FILE))
         readings, covers, noise = file.readings(), file.about(COVERS), file.about(NOISE)
         if _restates(file, changes):
@@ -148,6 +152,7 @@ class Campaign:
         for (section, key), why in self.unchangeable(merged).items():
             if key in changes.get(section, {}):
                 raise InputError(f"the cell: [{section}] {key} cannot be changed: {why}")
+        changed(self.config, changes)
         return self.at(merged)
 
     def unchangeable(self, changes: Changes | None = None) -> dict[tuple[str, str], str]:

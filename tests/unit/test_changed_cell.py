@@ -1,6 +1,7 @@
 """A cell that is changed after the readings were taken: a new revision, never other readings."""
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -137,6 +138,21 @@ def test_a_change_is_checked_as_cell_toml_is(changes: Changes, why: str, run: Pa
     with Campaign.open(run) as o, pytest.raises(InputError, match=why) as told:
         o.with_cell(changes)
     assert len(str(told.value).splitlines()) == 1
+
+
+def test_a_received_campaign_with_a_cell_that_cannot_be(tmp_path: Path) -> None:
+    run = imported(tmp_path, "run")
+    with Campaign.open(run, few_effects()) as o:
+        record = o.record(o.fit_in_use()[1])
+        for cell in ({"tool": {"mass_kg": "heavy"}}, {"robot": {"model": "/etc/passwd"}}):
+            o.file.append_revision(replace(record, options={**record.options, "cell": cell}))
+            with pytest.raises(
+                InputError, match=r"run.hilcal: a revision is damaged \(the cell: \["
+            ):
+                Campaign.open(run)
+        o.file.append_revision(replace(record, options={**record.options, "cell": [1]}))
+        with pytest.raises(InputError, match="damaged at revision 3"):
+            Campaign.open(run)
 
 
 def test_what_readings_do_not_use_is_not_changed(tmp_path: Path) -> None:
