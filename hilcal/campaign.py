@@ -9,14 +9,17 @@ from typing import Any, Self
 from hilcal.calibration.calibration import Calibration
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
+from hilcal.config.changes import INSTRUMENT_NOISE, Changes, changed
 from hilcal.data.campaign_file import CampaignFile
 from hilcal.data.command_line import COMMAND, typed_now
-from hilcal.data.covariance import COVERS, INSTRUMENT, WHOLE
+from hilcal.data.covariance import COVERS, FROM, INSTRUMENT, TRACKER, WHOLE
 from hilcal.data.purpose import refuse_fitting
 from hilcal.data.readings import Readings
 from hilcal.data.records import content_hash
-from hilcal.data.revision import STORED, RevisionRecord, to_text
+from hilcal.data.revision import CELL, STORED, RevisionRecord, to_text
 from hilcal.data.robot_file import ROBOT_FILE, check_robot
+from hilcal.data.run_log import PLAN
+from hilcal.data.table import with_what_rounding_does, write_table
 from hilcal.data.whitening import Mode, usual_mode
 from hilcal.diagnose.diagnosis import Diagnosis, History
 from hilcal.diagnose.serial_noise import with_serial_noise
@@ -27,8 +30,9 @@ from hilcal.identify.baseline import baseline
 from hilcal.identify.fit import Fit, fit
 from hilcal.identify.full_covariance import (
     CovarianceParts,
-    campaign_readings,
     covariance_parts,
+    full_readings,
+    with_noise_of,
 )
 from hilcal.identify.noise_estimate import NOISE, NoiseEstimate
 from hilcal.identify.posterior import Posterior, Source
@@ -40,6 +44,7 @@ from hilcal.report.build_story import Chapter
 from hilcal.report.diagnosis_document import to_json
 from hilcal.revisions import (
     chain,
+    chain_in_cell,
     check_sources,
     history,
     mode_of,
@@ -68,6 +73,8 @@ class Campaign:
         cell: the cell.
         readings: all readings, with the covariance of instrument, averaging and repeatability.
         catalogue: the effects that a model of it can have.
+        changes: what is different in the cell from what it was told to be when the readings were
+            taken, see `with_cell`.
     """
 
     file: CampaignFile
@@ -75,12 +82,13 @@ class Campaign:
     cell: Cell
     readings: Readings
     catalogue: Catalogue
+    changes: Changes
 
     @classmethod
     def open(
         cls, path: str | Path, catalogue: Catalogue | None = None, *, read_only: bool = False
     ) -> Self:
-        """Open a campaign file.
+        """Open a campaign file; its cell is that of the revision in use.
 
         Args:
             path: the file.
@@ -92,15 +100,81 @@ class Campaign:
         """
         file = CampaignFile.open(path, read_only=read_only)
         try:
-            config = CellConfig.from_json(file.config_json)
-            check_robot(file.path, file.config_json, file.about(ROBOT_FILE))
-            cell = cell_from_config(config, None, file.about(ROBOT_FILE))
-            readings = campaign_readings(file, cell, config)
-            readings = replace(readings, noise_stated=file.about(NOISE) is None)
+            number, records = file.accepted(), file.revisions()
+            used = records[-1:] if number is None else records[number - 1 : number]
+            changes = used[0].cell if used else {}
+            return cls._of(file, catalogue or installed(), changes)
         except BaseException:
             file.close()
             raise
-        return cls(file, config, cell, readings, catalogue or installed())
+
+    @classmethod
+    def _of(cls, file: CampaignFile, catalogue: Catalogue, changes: Changes) -> Self:
+        config = CellConfig.from_json(file.config_json)
+        try:
+            config = changed(config, changes)
+        except InputError as error:
+            raise InputError(f"{file.path}: a revision is damaged ({error})") from None
+        check_robot(file.path, file.config_json, file.about(ROBOT_FILE))
+        cell = cell_from_config(config, None, file.about(ROBOT_FILE))
+        readings, covers, noise = file.readings(), file.about(COVERS), file.about(NOISE)
+        if _restates(file, changes):
+            readings, covers, noise = with_noise_of(config.tracker, readings), INSTRUMENT, None
+        readings = full_readings(readings, covers, cell, config)
+        readings = replace(readings, noise_stated=noise is None)
+        return cls(file, config, cell, readings, catalogue, changes)
+
+    def at(self, changes: Changes) -> Self:
+        """Return the campaign with what a revision changed in the cell, on the same open file.
+
+        Args:
+            changes: see `RevisionRecord.cell`.
+        """
+        return self if changes == self.changes else self._of(self.file, self.catalogue, changes)
+
+    def with_cell(self, changes: Changes) -> Self:
+        """Return the campaign with a cell that is changed further; the file keeps what it has.
+
+        The noise of the tracker makes the covariances of readings whose table states none, as
+        importing it again would; no other number of a reading changes.
+
+        Args:
+            changes: values by key, by section, of the keys of `config.changes.CHANGEABLE`; None
+                leaves a key out.
+
+        Raises:
+            InputError: a key or a value that is not valid, or one that these readings do not use.
+        """
+        merged = {
+            section: {**self.changes.get(section, {}), **changes.get(section, {})}
+            for section in sorted(self.changes.keys() | changes.keys())
+        }
+        for (section, key), why in self.unchangeable(merged).items():
+            if key in changes.get(section, {}):
+                raise InputError(f"the cell: [{section}] {key} cannot be changed: {why}")
+        changed(self.config, changes)
+        return self.at(merged)
+
+    def unchangeable(self, changes: Changes | None = None) -> dict[tuple[str, str], str]:
+        """Return sections and keys of the cell that these readings do not let change, and why.
+
+        Args:
+            changes: in the cell with all of which they are asked for; those of now where None.
+        """
+        found: dict[tuple[str, str], str] = {}
+        noise, changes = self.file.about(NOISE), self.changes if changes is None else changes
+        if noise is None and self.file.about(FROM) != TRACKER:
+            why = "the covariances of these readings are those that were measured, or of the table"
+            found |= {("tracker", key): why for key in INSTRUMENT_NOISE}
+        covers = INSTRUMENT if _restates(self.file, changes) else self.file.about(COVERS)
+        if covers != INSTRUMENT:
+            more = "; state the noise in [tracker], too" if noise is not None else ""
+            why = f"the covariances of these readings include the arm's scatter already{more}"
+            old = "an older version of hilcal imported these readings; import the table again"
+            found["repeatability", "joint_std_rad"] = why if covers == WHOLE else old
+        if self.file.about(PLAN) is not None and self.config.force_sensor is not None:
+            found["tool", "load_point_m"] = "the force sensor's moments are stored about it"
+        return found
 
     @property
     def path(self) -> Path:
@@ -110,12 +184,18 @@ class Campaign:
     @property
     def covariance_parts(self) -> CovarianceParts:
         """What the covariance of its readings consists of."""
-        return covariance_parts(self.file.about(COVERS), self.config)
+        return covariance_parts(self._stated_covers, self.config)
 
     @property
     def noise(self) -> NoiseEstimate | None:
         """The noise as it was estimated at import; None where the table or the cell states it."""
+        if _restates(self.file, self.changes):
+            return None
         return NoiseEstimate.from_json(self.file.about(NOISE))
+
+    @property
+    def _stated_covers(self) -> str | None:
+        return INSTRUMENT if _restates(self.file, self.changes) else self.file.about(COVERS)
 
     @property
     def covers(self) -> str:
@@ -129,7 +209,7 @@ class Campaign:
         A file that does not say is read as it is: where importing would add the arm's scatter, its
         table says that it is in it.
         """
-        stored = self.file.about(COVERS)
+        stored = self._stated_covers
         if stored is not None:
             return stored
         added = covariance_parts(INSTRUMENT, self.config) != "instrument"
@@ -139,6 +219,26 @@ class Campaign:
     def data_hash(self) -> str:
         """SHA-256 of its readings as the file stores them, without those appended since."""
         return self.file.data_hash(len(self.readings))
+
+    def save_table(self, path: Path, *, as_stored: bool = False) -> None:
+        """Write the readings as an exchange table, CSV or Parquet by the file's name.
+
+        Args:
+            path: the file; one that is there is replaced.
+            as_stored: without the arm's scatter where it was added to their covariance.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        about = {"campaign": self.path.name, "source": self.file.source}
+        about["robot"] = self.cell.arm.name
+        readings, covers = self.readings, self.covers
+        if as_stored:
+            readings, covers = self.file.readings(), self.stored_covers
+            about["readings_sha256"] = content_hash(readings)
+            if _restates(self.file, self.changes):
+                readings = with_noise_of(self.config.tracker, readings)
+        write_table(readings, path, with_what_rounding_does(covers, readings), about)
 
     def close(self) -> None:
         """Close the file."""
@@ -207,10 +307,19 @@ class Campaign:
     def restore(self, record: RevisionRecord) -> Fit:
         """Return the fit of a stored revision; raises as `fit` does."""
         check_sources(record, self.path, self.catalogue)
+        self._require_its_cell(record)
         try:
             return restore(record, self.cell, self.readings, self.catalogue, self.data_hash)
         except InputError as error:
             raise InputError(f"{error}{self._until_used(record.number)}") from None
+
+    def _require_its_cell(self, record: RevisionRecord) -> None:
+        if record.cell != self.changes:
+            raise InputError(
+                f"revision {record.number} was fitted in a cell that was changed otherwise than "
+                f"that of the revision in use; use it first: hilcal accept {quoted(self.path)} "
+                f"{record.number}"
+            )
 
     def require_gc(self, number: int | None, scaling: str, what: str) -> None:
         """Refuse a fit whose residual is not whitened.
@@ -247,6 +356,7 @@ class Campaign:
 
     def fitted_readings(self, record: RevisionRecord) -> Readings:
         """Return the readings that a revision was fitted to; later ones come after them."""
+        self._require_its_cell(record)
         with sound(record):
             return self.readings[: int(record.result_json["identify"]["n_readings"])]
 
@@ -382,7 +492,9 @@ class Campaign:
             raise InputError(f"{self.path}: the fit is of other readings than this campaign's")
         document = None if diagnosis is None else to_json(diagnosis)
         record = to_record(found, document, added, hashed, removed, parent)
-        own = {STORED: self.data_hash, **typed_now()}
+        own: dict[str, Any] = {STORED: self.data_hash, **typed_now()}
+        if self.changes:
+            own[CELL] = self.changes
         return replace(record, options={**record.options, **own})
 
     def fit_in_use(
@@ -429,7 +541,7 @@ class Campaign:
             _, found = self.fit_in_use(say)
             say("diagnosing it")
             return [Chapter(1, None, found, diagnose(found, say=say))]
-        for record in chain(self.file.revisions(), last.number):
+        for record in chain_in_cell(self.file.revisions(), last.number):
             say(f"restoring revision {record.number}")
             found = self.restore(record)
             judged = None
@@ -444,3 +556,11 @@ def _content(record: RevisionRecord) -> str:
     """Text of a revision without when, and by which command, it was made."""
     options = {k: v for k, v in record.options.items() if k != COMMAND}
     return to_text(replace(record, options=options, created="", parent=None))
+
+
+def _restates(file: CampaignFile, changes: Changes) -> bool:
+    """Whether the covariances of readings are made anew of what changed in [tracker]."""
+    keys = changes.get("tracker", {}).keys()
+    if file.about(NOISE) is not None:
+        return not keys.isdisjoint(INSTRUMENT_NOISE)
+    return file.about(FROM) == TRACKER and not keys.isdisjoint((*INSTRUMENT_NOISE, "station_m"))

@@ -1,16 +1,23 @@
-"""A revision with one effect more, or one less, than another: made, judged, stored."""
+"""A revision with one effect more or less than another, or in a changed cell: judged, stored."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from hilcal.campaign import Campaign
+from hilcal.config.changes import Changes
+from hilcal.data.revision import RevisionRecord
 from hilcal.diagnose.diagnosis import Diagnosis, History
 from hilcal.diagnose.effect_ranking import Suspect, addition
-from hilcal.diagnose.verdict import diagnose
+from hilcal.diagnose.serial_noise import with_serial_noise
+from hilcal.diagnose.verdict import NOTHING, diagnose
 from hilcal.effects.options import Options
 from hilcal.effects.written import write_effect
-from hilcal.identify.fit import Fit
+from hilcal.identify.arm_scatter import with_arm_scatter, with_prior_scatter
+from hilcal.identify.background import with_background
+from hilcal.identify.baseline import with_effects
+from hilcal.identify.fit import Fit, fit
 from hilcal.refine import add, remove
+from hilcal.revisions import carried_of, has_background, mode_of
 
 Say = Callable[[str], None]
 
@@ -114,3 +121,71 @@ def _stored(
     promised = added is not None and before.scaling == "gc"
     expected = addition(before, after) if promised else None
     return Changed(number, before, made, after, d, added, removed, expected)
+
+
+def refit(o: Campaign, record: RevisionRecord, say: Say, history: History = NOTHING) -> Diagnosis:
+    """Fit the model of a revision to all readings of a campaign, in its cell, and judge the fit.
+
+    Frames that were unknown are in it where the cell does not know them now. What the revision has
+    beside its effects it has again, estimated anew: another campaign's prior, a background, the
+    arm's scatter. Nothing is stored.
+
+    Args:
+        o: the campaign.
+        record: the revision.
+        say: takes progress, one line each.
+        history: how its model was reached, where the new revision is made from it.
+
+    Raises:
+        InputError: an effect that the readings do not allow.
+        CannotAnswerError: the readings do not determine the model.
+    """
+    mode = mode_of(record)
+    frames = o.catalogue.unknown_frames(o.at(record.cell).cell)
+    names = [name for name in record.effects if name not in frames]
+    options = {n: of for n, of in record.options["effects"].items() if n not in frames}
+    say(f"fitting {' + '.join(names) or 'the nominal arm'} to {len(o.readings)} readings")
+    model = with_effects(o.cell, o.readings, mode, names, options, o.catalogue, carried_of(record))
+    found = with_serial_noise(fit(model, with_prior_scatter(model, o.readings), mode))
+    if has_background(record):
+        say("fitting all effects of the catalogue together")
+        found = with_background(found, found.model.names)
+    judged = diagnose(found, history, say)
+    if record.scatter_alone and judged.reason == "arm_scatter" and judged.scatter is not None:
+        say("the arm's scatter enters the covariance; diagnosing")
+        readings = with_arm_scatter(found.model.cell, found.readings, judged.scatter)
+        judged = diagnose(fit(found.model, readings, mode, start=found.theta), history, say)
+    return judged
+
+
+def change_cell(
+    o: Campaign,
+    number: int | None,
+    before: Fit,
+    changes: Changes,
+    say: Say,
+    judged: Diagnosis | None = None,
+) -> tuple[Campaign, int, Diagnosis]:
+    """Fit a revision's model in a changed cell, and store the fit as a revision that says so.
+
+    Args:
+        o: the campaign, in the cell of the revision.
+        number: of the revision; None where there is none yet: `before` then becomes one, too.
+        before: its fit.
+        changes: as for `Campaign.with_cell`.
+        say: takes progress, one line each.
+        judged: the diagnosis of `before`, which is kept with it.
+
+    Returns:
+        The campaign in the changed cell, number and diagnosis of the new revision.
+
+    Raises:
+        InputError: changes that are not valid; see `refit`.
+        CannotAnswerError: see `refit`.
+    """
+    there = o.with_cell(changes)
+    record = o.record(before) if number is None else o.file.revision(number)
+    found = refit(there, record, say, o.history(number))
+    if number is None:
+        number = o.store(before, judged)
+    return there, there.store(found.fit, found, parent=number), found

@@ -286,6 +286,12 @@ def restore_predictive(
     return predictive(model, theta, prior, readings[used], mode, sigma)
 
 
+def has_background(record: RevisionRecord) -> bool:
+    """Whether effects that are not named predict with the model of a revision."""
+    every = record.parameters_json.get(RANDOM, {}).get("effects", ())
+    return not set(every) <= set(record.effects)
+
+
 def mode_of(record: RevisionRecord) -> Mode:
     """Kind of readings of a revision."""
     return MODES[MODES.index(record.options["readings"])]
@@ -312,6 +318,12 @@ def chain(
         found.append(by_number[number])
         number = by_number[number].made_from
     return tuple(reversed(found))
+
+
+def chain_in_cell(records: tuple[RevisionRecord, ...], last: int) -> tuple[RevisionRecord, ...]:
+    """Return those revisions of a chain that were fitted in the cell of the last one."""
+    found = chain(records, last)
+    return tuple(r for r in found if r.cell == found[-1].cell)
 
 
 def history(records: tuple[RevisionRecord, ...]) -> History:

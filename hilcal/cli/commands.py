@@ -128,7 +128,7 @@ COMMANDS = {
     "view": Command("viewing:view", "Tell the story of the revisions in rerun."),
     "workbench": Command(
         "working:workbench",
-        "Compare, add, remove, measure next on one page, which only this machine can open.",
+        "Compare, add, remove, change the cell, measure next on one page of this machine alone.",
     ),
     "export": Command(
         "exporting:export", "Hand over: readings, parameters, calibration, URDF, DH, frames."

@@ -17,10 +17,8 @@ from hilcal.campaign import Campaign
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.terminal import Json, Revision, Run, Terminal, terminal
 from hilcal.data.covariance import INSTRUMENT
-from hilcal.data.records import content_hash
 from hilcal.data.revision_table import revision_table
 from hilcal.data.robot_file import ROBOT_FILE
-from hilcal.data.table import with_what_rounding_does, write_table
 from hilcal.data.tabular import check_suffix, write_columns
 from hilcal.errors import InputError
 from hilcal.identify import parameters_document
@@ -176,17 +174,14 @@ def _write_data(
     force: bool,
 ) -> None:
     """Write readings and configuration."""
-    about = {"campaign": run.path.name, "source": run.file.source, "robot": run.cell.arm.name}
     if readings is not None:
-        stored = run.file.readings()
-        covers = run.stored_covers
-        about["readings_sha256"] = content_hash(stored)
-        write_table(stored, readings, with_what_rounding_does(covers, stored), about)
-        with_arm = "" if covers == INSTRUMENT else ", the arm's scatter in their covariance"
-        t.show(f"{readings}: {len(stored)} readings as stored{with_arm}")
+        run.save_table(readings, as_stored=True)
+        with_arm = (
+            "" if run.stored_covers == INSTRUMENT else ", the arm's scatter in their covariance"
+        )
+        t.show(f"{readings}: {len(run.readings)} readings as stored{with_arm}")
     if table is not None:
-        full = run.readings
-        write_table(full, table, with_what_rounding_does(run.covers, full), about)
+        run.save_table(table)
         t.show(f"{table}: {len(run.readings)} readings, covariance: {run.covariance_parts}")
     if cell is not None:
         kept = run.file.about(ROBOT_FILE)

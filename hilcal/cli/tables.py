@@ -8,21 +8,16 @@ import numpy as np
 import typer
 from rich.padding import Padding
 
-from hilcal.cell import Cell, cell_from_config
+from hilcal.cell import Cell
 from hilcal.cli.previewing import show_preview
 from hilcal.cli.terminal import Json, terminal
-from hilcal.config import load_config
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.covariance import COVERS
-from hilcal.data.importing import import_readings
 from hilcal.data.readings import Readings
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify import description_words, frames_document
-from hilcal.identify.full_covariance import covariance_parts
 from hilcal.identify.gate import examine
-from hilcal.identify.noise_estimate import NOISE, with_estimated_noise
 from hilcal.identify.other_arm import other_arm
 from hilcal.identify.registration import Registration, register
+from hilcal.import_campaign import import_campaign
 from hilcal.report import text
 from hilcal.report.covariance_words import covariance_words
 from hilcal.report.progress import working
@@ -73,28 +68,10 @@ def import_(
     if config is None or output is None:
         what = "--config CELL.toml" if config is None else "-o RUN.hilcal"
         raise InputError(f"{what} is missing; without it only --preview is possible")
-    settings = load_config(config)
-    base_dir = config.absolute().parent
-    cell = cell_from_config(settings, base_dir)
     with working(t.progress) as say:
-        say(f"reading {table}")
-        found = import_readings(table, kind, settings, cell.arm, second)
-        if not found.noise_stated:
-            say("estimating the noise, which nothing states")
-        found, noise = with_estimated_noise(found, cell, settings)
-        readings, parts = found.readings, covariance_parts(found.covers, settings)
-        notes = (*found.notes, covariance_words(parts, noise), *cell.arm.notes)
-        say(f"writing {output}")
-        source = f"{table.name} ({Path(kind).name})"
-        CampaignFile.create(
-            output,
-            settings.to_json(),
-            str(base_dir),
-            source,
-            overwrite=force,
-            more={COVERS: found.covers, **({} if noise is None else {NOISE: noise.to_json()})},
-            readings=readings,
-        ).close()
+        found = import_campaign(table, config, output, kind, second, overwrite=force, say=say)
+    readings, settings, cell, noise = found.readings, found.config, found.cell, found.noise
+    notes = (*found.notes, covariance_words(found.parts, noise), *cell.arm.notes)
     loads = [readings.load_names[k] for k in np.unique(readings.load)]
     poses = len(np.unique(readings.pose))
     t.show(text.heading(f"{len(readings)} readings of {poses} poses"))
@@ -128,7 +105,7 @@ def import_(
             "elements": readings.m,
             "loads": loads,
             "targets": targets,
-            "covariance": parts,
+            "covariance": found.parts,
             "noise": None if noise is None else asdict(noise),
             "notes": list(notes),
             "description": None

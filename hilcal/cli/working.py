@@ -3,13 +3,20 @@
 import os
 import sys
 import threading
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
-from hilcal.cli.terminal import Json, Run, terminal
+from hilcal.cli.terminal import Json, Terminal, terminal
 from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.schema import is_campaign
+from hilcal.errors import InputError
+from hilcal.import_campaign import import_campaign
+from hilcal.names import quoted
+from hilcal.report.covariance_words import covariance_words
+from hilcal.report.progress import working
 from hilcal.workbench.guard import UNUSED_S
 from hilcal.workbench.server import require_nicegui, serve
 from hilcal.workbench.session import Session
@@ -19,7 +26,28 @@ ENDING = 8.0
 
 
 def workbench(
-    run: Run,
+    run: Annotated[
+        Path, typer.Argument(metavar="RUN.hilcal|TABLE", help="The campaign file, or a table.")
+    ],
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            "--config", metavar="CELL.toml", help="Begin with a table, measured in this cell."
+        ),
+    ] = None,
+    kind: Annotated[
+        str,
+        typer.Option("--format", metavar="FORMAT", help="Of the table, as hilcal import takes it."),
+    ] = "table",
+    second: Annotated[
+        Path | None, typer.Option("--second", metavar="TABLE", help="The second file of a table.")
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", "--output", metavar="RUN.hilcal", help="Of a table; TABLE.hilcal beside it else."
+        ),
+    ] = None,
     port: Annotated[
         int | None,
         typer.Option("--port", help="Port on this machine; 8787, or a free one, unless given."),
@@ -30,9 +58,16 @@ def workbench(
     effects_from: EffectsFrom = None,
     as_json: Json = False,
 ) -> None:
-    """Compare, add, remove, measure next on one page, which only this machine can open."""
+    """Compare, add, remove, change the cell, measure next on one page of this machine alone."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     require_nicegui()
+    if config is not None:
+        table, run = run, run.with_suffix(".hilcal") if output is None else output
+        _import(t, table, config, run, kind, second)
+    elif kind != "table" or second is not None or output is not None:
+        raise InputError("--format, --second and -o are of a table; give --config CELL.toml, too")
+    elif run.is_file() and not is_campaign(run):
+        raise InputError(f"{run}: no campaign; to begin with a table, give --config CELL.toml, too")
     with CampaignFile.open(run, read_only=True) as file:
         file.readings()  # a file without any is refused before a page is opened
 
@@ -49,3 +84,25 @@ def workbench(
     guard = threading.Timer(ENDING, os._exit, (0,))
     guard.daemon = True
     guard.start()
+
+
+def _import(
+    t: Terminal, table: Path, config: Path, run: Path, kind: str, second: Path | None
+) -> None:
+    """Make the campaign file of a table; one that is there stays.
+
+    Raises:
+        InputError: there is one, or anything in table or cell cannot be right.
+    """
+    if run.exists():
+        raise InputError(
+            f"{run}: the file exists, and is left as it is; open it with hilcal workbench "
+            f"{quoted(run)}, or name another one for the table with -o"
+        )
+    with working(t.progress) as say:
+        found = import_campaign(table, config, run, kind, second, say=say)
+    t.notice(
+        f"{len(found.readings)} readings of {table} are in {run} now; the table is not changed."
+    )
+    for note in (*found.notes, covariance_words(found.parts, found.noise)):
+        t.notice(note)

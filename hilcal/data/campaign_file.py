@@ -280,7 +280,7 @@ class CampaignFile:
         """Do the same inside a transaction that the caller has begun."""
         (last,) = self._connection.execute("SELECT ifnull(max(id), 0) FROM revisions").fetchone()
         number = int(last) + 1
-        if record.parent == last:
+        if record.parent == last and replace(record, parent=None).follows:
             record = replace(record, parent=None)
         record, key, posterior = split(record)
         text = to_text(record)
@@ -290,6 +290,8 @@ class CampaignFile:
             if key not in self._read_meta():
                 rows.insert_meta(self._connection, key, posterior)
             schema.require(self._connection, schema.CARRIED_PRIOR)
+        if record.cell:
+            schema.require(self._connection, schema.CHANGED_CELL)
         row = (number, text, rows.text_crc(str(number), text))
         rows.insert(self._connection, "revisions", [row])
         return number

@@ -31,6 +31,9 @@ from hilcal.types import Bools, Floats
 
 COVERS = "covariance"
 """Key among the texts about a campaign: what the stored covariances cover."""
+FROM = "covariance from"
+"""Key of `TRACKER` where they were made from the noise in [tracker]; absent elsewhere."""
+TRACKER = "tracker"
 INSTRUMENT = "instrument"
 """They cover the instrument alone, not the arm's repeatability."""
 WHOLE = "instrument+arm"

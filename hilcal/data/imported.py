@@ -16,9 +16,11 @@ class ImportResult:
         covers: what the covariances cover, see `data.covariance`.
         noise_stated: whether the table or [tracker] states the noise; where False, the covariances
             are those of the instrument that [tracker] has by default.
+        from_tracker: whether the covariances are those of the noise in [tracker].
     """
 
     readings: Readings
     notes: tuple[str, ...]
     covers: str = INSTRUMENT
     noise_stated: bool = True
+    from_tracker: bool = False

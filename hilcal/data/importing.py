@@ -67,7 +67,8 @@ def import_readings(
     copied = _copies(result.readings)
     notes += _told(result.readings, copied)
     kept, named = _named_loads(result.readings[~copied], config)
-    return ImportResult(kept, (*notes, *named), covers, stated or tracker.states_noise)
+    stated_noise = stated or tracker.states_noise
+    return ImportResult(kept, (*notes, *named), covers, stated_noise, not stated)
 
 
 def _mapping(form: str | Path) -> Mapping | None:

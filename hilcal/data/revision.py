@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
 from typing import Any
 
+from hilcal.config.changes import Changes
 from hilcal.data.stored_schema import Options, Result, check
 from hilcal.errors import InputError
 from hilcal.names import check_names
@@ -16,6 +17,9 @@ STORED = "stored_sha256"
 
 `data_hash` is that of the readings with the arm's scatter in their covariance, which is computed:
 its last bits depend on the machine."""
+
+CELL = "cell"
+"""Key among the options of a revision: what was changed in the cell, see `config.changes`."""
 
 
 def utc_now() -> str:
@@ -51,7 +55,8 @@ class RevisionRecord:
         created: ISO 8601, UTC.
         number: 1, 2, ... in one campaign; the campaign gives it.
         removed: the effect that this revision took out of the one before.
-        parent: number of the revision that it was made from; None where that is the one before.
+        parent: number of the revision that it was made from; None where that is the one before, or
+            where it was made from none.
     """
 
     effects: tuple[str, ...]
@@ -67,6 +72,12 @@ class RevisionRecord:
     parent: int | None = None
 
     @property
+    def cell(self) -> Changes:
+        """What was changed in the campaign's cell before this was fitted; nothing as a rule."""
+        found: Changes = self.options.get(CELL, {})
+        return found
+
+    @property
     def made_from(self) -> int | None:
         """Number of the revision that it was made from; None for a first model."""
         if not self.follows or self.number <= 1:
@@ -76,7 +87,8 @@ class RevisionRecord:
     @property
     def follows(self) -> bool:
         """Whether it was made from another revision."""
-        return self.added is not None or self.removed is not None or self.scatter_alone
+        changed = self.added is not None or self.removed is not None or self.scatter_alone
+        return changed or self.parent is not None
 
     @property
     def scatter_alone(self) -> bool:

@@ -20,7 +20,10 @@ from hilcal import limits
 from hilcal.errors import DeviceError, InputError
 
 APPLICATION_ID = 0x68696C63  # "hilc"
-VERSION = 5
+VERSION = 6
+CHANGED_CELL = 6
+"""Version of a file with a revision that was fitted in a cell that was changed since its readings
+were taken: programs that do not know it would take the cell as it was."""
 CARRIED_PRIOR = 5
 """Version of a file with a revision that was fitted with a prior of another campaign: programs that
 do not know it would fit without."""

@@ -68,6 +68,7 @@ class Options(_Document):
     scaling: Literal["none", "gu", "gc"]
     effects: dict[str, dict[str, Any]]
     effects_from: dict[str, dict[str, str]] = {}
+    cell: dict[str, dict[str, Any]] = {}
 
 
 class Detail(_Document):

@@ -6,10 +6,18 @@ from typing import Literal
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.config import CellConfig
+from hilcal.config import CellConfig, Tracker
 from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.covariance import COVERS, INSTRUMENT, WHOLE, scatter_factor
+from hilcal.data.covariance import (
+    COVERS,
+    INSTRUMENT,
+    WHOLE,
+    scatter_factor,
+    tracker_covariance,
+    tracker_noise,
+)
 from hilcal.data.readings import Readings
+from hilcal.data.stated_noise import rounding_variance, with_rounding
 from hilcal.data.whitening import inverse_root
 from hilcal.errors import CannotAnswerError
 from hilcal.identify.registration import register
@@ -57,6 +65,21 @@ def full_readings(
     if parts == "instrument and arm as stated":
         return with_common_scatter(cell, readings, joint_std)
     return replace(readings, scatter_stated=False)
+
+
+def with_noise_of(tracker: Tracker, readings: Readings) -> Readings:
+    """Return readings with the instrument's covariance that [tracker] states, as imports make it.
+
+    Args:
+        tracker: the section.
+        readings: N readings.
+
+    Raises:
+        InputError: a reading lies at the tracker's station.
+    """
+    position, station = readings.value[:, :3], tracker.station_m or (0.0, 0.0, 0.0)
+    cov = tracker_covariance(position, tracker_noise(tracker), station, readings.m)
+    return replace(readings, covariance=with_rounding(cov, rounding_variance(position, 1.0))[0])
 
 
 def covariance_parts(covers: str | None, config: CellConfig) -> CovarianceParts:

@@ -12,6 +12,7 @@ from hilcal.acquire.repeatability import RepeatabilityEstimate
 from hilcal.data.overview import Overview
 from hilcal.data.revision import RevisionRecord, change
 from hilcal.report import numbers, text
+from hilcal.report.two_revisions import cell_words
 
 SHOWN = ("start", "load", "doubted", "goal", "interrupted", "failed", "finished")
 """Kinds of events that are listed; drift is where it is over its limit."""
@@ -193,9 +194,10 @@ def _revisions_table(o: Overview, revisions: Sequence[RevisionRecord]) -> Render
 
 
 def model_words(r: RevisionRecord) -> str:
-    """Return what a revision changed, or its whole model where it is a first one."""
-    scatter = r.parameters_json.get("arm_scatter") is not None
-    return change(r.added, r.removed, scatter) or text.model_name(r.effects)
+    """Return what a revision changed, or its whole model where it is a first one; and its cell."""
+    scatter = r.parameters_json.get("arm_scatter") is not None and not r.cell
+    found = change(r.added, r.removed, scatter) or text.model_name(r.effects)
+    return f"{found}; {cell_words(r.cell)}" if r.cell else found
 
 
 def _used(o: Overview) -> str:
@@ -271,6 +273,7 @@ def _revision_json(r: RevisionRecord, o: Overview) -> dict[str, object]:
         "model": list(r.effects),
         "added": r.added,
         "removed": r.removed,
+        "cell": r.cell,
         "readings": r.options["readings"],
         "scaling": r.options["scaling"],
         "n_readings": fit["n_readings"],

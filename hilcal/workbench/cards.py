@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -10,18 +11,21 @@ from nicegui import background_tasks, run, ui
 from nicegui.events import GenericEventArguments, TableSelectionEventArguments
 
 from hilcal.data.plan import UNLOADED
+from hilcal.data.revision import RevisionRecord
 from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.diagnose.distinguish import Difference
 from hilcal.diagnose.effect_ranking import Suspect
-from hilcal.report import numbers, text, text_refine
+from hilcal.report import numbers, text
 from hilcal.report.charts import error_per_revision, measured_predicted, misfit, residuals
 from hilcal.report.charts.added_variable import added_variable
 from hilcal.report.charts.law import law
 from hilcal.report.charts.residual_over import residual_over
+from hilcal.report.text_info import model_words
+from hilcal.report.two_revisions import left_out_m, two_revisions, verdict_of
 from hilcal.report.verdict_words import headline, message
-from hilcal.workbench.elements import button, chart, number, plain, point, title
+from hilcal.workbench.elements import answer, button, chart, number, plain, point, title
 from hilcal.workbench.next_card import next_measurement
-from hilcal.workbench.snapshot import RevisionRow, Snapshot
+from hilcal.workbench.snapshot import Figure, Snapshot
 
 if TYPE_CHECKING:
     from hilcal.workbench.page import View
@@ -32,13 +36,16 @@ FURTHEST = 8
 FURTHEST_SHARE = 0.05
 """Share of the readings that are compared with the others as those furthest off; a choice."""
 DIFFERENCES = 4
+DOWNLOADS = {"report": "Report", "calibration": "Calibration", "table": "Table of readings"}
+NONE_PASSES = "No effect passes the tests by itself; what that means, the verdict says."
+"""Whether one is missing is the verdict's alone to say."""
 
 
 def waiting(view: View) -> None:
     """Say that nothing is there yet."""
     with ui.column().classes("part").style("margin-top: 16px"):
         ui.html(f"<h2>{plain(view.session.path.name)}</h2>", sanitize=False)
-        if view.work.failure:
+        if view.work.failure():
             ui.label("There is nothing to show: see above.").classes("soft")
             button(view, "Read it again", view.again, "outline")
         else:
@@ -73,6 +80,12 @@ def snapshot(view: View, d: Snapshot) -> None:
             with ui.column().classes("part"):
                 next_measurement(view, d)
                 view.planned = ui.column().style("width: 100%; gap: 8px")
+    with ui.column().classes("part"):
+        side_by_side(view, d)
+    with ui.column().classes("part"):
+        cell(view, d)
+    with ui.column().classes("part"):
+        downloads(view, d)
     view.draw_plan()
 
 
@@ -81,7 +94,9 @@ def head(d: Snapshot) -> None:
     kind = "deflections" if d.fit.mode == "deflection" else "absolute readings"
     with ui.row().classes("items-baseline").style("gap: 4px 16px; padding-top: 16px"):
         ui.html(f"<h1 class='verdict'>{plain(d.name)}</h1>", sanitize=False)
-        ui.label(f"{d.arm} · {d.n_readings} readings, judged as {kind}").classes("soft")
+        ui.label(f"{d.arm} · {d.n_readings} readings, judged as {kind} · from {d.source}").classes(
+            "soft"
+        )
 
 
 def verdict(view: View, d: Snapshot) -> None:
@@ -89,17 +104,6 @@ def verdict(view: View, d: Snapshot) -> None:
     found, fit = d.diagnosis, d.fit
     good = found.verdict == "adequate"
     with ui.column().classes("part").props("data-part=verdict"):
-        changed = view.session.changed
-        if changed is not None and changed.number == d.number:
-            effect = changed.added or changed.removed or ""
-            words = text_refine.fell if changed.added else text_refine.rose
-            ui.label(words(changed.before, changed.fit, effect)).classes("told").props(
-                "role=status"
-            )
-            for line in (
-                () if changed.expected is None else text_refine.addition_lines(changed.expected)
-            ):
-                ui.label(line).classes("bad")
         mark = "✓" if good else "!"
         said = numbers.sentence(headline(found))
         ui.html(
@@ -124,6 +128,7 @@ def model(view: View, d: Snapshot) -> None:
         ui.label(f"{called}: {text.model_name(d.fit.model.named)}").classes("soft")
         for name in d.removable:
             button(view, f"Remove {name}", partial(view.remove, name), "outline dense")
+    answer(view, "model")
 
 
 def fails(view: View, d: Snapshot) -> None:
@@ -151,7 +156,7 @@ def missing(view: View, d: Snapshot) -> None:
     title("What is missing")
     rows = suspects(d.diagnosis)
     if not rows:
-        ui.label(none_passes(d.diagnosis)).classes("soft")
+        ui.label(NONE_PASSES).classes("soft")
     else:
         columns = [
             {"name": "effect", "label": "effect", "field": "effect", "align": "left"},
@@ -200,23 +205,19 @@ def missing(view: View, d: Snapshot) -> None:
         ).classes("soft")
     others = [s.effect for s in d.diagnosis.suspects]
     view.adder = None
-    if others:
+    if not others:
+        answer(view, "missing")
+    else:
         kind = "unelevated" if rows else "outline"
         view.adder = button(view, f"Add {view.tab.suspect}", view.add, f"{kind} data-part=add")
         view.adder.set_visibility(view.tab.suspect is not None)
+        answer(view, "missing")
         ui.select(
             others,
             label="Another effect",
             value=view.tab.suspect,
             on_change=lambda e: view.choose(e.value),
         ).props("dense outlined options-dense").style("width: 100%")
-
-
-def none_passes(d: Diagnosis) -> str:
-    """Say why no suspects are listed; whether an effect is missing is the verdict's to say."""
-    if d.verdict == "adequate":
-        return "No effect of the catalogue is needed: none passes the tests."
-    return "No single effect of the catalogue passes the tests; the verdict says what is known."
 
 
 def suspects(d: Diagnosis) -> list[Suspect]:
@@ -333,35 +334,77 @@ def fell(view: View, d: Snapshot) -> None:
 def revisions(view: View, d: Snapshot) -> None:
     """Draw all revisions, each with the way back to it."""
     title("Revisions")
-    if not d.rows:
+    if not d.records:
         ui.label("None yet: the baseline is kept when something is added to it.").classes("soft")
-    for row in reversed(d.rows):
-        one_revision(view, d, row)
+    for record in reversed(d.records):
+        one_revision(view, d, record)
     if d.accepted is not None:
         ui.label(f"Revision {d.accepted} is accepted: every command uses it.").classes("soft")
+    answer(view, "revisions")
     ui.label("Revisions are only appended: nothing that was tried is lost.").classes("soft")
 
 
-def one_revision(view: View, d: Snapshot, row: RevisionRow) -> None:
+def one_revision(view: View, d: Snapshot, r: RevisionRecord) -> None:
     """Draw one revision."""
-    marks = [word for word, holds in (("shown", row.number == d.number),
-                                      ("used by every command", row.number == d.in_use))
+    marks = [word for word, holds in (("shown", r.number == d.number),
+                                      ("used by every command", r.number == d.in_use))
              if holds]  # fmt: skip
-    change = row.change or text.model_name(row.model)
-    with ui.element("div").classes("line").props(f"data-revision={row.number}"):
+    with ui.element("div").classes("line").props(f"data-revision={r.number}"):
         with ui.column().style("gap: 0"):
-            ui.label(f"{row.number}: {change}").style("font-weight: 500")
-            said = [
-                f"{numbers.length(row.left_out_m)} on poses left out",
-                row.verdict.replace("_", " "),
-                *marks,
-            ]
-            ui.label(" · ".join(word for word in said if word)).classes("soft")
-        if row.number != d.number:
-            button(view, "Look", lambda: view.show(row.number), "flat dense")
-        if row.number not in (d.number, d.in_use) or d.number != d.in_use:
-            button(view, "Go back to it" if row.number != d.number else "Use it",
-                   lambda: view.go_back(row.number), "outline dense")  # fmt: skip
+            ui.label(f"{r.number}: {model_words(r)}").style("font-weight: 500")
+            said = [f"{numbers.length(left_out_m(r))} on poses left out", verdict_of(r), *marks]
+            ui.label(" · ".join(said)).classes("soft")
+        if r.number != d.number:
+            button(view, "Look", lambda: view.show(r.number), "flat dense")
+        if r.number not in (d.number, d.in_use) or d.number != d.in_use:
+            button(view, "Go back to it" if r.number != d.number else "Use it",
+                   lambda: view.go_back(r.number), "outline dense")  # fmt: skip
+
+
+def side_by_side(view: View, d: Snapshot) -> None:
+    """Draw two revisions side by side."""
+    title("Two revisions side by side")
+    if len(d.records) < 2:
+        ui.label("There are two to compare once something was added, removed or changed.").classes(
+            "soft"
+        )
+        return
+    by_number = {r.number: r for r in d.records}
+    shown = d.number or d.records[-1].number
+    first, second = view.tab.pair or (shown - 1 or shown + 1, shown)
+    names = {n: f"{n}: {model_words(r)}" for n, r in by_number.items()}
+    with ui.element("div").classes("two"):
+        chosen = [
+            ui.select(names, label=label, value=n).props("dense outlined options-dense")
+            for label, n in (("First", first), ("Second", second))
+        ]
+    place = ui.column().classes("wide").props("data-part=pair")
+
+    def draw() -> None:
+        view.tab.pair = first, second = chosen[0].value, chosen[1].value
+        place.clear()
+        with place:
+            pair_table(by_number[first], by_number[second])
+
+    for one in chosen:
+        one.on_value_change(draw)
+    if {first, second} <= by_number.keys():
+        with place:
+            pair_table(by_number[first], by_number[second])
+
+
+def pair_table(a: RevisionRecord, b: RevisionRecord) -> None:
+    """Draw what two revisions say of each thing."""
+    columns = [
+        {"name": n, "label": label, "field": n, "align": "left"}
+        for n, label in (
+            *(("what", ""), ("first", f"revision {a.number}")),
+            *(("second", f"revision {b.number}"), ("difference", "difference")),
+        )
+    ]
+    rows = [asdict(row) for row in two_revisions(a, b)]
+    table = ui.table(columns=columns, rows=rows, row_key="what").props("flat dense wrap-cells")
+    table.style("width: 100%")
 
 
 def compared(view: View, d: Snapshot) -> None:
@@ -390,3 +433,48 @@ def viewer(view: View) -> None:
             frame.props["src"], frame.props["title"] = view.tab.viewer, "3-D view"
         else:
             button(view, "Open the 3-D view", view.open_viewer, "outline")
+            answer(view, "viewer")
+
+
+def cell(view: View, d: Snapshot) -> None:
+    """Draw what can be changed in the cell; what is typed stays until it is used."""
+    title("Noise and cell")
+    ui.label(
+        "Change values, written as in CELL.toml; an empty field leaves the key out. The shown "
+        "model is then fitted anew, as a revision; what was measured stays as it is."
+    ).classes("soft")
+    ui.label(f"Now: {d.covariance}.").classes("soft")
+    for why in dict.fromkeys(f.fixed for f in d.figures if f.fixed):
+        keys = [f.key for f in d.figures if f.fixed == why]
+        ui.label(f"Not to be changed here: {', '.join(keys)}: {why}.").classes("soft")
+    with ui.element("div").classes("figures").props("data-part=cell"):
+        for f in d.figures:
+            if not f.fixed:
+                figure_field(view, f)
+    button(view, "Fit with these values", view.change_cell, "unelevated data-part=change")
+    answer(view, "cell")
+
+
+def figure_field(view: View, f: Figure) -> None:
+    """Draw a value of the cell."""
+    at = f.section, f.key
+    field = ui.input(f"[{f.section}] {f.key}", value=view.tab.texts.get(at, f.text))
+    field.props("dense outlined").props["hint"] = f.valid
+
+    def typed() -> None:
+        view.tab.texts[at] = field.value or ""
+
+    field.on_value_change(typed)
+
+
+def downloads(view: View, d: Snapshot) -> None:
+    """Draw what can be had as a file."""
+    title("Downloads")
+    ui.label(
+        f"Of {'the baseline' if d.number is None else f'revision {d.number}'}: the story as one "
+        "page, the calibration for hilcal compensate, and the readings as an exchange table."
+    ).classes("soft")
+    with ui.row().style("gap: 8px"):
+        for kind, name in DOWNLOADS.items():
+            button(view, name, partial(view.download, kind), "outline")
+    answer(view, "download")

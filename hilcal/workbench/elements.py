@@ -11,7 +11,6 @@ from nicegui import ui
 from nicegui.events import GenericEventArguments
 
 from hilcal.names import escaped
-from hilcal.report import numbers
 from hilcal.report.charts import style
 from hilcal.workbench.work import Work
 
@@ -20,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class Status:
-    """The strip that says what is being done, what failed, and whether the file was changed."""
+    """The strip that says what is being done, and what became of the file."""
 
     def __init__(self, view: View) -> None:
         """Make it, empty."""
@@ -28,25 +27,29 @@ class Status:
             with ui.row().classes("bench items-center no-wrap").style("gap: 12px") as self.busy:
                 ui.spinner(size="1.3em")
                 self.doing = ui.label().classes("soft").props("aria-live=polite")
-            with ui.row().classes("bench items-center").style("gap: 12px") as self.failed:
-                self.why = ui.label().classes("bad").props("role=alert")
+            with ui.row().classes("bench items-center").style("gap: 12px") as self.answered:
+                self.told = ui.label().classes("answer").props("role=alert data-answer=file")
                 self.refit = button(
                     view, "Fit anew to all readings", view.fit_anew, "outline dense"
                 )
             with ui.row().classes("bench items-center").style("gap: 12px") as self.stale:
                 ui.label("Another command has changed the file.").classes("bad")
                 button(view, "Read it again", view.again, "outline dense")
-        for row in (self.busy, self.failed, self.stale):
+        for row in (self.busy, self.answered, self.stale):
             row.set_visibility(False)
 
     def show(self, work: Work) -> None:
         """Show how the work stands."""
-        line, failure = work.line, work.failure
+        line = work.line
         self.busy.set_visibility(bool(line))
         self.doing.set_text(f"{line} …")
-        self.failed.set_visibility(bool(failure) and not line)
-        self.why.set_text(numbers.sentence(failure) if failure else "")
-        self.refit.set_visibility("readings were appended" in failure)
+        self.answered.set_visibility("file" in work.answers and not line)
+        self.refit.set_visibility("readings were appended" in work.failure())
+
+
+def answer(view: View, place: str) -> None:
+    """Draw where it is said what is being done for the buttons above, and what came of it."""
+    view.answers[place] = ui.label().classes("answer").props(f"role=status data-answer={place}")
 
 
 def number(what: str, value: str) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from nicegui import ui
 
 from hilcal.report import text_next
-from hilcal.workbench.elements import button, title
+from hilcal.workbench.elements import answer, button, title
 from hilcal.workbench.session import Session
 from hilcal.workbench.snapshot import Snapshot
 
@@ -33,6 +33,7 @@ def next_measurement(view: View, d: Snapshot) -> None:
         view.plan(poses.value, file.value, quick=not compare.value)
 
     button(view, "Plan the next measurements", plan, "unelevated")
+    answer(view, "next")
 
 
 def planned(session: Session) -> None:

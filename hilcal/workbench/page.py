@@ -10,18 +10,22 @@ from fastapi.responses import PlainTextResponse, Response
 from nicegui import app as bench
 from nicegui import ui
 
+from hilcal.changes import Changed
+from hilcal.report import numbers, text_refine
+from hilcal.report.two_revisions import refitted
 from hilcal.workbench import cards, next_card
 from hilcal.workbench.elements import Status
 from hilcal.workbench.session import Say, Session
 from hilcal.workbench.snapshot import Snapshot
 from hilcal.workbench.viewer import WebViewer
-from hilcal.workbench.work import Work
+from hilcal.workbench.work import Answer, Work
 
 TICK = 0.2
 """How often a tab looks whether something has changed, s."""
 LOOK = 2.0
 """How often it looks at the file, s."""
 CSS = Path(__file__).with_name("page.css")
+SCRIPT = Path(__file__).with_name("page.js")
 DARK = "matchMedia('(prefers-color-scheme: dark)').matches"
 
 
@@ -36,6 +40,8 @@ class Tab:
         picked: measurements of the story that were clicked; None before.
         told: what they are, in words.
         dark: whether the browser asks for a dark page.
+        texts: values of the cell by section and key, as they were typed and not used yet.
+        pair: the two revisions that are shown side by side.
         looks: whether the 3-D view was asked for.
         viewer: address of the 3-D view; empty before it was opened.
     """
@@ -46,6 +52,8 @@ class Tab:
     picked: list[int] | None = None
     told: str = ""
     dark: bool = False
+    texts: dict[tuple[str, str], str] = field(default_factory=dict)
+    pair: tuple[int, int] | None = None
     looks: bool = False
     viewer: str = ""
 
@@ -82,13 +90,26 @@ def install(app: FastAPI, session: Session) -> None:
     bench.on_startup(lambda: shared.work.start(f"Reading {session.path.name}", read(session)))
 
 
-def read(session: Session, revision: int | None = None) -> Callable[[Say], None]:
+def read(session: Session, revision: int | None = None) -> Callable[[Say], str]:
     """Return what reads the file and shows a revision."""
 
-    def do(say: Say) -> None:
-        session.load(say, revision)
+    def do(say: Say) -> str:
+        known = session.snapshot is not None
+        found = session.load(say, revision)
+        return f"{found.name} was read again." if known else ""
 
     return do
+
+
+def told(c: Changed | None) -> str:
+    """Return what adding or removing an effect did."""
+    if c is None:
+        return ""
+    say = text_refine.fell if c.added else text_refine.rose
+    lines = [say(c.before, c.fit, c.added or c.removed or ""), f"It is revision {c.number}."]
+    return " ".join(
+        lines + ([] if c.expected is None else [*text_refine.addition_lines(c.expected)])
+    )
 
 
 class View:
@@ -106,8 +127,10 @@ class View:
         self.evidence: ui.column | None = None
         self.planned: ui.column | None = None
         self.adder: ui.button | None = None
-        self._drawn = (-1, "", False)
+        self.answers: dict[str, ui.label] = {}
+        self._drawn = -1, False
         self._ready = False
+        self._file: tuple[str, bytes] | None = None
         self._planned: object = None
 
     @property
@@ -124,6 +147,7 @@ class View:
         """Make the parts that stay, and look for changes from time to time."""
         ui.colors(primary="#1f6f9f", positive="#00785a", negative="#c0274b", warning="#8a5a00")
         ui.add_css(CSS)
+        ui.add_body_html(f"<script>{SCRIPT.read_text(encoding='utf-8')}</script>")
         self.status = Status(self)
         self.body = ui.column().classes("bench")
         self.below = ui.column().classes("bench")
@@ -138,14 +162,17 @@ class View:
     def tick(self) -> None:
         """Show what is being done, and draw anew what has changed."""
         self.status.show(self.work)
+        self.show_answers()
+        if self._file is not None:
+            name, content = self._file
+            self._file = None
+            ui.download.content(content, name)
         if not self._ready:
             return
-        state = (self.session.count, self.work.failure, self.work.what is not None)
-        if state != self._drawn:
-            redraw = state[0] != self._drawn[0] or self.session.snapshot is None
-            self._drawn = state
-            if redraw:
-                self.draw()
+        state = self.session.count, self.work.what is not None
+        if state != self._drawn and (state[0] != self._drawn[0] or self.session.snapshot is None):
+            self.draw()
+        self._drawn = state
         if self.session.planned is not self._planned:
             self.draw_plan()
         drawing = self.shared.drawing
@@ -156,17 +183,34 @@ class View:
             self.tab.viewer = f"{at}?persist=0&notebook=0&theme=dark{files}"
             self.draw_below()
 
+    def show_answers(self) -> None:
+        """Show at each place what is being done there, or what came of it."""
+        for place, label in self.answers.items():
+            busy = self.work.line if self.work.place == place else ""
+            found = self.work.answers.get(place)
+            label.set_text(f"{busy} …" if busy else numbers.sentence(found.words if found else ""))
+            label.set_visibility(bool(busy or found))
+            done = found is not None and found.done
+            label.props(f"data-came={'busy' if busy else 'done' if done else 'failed'}")
+
     def look(self) -> None:
         """Say when another command has changed the file."""
         self.status.stale.set_visibility(self.work.what is None and self.session.stale)
 
     def draw(self) -> None:
         """Draw everything for what the session shows now."""
-        self._drawn = (self.session.count, self.work.failure, self.work.what is not None)
-        snapshot = self.session.snapshot
-        if snapshot is not self.tab.snapshot:
+        self._drawn = self.session.count, self.work.what is not None
+        snapshot, before = self.session.snapshot, self.tab
+        if snapshot is not before.snapshot:
             named = snapshot.diagnosis.significant if snapshot else ()
-            self.tab = Tab(snapshot, named[0] if named else None, dark=self.tab.dark)
+            self.tab = Tab(
+                snapshot,
+                named[0] if named else None,
+                dark=before.dark,
+                texts=before.texts,
+                pair=before.pair,
+            )
+        self.answers = {"file": self.status.told}
         self.body.clear()
         with self.body:
             if snapshot is None:
@@ -174,6 +218,7 @@ class View:
             else:
                 cards.snapshot(self, snapshot)
         self.draw_below()
+        self.show_answers()
 
     def draw_below(self) -> None:
         """Draw the 3-D view alone."""
@@ -184,33 +229,56 @@ class View:
 
     # what can be clicked
 
-    def do(self, what: str, act: Callable[[Snapshot, Say], object]) -> None:
-        """Begin something on the snapshot of this tab; only one thing is done at a time."""
+    def do(self, place: str, what: str, act: Callable[[Snapshot, Say], object]) -> None:
+        """Begin something on the snapshot of this tab; only one thing is done at a time.
+
+        Args:
+            place: of the button, where the answer stays: what `act` returns if it is a text.
+            what: is done, in words.
+            act: does it.
+        """
         snapshot = self.tab.snapshot
-        if snapshot is not None and not self.work.start(what, lambda say: act(snapshot, say)):
-            ui.notify("Something else is being done; nothing was begun.")
+        if snapshot is not None and not self.work.start(
+            what, lambda say: act(snapshot, say), place
+        ):
+            self.work.answers[place] = Answer("Something else was being done; nothing was begun.")
 
     def add(self) -> None:
         """Add the chosen effect."""
         effect = self.tab.suspect or ""
-        self.do(f"Adding {effect}", lambda snapshot, say: self.session.add(snapshot, effect, say))
+
+        def act(snapshot: Snapshot, say: Say) -> str:
+            self.session.add(snapshot, effect, say)
+            return told(self.session.changed)
+
+        self.do("missing", f"Adding {effect}", act)
 
     def remove(self, effect: str) -> None:
         """Take an effect out."""
-        self.do(
-            f"Removing {effect}", lambda snapshot, say: self.session.remove(snapshot, effect, say)
-        )
+
+        def act(snapshot: Snapshot, say: Say) -> str:
+            self.session.remove(snapshot, effect, say)
+            return told(self.session.changed)
+
+        self.do("model", f"Removing {effect}", act)
 
     def go_back(self, number: int) -> None:
         """Show a revision and let every command use it."""
-        self.do(
-            f"Going to revision {number}",
-            lambda snapshot, say: self.session.go_back(snapshot, number, say),
-        )
+
+        def act(snapshot: Snapshot, say: Say) -> str:
+            self.session.go_back(snapshot, number, say)
+            return f"Revision {number} is shown, and every command uses it."
+
+        self.do("revisions", f"Going to revision {number}", act)
 
     def show(self, number: int) -> None:
         """Show a revision; nothing is written."""
-        self.do(f"Reading revision {number}", lambda snapshot, say: self.session.load(say, number))
+
+        def act(snapshot: Snapshot, say: Say) -> str:
+            self.session.load(say, number)
+            return f"Revision {number} is shown; what commands use is as it was."
+
+        self.do("revisions", f"Reading revision {number}", act)
 
     def again(self) -> None:
         """Read the file again."""
@@ -219,13 +287,42 @@ class View:
     def fit_anew(self) -> None:
         """Fit the model of the revision in use to all readings."""
         snapshot = self.session.snapshot
-        self.work.start("Fitting anew", lambda say: self.session.fit_anew(snapshot, say))
+
+        def act(say: Say) -> str:
+            found = self.session.fit_anew(snapshot, say)
+            return f"Fitted to all {found.n_readings} readings: revision {found.number}."
+
+        self.work.start("Fitting anew", act)
+
+    def change_cell(self) -> None:
+        """Fit in the cell as it was typed; what was typed stays until it is used."""
+        texts = dict(self.tab.texts)
+
+        def act(snapshot: Snapshot, say: Say) -> str:
+            before = snapshot.fit
+            found = self.session.change_cell(snapshot, texts, say)
+            for key in texts:
+                self.tab.texts.pop(key, None)
+            return f"{refitted(before, found.fit)} It is revision {found.number}."
+
+        self.do("cell", "Fitting in the changed cell", act)
+
+    def download(self, kind: str) -> None:
+        """Make a file about the shown revision, and give it to the browser."""
+
+        def act(snapshot: Snapshot, say: Say) -> str:
+            name, content = self._file = self.session.document(snapshot, kind, say)
+            size = f"{len(content) / 1e6:.1f} MB" if len(content) > 1e5 else f"{len(content)} bytes"
+            return f"Your browser has {name} now ({size})."
+
+        self.do("download", f"Making the {kind}", act)
 
     def plan(self, poses: float | None, file: str, *, quick: bool) -> None:
         """Plan the next measurements."""
         output = self.session.path.parent / Path(file).name
         count = None if poses is None else int(poses)
         self.do(
+            "next",
             "Planning the next measurements",
             lambda snapshot, say: self.session.plan(snapshot, count, output, say, quick=quick),
         )
@@ -240,7 +337,7 @@ class View:
             names = self.shared.viewer.prepare(snapshot.story, self.session.count, say)
             self.shared.drawing = snapshot, names
 
-        self.do("Opening the 3-D view", act)
+        self.do("viewer", "Opening the 3-D view", act)
 
     def choose(self, effect: str) -> None:
         """Show the evidence of a suspect."""

@@ -5,34 +5,35 @@ change names the snapshot on which it was asked for: where the session has gone 
 tab or a second click, it is refused and nothing is appended.
 """
 
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from hilcal.campaign import Campaign
-from hilcal.changes import Changed, add_effect, remove_effect
+from hilcal.changes import Changed, add_effect, change_cell, refit, remove_effect
+from hilcal.config.changes import Changes, read_value
 from hilcal.data.purpose import refuse_fitting
 from hilcal.data.revision import RevisionRecord
 from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.diagnose.distinguish import Difference, Recorded, distinguish, recorded_values
-from hilcal.diagnose.serial_noise import with_serial_noise
 from hilcal.diagnose.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.written import read_effects_text
 from hilcal.errors import InputError
-from hilcal.identify.arm_scatter import with_prior_scatter
-from hilcal.identify.baseline import with_effects
-from hilcal.identify.fit import fit
 from hilcal.identify.full_prediction import full_prediction
 from hilcal.names import quoted
 from hilcal.procedure.next_plan import NextPlan, doubt_to_settle, next_plan
 from hilcal.report.build_story import Chapter, build_story, regressor
+from hilcal.report.covariance_words import covariance_words
 from hilcal.report.story import Regressor
-from hilcal.revisions import carried_of, chain, mode_of
+from hilcal.revisions import chain_in_cell
 from hilcal.types import Ints
-from hilcal.workbench.snapshot import Snapshot, Stamp, require_judged, row_of
+from hilcal.workbench.snapshot import Snapshot, Stamp, figures_of, require_judged
+from hilcal.write_report import Asked, write_report
 
 Say = Callable[[str], None]
 
@@ -48,7 +49,7 @@ class Session:
         path: the file.
         snapshot: what is shown; None before `load`.
         changed: what the last change did; None before any, and after another revision was chosen.
-        planned: the next measurements and their file, of the shown snapshot.
+        planned: the next measurements that were planned last, and their file.
         count: grows whenever another snapshot is shown.
     """
 
@@ -79,8 +80,9 @@ class Session:
         with self._open(read_only=True) as o:
             self._forget_others(o)
             chapters = self._chapters(o, revision, say)
-            number = None if o.in_use(revision) is None else chapters[-1].number
-            snapshot = self._snapshot(o, number, chapters, stamp)
+            record = o.in_use(revision)
+            number = None if record is None else record.number
+            snapshot = self._snapshot(o.at(cell_of(record)), number, chapters, stamp)
         return self._show(snapshot)
 
     def add(self, snapshot: Snapshot, effect: str, say: Say = silent) -> Snapshot:
@@ -105,16 +107,6 @@ class Session:
             of = snapshot.number, snapshot.fit
             return self._changed(o, remove_effect(o, *of, effect, say, snapshot.diagnosis))
 
-    def accept(self, snapshot: Snapshot, number: int | None) -> Snapshot:
-        """Let every command use a revision from now on; None: the latest one.
-
-        Raises:
-            InputError: no such revision, or an outdated snapshot.
-        """
-        with self._writing(snapshot) as o:
-            o.accept(number)
-            return self._show(replace(snapshot, accepted=number, stamp=self._stamp()), self.changed)
-
     def go_back(self, snapshot: Snapshot, number: int, say: Say = silent) -> Snapshot:
         """Show a revision, and let every command use it; nothing is taken away.
 
@@ -124,7 +116,8 @@ class Session:
         with self._writing(snapshot) as o:
             chapters = self._chapters(o, number, say)
             o.accept(None if number == len(o.file.revisions()) else number)
-            found = self._snapshot(o, number, chapters, self._stamp())
+            there = o.at(o.file.revision(number).cell)
+            found = self._snapshot(there, number, chapters, self._stamp())
         return self._show(found)
 
     def fit_anew(self, snapshot: Snapshot | None, say: Say = silent) -> Snapshot:
@@ -140,17 +133,74 @@ class Session:
             record = o.in_use()
             if record is None:
                 raise InputError(f"{o.path}: no revision yet")
-            options, mode = record.options["effects"], mode_of(record)
-            say(f"fitting {' + '.join(record.effects)} to all {len(o.readings)} readings")
-            names, prior = record.effects, carried_of(record)
-            model = with_effects(o.cell, o.readings, mode, names, options, o.catalogue, prior)
-            fitted = with_prior_scatter(model, o.readings)
-            found = diagnose(with_serial_noise(fit(model, fitted, mode)), say=say)
+            found = refit(o, record, say)
             number = self._store(o, found)
             if o.file.accepted() is not None:
                 o.accept(None)  # it cannot be used any more
             snapshot = self._snapshot(o, number, (self._known[number],), self._stamp())
         return self._show(snapshot)
+
+    def change_cell(
+        self, snapshot: Snapshot, texts: Mapping[tuple[str, str], str], say: Say = silent
+    ) -> Snapshot:
+        """Fit the shown model in a changed cell, and show that revision; see `changes`.
+
+        Args:
+            snapshot: what is shown.
+            texts: values by section and key, written as in CELL.toml; those that are shown change
+                nothing, and an empty one leaves the key out.
+            say: takes progress, one line each.
+
+        Raises:
+            InputError: nothing is changed, a value that is not valid, or an outdated snapshot.
+            CannotAnswerError: the readings do not determine the model.
+        """
+        changes: dict[str, dict[str, Any]] = {}
+        for f in snapshot.figures:
+            text = texts.get((f.section, f.key), f.text)
+            if text.strip() != f.text:
+                changes.setdefault(f.section, {})[f.key] = read_value(f.section, f.key, text)
+        if not changes:
+            raise InputError("no value differs from what is used already; nothing was fitted")
+        with self._writing(snapshot) as o:
+            of = snapshot.number, snapshot.fit
+            there, number, found = change_cell(o, *of, changes, say, snapshot.diagnosis)
+            self._known[number] = Chapter(number, None, found.fit, found)
+            chapters = self._chapters(there, number, silent)
+            return self._show(self._snapshot(there, number, chapters, self._stamp()))
+
+    def document(self, snapshot: Snapshot, kind: str, say: Say = silent) -> tuple[str, bytes]:
+        """Return name and content of a file about the shown revision.
+
+        Args:
+            snapshot: what is shown.
+            kind: "report" (HTML), "calibration" (JSON), which keeps a baseline that is not kept,
+                or "table" (the exchange table).
+            say: takes progress, one line each.
+
+        Raises:
+            InputError: an outdated snapshot, or what cannot be written.
+        """
+        self._require(snapshot)
+        stem, number = self.path.stem, snapshot.number
+        with tempfile.TemporaryDirectory() as folder:
+            if kind == "calibration" and number is None:
+                with self._writing(snapshot) as o:
+                    number = self._store(o, snapshot.diagnosis)
+                    chapters = (self._known[number],)
+                    self._show(self._snapshot(o, number, chapters, self._stamp()))
+            with self._open(read_only=True) as opened:
+                o = opened.at(snapshot.changes)
+                if kind == "report":
+                    path = Path(folder) / f"{stem}.html"
+                    write_report(o, path, Asked(revision=number), say)
+                elif kind == "calibration":
+                    path = Path(folder) / f"{stem}-calibration.json"
+                    o.calibration(number).save(path)
+                else:
+                    path = Path(folder) / f"{stem}-readings.csv"
+                    o.save_table(path)
+            return path.name, path.read_bytes()
 
     def plan(
         self,
@@ -177,7 +227,8 @@ class Session:
         if output.exists():
             raise InputError(f"{output}: the file exists; choose another name")
         self._require(snapshot)
-        with self._open(read_only=True) as o:
+        with self._open(read_only=True) as opened:
+            o = opened.at(snapshot.changes)
             doubt = doubt_to_settle(o, snapshot.diagnosis, say)
             rng = np.random.default_rng(0)
             found = next_plan(o, doubt, poses, rng, say, compare=not quick)
@@ -236,10 +287,10 @@ class Session:
         try:
             refuse_fitting(o.file)
             self._forget_others(o)
+            return o if changed or snapshot is None else o.at(snapshot.changes)
         except BaseException:
             o.close()
             raise
-        return o
 
     def _require(self, snapshot: Snapshot | None, *, changed: bool = False) -> None:
         if snapshot is not self.snapshot:
@@ -258,7 +309,8 @@ class Session:
                 say("diagnosing the baseline")
                 self._known[0] = Chapter(1, None, found, diagnose(found, say=say))
             return (self._known[0],)
-        out = [self._chapter(o, r, say) for r in chain(o.file.revisions(), record.number)]
+        o = o.at(record.cell)
+        out = [self._chapter(o, r, say) for r in chain_in_cell(o.file.revisions(), record.number)]
         require_judged(o, out[-1])
         return tuple(out)
 
@@ -298,16 +350,20 @@ class Session:
             name=self.path.name,
             arm=o.cell.arm.name,
             n_readings=len(o.readings),
-            rows=tuple(row_of(r) for r in o.file.revisions()),
+            records=o.file.revisions(),
             accepted=o.file.accepted(),
             number=number,
             chapters=chapters,
             story=build_story(chapters),
             stamp=stamp,
+            source=o.file.source,
+            covariance=covariance_words(o.covariance_parts, o.noise),
+            changes=o.changes,
+            figures=figures_of(o),
         )
 
     def _show(self, snapshot: Snapshot, changed: Changed | None = None) -> Snapshot:
-        self.snapshot, self.changed, self.planned = snapshot, changed, None
+        self.snapshot, self.changed = snapshot, changed
         self.count += 1
         return snapshot
 
@@ -322,3 +378,8 @@ class Session:
         except OSError as error:
             raise InputError(f"{self.path}: cannot be read ({error.strerror})") from None
         return found.st_size, found.st_mtime_ns, found.st_ino
+
+
+def cell_of(record: RevisionRecord | None) -> Changes:
+    """Return what was changed in the cell before a revision was fitted."""
+    return {} if record is None else record.cell

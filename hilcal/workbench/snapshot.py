@@ -1,11 +1,11 @@
 """What the workbench shows of a campaign: a frozen value, made anew after every change."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from hilcal.campaign import Campaign
-from hilcal.data.revision import RevisionRecord, change
+from hilcal.config import Target
+from hilcal.config.changes import CHANGEABLE, INSTRUMENT_NOISE, Changes, described, write_value
+from hilcal.data.revision import RevisionRecord
 from hilcal.diagnose.diagnosis import Diagnosis
 from hilcal.identify.fit import Fit
 from hilcal.report.build_story import Chapter
@@ -16,26 +16,22 @@ Stamp = tuple[int, int, int]
 
 
 @dataclass(frozen=True, slots=True)
-class RevisionRow:
-    """A stored revision as it is listed.
+class Figure:
+    """A value of the cell that can be changed.
 
     Attributes:
-        number: of the revision.
-        change: what it changed in the one that it was made from; empty for a first model.
-        model: names of its effects.
-        made_from: number of the revision that it was made from; None for a first model.
-        verdict: on it; empty where it was not diagnosed when it was stored.
-        fitted_m: rms of the 3-D position error on the fitted readings, m.
-        left_out_m: the same on poses left out, m.
+        section: of CELL.toml.
+        key: in it.
+        text: the value as CELL.toml has it; empty where it is not given, or was estimated.
+        valid: what is valid, in words.
+        fixed: why these readings do not let it change; empty where they do.
     """
 
-    number: int
-    change: str
-    model: tuple[str, ...]
-    made_from: int | None
-    verdict: str
-    fitted_m: float
-    left_out_m: float
+    section: str
+    key: str
+    text: str
+    valid: str
+    fixed: str
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,23 +42,31 @@ class Snapshot:
         name: of the file.
         arm: name of the arm.
         n_readings: all readings.
-        rows: all revisions, oldest first.
+        records: all revisions, oldest first.
         accepted: the revision that every command uses; None where it is the latest.
         number: the revision that is shown; None for the baseline, which is not kept.
         chapters: the shown revision and those that it was made from, oldest first.
         story: the same as it is drawn.
         stamp: of the file as it was read.
+        source: where the readings come from.
+        covariance: what their covariance consists of, in words.
+        changes: what was changed in the cell since they were taken.
+        figures: of the cell as it is for the shown revision.
     """
 
     name: str
     arm: str
     n_readings: int
-    rows: tuple[RevisionRow, ...]
+    records: tuple[RevisionRecord, ...]
     accepted: int | None
     number: int | None
     chapters: tuple[Chapter, ...]
     story: Story
     stamp: Stamp
+    source: str
+    covariance: str
+    changes: Changes
+    figures: tuple[Figure, ...]
 
     @property
     def fit(self) -> Fit:
@@ -85,7 +89,7 @@ class Snapshot:
     @property
     def in_use(self) -> int | None:
         """The revision that every command uses; None where there is none yet."""
-        latest = self.rows[-1].number if self.rows else None
+        latest = self.records[-1].number if self.records else None
         return latest if self.accepted is None else self.accepted
 
     @property
@@ -95,19 +99,23 @@ class Snapshot:
         return tuple(name for name in self.fit.model.named if name not in frames)
 
 
-def row_of(record: RevisionRecord) -> RevisionRow:
-    """Return how a stored revision is listed."""
-    result: Mapping[str, Any] = record.result_json
-    error = result["identify"]["error"]
-    return RevisionRow(
-        number=record.number,
-        change=change(record.added, record.removed, record.scatter_alone),
-        model=record.effects,
-        made_from=record.made_from,
-        verdict=str(result.get("diagnose", {}).get("verdict", "")),
-        fitted_m=float(error["fit"]["rms_m"]),
-        left_out_m=float(error["holdout"]["rms_m"]),
-    )
+def figures_of(o: Campaign) -> tuple[Figure, ...]:
+    """Return what can be changed in the cell of a campaign."""
+    together = {"tracker": dict.fromkeys(INSTRUMENT_NOISE)}  # what needs a stated noise is shown
+    fixed, found = o.unchangeable(together), []
+    for section, keys in CHANGEABLE.items():
+        of = getattr(o.config, section)
+        for key in keys:
+            value = getattr(of, key)
+            if isinstance(value, tuple) and value and isinstance(value[0], Target):
+                value = [target.model_dump(exclude_none=True) for target in value]
+            elif key == "targets" or (o.config.tool.targets and key.startswith("target_")):
+                continue  # the tool has one target, or several
+            estimated = o.noise is not None and key in INSTRUMENT_NOISE
+            shown = "" if value is None or estimated else write_value(value)
+            valid = described(section, key)
+            found.append(Figure(section, key, shown, valid, fixed.get((section, key), "")))
+    return tuple(found)
 
 
 def require_judged(o: Campaign, chapter: Chapter) -> None:

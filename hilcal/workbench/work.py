@@ -11,27 +11,36 @@ from hilcal.errors import HilcalError
 Say = Callable[[str], None]
 
 
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What came of a piece of work, in words, and whether it was done."""
+
+    words: str
+    done: bool = True
+
+
 @dataclass(slots=True)
 class Work:
     """What is being done.
 
     Attributes:
         what: it, in words; None where nothing is.
+        place: the part of the page where it was asked for.
         said: the last line of its progress.
-        failure: why the last piece of work failed, one line; empty where it did not.
-        begun: when it began, monotonic s.
+        answers: the last answer at each place; it stays until the next one there.
     """
 
     what: str | None = None
+    place: str = ""
     said: str = ""
-    failure: str = ""
-    begun: float = 0.0
+    answers: dict[str, Answer] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
-    def start(self, what: str, do: Callable[[Say], object]) -> bool:
+    def start(self, what: str, do: Callable[[Say], object], place: str = "file") -> bool:
         """Begin a piece of work in a thread of its own; not while another is being done.
 
-        What it raises is kept as one line. The thread does not outlive the program.
+        What it raises, or the text that it returns, is kept as its answer. The thread does not
+        outlive the program.
 
         Returns:
             Whether it was begun.
@@ -39,23 +48,25 @@ class Work:
         with self._lock:
             if self.what is not None:
                 return False
-            self.what, self.said, self.failure = what, "", ""
-            self.begun = time.monotonic()
+            self.what, self.said, self.place = what, "", place
+            self.answers.pop(place, None)
         threading.Thread(target=self._run, args=(do,), name="workbench", daemon=True).start()
         return True
 
     def _run(self, do: Callable[[Say], object]) -> None:
-        failure = ""
         try:
-            do(self._say)
+            told = do(self._say)
+            answer = Answer(told) if isinstance(told, str) and told else None
         except HilcalError as error:
-            failure = str(error)
+            answer = Answer(str(error), done=False)
         except Exception as error:
-            told = failure_of(error)
             words = " ".join(str(error).split())
-            failure = str(told or f"unexpected {type(error).__name__}: {words}; please report it")
+            unexpected = f"unexpected {type(error).__name__}: {words}; please report it"
+            answer = Answer(str(failure_of(error) or unexpected), done=False)
         with self._lock:
-            self.failure, self.what, self.said = failure, None, ""
+            if answer is not None:
+                self.answers[self.place] = answer
+            self.what, self.said = None, ""
 
     def _say(self, words: str) -> None:
         self.said = words
@@ -67,6 +78,11 @@ class Work:
         if what is None:
             return ""
         return what if said.lower() in ("", what.lower()) else f"{what}: {said}"
+
+    def failure(self, place: str = "file") -> str:
+        """Why the last piece of work that was asked for at a place failed; empty otherwise."""
+        found = self.answers.get(place)
+        return "" if found is None or found.done else found.words
 
     def wait(self, timeout: float) -> bool:
         """Wait until nothing is being done; whether that came in time, s."""

@@ -19,14 +19,21 @@ from functools import cached_property
 from http.client import HTTPConnection
 from pathlib import Path
 
+import numpy as np
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Locator, Page, expect
 
+from hilcal.calibration.calibration import Calibration
 from hilcal.campaign import Campaign
+from hilcal.config.write import to_toml
+from hilcal.data.table import write_table
+from hilcal.import_campaign import import_campaign
+from hilcal.whole_file import replace_file
 from hilcal.workbench.guard import Guard, Message, Receive, Scope, Send
 from tests.support.bench_cases import BASE, TILT, stored
 from tests.support.browser import CHROMIUM, DESKTOP, PHONE, needs_chromium, open_browser
 from tests.support.cli_cases import refused, start
+from tests.support.next_cases import SMALL, doubtful
 from tests.support.paths import ROOT
 
 WAIT = 120_000
@@ -89,14 +96,15 @@ class Served:
 
 
 @contextmanager
-def workbench(folder: Path, browser: bool = False) -> Iterator[Served]:
-    run = stored(folder / "run.hilcal")
+def workbench(folder: Path, browser: bool = False, *given: str | Path) -> Iterator[Served]:
+    """Serve a campaign, or what is given in its place."""
+    begun = given or (stored(folder / "run.hilcal"),)
     options = () if browser else ("--no-browser",)
-    process = start("workbench", run, *options, "--port", "0", "--json", cwd=folder)
+    process = start("workbench", *begun, *options, "--port", "0", "--json", cwd=folder)
     try:
         assert process.stdout is not None
-        told = "".join(iter(process.stdout.readline, "}\n")) + "}"
-        yield Served(run, json.loads(told)["url"], process)
+        told = json.loads("".join(iter(process.stdout.readline, "}\n")) + "}")
+        yield Served(folder / told["run"], told["url"], process)
     finally:
         process.kill()
         process.communicate()
@@ -400,10 +408,16 @@ def test_an_operator_sees_adds_removes_and_goes_back(browser: Browser, served: S
     bar = page.locator("[data-part=fails] .bars .point path").nth(1).bounding_box()
     assert bar is not None
     x, y = bar["x"] + bar["width"] / 2, bar["y"] + bar["height"] / 2
-    page.mouse.move(x - 2, y)
-    page.mouse.move(x, y)
-    page.mouse.click(x, y)
-    page.locator("[data-part=picked] tbody tr").first.wait_for()
+    picked = page.locator("[data-part=picked] tbody tr").first
+    for _ in range(20):  # Plotly takes a click for one of a bar once it has seen the pointer there
+        page.mouse.move(x - 2, y)
+        page.mouse.move(x, y)
+        page.wait_for_timeout(500)
+        page.mouse.click(x, y)
+        page.wait_for_timeout(2000)
+        if picked.is_visible():
+            break
+    expect(picked).to_be_visible()
     expect(page.locator("[data-part=differences]")).to_contain_text("apart")
 
     suspects = page.locator("[data-part=missing] tbody tr")
@@ -428,6 +442,8 @@ def test_an_operator_sees_adds_removes_and_goes_back(browser: Browser, served: S
 
     page.locator("[data-revision='2']").get_by_role("button", name="Go back to it").click()
     page.get_by_text("Revision 2 is accepted").wait_for()
+    came(page, "revisions", "done", "Revision 2 is shown, and every command uses it.")
+    expect(page.locator("[data-answer=model]")).to_contain_text(f"Without {BASE}")  # still there
     assert number(page, "error on poses left out") == after
     with Campaign.open(served.run, read_only=True) as o:
         made = [(r.added, r.removed) for r in o.file.revisions()]
@@ -439,11 +455,104 @@ def test_an_operator_sees_adds_removes_and_goes_back(browser: Browser, served: S
     os.utime(served.run)  # as another command leaves it
     page.get_by_text("Another command has changed the file").wait_for()
     page.get_by_role("button", name=f"Remove {BASE}").click()
-    expect(page.get_by_role("alert").filter(has_text="read it again first")).to_be_visible()
+    expect(page.locator("[data-answer=model]")).to_contain_text("read it again first")
     page.get_by_role("button", name="Read it again").click()
     page.get_by_text("Another command has changed the file").wait_for(state="hidden")
     assert number(page, "error on poses left out") == after
     assert told == []
+
+
+def field(page: Page, name: str) -> Locator:
+    return page.get_by_label(name, exact=True)
+
+
+def came(page: Page, place: str, how: str, words: str) -> None:
+    """Wait for an answer at a place of the page."""
+    answer = page.locator(f"[data-answer={place}]")
+    expect(answer).to_have_attribute("data-came", how, timeout=WAIT)
+    expect(answer).to_contain_text(words)
+    expect(answer).to_be_in_viewport()
+
+
+@needs_chromium
+def test_a_table_becomes_a_calibration_at_one_page(
+    browser: Browser, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told: list[str] = []
+    table, config = unstated(tmp_path / "t.csv"), tmp_path / "CELL.toml"
+    replace_file(config, to_toml(SMALL).replace("[tracker]", "[tracker]\nrange_std_m = 5e-6"))
+    before = table.read_bytes()
+    with workbench(tmp_path, False, table, "--config", config) as served:
+        assert served.run == tmp_path / "t.hilcal"
+        page = opened(browser, served, told, viewport=DESKTOP)
+        expect(page.get_by_text("from t.csv (table)")).to_be_visible()
+        with Campaign.open(served.run, read_only=True) as o:
+            stored_covariance = o.file.readings().covariance
+
+        field(page, "[tracker] range_std_m").fill("0.00002")
+        field(page, "[tracker] transverse_std_m").fill("20 µm")
+        change = page.locator("[data-part=change]")
+        change.click()
+        came(page, "cell", "failed", "[tracker] transverse_std_m = 20 µm is not valid: it must be")
+        expect(field(page, "[tracker] transverse_std_m")).to_have_value("20 µm")
+        expect(field(page, "[tracker] range_std_m")).to_have_value("0.00002")
+        field(page, "[tracker] transverse_std_m").fill("2e-5")
+        change.click()
+        came(page, "cell", "done", "It is revision 2.")
+        expect(field(page, "[tracker] transverse_std_m")).to_have_value("2e-05")
+        with Campaign.open(served.run, read_only=True) as o:
+            made = [r.cell for r in o.file.revisions()]
+            assert made == [{}, {"tracker": {"range_std_m": 2e-5, "transverse_std_m": 2e-5}}]
+            assert np.array_equal(o.file.readings().covariance, stored_covariance)
+
+        pair = page.locator("[data-part=pair]")
+        for words in (
+            "revision 1",
+            "range_std_m = 2e-05",
+            "variance factor",
+            "joint_compliance.j2",
+        ):
+            expect(pair).to_contain_text(words)
+
+        for name, place in (("Report", "t.html"), ("Calibration", "t-calibration.json"),
+                            ("Table of readings", "t-readings.csv")):  # fmt: skip
+            with page.expect_download(timeout=WAIT) as download:
+                page.get_by_role("button", name=name, exact=True).click()
+            assert download.value.suggested_filename == place
+            download.value.save_as(tmp_path / place)
+            came(page, "download", "done", f"Your browser has {place} now")
+        assert "joint_compliance" in (tmp_path / "t.html").read_text()
+        found = Calibration.load(tmp_path / "t-calibration.json")
+        assert found.source["revision"] == 2
+        again = import_campaign(tmp_path / "t-readings.csv", config, tmp_path / "again.hilcal")
+        with Campaign.open(served.run, read_only=True) as o:
+            assert np.allclose(again.readings.covariance, o.readings.covariance, rtol=1e-9)
+        came(page, "cell", "done", "It is revision 2.")  # it is still there
+        for width in (1280, 800):
+            page.set_viewport_size({"width": width, "height": 900})
+            page.wait_for_timeout(300)
+            page.screenshot(path=tmp_path / f"table-{width}.png", full_page=True)
+            assert page.evaluate("document.documentElement.scrollWidth") <= width
+        page.locator("[data-revision='1']").get_by_role("button", name="Go back to it").click()
+        came(page, "revisions", "done", "Revision 1 is shown, and every command uses it.")
+        expect(field(page, "[tracker] transverse_std_m")).to_have_value("7.5e-06")
+    assert told == []
+    assert table.read_bytes() == before
+    line = refused(capsys, 2, "workbench", table, "--config", config)
+    assert "t.hilcal: the file exists, and is left as it is; open it with hilcal workbench" in line
+    assert "give --config CELL.toml, too" in refused(capsys, 2, "workbench", table)
+    mapped = ("workbench", table, "--config", config, "-o", tmp_path / "o.hilcal", "--format", "x")
+    assert "--format x is unknown" in refused(capsys, 2, *mapped)
+    assert "are of a table" in refused(capsys, 2, "workbench", served.run, "--format", "ipa-ur10")
+
+
+def unstated(path: Path) -> Path:
+    """Write readings as a table that does not state their covariances."""
+    write_table(doubtful(BASE, 2).rehearsal.readings, path)
+    rows = [line.split(",") for line in path.read_text().splitlines()]
+    kept = [k for k, name in enumerate(rows[0]) if not name.startswith("cov")]
+    replace_file(path, "".join(",".join(row[k] for k in kept) + "\n" for row in rows))
+    return path
 
 
 @needs_chromium

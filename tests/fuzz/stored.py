@@ -30,8 +30,8 @@ from hilcal.identify import posterior_document
 from hilcal.identify.carried import carried_prior, check_arm
 from hilcal.procedure.state import next_step, settings_of
 from hilcal.report import text_info
+from hilcal.report.two_revisions import two_revisions
 from hilcal.robot.catalogue import configs_dir, load_arm
-from hilcal.workbench.snapshot import row_of
 from tests.fuzz.bench import CELL, Bench
 from tests.fuzz.damage import (
     NUMBERS,
@@ -97,7 +97,7 @@ def _told(file: CampaignFile) -> None:
     text_info.to_json(found, "x", "instrument")
     revision_table(found.revisions, found.in_use)
     for record in found.revisions:
-        row_of(record)
+        two_revisions(record, record)
     if file.about(run_log.PLAN) is not None:
         log = run_log.RunLog(file)
         log.details()
@@ -237,7 +237,7 @@ def _revision(path: Path) -> None:
     except ValueError as error:
         raise hc.InputError(str(error)) from error
     revision.fitted_to(record)
-    row_of(record)
+    two_revisions(record, record)
     revision_table([record], 1)
 
 

@@ -24,6 +24,7 @@ HASHED = next(path for path in FILES if "hashed" in path.name)
 """Its revision names the hash of the readings as they are stored."""
 HASHES = {
     "version-5-hashed": "f91c9c4b17595fd06c9913893dded67c902babcea3f5cb885cd6e043b3e1034f",
+    "version-6": "f91c9c4b17595fd06c9913893dded67c902babcea3f5cb885cd6e043b3e1034f",
     "version-1": "dfcb9facd5eab32baa432c85c7a0255fbf2af611ee13ac62efa29595dd3d3874",
     "version-2": "dfcb9facd5eab32baa432c85c7a0255fbf2af611ee13ac62efa29595dd3d3874",
     "version-3": "167ca0438879f2c498270598303a9f81fb5d5bf701de512ebabe23992d484fc6",

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hilcal.calibration.calibration import Calibration
 from hilcal.campaign import Campaign
 from hilcal.cli.prior import fitted_with
 from hilcal.data.campaign_file import CampaignFile
@@ -13,6 +14,8 @@ from hilcal.diagnose.verdict import diagnose
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identify.carried import carried_prior
 from hilcal.report.diagnosis_document import to_json
+from hilcal.report.two_revisions import left_out_m, two_revisions, verdict_of
+from hilcal.whole_file import replace_file
 from hilcal.workbench.session import Session
 from tests.support.bench_cases import BASE, few_effects, stored
 from tests.support.campaigns import campaign, configuration
@@ -33,7 +36,7 @@ def test_an_operator_adds_removes_and_goes_back(run: Path) -> None:
     session = Session(run, few_effects())
     snapshot = session.load()
     assert (run.read_bytes(), list(run.parent.iterdir())) == (before, [run])  # only looked at
-    assert (snapshot.number, snapshot.rows, snapshot.in_use) == (None, (), None)
+    assert (snapshot.number, snapshot.records, snapshot.in_use) == (None, (), None)
     with Campaign.open(run, few_effects(), read_only=True) as o:
         assert to_json(snapshot.diagnosis) == to_json(diagnose(o.fit_in_use()[1]))
     assert snapshot.diagnosis.significant[0] == BASE
@@ -57,12 +60,12 @@ def test_an_operator_adds_removes_and_goes_back(run: Path) -> None:
 
     added = session.add(snapshot, BASE)
     assert session.changed is not None
-    assert (added.number, [row.change for row in added.rows]) == (2, ["", f"+ {BASE}"])
+    assert (added.number, [r.added for r in added.records]) == (2, [None, BASE])
     assert added.fit.holdout.rms_m < 0.8 * snapshot.fit.holdout.rms_m
     assert [c.number for c in added.chapters] == [1, 2]
-    assert added.rows[1].left_out_m == added.fit.holdout.rms_m
-    assert added.rows[1].verdict == added.diagnosis.verdict
-    assert added.rows[0].verdict == snapshot.diagnosis.verdict
+    assert left_out_m(added.records[1]) == added.fit.holdout.rms_m
+    judged = [snapshot.diagnosis.verdict, added.diagnosis.verdict]
+    assert [verdict_of(r) for r in added.records] == [v.replace("_", " ") for v in judged]
 
     with pytest.raises(InputError, match="has gone on since that click; nothing was changed"):
         session.add(snapshot, BASE)  # the second of a double click
@@ -93,6 +96,42 @@ def test_an_operator_adds_removes_and_goes_back(run: Path) -> None:
     assert session.stale
     with pytest.raises(InputError, match="cannot be read"):
         session.load()
+
+
+def test_a_changed_cell_keeps_how_the_model_was_reached(run: Path) -> None:
+    """A verdict that doubts an addition doubts it in another cell, too, also when read again."""
+    session = Session(run, few_effects())
+    snapshot = session.load()
+    mass = {("tool", "mass_kg"): "1.4"}
+    with pytest.raises(InputError, match="no value differs from what is used already"):
+        session.change_cell(snapshot, {("tool", "mass_kg"): " 0.8 "})
+    added = session.add(snapshot, BASE)
+    with pytest.raises(InputError, match="has gone on since that click"):
+        session.change_cell(snapshot, mass)
+    found = session.change_cell(added, mass)
+    assert (found.number, found.changes) == (3, {"tool": {"mass_kg": 1.4}})
+    assert found.diagnosis.history == added.diagnosis.history
+    assert found.diagnosis.verdict == added.diagnosis.verdict
+    again = Session(run, few_effects()).load()
+    assert (again.number, again.diagnosis.verdict) == (3, found.diagnosis.verdict)
+    assert [c.number for c in again.chapters] == [3]
+    assert next(f.text for f in again.figures if f.key == "mass_kg") == "1.4"
+    before = Session(run, few_effects()).load(revision=2)
+    assert (before.changes, before.diagnosis.verdict) == ({}, added.diagnosis.verdict)
+    rows = {row.what: row for row in two_revisions(*again.records[1:])}
+    assert (rows["cell"].second, rows["model"].difference) == ("[tool] mass_kg = 1.4", "")
+    assert two_revisions(*again.records[:2])[0].difference == f"+ {BASE}"
+
+
+def test_a_calibration_is_of_a_revision_that_is_kept(run: Path, tmp_path: Path) -> None:
+    session = Session(run, few_effects())
+    name, content = session.document(session.load(), "calibration")
+    assert name == "run-calibration.json"
+    kept = session.snapshot
+    assert kept is not None
+    assert (kept.number, revisions(run)) == (1, [(None, None, None)])
+    replace_file(tmp_path / name, content)
+    assert Calibration.load(tmp_path / name).source["revision"] == 1
 
 
 def test_readings_that_came_later_are_fitted_anew(run: Path) -> None:

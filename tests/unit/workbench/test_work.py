@@ -18,7 +18,7 @@ def test_only_one_thing_is_done_at_a_time() -> None:
     assert work.line == "Adding creep"
     go.set()
     assert work.wait(10)
-    assert (done, work.line, work.failure) == (["slow"], "", "")
+    assert (done, work.line, work.failure()) == (["slow"], "", "")
 
 
 def test_progress_and_failures_are_lines() -> None:
@@ -29,7 +29,7 @@ def test_progress_and_failures_are_lines() -> None:
         work = Work()
         assert work.start("Reading", do)
         assert work.wait(10)
-        return work.failure
+        return work.failure()
 
     assert fails(InputError("no such file")) == "no such file"
     told = fails(ZeroDivisionError("by\nzero"))

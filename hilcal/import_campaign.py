@@ -1,0 +1,87 @@
+"""A campaign file of a table of readings."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from hilcal.cell import Cell, cell_from_config
+from hilcal.config import CellConfig, load_config
+from hilcal.data.campaign_file import CampaignFile
+from hilcal.data.covariance import COVERS, FROM, TRACKER
+from hilcal.data.importing import import_readings
+from hilcal.data.readings import Readings
+from hilcal.identify.full_covariance import CovarianceParts, covariance_parts
+from hilcal.identify.noise_estimate import NOISE, NoiseEstimate, with_estimated_noise
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Imported:
+    """What was imported.
+
+    Attributes:
+        config: of the cell.
+        cell: the cell.
+        readings: as they are stored.
+        noise: its estimate; None where it is stated, or cannot be estimated.
+        parts: what the covariances consist of.
+        notes: one sentence for each decision.
+    """
+
+    config: CellConfig
+    cell: Cell
+    readings: Readings
+    noise: NoiseEstimate | None
+    parts: CovarianceParts
+    notes: tuple[str, ...]
+
+
+def import_campaign(
+    table: Path,
+    config: Path,
+    output: Path,
+    kind: str = "table",
+    second: Path | None = None,
+    *,
+    overwrite: bool = False,
+    say: Say = lambda text: None,
+) -> Imported:
+    """Make a campaign file from a table of readings.
+
+    Args:
+        table: what was measured.
+        config: CELL.toml of the cell that it was measured in.
+        output: the file to make.
+        kind: "table", "ipa-ur10", the name of a mapping, or the path of one.
+        second: the second file of a mapping that is for two.
+        overwrite: replace a campaign that is there.
+        say: takes progress, one line each.
+
+    Raises:
+        InputError: anything in table or cell that cannot be right, or the file exists.
+    """
+    settings = load_config(config)
+    base_dir = config.absolute().parent
+    cell = cell_from_config(settings, base_dir)
+    say(f"reading {table}")
+    found = import_readings(table, kind, settings, cell.arm, second)
+    if not found.noise_stated:
+        say("estimating the noise, which nothing states")
+    found, noise = with_estimated_noise(found, cell, settings)
+    more = {COVERS: found.covers}
+    more |= {FROM: TRACKER} if found.from_tracker else {}
+    more |= {} if noise is None else {NOISE: noise.to_json()}
+    say(f"writing {output}")
+    source = f"{table.name} ({Path(kind).name})"
+    CampaignFile.create(
+        output,
+        settings.to_json(),
+        str(base_dir),
+        source,
+        overwrite=overwrite,
+        more=more,
+        readings=found.readings,
+    ).close()
+    parts = covariance_parts(found.covers, settings)
+    return Imported(settings, cell, found.readings, noise, parts, found.notes)

@@ -1,0 +1,23 @@
+/* The answer to a click stays where it is seen while the page around it is drawn anew. */
+(() => {
+  let place = null, want = null, last = null, moved = 0;
+  for (const kind of ["wheel", "touchmove", "keydown", "pointerdown"])
+    addEventListener(kind, () => { moved = performance.now(); }, true);
+  addEventListener("click", (e) => {
+    const card = e.target.closest("button") && e.target.closest(".part");
+    const answer = card && card.querySelector(".answer");
+    if (answer) { place = answer.dataset.answer; want = last = null; }
+  }, true);
+  const follow = () => {
+    const answer = place && document.querySelector(`[data-answer=${place}]`);
+    if (answer && answer.offsetParent) {
+      const box = answer.getBoundingClientRect(), at = box.top + scrollY;
+      if (want === null || (at === last && performance.now() - moved < 1000))
+        want = want === null ? Math.min(box.top, innerHeight - box.height - 16) : box.top;
+      if (at !== last) scrollTo(0, at - want);
+      last = at;
+    }
+    requestAnimationFrame(follow);
+  };
+  follow();
+})();

@@ -1,0 +1,99 @@
+"""The page in NiceGUI's own simulation: what it says, where, and that it stays."""
+
+import asyncio
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from dataclasses import replace
+from typing import get_args
+
+import pytest
+from nicegui import ui
+from nicegui.testing import User, user_simulation
+
+from hilcal.diagnose.diagnosis import Reason
+from hilcal.report.verdict_words import HEADLINES
+from hilcal.workbench.page import Shared, View
+from hilcal.workbench.session import Session
+from tests.support.bench_cases import few_effects, stored
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
+    made = Session(stored(tmp_path_factory.mktemp("page") / "run.hilcal"), few_effects())
+    made.load()
+    return made
+
+
+@asynccontextmanager
+async def opened(shared: Shared) -> AsyncIterator[User]:
+    def page() -> None:
+        view = View(shared, "http://test/")
+        view.build()
+        view.begin(dark=False)
+
+    async with user_simulation(root=page) as user:
+        await user.open("/")
+        yield user
+
+
+def seen(user: User, kind: type[ui.element], mark: str) -> list[str]:
+    """Texts of elements that show, with a property."""
+    assert user.client is not None
+    found = [e for e in user.client.elements.values() if isinstance(e, kind) and e.visible]
+    return [str(e.props.get("innerHTML") or getattr(e, "text", "")) for e in found
+            if mark in str(dict(e.props)) or mark in e.classes]  # fmt: skip
+
+
+def simulated(do: Callable[[], Awaitable[None]]) -> None:
+    asyncio.run(do())  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("reason", get_args(Reason))
+def test_nothing_but_the_verdict_says_whether_an_effect_is_missing(
+    session: Session, reason: Reason, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where no effect is listed, whatever the verdict."""
+    monkeypatch.setattr("hilcal.workbench.cards.message", lambda d: "the sentence")
+    snapshot = session.snapshot
+    assert snapshot is not None
+    judged = replace(snapshot.diagnosis, reason=reason, suspects=())
+    last = replace(snapshot.chapters[-1], diagnosis=judged)
+    shown = Session(session.path, few_effects())
+    shown.snapshot = replace(snapshot, chapters=(*snapshot.chapters[:-1], last))
+
+    async def look() -> None:
+        async with opened(Shared(shown)) as user:
+            await user.should_see("No effect passes the tests by itself")
+            said = " ".join(seen(user, ui.html, "innerHTML") + seen(user, ui.label, "")).lower()
+            first = {v: words.split(":")[0] for v, words in HEADLINES.items()}
+            found = [v for v, w in first.items() if f"! {w}" in said or f"✓ {w}" in said]
+            assert found == [judged.verdict]
+            assert "is needed" not in said
+            assert "nothing is missing" not in said
+
+    simulated(look)
+
+
+def test_an_answer_appears_at_its_button_and_stays(session: Session) -> None:
+    async def look() -> None:
+        shared = Shared(session)
+        before = session.path.read_bytes()
+        async with opened(shared) as user:
+            for label, text in (("[tool] mass_kg", "two kilos"), ("[tool] com_m", "[0, 0, 0.07]")):
+                field = next(iter(user.find(kind=ui.input, content=label).elements))
+                field.set_value(text)
+            user.find(kind=ui.button, content="Fit with these values").click()
+            line = "[tool] mass_kg = two kilos is not valid: it must be a mass in kg, 0 or more"
+            await user.should_see(line, retries=50)
+            assert [line in t for t in seen(user, ui.label, "cell")] == [True]
+            session.load()  # as another tab does: everything is drawn anew
+            await asyncio.sleep(1.0)
+            assert [line in t for t in seen(user, ui.label, "cell")] == [True]
+            values = {e.value for e in user.find(kind=ui.input).elements}
+            assert {"two kilos", "[0, 0, 0.07]"} <= values  # nothing that was typed is lost
+            shared.work.start("Waiting", lambda say: None, "missing")
+            await asyncio.sleep(0.5)
+            assert [line in t for t in seen(user, ui.label, "cell")] == [True]
+        assert session.path.read_bytes() == before
+
+    simulated(look)
