@@ -1,6 +1,5 @@
 """Criteria by name, the choice of units, and of the loads that are worth their change."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -166,7 +166,10 @@ def make(
     pose_of = np.array([pose for pose, _ in of.what])
     first, relaxed = promising(asked, budget)
     usable = ~np.isin(pose_of, _unreachable(space, of, home, first))
-    for _ in range(ROUNDS):
+    reached: set[int] = set()
+    for left in reversed(range(ROUNDS)):
+        if not left:  # of those that were chosen before, enough are reached
+            usable &= np.isin(pose_of, [*reached])
         if whole:
             design = choose_poses(asked, of, usable, request.poses, rng, request.effort)
         else:
@@ -177,6 +180,7 @@ def make(
         if not len(lost):
             break
         usable &= ~np.isin(pose_of, lost)
+        reached |= {of.what[k][0] for k in units} - set(lost.tolist())
     else:
         raise CannotAnswerError(
             f"after {ROUNDS} rounds there are still poses that no clear straight motion from the "
@@ -185,8 +189,8 @@ def make(
     visited = len({of.what[k][0] for k in units}) + 1
     if not cell.registration_known and known is None and visited < MIN_POSES:
         raise CannotAnswerError(
-            f"the plan has {visited} poses, the reference among them; an unknown registration needs "
-            f"at least {MIN_POSES}: ask for more {'poses' if whole else 'readings'}"
+            f"the plan has {visited} poses, the reference among them; an unknown registration "
+            f"needs at least {MIN_POSES}: ask for more {'poses' if whole else 'readings'}"
         )
     say("ordering the readings")
     counts = np.zeros(len(usable), dtype=np.int64)

@@ -82,8 +82,7 @@ def in_words(p: StoryParameter) -> str:
     """Return name, value and standard uncertainty in a unit for people."""
     if p.value is None or not p.identifiable:
         return f"{p.name}: these readings do not determine it"
-    unit, factor = numbers.unit_for(p.unit, [p.value])
-    value, std = numbers.with_std(factor * p.value, factor * (p.std or 0.0))
+    value, std, unit = numbers.measured(p.unit, p.value, p.std or 0.0)
     return f"{p.name} = {value} {'± ' + std + ' ' if std else ''}{unit}"
 
 
