@@ -9,7 +9,7 @@ from hilcal.plan.approximate_design import KINKED_TOLERANCE, ApproximateDesign, 
 from hilcal.plan.candidate_set import CandidateSet
 from hilcal.plan.criteria import A, D, MeanVariance
 from hilcal.plan.criterion import Criterion
-from hilcal.plan.discriminated_pairs import discriminated_pairs
+from hilcal.plan.discriminated_pairs import DiscriminatedPairs, discriminated_pairs
 from hilcal.plan.eigenvalue_criteria import E, K
 from hilcal.plan.information import Problem
 from hilcal.plan.optimum import Design, best
@@ -40,12 +40,14 @@ class Objective:
         units: the units by the parameters that φ is of.
         prior: (P, P) prior information of these.
         names: of the parameters; none where they are combinations.
+        apart: the pairs of effects that "separate" is of; None of other criteria.
     """
 
     criterion: Criterion
     units: CandidateSet
     prior: Floats
     names: tuple[str, ...]
+    apart: DiscriminatedPairs | None = None
 
 
 def canonical(name: str) -> str:
@@ -79,7 +81,7 @@ def objective_of(problem: Problem, name: str, work: PredictionPoses | None) -> O
     if name == "separate":
         apart = discriminated_pairs(problem)
         units, pairs, prior = condensed(problem.units, apart.pairs, apart.prior)
-        return Objective(Separate(pairs), units, prior, ())
+        return Objective(Separate(pairs), units, prior, (), apart)
     if name == "E":
         return replace(whole, criterion=E(unknown(problem)))
     if name == "K":  # of the model alone: more information, also of the others, may make it worse

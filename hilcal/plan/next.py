@@ -14,7 +14,6 @@ from hilcal.plan.discriminated_pairs import (
     LEAST_POWER,
     LEVEL,
     DiscriminatedPairs,
-    discriminated_pairs,
     not_ruled_out,
     pair_of,
     power,
@@ -131,7 +130,8 @@ def measure_next(
     if reference is not None and not np.array_equal(reference, made.ordered.plan.q[0]):
         made = _from_reference(cell, config, made, reference, rng, request)
     say("predicting the powers")
-    of = discriminated_pairs(made.problem)
+    of = made.asked.apart
+    assert of is not None  # noqa: S101  (the criterion is of pairs)
     then = of.prior + made.problem.units.information(made.counts)
     powers = tuple(_pair_powers(made.problem, of, names, then))
     seen = {e.name for e in made.problem.families}
