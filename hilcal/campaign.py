@@ -325,9 +325,9 @@ class Campaign:
             return self.append_records(
                 [self.record(s.fit, s.diagnosis, s.added, s.removed) for s in steps]
             )[-1]
-        judged = isinstance(found, Diagnosis)
-        record = self.record(found.fit, found) if judged else self.record(found)
-        return self.append_records([record])[-1]
+        if isinstance(found, Diagnosis):
+            return self.append_records([self.record(found.fit, found)])[-1]
+        return self.append_records([self.record(found)])[-1]
 
     def append_records(
         self, records: Sequence[RevisionRecord], parent: int | None = None

@@ -267,12 +267,12 @@ def refine(
                 laws.write(found.names)
             for step in found.steps:
                 finish(step.fit, say)
-            start = () if latest is None else (latest.number,)
+            begun = () if latest is None else (latest.number,)
             records = [
-                o.record(s.fit, s.diagnosis, s.added, s.removed) for s in found.steps[len(start) :]
+                o.record(s.fit, s.diagnosis, s.added, s.removed) for s in found.steps[len(begun) :]
             ]
             before = len(o.file.revisions())
-            numbered = (*start, *o.append_records(records, *start))
+            numbered = (*begun, *o.append_records(records, *begun))
             rows: list[Row] = [
                 Row(number, s.fit, s.diagnosis.verdict, s.added, s.removed)
                 for number, s in zip(numbered, found.steps, strict=True)
