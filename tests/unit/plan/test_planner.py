@@ -2,6 +2,7 @@
 
 import csv
 import json
+import sys
 from collections import Counter
 from functools import cache
 from pathlib import Path
@@ -17,9 +18,12 @@ from hilcal.data.covariance import WHOLE
 from hilcal.data.plan import REFERENCE, UNLOADED, load_plan, read_plan
 from hilcal.data.table import write_table
 from hilcal.plan.choice import CRITERIA, costly_loads, objective_of
+from hilcal.plan.feasible import Space
+from hilcal.plan.information import Problem
 from hilcal.plan.planner import Planned, Request, make
 from hilcal.plan.predicted import predicted
 from hilcal.plan.summary import remarks, summarise
+from hilcal.types import Floats, Ints
 from tests.support.cli_cases import CELL, ok, quickly_planned, refused, rehearsal, run
 
 Capsys = pytest.CaptureFixture[str]
@@ -66,6 +70,26 @@ def test_the_plan_may_be_run_and_is_the_same_every_time(usual: Planned) -> None:
     again = planned(config, readings=25).ordered.plan
     assert again.to_json() == plan.to_json()
     assert read_plan(plan.to_json(), "plan").to_json() == plan.to_json()
+
+
+def test_the_last_round_takes_poses_that_are_reached(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half of what each round chooses is not reached: a plan was refused for that."""
+    module = sys.modules["hilcal.plan.planner"]
+    reached, rounds = module._unreachable, []
+
+    def lost(space: Space, of: Problem, home: Floats, units: Ints) -> Ints:
+        chosen = {of.what[k][0] for k in units}
+        odd = {pose for pose in chosen if pose % 2} if rounds else set()
+        rounds.append(chosen)
+        return np.array(sorted(odd | {*reached(space, of, home, units).tolist()}), dtype=np.int64)
+
+    monkeypatch.setattr(module, "_unreachable", lost)
+    monkeypatch.setattr(module, "ROUNDS", 2)
+    made = planned(small(), 12)
+    _, first, last = rounds
+    assert any(pose % 2 for pose in first)
+    assert last <= {pose for pose in first if not pose % 2}
+    assert {s.pose for s in made.ordered.plan.steps if s.load == "10kg"} > {REFERENCE}
 
 
 def test_more_readings_promise_more() -> None:
