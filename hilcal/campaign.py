@@ -1,6 +1,6 @@
 """A campaign: its readings with their full covariance, and the fits that were stored in it."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
@@ -11,12 +11,12 @@ from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
 from hilcal.config.changes import INSTRUMENT_NOISE, Changes, changed
 from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.command_line import COMMAND, typed_now
+from hilcal.data.command_line import typed_now
 from hilcal.data.covariance import COVERS, FROM, INSTRUMENT, TRACKER, WHOLE
 from hilcal.data.purpose import refuse_fitting
 from hilcal.data.readings import Readings
 from hilcal.data.records import content_hash
-from hilcal.data.revision import CELL, STORED, RevisionRecord, to_text
+from hilcal.data.revision import CELL, STORED, RevisionRecord
 from hilcal.data.robot_file import ROBOT_FILE, check_robot
 from hilcal.data.run_log import PLAN
 from hilcal.data.table import with_what_rounding_does, write_table
@@ -47,6 +47,7 @@ from hilcal.revisions import (
     chain_in_cell,
     check_sources,
     history,
+    is_again,
     mode_of,
     restore,
     restore_model,
@@ -421,21 +422,44 @@ class Campaign:
     def append(self, found: Fit | Diagnosis | Refinement) -> int:
         """Store a fit, a diagnosed fit, or all steps of a refinement; revisions only append.
 
+        What the latest revision, or those that led to it, are already is not stored again.
+
         Returns:
             The number of the (last) revision.
 
         Raises:
             InputError: it was fitted to other readings than those of this campaign.
         """
-        number = 0
         if isinstance(found, Refinement):
-            for step in found.steps:
-                parent = number or None
-                number = self.store(step.fit, step.diagnosis, step.added, step.removed, parent)
-            return number
+            steps = found.steps
+            return self.append_records(
+                [self.record(s.fit, s.diagnosis, s.added, s.removed) for s in steps]
+            )[-1]
         if isinstance(found, Diagnosis):
-            return self.store(found.fit, found)
-        return self.store(found)
+            return self.append_records([self.record(found.fit, found)])[-1]
+        return self.append_records([self.record(found)])[-1]
+
+    def append_records(
+        self, records: Sequence[RevisionRecord], parent: int | None = None
+    ) -> tuple[int, ...]:
+        """Store revisions of which each is made from the one before; returns their numbers.
+
+        Args:
+            records: from `record`; none of them is stored where the latest revision, and those
+                that led to it, are these already.
+            parent: number of the revision that the first one is made from; None for a first model.
+        """
+        if not records:
+            return ()
+        last = chain(self.file.revisions())[-len(records) :]
+        there = last and last[0].made_from == parent and len(last) == len(records)
+        if there and all(map(is_again, records, last)):
+            return tuple(r.number for r in last)
+        numbers: list[int] = []
+        for record in records:
+            before = numbers[-1] if numbers else parent
+            numbers.append(self.file.append_revision(replace(record, parent=before)))
+        return tuple(numbers)
 
     def store(
         self,
@@ -462,20 +486,6 @@ class Campaign:
                 of a validation campaign (`data.purpose`).
         """
         return self.file.append_revision(self.record(found, diagnosis, added, removed, parent))
-
-    def store_once(
-        self,
-        found: Fit,
-        diagnosis: Diagnosis | None = None,
-        added: str | None = None,
-        removed: str | None = None,
-        parent: int | None = None,
-    ) -> int:
-        """Do so, unless the latest revision is the same to the last bit: then return its number."""
-        record, last = self.record(found, diagnosis, added, removed, parent), self.latest()
-        if last is not None and _content(last) == _content(record):
-            return last.number
-        return self.file.append_revision(record)
 
     def record(
         self,
@@ -550,12 +560,6 @@ class Campaign:
                 judged = diagnose(found, self.history(record.number), say)
             out.append(Chapter(record.number, record.added, found, judged, record.removed))
         return out
-
-
-def _content(record: RevisionRecord) -> str:
-    """Text of a revision without when, and by which command, it was made."""
-    options = {k: v for k, v in record.options.items() if k != COMMAND}
-    return to_text(replace(record, options=options, created="", parent=None))
 
 
 def _restates(file: CampaignFile, changes: Changes) -> bool:

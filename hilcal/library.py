@@ -333,7 +333,7 @@ def plan(
     config, rng = cell.configured(), np.random.default_rng(seed)
     if given is not None and prior is not None:
         raise InputError("a plan after a fit has the prior of that fit; leave out one of both")
-    request = Request(poses, whole=True, criterion=criterion)
+    request = Request(poses, criterion=criterion)
     planned = make(cell, config, request, rng, given, prior=_carried(prior, None))
     file = replace(planned.ordered.plan, about=about(planned))
     return checked(cell, config, file, summarise(planned, config, rng, compare=False))

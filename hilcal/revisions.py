@@ -1,5 +1,6 @@
 """Fits as revisions of a campaign file: what is stored, and how the fit comes back."""
 
+import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -11,9 +12,10 @@ import numpy as np
 from hilcal import __version__
 from hilcal.cell import Cell
 from hilcal.data.arm_scatter import ArmScatter
+from hilcal.data.command_line import COMMAND
 from hilcal.data.readings import Readings
 from hilcal.data.records import content_hash
-from hilcal.data.revision import STORED, RevisionRecord
+from hilcal.data.revision import STORED, RevisionRecord, to_text
 from hilcal.data.serial_noise import SerialNoise
 from hilcal.data.stored_priors import CARRIED
 from hilcal.data.whitening import MODES, SCALINGS, Mode, Scaling
@@ -96,6 +98,22 @@ def to_record(
         },
         result_json=result,
     )
+
+
+def is_again(new: RevisionRecord, stored: RevisionRecord) -> bool:
+    """Whether a stored revision holds all of a new one but the time and the command.
+
+    That is the same model, readings, options, program and numbers, exactly; the stored one may be
+    diagnosed where the new one is not.
+    """
+
+    def plain(r: RevisionRecord) -> dict[str, Any]:
+        told = {key: r.result_json.get(key) for key in new.result_json}
+        options = {key: value for key, value in r.options.items() if key != COMMAND}
+        alike = replace(r, options=options, result_json=told, created="", parent=None)
+        return dict(json.loads(to_text(alike)))
+
+    return plain(new) == plain(stored)
 
 
 def _random_to_json(model: Model) -> dict[str, object]:

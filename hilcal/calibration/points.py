@@ -2,7 +2,9 @@
 
 One row per point, with a header; separator and decimal mark are those that the file has. A table
 of readings as `import` takes it, of the exchange format or by a mapping, is a table of points too:
-what is not listed here (covariances, cycles, actual joints, columns `x_…`) is passed over.
+what is not listed here (covariances, cycles, actual joints, columns `x_…`) is passed over. Where no
+column has a name of ours, a mapping is guessed as `import --preview` does, and taken where nothing
+in it is unsure.
 
 - `pose`: its name; numbered without.
 - `q1_rad` … or `q1_deg` …: joint values. Alone, the point is where the nominal arm has the tool
@@ -17,7 +19,7 @@ what is not listed here (covariances, cycles, actual joints, columns `x_…`) is
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -39,8 +41,10 @@ from hilcal.data.csvfile import CsvTable, Dialect, read_columns
 from hilcal.data.grid import SEPARATORS
 from hilcal.data.mapped import import_mapped
 from hilcal.data.mapping import Mapping as TableMapping
+from hilcal.data.propose import propose
 from hilcal.data.sniff import sniff
 from hilcal.errors import InputError
+from hilcal.names import quoted
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.robot.chain import evaluate
@@ -71,6 +75,7 @@ class Points:
         sensed: (N, 6) what the load adds to the force sensor's reading, sensor axes; None where
             it is not given.
         recorded: other columns of `States`.
+        taken: which columns were taken for what, where their names are not ours.
     """
 
     names: tuple[str, ...]
@@ -79,6 +84,11 @@ class Points:
     wrench: Floats | None = None
     sensed: Floats | None = None
     recorded: Mapping[str, Floats] = field(default_factory=dict)
+    taken: str = ""
+
+
+class _OtherNamesError(InputError):
+    """No column has a name that a table of points has."""
 
 
 def read_points(
@@ -104,7 +114,11 @@ def read_points(
         header.extend(given)
         return _checked(path, given, groups, arm)
 
-    table = read_columns(path, choose, _dialect(path))
+    try:
+        table = read_columns(path, choose, _dialect(path))
+    except _OtherNamesError as error:
+        mapping, taken = _guessed(path, arm, error)
+        return replace(_mapped(path, arm, loads, mapping), taken=taken)
     found = {key: table.matrix(names) for key, names in groups.items() if names[0] in header}
     q = found.pop("q_rad", None)
     if "q_deg" in found:
@@ -228,6 +242,29 @@ def _dialect(path: Path) -> Dialect | None:
     return Dialect(SEPARATORS.get(separator, separator), str(how.get("decimal", ".")))
 
 
+def _guessed(path: Path, arm: Arm, unknown: InputError) -> tuple[TableMapping, str]:
+    """Return what the columns of a table seem to hold, and that in words.
+
+    Raises:
+        InputError: something is missing, unsure or not understood; says so after `unknown`.
+    """
+    found = propose(path, joints=arm.n).proposal
+    understood = [
+        f"{u.what} = {', '.join(u.columns)}" + f" ({u.meaning})" * bool(u.meaning)
+        for u in found.understood
+    ]
+    # names of loads are compared with those of the campaign, and poses need none
+    unsure = [u for u in found.unsure if u[0] not in ("pose", "load")]
+    doubts = [*found.lacking, *(f"{about}: {words}" for about, words in unsure)]
+    doubts += [f"{name} is not understood" for name, _ in found.unused]
+    if doubts:
+        raise InputError(
+            f"{unknown}; what they hold cannot be told ({'; '.join(doubts)}): write it down, "
+            f"starting from hilcal import {quoted(path)} --preview"
+        )
+    return found.mapping(), f"taken, in base axes: {'; '.join(understood)}"
+
+
 def _mapped(path: Path, arm: Arm, loads: Mapping[str, Floats], mapping: TableMapping) -> Points:
     """Return the states of a table of readings as points, their positions in base axes."""
     # the noise weighs nothing here
@@ -235,8 +272,12 @@ def _mapped(path: Path, arm: Arm, loads: Mapping[str, Floats], mapping: TableMap
     s = r.states
     wrench = s.wrench.copy()
     for k, load in enumerate(r.load_names):
-        if not s.wrench[r.load == k].any() and load in loads:
-            wrench[r.load == k] = loads[load]
+        if load == NO_LOAD or s.wrench[r.load == k].any():
+            continue
+        if load not in loads:
+            valid = ", ".join((NO_LOAD, *loads))
+            raise InputError(f"{path}: unknown load {load!r}; valid: {valid}")
+        wrench[r.load == k] = loads[load]
     found = {"position_m": r.value[:, :3]}
     if r.m == 6:
         found["rotation_rad"] = r.value[:, 3:]
@@ -276,10 +317,12 @@ def _checked(
     """
     known = [name for names in groups.values() for name in names]
     exchanged = set(known_columns(arm.n))
+    ours = {*known, *exchanged} - {"pose", "load", "target"}
     for name in header:
         if name not in (*known, "pose", "load", *exchanged) and not name.startswith(OWN_PREFIX):
             valid = ", ".join(("pose", "load", *known))
-            raise InputError(
+            kind = InputError if ours & set(header) else _OtherNamesError
+            raise kind(
                 f"{path}: unknown column '{name}'; valid: {valid}, columns of the exchange table, "
                 "and x_…; other tables: --format MAPPING, as for import"
             )

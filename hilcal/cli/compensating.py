@@ -132,6 +132,8 @@ def compensate(
         calibration = _calibration(model, catalogue, revision)
         arm = calibration.model.cell.arm
         task = _task(points, calibration, tool, leave, kind)
+        if task.points.taken:
+            t.notice(f"{points}: {task.points.taken}")
         given = _wrench(task.points, calibration, load, wrench)
         start = None if near is None else np.radians(_numbers(near, arm.n, "--near"))
         say(f"compensating {len(task.points.names)} points")

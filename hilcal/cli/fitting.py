@@ -127,7 +127,8 @@ def identify(
                 fits[s] = with_serial_noise(fit(model, fitted, mode, s))
                 finish(fits[s], say)
             kept = fits[wanted[-1]]
-            number = o.store_once(kept)
+            before = len(o.file.revisions())
+            number = o.append(kept)
     t.show(text.fit_report(kept, details))
     t.show(prior_lines(kept))
     if details or o.noise:
@@ -142,7 +143,10 @@ def identify(
     if len(fits) > 1:
         t.show(["", *scalings_table(fits)])
         document["scalings"] = {s: to_json(found) for s, found in fits.items()}
-    t.show(f"\nStored as revision {number} of {run}.")
+    if number <= before:
+        t.show(f"\nRevision {number} of {run} is this fit already; nothing was stored.")
+    else:
+        t.show(f"\nStored as revision {number} of {run}.")
     t.document(document)
 
 

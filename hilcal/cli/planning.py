@@ -85,13 +85,13 @@ def plan(
     carried = PriorOptions(prior, prior_of, drift).load(catalogue)
     config, numbers = read_cell(cell)
     unloaded: Literal["around", "first"] = "first" if unloaded_first else "around"
-    wanted = Request(poses, True, readings, _criterion(criterion), unloaded=unloaded)
+    wanted = Request(poses, readings, _criterion(criterion), unloaded=unloaded)
     with working(t.progress) as say:
         known = None if after is None else _known(t, after, revision, catalogue, say)
         rng = generator(seed)
         chosen = make(numbers, config, wanted, rng, known, say, catalogue, carried)
         plan_ = replace(chosen.ordered.plan, about=about(chosen))
-        summary = summarise(chosen, config, rng, say, compare=not quick)
+        summary = summarise(chosen, config, rng, say, compare=not quick, curve=not quick)
         say("checking every motion in a dry run")
         made = checked(numbers, config, plan_, summary)
     write(t, numbers, config, made, output, csv, record)
@@ -175,14 +175,14 @@ def make_plan(
     catalogue: Catalogue,
     say: Say = lambda words: None,
 ) -> Plan:
-    """Return a plan of as many readings as so many poses take under every load of the cell."""
+    """Return a plan of so many poses, each read unloaded and under every load that it bears."""
     return _with_origin(make(cell, config, Request(poses), generator(seed), None, say, catalogue))
 
 
 def make_checked(
     cell: Cell, config: CellConfig, poses: int, seed: int, catalogue: Catalogue, say: Say
 ) -> CheckedPlan:
-    """Return the same plan with its dry run and its summary, without comparisons."""
+    """Return the same plan with its dry run, its summary, and what other numbers of poses give."""
     rng = generator(seed)
     chosen = make(cell, config, Request(poses), rng, None, say, catalogue)
     summary = summarise(chosen, config, rng, say, compare=False)

@@ -265,17 +265,18 @@ def refine(
             found = refine_model(model, fitted, mode, say, how, laws, seen, background)
             if laws is not None:
                 laws.write(found.names)
-            rows: list[Row] = []
-            for k, step in enumerate(found.steps):
+            for step in found.steps:
                 finish(step.fit, say)
-                if k == 0 and latest is not None:
-                    number = latest.number
-                else:
-                    parent = rows[-1].number if rows else None
-                    number = o.store_once(
-                        step.fit, step.diagnosis, step.added, step.removed, parent
-                    )
-                rows.append(Row(number, step.fit, step.diagnosis.verdict, step.added, step.removed))
+            begun = () if latest is None else (latest.number,)
+            records = [
+                o.record(s.fit, s.diagnosis, s.added, s.removed) for s in found.steps[len(begun) :]
+            ]
+            before = len(o.file.revisions())
+            numbered = (*begun, *o.append_records(records, *begun))
+            rows: list[Row] = [
+                Row(number, s.fit, s.diagnosis.verdict, s.added, s.removed)
+                for number, s in zip(numbered, found.steps, strict=True)
+            ]
         t.show(text_refine.revisions_table([r.shown for r in rows]))
         t.show(text_refine.key())
         t.show(options_line(rows[-1].fit))
@@ -283,6 +284,8 @@ def refine(
             t.show(numbers.sentence(covariance_words(o.covariance_parts, o.noise)))
         t.show(text.set_aside(found.fit, details))
         t.show(text_refine.verdict_line(found.diagnosis))
+        if numbered[-1] <= before:
+            t.show(f"Revision {numbered[-1]} is this model already; nothing was stored.")
         t.show([*fitted_lines(found.fit)][: None if details else 1])
         t.show(prior_lines(found.fit))
         other = other_arm_of(o.cell, o.readings) if latest is None else None

@@ -12,6 +12,7 @@ from hilcal.errors import InputError
 from hilcal.identify.description import Change
 from hilcal.identify.gate import Explanation, Finding, examine
 from hilcal.identify.registration import Registration
+from hilcal.report.numbers import length
 
 SIGN, OFFSET, COUPLING = Conventions.model_fields
 """Keys that say how joints are counted, in their order there."""
@@ -36,7 +37,7 @@ def refuse_misdescribed(registered: Registration, readings: Readings) -> None:
 
 def words(finding: Finding, cell: Cell, readings: Readings) -> str:
     """Return in one line what is wrong, and what to write instead."""
-    size = _length(finding.rms)
+    size = length(finding.rms)
     begin = f"the readings do not fit the description of the arm ({size} rms after registration)"
     rows = _rows(finding, readings)
     if finding.explanations:
@@ -48,7 +49,7 @@ def words(finding: Finding, cell: Cell, readings: Readings) -> str:
     if rows:
         return f"{begin}: {rows}; the others fit. Correct or remove them"
     return (
-        f"{begin}; at most {_length(finding.gate)} is fitted. Nothing that was tried explains it "
+        f"{begin}; at most {length(finding.gate)} is fitted. Nothing that was tried explains it "
         f"({finding.tried} descriptions: {TRIED}). Check the robot's model, and that joints and "
         "positions in one row belong together"
     )
@@ -56,7 +57,7 @@ def words(finding: Finding, cell: Cell, readings: Readings) -> str:
 
 def _explained(e: Explanation, finding: Finding, cell: Cell) -> str:
     what = " and ".join(_said(c) for c in e.changes)
-    change = f"{_length(finding.rms)} → {_length(e.rms)} with it"
+    change = f"{length(finding.rms)} → {length(e.rms)} with it"
     return f"{what}: {change}{_remedy(e, cell)}"
 
 
@@ -166,12 +167,6 @@ def _rows(finding: Finding, readings: Readings) -> str:
     named = ", ".join(name(int(k)) for k in which[:MOST_NAMED])
     more = f" and {len(which) - MOST_NAMED} more" if len(which) > MOST_NAMED else ""
     return f"{len(which)} of {len(readings)} rows do not fit: {named}{more}"
-
-
-def _length(metres: float) -> str:
-    if metres >= 1.0:
-        return f"{metres:.3g} m"
-    return f"{metres * 1e3:.3g} mm" if metres >= 1e-3 else f"{metres * 1e6:.3g} µm"
 
 
 def document(finding: Finding, cell: Cell, readings: Readings) -> dict[str, object]:

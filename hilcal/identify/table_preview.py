@@ -21,6 +21,7 @@ from hilcal.identify import description_words
 from hilcal.identify.conventions import CLEARER, Fit, choose_convention
 from hilcal.identify.gate import examine
 from hilcal.identify.registration import register
+from hilcal.report import numbers
 from hilcal.robot.arm import Arm
 from hilcal.toml import check_section
 from hilcal.types import Floats
@@ -201,7 +202,7 @@ def _try(table: Path, found: Proposed, settings: CellConfig, cell: Cell) -> list
     told = [*result.notes]
     try:
         registered = register(cell, readings)
-        told.append(f"the nominal {cell.arm.name} leaves {1e3 * registered.rms:.3g} mm rms")
+        told.append(f"the nominal {cell.arm.name} leaves {numbers.length(registered.rms)} rms")
         if (wrong := examine(registered, readings)) is not None:
             told.append(description_words.words(wrong, cell, readings))
     except CannotAnswerError as error:

@@ -1,6 +1,5 @@
 """Criteria by name, the choice of units, and of the loads that are worth their change."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +9,7 @@ from hilcal.plan.approximate_design import KINKED_TOLERANCE, ApproximateDesign, 
 from hilcal.plan.candidate_set import CandidateSet
 from hilcal.plan.criteria import A, D, MeanVariance
 from hilcal.plan.criterion import Criterion
-from hilcal.plan.discriminated_pairs import discriminated_pairs
+from hilcal.plan.discriminated_pairs import DiscriminatedPairs, discriminated_pairs
 from hilcal.plan.eigenvalue_criteria import E, K
 from hilcal.plan.information import Problem
 from hilcal.plan.optimum import Design, best
@@ -41,12 +40,14 @@ class Objective:
         units: the units by the parameters that φ is of.
         prior: (P, P) prior information of these.
         names: of the parameters; none where they are combinations.
+        apart: the pairs of effects that "separate" is of; None of other criteria.
     """
 
     criterion: Criterion
     units: CandidateSet
     prior: Floats
     names: tuple[str, ...]
+    apart: DiscriminatedPairs | None = None
 
 
 def canonical(name: str) -> str:
@@ -80,7 +81,7 @@ def objective_of(problem: Problem, name: str, work: PredictionPoses | None) -> O
     if name == "separate":
         apart = discriminated_pairs(problem)
         units, pairs, prior = condensed(problem.units, apart.pairs, apart.prior)
-        return Objective(Separate(pairs), units, prior, ())
+        return Objective(Separate(pairs), units, prior, (), apart)
     if name == "E":
         return replace(whole, criterion=E(unknown(problem)))
     if name == "K":  # of the model alone: more information, also of the others, may make it worse
@@ -175,30 +176,13 @@ def promising(asked: Objective, budget: float) -> tuple[Ints, ApproximateDesign]
     return np.union1d(found.index, best_first[:count]), found
 
 
-@dataclass(frozen=True, slots=True)
-class Loads:
-    """Loads that are worth hanging.
-
-    Attributes:
-        names: those that are kept.
-        budget: readings for them within the time.
-        left_out: those that are not, with the gain of leaving each out as a share of φ.
-        spared: those that are kept, since all are asked for, with the same gain.
-    """
-
-    names: tuple[str, ...]
-    budget: float
-    left_out: tuple[tuple[str, float], ...]
-    spared: tuple[tuple[str, float], ...] = ()
-
-
-def worthwhile(
+def costly_loads(
     asked: Objective, problem: Problem, budget: float, change: float, rng: np.random.Generator
-) -> Loads:
-    """Leave out loads, one after the other, while the same time buys more without them.
+) -> tuple[tuple[str, float], ...]:
+    """Return loads without which the same time buys more, with the gain as a share of φ.
 
     Hanging a load costs as much time as so many readings; a plan without it takes these
-    instead. Compared are the continuous optima over some of the poses.
+    instead. Compared are the continuous optima over some of the poses, one load after the other.
 
     Args:
         asked: the question.
@@ -210,10 +194,11 @@ def worthwhile(
     poses = np.array([pose for pose, _ in problem.what])
     few = rng.permutation(len(problem.candidates))[:SAMPLE]
     sample = np.isin(poses, few)
-    keep = tuple(name for name in problem.candidates.loads[1:] if _uses(problem, name).any())
-    left: list[tuple[str, float]] = []
+    used = {name for _, names in problem.what for name in names}
+    keep = tuple(name for name in problem.candidates.loads[1:] if name in used)
+    costly: list[tuple[str, float]] = []
     if len(keep) < 2 or change <= 0:
-        return Loads(keep, float(np.floor(budget + 1e-9)), ())
+        return ()
     now = _value(asked, problem, sample, keep, budget)
     while len(keep) > 1 and now > 0:
         tried = [
@@ -224,9 +209,9 @@ def worthwhile(
         value, name = max(tried)
         if not value > now * (1.0 + LOOSE):
             break
-        left.append((name, value / now - 1.0))
+        costly.append((name, value / now - 1.0))
         keep, now, budget = tuple(k for k in keep if k != name), value, budget + change
-    return Loads(keep, float(np.floor(budget + 1e-9)), tuple(left))
+    return tuple(costly)
 
 
 def only(asked: Objective, wanted: Bools) -> Objective:
@@ -234,21 +219,12 @@ def only(asked: Objective, wanted: Bools) -> Objective:
     return replace(asked, units=CandidateSet(asked.units.rows[wanted], asked.units.cost[wanted]))
 
 
-def within(problem: Problem, loads: Sequence[str]) -> Bools:
-    """(K,) which units take no other loads than these."""
-    allowed = {*loads, problem.candidates.loads[0]}
-    return np.array([set(names) <= allowed for _, names in problem.what])
-
-
-def _uses(problem: Problem, load: str) -> Bools:
-    return np.array([load in names for _, names in problem.what])
-
-
 def _value(
     asked: Objective, problem: Problem, sample: Bools, loads: tuple[str, ...], budget: float
 ) -> float:
     """φ of the continuous optimum; 0 where these loads do not determine everything."""
-    some = only(asked, sample & within(problem, loads))
+    allowed = {*loads, problem.candidates.loads[0]}
+    some = only(asked, sample & np.array([set(names) <= allowed for _, names in problem.what]))
     try:
         found = relax(
             some.units, some.criterion, budget, some.prior, names=some.names, tolerance=LOOSE

@@ -17,6 +17,9 @@ EFFORT = 6000
 A choice: the 40 of 100,000 states of the benchmark are certified at 98 % within it."""
 KINKED_EFFORT = 1500
 """The same for criteria with kinks, whose values cost more."""
+ENOUGH, KINKED_ENOUGH = 1.0 - 1e-6, 0.99
+"""Share of the bound at which the search ends; for criteria with kinks. A choice: a percent of what
+separates two effects is a percent of the readings, and to find it takes as long as the rest."""
 
 # Choices for speed; the certificate does not depend on them.
 _POOL = 4000  # units of the best prices, among which a plan is sought
@@ -40,7 +43,7 @@ def exact(
     *,
     most: int | None = None,
     effort: int | None = None,
-    enough: float = 1.0 - 1e-6,
+    enough: float | None = None,
 ) -> Ints:
     """Return (K,) whole numbers n of units with Σ n_k c_k ≤ B that nearly maximise φ.
 
@@ -59,11 +62,13 @@ def exact(
         rng: generator.
         most: how often a unit may be taken; any number of times by default.
         effort: units put into a plan before the search ends; `EFFORT` by default.
-        enough: share of the bound at which it ends earlier.
+        enough: share of the bound at which it ends earlier; `ENOUGH` by default.
     """
     prior = checked(units, budget, prior, most)
     if effort is None:
         effort = KINKED_EFFORT if criterion.kinked else EFFORT
+    if enough is None:
+        enough = KINKED_ENOUGH if criterion.kinked else ENOUGH
     search = _search(units, criterion, budget, prior, relaxed, most)
     floor = np.floor(search.ideal_weight + 1e-6).astype(np.int64)
     plan = search.refilled(np.minimum(floor, search.most))

@@ -14,7 +14,6 @@ from hilcal.plan.discriminated_pairs import (
     LEAST_POWER,
     LEVEL,
     DiscriminatedPairs,
-    discriminated_pairs,
     not_ruled_out,
     pair_of,
     power,
@@ -33,8 +32,6 @@ from hilcal.types import Floats, Ints
 
 CANDIDATES = 600
 """Most poses to choose from. A choice: more cost time and hardly raise the power."""
-FEW = 2
-"""Suspects up to which loads are left out one by one. A choice: more take minutes."""
 DRAWS = 24
 """Parameters of each suspect over which a power is averaged. A choice."""
 SURE = 0.9
@@ -101,7 +98,8 @@ def measure_next(
         config: its limits, loads and noise.
         fit: what has been measured, in scaling gc, of a model without the suspects.
         suspects: two effects or more.
-        request: how many readings.
+        request: how many readings, or as many as so many poses take under every load: which
+            poses and loads tell most of a difference is what the plan chooses.
         rng: generator.
         say: takes progress, one line each.
         reference: (n,) joints of the campaign's reference pose, rad; a new one where None.
@@ -120,10 +118,8 @@ def measure_next(
     }
     planning = config.planning.model_copy(update=asked)
     config = config.model_copy(update={"planning": planning})
-    wanted = replace(request, criterion="separate")
-    if len(names) > FEW and request.readings is None:
-        # leaving out loads, one after the other, would take minutes
-        wanted = replace(wanted, readings=request.poses * (1 + len(config.loads)))
+    readings = request.readings or request.poses * (1 + len(config.loads))
+    wanted = replace(request, criterion="separate", readings=readings)
     try:
         made = make(cell, config, wanted, rng, fit, say)
     except InputError as error:
@@ -134,7 +130,8 @@ def measure_next(
     if reference is not None and not np.array_equal(reference, made.ordered.plan.q[0]):
         made = _from_reference(cell, config, made, reference, rng, request)
     say("predicting the powers")
-    of = discriminated_pairs(made.problem)
+    of = made.asked.apart
+    assert of is not None  # noqa: S101  (the criterion is of pairs)
     then = of.prior + made.problem.units.information(made.counts)
     powers = tuple(_pair_powers(made.problem, of, names, then))
     seen = {e.name for e in made.problem.families}

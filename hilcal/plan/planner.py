@@ -17,15 +17,13 @@ from hilcal.identify.fit import Fit
 from hilcal.identify.registration import MIN_POSES
 from hilcal.plan.choice import (
     EFFORT,
-    Loads,
     Objective,
     canonical,
     choose,
     choose_poses,
+    costly_loads,
     only,
     promising,
-    within,
-    worthwhile,
 )
 from hilcal.plan.compound_criteria import compound_objective
 from hilcal.plan.draw import Drawn, draw
@@ -58,18 +56,15 @@ class Request:
     """Size and criterion of a plan.
 
     Attributes:
-        poses: as many readings as so many poses take unloaded and under each load.
-        whole: just so many poses, each read once unloaded and under every load that it bears;
-            else these readings are spread over as many poses, and under those loads, as determine
-            most.
-        readings: or this many readings, those at the reference and repeats not counted.
+        poses: just so many, each read once unloaded and under every load that it bears.
+        readings: or this many readings, those at the reference and repeats not counted, spread
+            over as many poses, and under those loads, as determine most.
         criterion: of `[planning]` where None.
         effort: of the search for whole numbers.
         unloaded: "around" or "first", see `Ordering`.
     """
 
     poses: int = 20
-    whole: bool = False
     readings: int | None = None
     criterion: str | None = None
     effort: int = EFFORT
@@ -83,7 +78,7 @@ class Planned:
     Attributes:
         ordered: the plan in order, with what the order costs.
         design: the units that were chosen, with the certificate.
-        loads: which loads are worth hanging.
+        costly: loads that cost more than they tell, with what leaving each out would gain.
         problem: the design problem.
         asked: the design problem with its criterion.
         usable: (K,) which units were to choose from.
@@ -93,13 +88,12 @@ class Planned:
         criterion: name of the criterion.
         predicted: standard uncertainties that a fit to the readings will have.
         undetermined: parameters of the model that no reading of the cell determines.
-        asked_poses: poses that the budget was asked for by; None where readings were.
-        whole: whether each pose is read once under all that it bears, see `Request`.
+        asked_poses: poses that were asked for, see `Request`; None where readings were.
     """
 
     ordered: Ordered
     design: Design
-    loads: Loads
+    costly: tuple[tuple[str, float], ...]
     problem: Problem
     asked: Objective
     usable: Bools
@@ -110,7 +104,6 @@ class Planned:
     predicted: Predicted
     undetermined: tuple[Undetermined, ...]
     asked_poses: int | None
-    whole: bool = False
 
     @property
     def counts(self) -> Floats:
@@ -163,31 +156,31 @@ def make(
     work = prediction_poses(of.nominal, config, drawn.q, space.clear)
     budget = _budget(request, of)
     asked = compound_objective(of, criterion, work, budget, rng)
-    say("choosing loads")
-    seconds = pace(config)
-    # so many readings and no more: then there is nothing to be had for a load's time
-    change = 0.0 if request.readings is not None else seconds.change_s / seconds.reading_s
-    loads = worthwhile(asked, of, budget, change, rng)
-    if whole := request.whole and request.readings is None:
-        kept = (*loads.names, *(name for name, _ in loads.left_out))
-        loads = Loads(kept, budget, (), loads.left_out)
-    usable = within(of, loads.names)
+    whole = request.readings is None
+    costly: tuple[tuple[str, float], ...] = ()
+    if whole:
+        say("weighing what each load costs")
+        seconds = pace(config)
+        costly = costly_loads(asked, of, budget, seconds.change_s / seconds.reading_s, rng)
     say(f"choosing poses by criterion {criterion}")
     pose_of = np.array([pose for pose, _ in of.what])
-    before = usable.copy()
-    first, relaxed = promising(only(asked, usable), loads.budget)
-    usable &= ~np.isin(pose_of, _unreachable(space, of, home, np.flatnonzero(usable)[first]))
-    for _ in range(ROUNDS):
+    first, relaxed = promising(asked, budget)
+    usable = ~np.isin(pose_of, _unreachable(space, of, home, first))
+    reached: set[int] = set()
+    for left in reversed(range(ROUNDS)):
+        if not left:  # of those that were chosen before, enough are reached
+            usable &= np.isin(pose_of, [*reached])
         if whole:
             design = choose_poses(asked, of, usable, request.poses, rng, request.effort)
         else:
-            optimum = relaxed.among(usable[before])
-            design = choose(only(asked, usable), loads.budget, rng, request.effort, optimum)
+            optimum = relaxed.among(usable)
+            design = choose(only(asked, usable), budget, rng, request.effort, optimum)
         units = np.flatnonzero(usable)[np.flatnonzero(design.counts)]
         lost = _unreachable(space, of, home, units)
         if not len(lost):
             break
         usable &= ~np.isin(pose_of, lost)
+        reached |= {of.what[k][0] for k in units} - set(lost.tolist())
     else:
         raise CannotAnswerError(
             f"after {ROUNDS} rounds there are still poses that no clear straight motion from the "
@@ -196,8 +189,8 @@ def make(
     visited = len({of.what[k][0] for k in units}) + 1
     if not cell.registration_known and known is None and visited < MIN_POSES:
         raise CannotAnswerError(
-            f"{loads.budget:g} readings are best taken at {visited} poses, the reference among "
-            f"them; an unknown registration needs at least {MIN_POSES}: raise the readings"
+            f"the plan has {visited} poses, the reference among them; an unknown registration "
+            f"needs at least {MIN_POSES}: ask for more {'poses' if whole else 'readings'}"
         )
     say("ordering the readings")
     counts = np.zeros(len(usable), dtype=np.int64)
@@ -205,8 +198,8 @@ def make(
     ordered = _ordered(space, of, home, counts, rng, request.unloaded)
     knows = predicted(of, counts.astype(float), work=work)
     return Planned(
-        ordered, design, loads, of, asked, usable, work, drawn, loads.budget, criterion, knows,
-        undetermined, None if request.readings is not None else request.poses, whole,
+        ordered, design, costly, of, asked, usable, work, drawn, budget, criterion, knows,
+        undetermined, request.poses if whole else None,
     )  # fmt: skip
 
 

@@ -121,9 +121,7 @@ class PlanSummary:
         confounding: of the plan's order with a linear drift; None where it is not known.
         shortest: confounding of the shortest order.
         remarks: assumptions and omissions, one sentence each.
-        asked_poses: poses that were asked for: as many readings as these take under every load;
-            None where readings were.
-        whole: whether each pose is read under all that it bears, see `planner.Request`.
+        asked_poses: poses that were asked for, see `planner.Request`; None where readings were.
     """
 
     poses: int
@@ -143,7 +141,6 @@ class PlanSummary:
     shortest: Confounding | None = None
     remarks: tuple[str, ...] = ()
     asked_poses: int | None = None
-    whole: bool = False
 
     @property
     def quantity(self) -> str:
@@ -195,6 +192,7 @@ def summarise(
     say: Say = lambda words: None,
     *,
     compare: bool = True,
+    curve: bool = True,
 ) -> PlanSummary:
     """Return the summary of a plan.
 
@@ -203,11 +201,12 @@ def summarise(
         config: the cell's configuration.
         rng: generator, for the designs of the other criteria.
         say: progress callback.
-        compare: whether to compute the criterion comparison and the sample-size curve.
+        compare: whether to compute the criterion comparison.
+        curve: whether to compute the sample-size curve.
     """
     plan, knows = planned.ordered.plan, planned.predicted
-    if compare:
-        say("comparing criteria and numbers of poses")
+    if compare or curve:
+        say("comparing criteria and numbers of poses" if compare else "comparing numbers of poses")
     return PlanSummary(
         poses=len({s.pose for s in plan.steps} - {REFERENCE}),
         readings=len(plan.steps),
@@ -219,14 +218,13 @@ def summarise(
         position_std_m=_finite(knows.position),
         position=planned.work.what,
         criteria=tuple(_criteria(planned, rng)) if compare else (),
-        curve=tuple(_curve(planned)) if compare else (),
+        curve=tuple(_curve(planned)) if curve else (),
         detectable=tuple(detectable_effects(planned, config)),
         longer=planned.ordered.longer,
         confounding=planned.ordered.confounding,
         shortest=planned.ordered.confounding_shortest,
         remarks=remarks(planned),
         asked_poses=planned.asked_poses,
-        whole=planned.whole,
     )
 
 
@@ -259,16 +257,11 @@ def _parameters(planned: Planned) -> tuple[PredictedParameter, ...]:
 def remarks(planned: Planned) -> tuple[str, ...]:
     """Return assumptions and omissions of a plan, one sentence each."""
     omitted = tuple(
-        f'load "{name}" is left out: without it the plan is {100 * gain:.0f} % more efficient in '
-        "the same time"
-        for name, gain in planned.loads.left_out
-    )
-    omitted += tuple(
         f'load "{name}" costs more than it tells: without it the same time would make the plan '
         f"{100 * gain:.0f} % more efficient"
-        for name, gain in planned.loads.spared
+        for name, gain in planned.costly
     )
-    if planned.whole and planned.design.efficiency < WORTH:
+    if planned.asked_poses is not None and planned.design.efficiency < WORTH:
         readings = int(planned.design.cost)
         omitted += (
             f"as many readings, spread over as many poses and loads as tell most (--readings "
@@ -293,7 +286,6 @@ def about(planned: Planned) -> dict[str, object]:
         "position": planned.work.what,
         "position_note": position_note(planned.work.what.split(" ")[0]),
         "candidates": len(planned.drawn.q),
-        "loads_left_out": [name for name, _ in planned.loads.left_out],
     }
 
 
@@ -310,7 +302,7 @@ def _criteria(planned: Planned, rng: np.random.Generator) -> Iterator[CriterionR
             continue
         try:
             asked = compound_objective(of, name, planned.work, planned.budget, rng)
-            if planned.whole and planned.asked_poses is not None:
+            if planned.asked_poses is not None:
                 design = choose_poses(asked, of, planned.usable, planned.asked_poses, rng, 1)
             else:
                 design = choose(only(asked, planned.usable), planned.budget, rng, 1)

@@ -65,7 +65,7 @@ def next_plan(
     config, numbers = (o.config, o.cell) if cell is None else cell
     found = separating(numbers, config, doubt, poses, rng, say, reference_in(o.file), POSES)
     compare = compare and not doubt.alone
-    summary = summarise(found.planned, config, rng, say, compare=compare)
+    summary = summarise(found.planned, config, rng, say, compare=compare, curve=compare)
     say("checking every motion in a dry run")
     made = checked(numbers, config, plan_of(found, doubt.suspects), summary)
     return NextPlan(doubt, found, made)

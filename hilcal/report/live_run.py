@@ -143,8 +143,7 @@ def figures(event: ReadingStored) -> str:
     if event.deflection is not None:
         parts.append(f"deflection {numbers.length(event.deflection)}")
     elif live.deflection is not None:
-        unit, factor = numbers.unit_for("m", [live.deflection])
-        value, std = numbers.with_std(factor * live.deflection, factor * live.deflection_std)
+        value, std, unit = numbers.measured("m", live.deflection, live.deflection_std)
         parts.append(f"deflection ≈ {value} ± {std} {unit}")
     if live.residual is not None:
         sigma = "" if live.sigma is None else f"{live.sigma:.1f} σ"

@@ -18,8 +18,8 @@ _UNITS: dict[str, tuple[tuple[str, float, float], ...]] = {
     "1": (("ppm", 1e6, 1e-3), ("%", 1e2, math.inf)),
 }
 
-LEAST_LENGTH = 1e-9
-"""m; what is less is the rounding of a computation, and no length that anything measures."""
+LEAST = {"m": 1e-9, "rad": 1e-9}
+"""SI; what is less is the rounding of a computation, and nothing that anything measures."""
 
 
 def unit_for(unit: str, values: Sequence[float]) -> tuple[str, float]:
@@ -38,21 +38,38 @@ def angle_or(unit: str) -> tuple[str, float]:
 
 def sizes(of: Iterable[tuple[str, float]]) -> str:
     """Write (unit, value) pairs, SI, in units for people."""
-    parts = []
-    for unit, value in of:
-        name, factor = unit_for(unit, [value])
-        parts.append(f"{digits(factor * value, 2)} {name}")
-    return ", ".join(parts)
+    return ", ".join(f"{text} {name}" for text, _, name in (measured(u, v, count=2) for u, v in of))
+
+
+def measured(
+    unit: str, value: float, std: float = math.nan, alike: Sequence[float] = (), count: int = 3
+) -> tuple[str, str, str]:
+    """Write a value, its standard uncertainty and their unit for people.
+
+    What is below `LEAST` is said to be less than that.
+
+    Args:
+        unit: SI.
+        value: in it.
+        std: in it; not finite or 0 where there is none, which is written "".
+        alike: values whose column has one unit; the value alone where empty.
+        count: significant digits of a value without an uncertainty.
+    """
+    name, factor = unit_for(unit, alike or [value])
+    least = LEAST.get(unit, 0.0)
+    less = "< " + f"{factor * least:.9f}".rstrip("0")
+    if math.isfinite(std) and std > 0:
+        written, spread = with_std(factor * value, factor * max(std, least))
+        return written, less if std < least else spread, name
+    return less if 0 < abs(value) < least else digits(factor * value, count), "", name
 
 
 def length(metres: float) -> str:
     """Return a length: µm below 1 mm, then mm, then m; three digits, but no less than 1 nm."""
-    size = abs(metres)
-    if 0.0 < size < LEAST_LENGTH:
-        return "< 0.001 µm"
-    if size < 1e-3:
-        return f"{digits(1e6 * metres)} µm"
-    return f"{digits(1e3 * metres)} mm" if size < 1.0 else f"{digits(metres)} m"
+    if abs(metres) >= 1.0:
+        return f"{digits(metres)} m"
+    value, _, unit = measured("m", metres)
+    return f"{value} {unit}"
 
 
 def digits(value: float, count: int = 3) -> str:
@@ -70,7 +87,7 @@ def with_std(value: float, std: float) -> tuple[str, str]:
     if not (math.isfinite(std) and std > 0):
         return digits(value), ""
     places = 1 - math.floor(math.log10(std))
-    if not -7 < places < 7:
+    if not -7 < places < 8:
         return digits(value), digits(std, 2)
     places = max(places, 0)
     return f"{value:.{places}f}", f"{std:.{places}f}"

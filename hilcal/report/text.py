@@ -150,12 +150,10 @@ def _parameter_rows(fit: Fit, effect: Effect, index: Ints) -> Iterator[tuple[str
         alike = [
             i for i, o in zip(index, effect.parameters, strict=True) if o.unit == p.unit and seen[i]
         ]
-        unit, factor = numbers.unit_for(p.unit, [float(fit.theta[i]) for i in alike])
         if not seen[k]:
             continue
-        value, std = numbers.with_std(
-            factor * float(fit.theta[k]), factor * float(fit.uncertainty.std[k])
-        )
+        std_si, of = float(fit.uncertainty.std[k]), [float(fit.theta[i]) for i in alike]
+        value, std, unit = numbers.measured(p.unit, float(fit.theta[k]), std_si, of)
         yield f"{effect.name}.{p.name}", value, std, unit, p.meaning
 
 

@@ -147,8 +147,7 @@ def sentence(change: Change) -> str:
             f"{head} has changed: it moves the target by {numbers.length(change.moved_m)} rms "
             f"({numbers.p_equals(change.p_value)}). {why[:1].upper()}{why[1:]}".rstrip()
         )
-    unit, factor = numbers.unit_for(s.unit, [s.value])
-    value, std = numbers.with_std(factor * s.value, factor * s.std)
+    value, std, unit = numbers.measured(s.unit, s.value, s.std)
     share = ""
     if c.moving.effect.elastic and s.before is not None and s.before[0] > 0:
         share = f", to {numbers.digits((s.before[0] + s.value) / s.before[0], 2)} times what it was"
@@ -163,8 +162,7 @@ def _table(found: Sequence[Change]) -> RenderableType:
         first = True
         shown = [s for s in change.sizes if len(change.sizes) == 1 or abs(s.z) >= CLEAR]
         for s in shown[:MOST_PARAMETERS]:
-            unit, factor = numbers.unit_for(s.unit, [s.value, s.std])
-            value, std = numbers.with_std(factor * s.value, factor * s.std)
+            value, std, unit = numbers.measured(s.unit, s.value, s.std, [s.value, s.std])
             name = change.candidate.name if len(change.sizes) == 1 else _name(change, s)
             more = (numbers.chance(change.p_value), numbers.length(change.moved_m))
             out.add_row(name, value, std, unit, f"{abs(s.z):.1f}", *(more if first else ("", "")))

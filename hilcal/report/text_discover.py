@@ -145,8 +145,7 @@ def curve_json(c: Curve) -> dict[str, object]:
 
 def coefficient(c: Coefficient) -> str:
     """Write a coefficient with its standard uncertainty, in a unit for people."""
-    unit, factor = numbers.unit_for(c.unit, [c.value])
-    value, std = numbers.with_std(factor * c.value, factor * c.std)
+    value, std, unit = numbers.measured(c.unit, c.value, c.std)
     return f"{value} ± {std} {'' if unit == '1' else unit}".rstrip()
 
 

@@ -89,8 +89,7 @@ def _row(p: "Spread", repeated: bool) -> list[str]:
 
 
 def _with_unit(value: float, std: float, of: str) -> str:
-    unit, factor = numbers.unit_for(of, [value])
-    number, error = numbers.with_std(factor * value, factor * std)
+    number, error, unit = numbers.measured(of, value, std)
     return f"{number} ± {error} {unit}"
 
 

@@ -46,7 +46,14 @@ CRITERIA_NOTE = (
 
 
 def plan_facts(s: PlanSummary) -> Iterator[RenderableType]:
-    """Yield what a plan costs and reaches."""
+    """Yield what a plan costs and reaches, and what more poses would give."""
+    yield from _facts(s)
+    if larger := [c for c in s.curve if c.poses > s.poses]:
+        told = [f"{c.poses} poses ± {numbers.length(c.position_std_m)}" for c in larger[::2]]
+        yield f"More would give, predicted for the {s.quantity}: {', '.join(told)}."
+
+
+def _facts(s: PlanSummary) -> Iterator[RenderableType]:
     yield text.heading("Plan")
     rows = Table.grid(padding=(0, 2))
     rows.add_column(no_wrap=True)
@@ -65,9 +72,6 @@ def plan_screen(s: PlanSummary) -> Iterator[RenderableType]:
     if out.row_count:
         yield out
         yield ""
-    if larger := [c for c in s.curve if c.poses > s.poses]:
-        told = [f"{c.poses} poses ± {numbers.length(c.position_std_m)}" for c in larger[::2]]
-        yield f"More would give, predicted for the {s.quantity}: {', '.join(told)}."
     if seen := detectable(s):
         (first, least), (last, most) = seen[0], seen[-1]
         yield f"Outside of the model: {first} is seen from {least}, ..., {last} from {most}."
@@ -102,7 +106,7 @@ def effect_rows(parameters: Sequence[PredictedParameter]) -> Iterator[tuple[str,
 
 def plan_report(s: PlanSummary) -> Iterator[RenderableType]:
     """Yield the tables and remarks of a plan."""
-    yield from plan_facts(s)
+    yield from _facts(s)
     if s.confounding is not None:
         yield f"{order_remark(s)}\n"
     if s.parameters:
@@ -169,9 +173,7 @@ def _asked(s: PlanSummary) -> str:
     """Say why there are other poses than were asked for; nothing where there are as many."""
     if s.asked_poses in (None, s.poses):
         return ""
-    if s.whole:
-        return f": the cell leaves no more of {s.asked_poses}, so that some are read again"
-    return f": as many readings as {s.asked_poses} poses take, which determine more at {s.poses}"
+    return f": the cell leaves no more of {s.asked_poses}, so that some are read again"
 
 
 def order_remark(s: PlanSummary) -> str:

@@ -21,8 +21,7 @@ def stream_report(fit: StreamFit) -> Iterator[RenderableType]:
         if p.value is None or p.std is None:
             unseen.append(p.name)
             continue
-        unit, factor = numbers.unit_for(p.unit, [p.value])
-        value, std = numbers.with_std(factor * p.value, factor * p.std)
+        value, std, unit = numbers.measured(p.unit, p.value, p.std)
         rows.add_row(p.name, value, std, unit, meaning[p.name])
     yield rows
     yield Text("±: standard uncertainty.\n", style="dim")

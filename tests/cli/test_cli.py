@@ -206,6 +206,30 @@ def test_refine_can_start_elsewhere(campaign: Path, capsys: Capsys) -> None:
     assert ok(capsys, "identify", campaign, "--json").document["readings"] == "absolute"
 
 
+def test_what_is_stored_already_is_not_stored_again(campaign: Path, capsys: Capsys) -> None:
+    def numbers() -> list[int]:
+        with CampaignFile.open(campaign, read_only=True) as stored:
+            return [r.number for r in stored.revisions()]
+
+    first = ok(capsys, "identify", campaign, "--json").document
+    assert ok(capsys, "identify", campaign, "--json").document == first
+    words = " ".join(ok(capsys, "identify", campaign).out.split())
+    assert f"Revision 1 of {campaign} is this fit already; nothing was stored." in words
+    ok(capsys, "identify", campaign, "--scaling", "gu")  # another one
+    assert numbers() == [1, 2]
+    refined = ok(capsys, "refine", campaign, "--json").document
+    assert [r["revision"] for r in refined["revisions"]] == [3, 4]
+    assert ok(capsys, "refine", campaign, "--json").document == refined
+    assert "Revision 4 is this model already" in ok(capsys, "refine", campaign).out
+    again = ok(capsys, "refine", campaign, "--revision", "3", "--json").document
+    assert [r["revision"] for r in again["revisions"]] == [3, 4]
+    assert numbers() == [1, 2, 3, 4]
+    # the latest revision is what is used: an earlier one is made again
+    assert ok(capsys, "identify", campaign, "--json").document["revision"] == 5
+    assert "Revision 5" not in ok(capsys, "refine", campaign).out
+    assert numbers() == [1, 2, 3, 4, 5, 6, 7]
+
+
 def test_validate_predicts_what_was_never_fitted(
     campaign: Path, tmp_path: Path, capsys: Capsys
 ) -> None:

@@ -189,7 +189,7 @@ def _bad(path: Path, found: hc.Fit, how: str) -> None:
     """Make revision 2 of three a bad one."""
     with hc.Campaign.open(path) as o:
         for _ in range(3):
-            o.append(found)
+            o.store(found)
         o.accept(1)
         o.accept(3)
         wrong = replace(o.file.revision(2), parent=None)
@@ -237,7 +237,7 @@ def test_a_bad_revision_is_set_aside_and_no_reading(
             file.connection.execute("DELETE FROM revisions")
     assert from_text(to_text(_first(run)), 1) == _first(run)
     ok(capsys, "compare", run)
-    ok(capsys, "identify", run)
+    ok(capsys, "identify", run, "--scaling", "gu")
     assert checked(run) == 2
     before = run.read_bytes()
     assert ok(capsys, "repair", run, "--json").document["set_aside"] == []

@@ -235,7 +235,7 @@ def test_exploring_does_not_change_what_others_use_once_a_revision_is_accepted(
     assert ok(capsys, "compare", run, "--json").document["revision"] == 5
     d = ok(capsys, "accept", run, "--release", "--json").document
     assert d == {"accepted": None, "in_use": 5, "latest": 5}
-    assert "Stored as revision 5" in ok(capsys, "identify", run).out  # the same fit again
+    assert "Revision 5 of" in ok(capsys, "identify", run).out  # the same fit again
     assert ok(capsys, "compare", run, "--json").document["revision"] == 5
     for _ in range(2):
         ok(capsys, "refine", run, "--effects", "joint_compliance,hysteresis")

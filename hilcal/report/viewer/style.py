@@ -84,10 +84,10 @@ def micrometres(length: float) -> str:
 
 def quantity(value: float, std: float | None, unit: str) -> tuple[str, str, str]:
     """Return a value and its standard uncertainty in a unit for people, and that unit."""
-    name, factor = numbers.unit_for(unit, [value])
     if std is None:
+        name, factor = numbers.unit_for(unit, [value])
         return number(factor * value), "", name
-    return (*numbers.with_std(factor * value, factor * std), name)
+    return numbers.measured(unit, value, std)
 
 
 def bars(share: float, width: int = 10) -> str:

@@ -117,6 +117,35 @@ def test_tables_as_import_takes_them(tmp_path: Path) -> None:
     np.testing.assert_allclose(on_branch(mapped, ARM, TOOL, None), q, atol=1e-8)
     assert mapped.wrench is not None
     np.testing.assert_array_equal(mapped.wrench[:, 2], [-98.0665, -98.0665])
+    lost = written(tmp_path, table.replace("10kg", "9kg"), "l.csv")
+    with pytest.raises(InputError, match=r"unknown load '9kg'; valid: none, .*10kg"):
+        read_points(lost, ARM, LOADS, find_mapping(mapping))
+
+
+def other_names(header: str) -> str:
+    """A table of two points, as others write it."""
+    rows = np.hstack([np.degrees(Q[:2]), 1e3 * poses(Q[:2])[:, :3, 3]])
+    return f"{header},Load\n" + "".join(
+        ",".join(f"{v:.9f}" for v in row) + ",10kg\n" for row in rows
+    )
+
+
+def test_other_names_are_taken_where_nothing_is_unsure(tmp_path: Path) -> None:
+    joints = ",".join(f"J{k} [deg]" for k in range(1, 7))
+    told = other_names(f"{joints},X [mm],Y [mm],Z [mm]")
+    found = read_points(written(tmp_path, told), ARM, LOADS)
+    np.testing.assert_allclose(found.q, Q[:2], atol=1e-9)
+    np.testing.assert_allclose(found.wanted[:, :3, 3], poses(Q[:2])[:, :3, 3], atol=1e-9)
+    assert found.wrench is not None
+    assert found.wrench[0, 2] == -98.0665
+    for part in ("joints = J1 [deg], J2 [deg]", "position = X [mm], Y [mm]", "load = Load"):
+        assert part in found.taken
+    vague = other_names(",".join("abcdefghi"))
+    with pytest.raises(InputError, match=r"unknown column 'a'; .*cannot be told .*--preview"):
+        read_points(written(tmp_path, vague), ARM, LOADS)
+    typed = f"{JOINTS},lod\n0,0,0,0,0,0,10kg\n"  # one of ours that is not
+    with pytest.raises(InputError, match="unknown column 'lod'; valid"):
+        read_points(written(tmp_path, typed), ARM, LOADS)
 
 
 def test_an_unknown_column_names_all_that_are_valid(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.linalg as sl
 from scipy import stats
 
 from hilcal.cell import cell_from_config
@@ -18,10 +19,11 @@ from hilcal.plan.discriminated_pairs import (
     discriminated_pairs,
     not_separable_message,
     power,
+    supported_parameters,
 )
 from hilcal.plan.effect_estimate import estimate
 from hilcal.plan.information import Problem, problem
-from hilcal.plan.next import measure_next
+from hilcal.plan.next import DRAWS, measure_next
 from hilcal.plan.nominal_model import after
 from hilcal.plan.planner import Request
 from hilcal.plan.t_optimality import Pair
@@ -88,6 +90,33 @@ def test_the_power_is_the_share_of_rejections_in_the_simulated_world() -> None:
         s, g = x.T @ f.project_out(x), x.T @ rival.white
         rejected += bool(g @ np.linalg.solve(s, g) > stats.chi2.isf(LEVEL, len(g)))
     assert share_is(rejected, 100, promised)
+
+
+def test_the_powers_of_a_plan_are_shares_of_rejections() -> None:
+    """Of what is known and planned for, with the parameters that the readings support."""
+    first = doubtful("base_compliance", 2)
+    rng, trials = np.random.default_rng(3), 2000
+    found = measure_next(
+        first.rehearsal.cell, SMALL, first.fit, first.suspects, Request(6), rng,
+        reference=first.plan.joints("reference"),
+    )  # fmt: skip
+    of, known = found.planned.problem, discriminated_pairs(found.planned.problem).prior
+    values, vectors = np.linalg.eigh(known)
+    before = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+    planned = np.repeat(of.units.rows, found.planned.counts.astype(int), axis=0)
+    every = np.vstack([before, planned.reshape(-1, of.units.size)])
+    supported = supported_parameters(of, DRAWS)
+    for p in found.powers:
+        where, rival = of.of_effect(p.effect), of.of_effect(p.rival)
+        fitted = np.concatenate([np.arange(of.model_size), rival])
+        beta = supported[p.effect][rng.integers(DRAWS, size=trials)] / of.scale[where]
+        for rows, promised in ((before, p.now), (every, p.then)):
+            y = rows[:, where] @ beta.T + rng.standard_normal((len(rows), trials))
+            spanned = [sl.orth(rows[:, c]) for c in (fitted, np.append(fitted, where))]
+            less, more = (np.sum((basis.T @ y) ** 2, axis=0) for basis in spanned)
+            added = spanned[1].shape[1] - spanned[0].shape[1]
+            rejected = int(np.sum(more - less > stats.chi2.isf(LEVEL, added)))
+            assert share_is(rejected, trials, promised), p
 
 
 # how strong suspects are

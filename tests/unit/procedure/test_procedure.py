@@ -66,6 +66,17 @@ def test_it_goes_on_after_any_stop(done: tuple[Drawn, Improvement]) -> None:
             assert log.done() == frozenset(steps)
 
 
+def test_it_is_of_as_many_poses_as_asked_for_under_every_load(done) -> None:
+    d, _ = done
+    with CampaignFile.open(d.procedure.run) as campaign:
+        steps = [s for s in RunLog(campaign).plans[0].steps if s.pose != REFERENCE]
+    assert len({s.pose for s in steps}) == d.procedure.settings.poses
+    loads = {s.load for s in steps}
+    assert loads == {"none", *(load.name for load in d.procedure.config.loads)}
+    for load in ("none", "pull x"):  # which every pose of this plan bears
+        assert [s.load for s in steps if not s.cycle].count(load) == d.procedure.settings.poses
+
+
 def test_the_error_falls_as_far_as_predicted(done: tuple[Drawn, Improvement]) -> None:
     _, found = done
     every = found.everything

@@ -18,6 +18,9 @@ from hilcal.report import numbers
         (1.04e-3, "1.04 mm"),
         (0.327, "327 mm"),
         (2.5, "2.50 m"),
+        (4.59e-16, "< 0.001 µm"),
+        (-4.59e-16, "< 0.001 µm"),
+        (1.04e-9, "0.00104 µm"),
     ],
 )
 def test_lengths(metres: float, words: str) -> None:
@@ -38,6 +41,19 @@ def test_a_value_is_written_to_the_digits_of_its_uncertainty(value: float, std: 
     assert abs(float(written) - value) <= (0.5 if std >= 9.95 else 0.06 * std)
     assert float(spread) == pytest.approx(std, rel=0.06, abs=0.5 if std >= 9.95 else 0)
     assert len(written.partition(".")[2]) == len(spread.partition(".")[2])
+
+
+def test_what_rounding_leaves_is_no_number() -> None:
+    assert numbers.measured("m", 3e-4, 4.59e-16) == ("300.0000", "< 0.001", "µm")
+    assert numbers.measured("m", 2e-2, 4.59e-16) == ("20.0000000", "< 0.000001", "mm")
+    assert numbers.measured("rad", 4.59e-16) == ("< 0.001", "", "µrad")
+    assert numbers.measured("m", 0.0, 0.0) == ("0", "", "µm")
+    assert numbers.sizes([("m", 4.59e-16), ("rad/K", 4e-9)]) == "< 0.001 µm, 0.0040 µrad/K"
+
+
+@given(st.sampled_from(["m", "rad"]), st.floats(-1, 1), st.floats(0, 1))
+def test_no_length_nor_angle_has_an_exponent(unit: str, value: float, std: float) -> None:
+    assert "e" not in "".join(numbers.measured(unit, value, std)[:2])
 
 
 def test_an_uncertainty_that_is_unknown_is_not_shown() -> None:

@@ -116,12 +116,11 @@ def test_what_is_absent_is_not_told() -> None:
 
 
 def test_other_poses_than_asked_for_are_explained() -> None:
-    words = " ".join(_shown(replace(SUMMARY, asked_poses=14), 80).split())
+    words = " ".join(_shown(replace(SUMMARY, asked_poses=24), 80).split())
     assert (
-        "18 and the reference: as many readings as 14 poses take, which determine more at 18"
-        in words
+        "18 and the reference: the cell leaves no more of 24, so that some are read again" in words
     )
-    assert "which determine more" not in _shown(replace(SUMMARY, asked_poses=18), 80)
+    assert "the cell leaves" not in _shown(replace(SUMMARY, asked_poses=18), 80)
 
 
 def test_a_parameter_without_uncertainty_is_named() -> None:
